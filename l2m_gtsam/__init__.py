@@ -1,0 +1,1 @@
+"""Calibrate magnetometers against a LiDAR from one drive through a mapped magnetic field."""

@@ -1,0 +1,37 @@
+"""Everything that can go wrong with a user's input, as one sentence each.
+
+Every message names the offender (file, topic, sensor or key) and says what would be accepted.
+The command line prints it as one line and exits with code 2.
+"""
+
+
+class L2MError(Exception):
+    """Base of all errors that a user can mend."""
+
+
+class BagError(L2MError):
+    """A recording that cannot be opened, or that lacks what was asked for."""
+
+
+class UnitsError(L2MError):
+    """A field strength that does not fit the unit it is said to be in."""
+
+
+class SyncError(L2MError):
+    """Readings and poses that cannot be brought together in time."""
+
+
+class MapError(L2MError):
+    """A map that cannot be built, read or queried where it was asked."""
+
+
+class CalibrationError(L2MError):
+    """A calibration that cannot be started or read."""
+
+
+class ConfigError(L2MError):
+    """A configuration key or value that is not understood."""
+
+
+class OutputError(L2MError):
+    """A result that cannot be written."""
