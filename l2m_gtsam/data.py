@@ -249,6 +249,15 @@ class Distortion:
         """Return the distortion of an ideal sensor aligned with the lidar."""
         return cls(np.eye(3), np.zeros(3))
 
+    @classmethod
+    def from_vector(cls, vector: FloatArray) -> "Distortion":
+        """Return the distortion from C row by row and H, shape (12,)."""
+        return cls(vector[:9].reshape(3, 3), vector[9:])
+
+    def vector(self) -> FloatArray:
+        """Return C row by row and H, shape (12,)."""
+        return np.concatenate([self.C.ravel(), self.H])
+
     def apply(self, b_lidar: FloatArray) -> FloatArray:
         """Return the readings for fields ``b_lidar`` in the lidar frame, shape (..., 3), uT."""
         return np.asarray(b_lidar @ self.C.T + self.H)
@@ -256,6 +265,25 @@ class Distortion:
     def undo(self, b_meas: FloatArray) -> FloatArray:
         """Return the fields in the lidar frame for readings ``b_meas``, shape (..., 3), uT."""
         return np.asarray(np.linalg.solve(self.C, (b_meas - self.H).T).T)
+
+
+@dataclass(frozen=True)
+class KnownSensor:
+    """A magnetometer whose place and distortion are known, as on a mapping suite or in a truth.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    t_lidar_mag
+        Position in the lidar frame in metres, shape (3,).
+    distortion
+        C and H.
+    """
+
+    sensor: str
+    t_lidar_mag: FloatArray
+    distortion: Distortion
 
 
 class SensorStatus(StrEnum):

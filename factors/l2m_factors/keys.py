@@ -1,0 +1,13 @@
+"""Every symbol of the graph, in one place."""
+
+import gtsam
+
+
+def T(sensor: int) -> int:
+    """Return the key of ``t_lidar_mag`` of this sensor: Point3, metres, lidar frame."""
+    return int(gtsam.symbol("T", sensor))
+
+
+def D(sensor: int) -> int:
+    """Return the key of this sensor's distortion: Vector 12, C row by row, then H in uT."""
+    return int(gtsam.symbol("D", sensor))

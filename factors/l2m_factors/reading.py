@@ -1,0 +1,149 @@
+"""Magnetic readings as GTSAM factors: one factor per reading, or one per sensor.
+
+GTSAM asks every factor for its error separately. The numbers come out of one evaluation of all
+readings, made when the first factor of a linearisation asks and kept until a variable changes.
+"""
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from l2m_factors.field_map import FieldMap, FloatArray
+from l2m_factors.keys import D, T
+from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
+
+
+class BatchedReadings:
+    """Readings of several sensors over one map, evaluated together.
+
+    Parameters
+    ----------
+    field_map
+        The map.
+    readings
+        N readings; sensor indices count from 0.
+    distortion
+        Fixed distortions (C row by row, H in uT), shape (S, 12); the factors then depend on
+        ``T(i)`` alone. Without it they depend on ``T(i)`` and ``D(i)``.
+    """
+
+    def __init__(
+        self,
+        field_map: FieldMap,
+        readings: MagneticReadings,
+        distortion: FloatArray | None = None,
+    ) -> None:
+        self._map = field_map
+        self._readings = readings
+        self._fixed = distortion
+        self._sensors = [int(s) for s in np.unique(readings.sensor)]
+        self._keys = {s: [T(s)] if distortion is not None else [T(s), D(s)] for s in self._sensors}
+        self._seen: dict[int, bytes] = {}
+        self._residuals = ReadingResiduals(*(np.empty(0),) * 3)
+
+    def __len__(self) -> int:
+        return len(self._readings)
+
+    @property
+    def sensors(self) -> list[int]:
+        """Sensors that made at least one reading."""
+        return self._sensors
+
+    def sensor_of(self, reading: int) -> int:
+        """Return the sensor that made this reading."""
+        return int(self._readings.sensor[reading])
+
+    def rows_of(self, sensor: int) -> npt.NDArray[np.int64]:
+        """Return the indices of this sensor's readings."""
+        return np.flatnonzero(self._readings.sensor == sensor)
+
+    def keys_of(self, sensor: int) -> list[int]:
+        """Return the keys that this sensor's factors depend on."""
+        return self._keys[sensor]
+
+    def residuals(self, values: gtsam.Values, sensor: int) -> ReadingResiduals:
+        """Return the residuals of all readings, evaluated anew if this sensor's values changed."""
+        if self._seen.get(sensor) != self._stamp(values, sensor):
+            self._evaluate(values)
+        return self._residuals
+
+    def jacobians(self, residuals: ReadingResiduals) -> list[FloatArray]:
+        """Return the derivatives by each of ``keys_of``, each of shape (N, 3, .)."""
+        by_t = residuals.de_dt
+        return [by_t, residuals.de_dD] if self._fixed is None else [by_t]
+
+    def _stamp(self, values: gtsam.Values, sensor: int) -> bytes:
+        """Return the sensor's values as bytes, which compare faster than arrays."""
+        keys = self._keys[sensor]
+        stamp: bytes = values.atPoint3(keys[0]).tobytes()
+        return stamp + values.atVector(keys[1]).tobytes() if self._fixed is None else stamp
+
+    def _evaluate(self, values: gtsam.Values) -> None:
+        # A sensor without values, as when one factor is used alone, comes out as NaN.
+        count = self._sensors[-1] + 1
+        t = np.full((count, 3), np.nan)
+        distortion = np.full((count, 12), np.nan) if self._fixed is None else self._fixed
+        present = [s for s in self._sensors if values.exists(self._keys[s][0])]
+        for sensor in present:
+            t[sensor] = values.atPoint3(self._keys[sensor][0])
+            if self._fixed is None:
+                distortion[sensor] = values.atVector(self._keys[sensor][1])
+        self._residuals = reading_residuals(self._readings, self._map, t, distortion)
+        self._seen = {sensor: self._stamp(values, sensor) for sensor in present}
+
+
+def reading_factor(
+    batch: BatchedReadings, reading: int, noise_model: gtsam.noiseModel.Base
+) -> gtsam.CustomFactor:
+    """Return the factor of one reading.
+
+    Parameters
+    ----------
+    batch
+        The readings that are evaluated together.
+    reading
+        Index of the reading in the batch.
+    noise_model
+        Noise of its three axes in microtesla; any Gaussian or robust model.
+    """
+    sensor = batch.sensor_of(reading)
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        residuals = batch.residuals(values, sensor)
+        if jacobians is not None:
+            for slot, jacobian in enumerate(batch.jacobians(residuals)):
+                jacobians[slot] = jacobian[reading]
+        return np.asarray(residuals.residual[reading])
+
+    return gtsam.CustomFactor(noise_model, batch.keys_of(sensor), error)
+
+
+def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> gtsam.CustomFactor:
+    """Return one factor for all readings of one sensor: the same mathematics, less overhead.
+
+    Parameters
+    ----------
+    batch
+        The readings that are evaluated together.
+    sensor
+        Index of the sensor.
+    whitening
+        For each reading of the batch the matrix W that makes the noise of ``W e`` white with unit
+        variance, in 1/uT, shape (N, 3, 3).
+    """
+    rows = batch.rows_of(sensor)
+    W = whitening[rows]
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        residuals = batch.residuals(values, sensor)
+        if jacobians is not None:
+            for slot, jacobian in enumerate(batch.jacobians(residuals)):
+                jacobians[slot] = (W @ jacobian[rows]).reshape(3 * len(rows), -1)
+        return np.asarray(np.einsum("nij,nj->ni", W, residuals.residual[rows]).ravel())
+
+    unit = gtsam.noiseModel.Unit.Create(3 * len(rows))
+    return gtsam.CustomFactor(unit, batch.keys_of(sensor), error)

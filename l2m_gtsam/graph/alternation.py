@@ -1,0 +1,121 @@
+"""The paper's two-step loop: a closed form for C and H, then a graph for t, until t settles."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.graph.calibration import Estimate, FactorForm, batch_readings, reading_graph
+from l2m_gtsam.graph.optimise import Optimizer, optimise
+from l2m_gtsam.graph.view import QueryableMap, View, observe
+from l2m_gtsam.options import Options
+from l2m_gtsam.solve.closed_form import (
+    ClosedFormOptions,
+    fit_distortion,
+    ridge_unit,
+    row_weights,
+)
+from l2m_gtsam.solve.noise import estimate_noise
+from l2m_gtsam.solve.rank import RankOptions
+
+Progress = Callable[[str, float], None]
+
+
+class OneKeyOptions(Options):
+    """How a calibration is solved."""
+
+    optimizer: Optimizer = Optimizer.LM
+    """`lm` (Levenberg-Marquardt) or `gn` (Gauss-Newton, as in the paper)."""
+    closed_form: ClosedFormOptions = ClosedFormOptions()
+    """The inner step for C and H."""
+    factors: FactorForm = FactorForm.BLOCK
+    """`block` (one factor per sensor, fast) or `reading` (one per reading)."""
+    max_steps: int = 100
+    """Largest number of alternations (the paper's 100)."""
+    graph_iterations: int = 3
+    """Linearisations of the translation graph between two closed forms."""
+    settled_m: float = 1e-3
+    """The alternation ends when no sensor moves further than this; the joint graph takes over."""
+    joint_iterations: int = 50
+    """Largest number of linearisations of a joint optimisation."""
+    sensor_noise_ut: float | None = None
+    """Standard deviation of the sensors' noise; estimated for each sensor if not given."""
+    min_readings: int = 30
+    """A sensor with fewer readings inside the map is not solved."""
+    rank: RankOptions = RankOptions()
+    """When a direction counts as determined."""
+
+
+@dataclass(frozen=True)
+class Alternated:
+    """Where the alternation arrived, and after how many steps."""
+
+    estimate: Estimate
+    steps: int
+
+
+def start_estimate(t_start: FloatArray, options: OneKeyOptions) -> Estimate:
+    """Return ideal sensors at these positions, shape (S, 3), metres."""
+    count = len(t_start)
+    ideal = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+    noise = np.full(count, options.sensor_noise_ut or 1.0)  # replaced by the first closed form
+    return Estimate(t_start, np.tile(ideal, (count, 1)), noise, np.zeros(count))
+
+
+def alternate(
+    readings: Readings,
+    field_map: QueryableMap,
+    start: Estimate,
+    options: OneKeyOptions,
+    progress: Progress,
+) -> Alternated:
+    """Alternate closed form and translation graph until no sensor moves further than settled."""
+    estimate, furthest = start, options.settled_m
+    for step in range(1, options.max_steps + 1):
+        view = observe(readings, field_map, estimate, options.min_readings)
+        if not view.sensors:
+            return Alternated(estimate, step)
+        moved = move_sensors(view, field_map, fit_distortions(view, estimate, options), options)
+        move = float(np.abs(moved.t - estimate.t).max())
+        estimate, furthest = moved, max(furthest, move)
+        progress("alternation", _share_done(move, furthest, options.settled_m))
+        if move <= options.settled_m:
+            break
+    return Alternated(estimate, step)
+
+
+def fit_distortions(view: View, estimate: Estimate, options: OneKeyOptions) -> Estimate:
+    """Solve C and H of every sensor in closed form, and its noise if that is not given."""
+    distortion, noise = estimate.distortion.copy(), estimate.noise.copy()
+    ridge, variance = estimate.ridge.copy(), view.map_variance.mean(axis=1)
+    for s in view.sensors:
+        rows = view.readings.rows_of(s)
+        b_lidar, b_meas, v = view.b_lidar[rows], view.readings.field[rows], variance[rows]
+        weights = row_weights(v, noise[s] ** 2, options.closed_form.weighting)
+        fit = fit_distortion(b_lidar, b_meas, weights, options.closed_form)
+        distortion[s] = fit.distortion.vector()
+        if options.sensor_noise_ut is None:
+            noise[s] = estimate_noise(fit.distortion.apply(b_lidar) - b_meas, v)
+        ridge[s] = fit.ridge * ridge_unit(b_lidar, 1 / (v + noise[s] ** 2))
+    return Estimate(estimate.t, distortion, noise, ridge)
+
+
+def move_sensors(
+    view: View, field_map: QueryableMap, estimate: Estimate, options: OneKeyOptions
+) -> Estimate:
+    """Optimise all T(i) with the distortions fixed and the weights of the closed form."""
+    variance = view.map_variance.mean(axis=1) + estimate.noise[view.readings.sensor] ** 2
+    covariance = variance[:, None, None] * np.eye(3)
+    batch = batch_readings(view.readings, field_map, estimate.distortion)
+    graph = reading_graph(batch, covariance, options.factors)
+    start = estimate.positions(view.sensors)
+    optimised = optimise(graph, start, options.optimizer, options.graph_iterations)
+    return estimate.updated(optimised.values, view.sensors)
+
+
+def _share_done(move: float, furthest: float, settled: float) -> float:
+    """Return progress on a logarithmic scale: the loop converges linearly."""
+    if move <= settled:
+        return 1.0
+    return float(np.log(furthest / move) / np.log(furthest / settled))

@@ -1,0 +1,158 @@
+"""The joint graph over ``T(i)`` and ``D(i)``: the finish of the solve, and its uncertainty."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import BatchedReadings, D, T
+from l2m_gtsam.data import FloatArray, ResidualFigures
+from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.graph.calibration import (
+    Estimate,
+    batch_readings,
+    prior_graph,
+    reading_graph,
+    sensor_covariance,
+    whitened_jacobian,
+)
+from l2m_gtsam.graph.optimise import Ending, optimise
+from l2m_gtsam.graph.view import QueryableMap, View
+from l2m_gtsam.solve.figures import residual_figures
+from l2m_gtsam.solve.noise import estimate_noise, map_covariance, reading_covariance, whitening
+from l2m_gtsam.solve.rank import Determinacy, determinacy
+
+
+@dataclass(frozen=True)
+class SensorSolution:
+    """What the joint graph says of one sensor.
+
+    Attributes
+    ----------
+    sensor
+        Index of the sensor.
+    covariance
+        Of (t, C row by row, H) in m and uT; undetermined parameters have infinite variance and
+        no correlation, shape (15, 15).
+    figures
+        Residuals of the readings used.
+    determinacy
+        What the data determine.
+    remaining_sigmas
+        Length of the Newton step that remains, in standard deviations.
+    """
+
+    sensor: int
+    covariance: FloatArray
+    figures: ResidualFigures
+    determinacy: Determinacy
+    remaining_sigmas: float
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """The joint graph with its weights frozen at one estimate.
+
+    Attributes
+    ----------
+    view
+        The readings used.
+    batch
+        The same, as the factors evaluate them.
+    map_share
+        Covariance that the map contributes to each residual in uT^2, shape (N, 3, 3).
+    covariance
+        Covariance of each residual in uT^2, shape (N, 3, 3).
+    jacobians
+        Whitened derivatives by the 15 parameters of each sensor, shape (3 n, 15).
+    determinacies
+        Rank test of each sensor.
+    graph
+        Readings, ridge, and a hold on what the data cannot determine.
+    """
+
+    view: View
+    batch: BatchedReadings
+    map_share: FloatArray
+    covariance: FloatArray
+    jacobians: dict[int, FloatArray]
+    determinacies: dict[int, Determinacy]
+    graph: gtsam.NonlinearFactorGraph
+
+
+@dataclass(frozen=True)
+class JointStep:
+    """An optimum for frozen weights."""
+
+    estimate: Estimate
+    ending: Ending
+
+
+def joint_problem(
+    view: View, field_map: QueryableMap, estimate: Estimate, options: OneKeyOptions
+) -> JointProblem:
+    """Build the joint graph at an estimate: rank test first, undetermined directions held."""
+    sensor = view.readings.sensor
+    share = map_covariance(estimate.C()[sensor], view.readings.R_map_lidar, view.map_variance)
+    covariance = reading_covariance(estimate.noise[sensor], share)
+    batch = batch_readings(view.readings, field_map)
+    values, W = estimate.values(view.sensors), whitening(covariance)
+    jacobians = {s: whitened_jacobian(batch, W, values, s) for s in view.sensors}
+    tests = {s: determinacy(J, options.rank) for s, J in jacobians.items()}
+    graph = reading_graph(batch, covariance, options.factors)
+    graph.push_back(prior_graph(estimate, {s: test.held for s, test in tests.items()}))
+    return JointProblem(view, batch, share, covariance, jacobians, tests, graph)
+
+
+def joint_step(problem: JointProblem, estimate: Estimate, options: OneKeyOptions) -> JointStep:
+    """Optimise T(i) and D(i) of all sensors, then the noise from the residuals that remain."""
+    sensors = problem.view.sensors
+    start = estimate.values(sensors)
+    optimised = optimise(problem.graph, start, options.optimizer, options.joint_iterations)
+    after = estimate.updated(optimised.values, sensors)
+    if options.sensor_noise_ut is None:
+        after = replace(after, noise=_noise(problem, after))
+    return JointStep(after, optimised.ending)
+
+
+def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
+    """Return the most likely noise of each sensor in uT, shape (S,)."""
+    noise, values = estimate.noise.copy(), estimate.values(problem.view.sensors)
+    variance = np.trace(problem.map_share, axis1=1, axis2=2) / 3
+    for s in problem.view.sensors:
+        rows = problem.batch.rows_of(s)
+        residual = problem.batch.residuals(values, s).residual[rows]
+        noise[s] = estimate_noise(residual, variance[rows])
+    return noise
+
+
+def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
+    """Return covariance and figures of every sensor at the optimum of its own weights."""
+    values = estimate.values(problem.view.sensors)
+    marginals = gtsam.Marginals(problem.graph, values)
+    step = problem.graph.linearize(values).optimize()
+    W = whitening(problem.covariance)
+    solutions = []
+    for s in problem.view.sensors:
+        rows, test = problem.batch.rows_of(s), problem.determinacies[s]
+        residual = problem.batch.residuals(values, s).residual[rows]
+        remaining = problem.jacobians[s] @ np.concatenate([step.at(T(s)), step.at(D(s))])
+        solutions.append(
+            SensorSolution(
+                sensor=s,
+                covariance=_with_infinities(sensor_covariance(marginals, s), test),
+                figures=residual_figures(residual, W[rows]),
+                determinacy=test,
+                remaining_sigmas=float(np.linalg.norm(remaining)),
+            )
+        )
+    return tuple(solutions)
+
+
+def _with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
+    """Return the covariance without the made-up figures of directions that were held."""
+    honest = covariance.copy()
+    honest[test.touched, :] = 0.0
+    honest[:, test.touched] = 0.0
+    honest[test.touched, test.touched] = np.inf
+    return honest

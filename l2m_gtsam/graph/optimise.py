@@ -1,0 +1,80 @@
+"""Run a GTSAM optimiser and say how it ended."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import gtsam
+
+# Smallest decrease of the error that counts, relative and absolute: tight, because a step more
+# costs little and what remains is judged afterwards in standard deviations.
+TOLERANCE = 1e-10
+
+
+class Optimizer(StrEnum):
+    """A nonlinear least-squares method."""
+
+    LM = "lm"
+    GN = "gn"
+
+
+class Ending(StrEnum):
+    """How an optimisation ended."""
+
+    TOLERANCE = "the error no longer falls"
+    ITERATION_LIMIT = "the iteration limit was reached"
+    SINGULAR = "the linear system is singular"
+
+
+@dataclass(frozen=True)
+class Optimised:
+    """Where an optimisation arrived.
+
+    Attributes
+    ----------
+    values
+        Optimised values; the start if the system was singular.
+    ending
+        Why it stopped.
+    """
+
+    values: gtsam.Values
+    ending: Ending
+
+
+def optimise(
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    optimizer: Optimizer,
+    max_iterations: int,
+) -> Optimised:
+    """Minimise a graph's error from a start, with at most so many linearisations."""
+    engine = _engine(graph, start, optimizer, max_iterations)
+    try:
+        values = engine.optimize()
+    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException has no Python type
+        if "ndetermina" not in str(error):
+            raise
+        return Optimised(start, Ending.SINGULAR)
+    spent = engine.iterations() >= max_iterations
+    return Optimised(values, Ending.ITERATION_LIMIT if spent else Ending.TOLERANCE)
+
+
+def _engine(
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    optimizer: Optimizer,
+    max_iterations: int,
+) -> gtsam.NonlinearOptimizer:
+    if optimizer is Optimizer.GN:
+        gauss_newton = gtsam.GaussNewtonParams()
+        _limit(gauss_newton, max_iterations)
+        return gtsam.GaussNewtonOptimizer(graph, start, gauss_newton)
+    levenberg = gtsam.LevenbergMarquardtParams()
+    _limit(levenberg, max_iterations)
+    return gtsam.LevenbergMarquardtOptimizer(graph, start, levenberg)
+
+
+def _limit(params: gtsam.NonlinearOptimizerParams, max_iterations: int) -> None:
+    params.setMaxIterations(max_iterations)
+    params.setRelativeErrorTol(TOLERANCE)
+    params.setAbsoluteErrorTol(TOLERANCE)

@@ -1,0 +1,1 @@
+"""Closed forms, rank and statistics: pure functions on arrays."""

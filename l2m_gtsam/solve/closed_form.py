@@ -1,0 +1,193 @@
+r"""Distortion from pairs of fields, in closed form: OLS, TLS, RRTLS and w-RRTLS.
+
+All solve ``b_meas = C b_lidar + H`` for N pairs. They differ in three steps that can be taken or
+not: weights, truncation, ridge.
+
+1. Rows are weighted and centred with the weighted means, so that H follows from the means and is
+   never penalised (mixed LS-TLS; the paper omits the intercept).
+2. TLS truncates the compound matrix [b_lidar b_meas] to rank 3 (paper, section III-C).
+3. The ridge pulls C towards C0: ``lambda ||C - C0||_F^2`` (the paper penalises the data).
+
+Everything after step 1 works on the 6 x 6 triangular factor of the compound matrix.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import assert_never
+
+import numpy as np
+
+from l2m_gtsam.data import Distortion, FloatArray
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.options import Options
+from l2m_gtsam.solve.ridge import generalised_cross_validation, l_curve, ridge_path
+
+
+class Method(StrEnum):
+    """A closed form for C and H."""
+
+    OLS = "ols"
+    TLS = "tls"
+    RRTLS = "rrtls"
+    W_RRTLS = "w_rrtls"
+
+
+class Weighting(StrEnum):
+    """What a reading's weight is made of."""
+
+    LIKELIHOOD = "likelihood"
+    PAPER = "paper"
+
+
+class RidgeRule(StrEnum):
+    """How the strength of the ridge is chosen."""
+
+    FIXED = "fixed"
+    GCV = "gcv"
+    L_CURVE = "l_curve"
+
+
+class ClosedFormOptions(Options):
+    """Which closed form solves for the distortion."""
+
+    method: Method = Method.W_RRTLS
+    """`ols`, `tls`, `rrtls` (ridge, truncated) or `w_rrtls` (weighted as well)."""
+    weighting: Weighting = Weighting.LIKELIHOOD
+    """`likelihood`: 1 / (map variance + sensor variance); `paper`: map variance to the power -2,
+    as the published norm amounts to."""
+    ridge: RidgeRule = RidgeRule.FIXED
+    """`fixed` (at `ridge_strength`), `gcv` or `l_curve`."""
+    ridge_strength: float = 1e-9
+    """Fixed ridge relative to the spread of the field. The default only stops directions that the
+    data leave open from running away; it moves C by a billionth."""
+
+
+@dataclass(frozen=True)
+class DistortionFit:
+    """A distortion and the ridge that shaped it.
+
+    Attributes
+    ----------
+    distortion
+        C and H.
+    ridge
+        Strength relative to the spread of the field (`ridge_unit`); 0 where the method has none.
+    """
+
+    distortion: Distortion
+    ridge: float
+
+
+def row_weights(
+    map_variance: FloatArray, sensor_variance: float, weighting: Weighting
+) -> FloatArray:
+    """Return the weight of each reading's squared residual.
+
+    Parameters
+    ----------
+    map_variance
+        Mean variance of the map's prediction over the three axes in uT^2, shape (N,).
+    sensor_variance
+        Variance of the sensor's noise in uT^2.
+    weighting
+        `LIKELIHOOD` or `PAPER` (infinite weights of an exact map become equal ones).
+    """
+    match weighting:
+        case Weighting.LIKELIHOOD:
+            return 1.0 / (map_variance + sensor_variance)
+        case Weighting.PAPER:
+            floor = np.finfo(float).eps * max(float(map_variance.max(initial=0.0)), 1.0)
+            return 1.0 / np.maximum(map_variance, floor) ** 2
+        case _:
+            assert_never(weighting)
+
+
+def fit_distortion(
+    b_lidar: FloatArray,
+    b_meas: FloatArray,
+    weights: FloatArray,
+    options: ClosedFormOptions,
+    C0: FloatArray | None = None,
+) -> DistortionFit:
+    """Solve ``b_meas = C b_lidar + H``.
+
+    Parameters
+    ----------
+    b_lidar
+        Field in the lidar frame that the map predicts, uT, shape (N, 3).
+    b_meas
+        Readings in uT, shape (N, 3).
+    weights
+        Weight of each reading's squared residual, shape (N,); used by `w_rrtls` only.
+    options
+        The closed form.
+    C0
+        Where the ridge pulls to, and where directions without any data stay; identity by default.
+
+    Raises
+    ------
+    CalibrationError
+        Fewer than four readings: C and H cannot follow from them.
+    """
+    if len(b_lidar) < 4:
+        msg = f"{len(b_lidar)} readings cannot determine a distortion, at least 4 are needed"
+        raise CalibrationError(msg)
+    C0 = np.eye(3) if C0 is None else C0
+    method = options.method
+    w = weights if method is Method.W_RRTLS else np.ones(len(b_lidar))
+    mean_l, mean_m = np.average(np.stack([b_lidar, b_meas]), axis=1, weights=w)
+    rows = np.sqrt(w / w.mean())[:, None] * np.hstack([b_lidar - mean_l, b_meas - mean_m])
+    factor = np.asarray(np.linalg.qr(rows, mode="r"))
+    kept = factor if method is Method.OLS else _truncated(factor)
+    X, Y = kept[:, :3], kept[:, 3:] - kept[:, :3] @ C0.T
+    ridge = 0.0
+    if method in (Method.RRTLS, Method.W_RRTLS):
+        ridge = _ridge(X, Y, float(np.sum((factor - kept) ** 2)), len(rows), options)
+    C = C0 + _solve_ridge(X, Y, ridge * _unit(X)).T
+    return DistortionFit(Distortion(C, mean_m - C @ mean_l), ridge)
+
+
+def ridge_unit(b_lidar: FloatArray, weights: FloatArray) -> float:
+    """Return the ridge strength that is called 1: the field's weighted spread.
+
+    It is the sum of squares of the centred field, averaged over the axes.
+
+    Parameters
+    ----------
+    b_lidar
+        Field in uT, shape (N, 3).
+    weights
+        Weight of each reading's squared residual, shape (N,).
+    """
+    centred = b_lidar - np.average(b_lidar, axis=0, weights=weights)
+    return float(np.sum(weights[:, None] * centred**2)) / 3
+
+
+def _unit(X: FloatArray) -> float:
+    return float(np.sum(X**2)) / 3
+
+
+def _truncated(factor: FloatArray) -> FloatArray:
+    """Return the nearest matrix of rank 3."""
+    U, s, Vt = np.linalg.svd(factor, full_matrices=False)
+    return np.asarray((U[:, :3] * s[:3]) @ Vt[:3])
+
+
+def _ridge(
+    X: FloatArray, Y: FloatArray, removed: float, observations: int, options: ClosedFormOptions
+) -> float:
+    """Return the relative strength by the rule of the options."""
+    unit = _unit(X)
+    if options.ridge is RidgeRule.FIXED or unit == 0.0:
+        return options.ridge_strength
+    path = ridge_path(X, Y, removed)
+    if options.ridge is RidgeRule.GCV:
+        return generalised_cross_validation(path, observations) / unit
+    return l_curve(path) / unit
+
+
+def _solve_ridge(X: FloatArray, Y: FloatArray, strength: float) -> FloatArray:
+    """Return the minimiser of ``||X A - Y||^2 + strength ||A||^2``, smallest where open."""
+    regressors = np.vstack([X, np.sqrt(strength) * np.eye(3)])
+    observations = np.vstack([Y, np.zeros((3, 3))])
+    return np.asarray(np.linalg.lstsq(regressors, observations, rcond=1e-12)[0])

@@ -1,0 +1,72 @@
+"""The noise of readings: what the map and the sensor contribute, and how large the sensor's is."""
+
+import numpy as np
+from scipy.optimize import brentq
+
+from l2m_gtsam.data import FloatArray
+
+# Search range for a sensor's noise in uT: from below the resolution of any vehicle's magnetometer
+# to above the Earth's field.
+NOISE_RANGE = (1e-4, 1e3)
+
+
+def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatArray) -> FloatArray:
+    """Return ``C R^T V R C^T``: the map's uncertainty as a sensor sees it, uT^2, (N, 3, 3).
+
+    Parameters
+    ----------
+    C
+        Distortion matrix of the sensor that made each reading, shape (N, 3, 3).
+    R_map_lidar
+        Rotations from lidar to map, shape (N, 3, 3).
+    map_variance
+        Variance of the map per axis of the map frame in uT^2, shape (N, 3).
+    """
+    A = C @ R_map_lidar.transpose(0, 2, 1)
+    return np.asarray(np.einsum("nik,nk,njk->nij", A, map_variance, A))
+
+
+def reading_covariance(noise: FloatArray, map_share: FloatArray) -> FloatArray:
+    """Return ``sigma^2 I + map_share``, the covariance of each residual in uT^2, (N, 3, 3).
+
+    Parameters
+    ----------
+    noise
+        Standard deviation of the sensor that made the reading in uT, shape (N,).
+    map_share
+        What the map contributes, shape (N, 3, 3).
+    """
+    return np.asarray((noise**2)[:, None, None] * np.eye(3) + map_share)
+
+
+def whitening(covariance: FloatArray) -> FloatArray:
+    """Return matrices W with ``W S W^T = I``, shape (N, 3, 3)."""
+    lower = np.linalg.cholesky(covariance)
+    return np.asarray(np.linalg.solve(lower, np.broadcast_to(np.eye(3), lower.shape)))
+
+
+def estimate_noise(residual: FloatArray, map_variance: FloatArray) -> float:
+    """Return the most likely standard deviation of a sensor's noise in uT.
+
+    The residuals are modelled as independent normal numbers of variance
+    ``sigma^2 + map_variance``; what the map's variance already explains is not counted again.
+
+    Parameters
+    ----------
+    residual
+        Residuals in uT, shape (N, 3).
+    map_variance
+        Mean variance of the map's prediction in uT^2, shape (N,).
+    """
+    e2, v = residual**2, map_variance[:, None]
+
+    def score(log_sigma: float) -> float:
+        total = np.exp(2 * log_sigma) + v
+        return float(np.sum(1 / total - e2 / total**2))
+
+    low, high = np.log(NOISE_RANGE)
+    if score(low) >= 0:
+        return NOISE_RANGE[0]
+    if score(high) <= 0:
+        return NOISE_RANGE[1]
+    return float(np.exp(brentq(score, low, high, xtol=1e-6)))

@@ -1,0 +1,90 @@
+"""What the data determine and what they do not: the rank test before any covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr
+
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.options import Options
+
+PARAMETERS = (
+    *("t_x", "t_y", "t_z"),
+    *(f"C_{row}{column}" for row in "xyz" for column in "xyz"),
+    *("H_x", "H_y", "H_z"),
+)
+
+
+class RankOptions(Options):
+    """When a direction counts as determined: its sigma, with nothing else known, is below these."""
+
+    useful_t_m: float = 0.3
+    """Metres."""
+    useful_C: float = 0.3
+    """Entries of C, without unit."""
+    useful_H_ut: float = 15.0
+    """Microtesla."""
+
+    def scale(self) -> FloatArray:
+        """Return the largest useful sigma of each parameter, shape (15,)."""
+        parts = np.repeat([self.useful_t_m, self.useful_C, self.useful_H_ut], [3, 9, 3])
+        return np.asarray(parts, dtype=float)
+
+
+@dataclass(frozen=True)
+class Determinacy:
+    """Which directions of (t, C row by row, H) a set of readings determines.
+
+    Attributes
+    ----------
+    held
+        Rows that span what is not determined, in parameters divided by their scale,
+        orthonormal there, shape (K, 15).
+    names
+        One name per undetermined direction: the parameters that take part in it.
+    touched
+        Parameters that take part in an undetermined direction, shape (15,).
+    """
+
+    held: FloatArray
+    names: tuple[str, ...]
+    touched: BoolArray
+
+
+def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
+    """Test the rank of a whitened Jacobian.
+
+    Columns are scaled so that a step of one is the largest sigma of use; a singular value s then
+    means a sigma of 1/s along its direction, and s < 1 an undetermined one.
+
+    Parameters
+    ----------
+    jacobian
+        Derivatives of whitened residuals by the 15 parameters, shape (M, 15).
+    options
+        The scales.
+    """
+    triangular = np.asarray(np.linalg.qr(jacobian * options.scale(), mode="r"))
+    square = np.zeros((15, 15))
+    square[: len(triangular)] = triangular
+    _, s, Vt = np.linalg.svd(square)
+    weak = Vt[s < 1.0]
+    simple = _simple_basis(weak)
+    names = tuple(_name(row) for row in simple)
+    touched = np.sum(weak**2, axis=0) > 1e-4  # a share of one per cent in length
+    return Determinacy(weak / options.scale(), names, touched)
+
+
+def _simple_basis(rows: FloatArray) -> FloatArray:
+    """Return a basis of the same space in which each row has one parameter to itself."""
+    if not len(rows):
+        return rows
+    _, triangular, order = qr(rows, mode="economic", pivoting=True)
+    basis = np.empty_like(rows)
+    basis[:, order] = np.linalg.solve(triangular[:, : len(rows)], triangular)
+    return basis
+
+
+def _name(row: FloatArray) -> str:
+    members = np.flatnonzero(np.abs(row) > 0.2 * np.abs(row).max())
+    return " with ".join(PARAMETERS[i] for i in members)

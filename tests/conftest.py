@@ -1,0 +1,26 @@
+"""Fixtures shared by all tests."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """Root of the checkout."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Recordings that others made; they are not part of the project and may be absent."""
+    path = Path(os.environ.get("L2M_SHARED_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not (path / "bags").is_dir():
+        reason = f"no shared recordings at {path}; set L2M_SHARED_DATA to their folder"
+        if os.environ.get("L2M_REQUIRE_SHARED") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return path

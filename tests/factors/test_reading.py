@@ -1,0 +1,171 @@
+"""The magnetic reading factors: derivatives, batching, and the two forms of one mathematics."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from l2m_factors import (
+    BatchedReadings,
+    D,
+    MagneticReadings,
+    T,
+    assert_jacobians_match,
+    block_factor,
+    distortion_prior,
+    held_directions,
+    reading_factor,
+)
+from l2m_gtsam.data import FloatArray, Readings
+from tests.worlds import DipoleWorld, dipole_world, drive, random_sensors
+
+
+def as_magnetic(readings: Readings) -> MagneticReadings:
+    return MagneticReadings(
+        readings.sensor, readings.R_map_lidar, readings.p_map_lidar, readings.field
+    )
+
+
+def random_values(seed: int, sensors: int) -> gtsam.Values:
+    rng = np.random.default_rng(seed)
+    values = gtsam.Values()
+    for i in range(sensors):
+        values.insert(T(i), rng.uniform(-0.5, 0.5, 3))
+        C = Rotation.random(rng=rng).as_matrix() + rng.normal(0, 0.2, (3, 3))
+        values.insert(D(i), np.concatenate([C.ravel(), rng.normal(0, 20, 3)]))
+    return values
+
+
+def fixed_distortion(values: gtsam.Values, sensors: int) -> FloatArray:
+    return np.stack([values.atVector(D(i)) for i in range(sensors)])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_jacobians_match_central_differences(seed: int) -> None:
+    """Random poses, translations and distortions; 1e-6 of the largest entry (issue contract)."""
+    world, sensors = dipole_world(seed), random_sensors(seed, 2)
+    readings = as_magnetic(drive(seed, sensors, world, count=3, tilt=0.5))
+    values = random_values(seed, 2)
+    noise = gtsam.noiseModel.Gaussian.Covariance(np.diag([0.1, 0.2, 0.3]) + 0.02)
+    joint = BatchedReadings(world, readings)
+    alone = BatchedReadings(world, readings, fixed_distortion(values, 2))
+    whitening = np.broadcast_to(np.linalg.cholesky(np.diag([3.0, 4.0, 5.0]) + 1), (6, 3, 3))
+    factors = (
+        reading_factor(joint, 1, noise),
+        reading_factor(alone, 4, noise),
+        block_factor(joint, 0, whitening),
+        block_factor(alone, 1, whitening),
+    )
+    for factor in factors:
+        assert_jacobians_match(factor, values, rtol=1e-6, step=1e-4)
+
+
+def test_prior_jacobians_match() -> None:
+    rng = np.random.default_rng(5)
+    values = random_values(5, 1)
+    assert_jacobians_match(distortion_prior(0, np.eye(3), 0.3), values)
+    assert_jacobians_match(held_directions(0, rng.normal(size=(2, 15)), np.zeros(15)), values)
+
+
+def test_check_catches_a_wrong_jacobian() -> None:
+    """The paper prints R C grad M; on a turned vehicle the check must refuse it."""
+    world, sensors = dipole_world(1), random_sensors(1, 1)
+    readings = as_magnetic(drive(1, sensors, world, count=1))
+    values = random_values(1, 1)
+    batch = BatchedReadings(world, readings, fixed_distortion(values, 1))
+
+    def papers(
+        _: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        residuals = batch.residuals(at, 0)
+        if jacobians is not None:
+            R, t = readings.R_map_lidar[0], at.atPoint3(T(0))
+            G = world.field_and_gradient((R @ t + readings.p_map_lidar[0])[None])[1]
+            jacobians[0] = np.asarray(R @ values.atVector(D(0))[:9].reshape(3, 3) @ G[0])
+        return np.asarray(residuals.residual[0])
+
+    factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [T(0)], papers)
+    with pytest.raises(AssertionError, match="Jacobian by T0"):
+        assert_jacobians_match(factor, values)
+
+
+class CountingWorld:
+    """A map that counts how often it is asked."""
+
+    def __init__(self, world: DipoleWorld) -> None:
+        self.world, self.calls = world, 0
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        self.calls += 1
+        return self.world.field_and_gradient(points)
+
+
+def test_one_map_query_per_linearisation() -> None:
+    sensors = random_sensors(2, 3)
+    counting = CountingWorld(dipole_world(2))
+    readings = as_magnetic(drive(2, sensors, counting.world, count=20))
+    batch = BatchedReadings(counting, readings)
+    graph = gtsam.NonlinearFactorGraph()
+    for n in range(len(batch)):
+        graph.add(reading_factor(batch, n, gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
+    values = random_values(2, 3)
+    graph.error(values)
+    graph.linearize(values)
+    assert counting.calls == 1
+    values.update(T(1), np.array([0.1, 0.2, 0.3]))
+    graph.linearize(values)
+    assert counting.calls == 2
+    values.update(D(2), np.arange(12.0))
+    graph.error(values)
+    assert counting.calls == 3
+
+
+def test_a_factor_alone_needs_only_its_own_sensor() -> None:
+    world, sensors = dipole_world(3), random_sensors(3, 2)
+    readings = as_magnetic(drive(3, sensors, world, count=4))
+    batch = BatchedReadings(world, readings)
+    values = gtsam.Values()
+    values.insert(T(1), sensors[1].t_lidar_mag)
+    values.insert(D(1), np.concatenate([sensors[1].distortion.C.ravel(), sensors[1].distortion.H]))
+    factor = reading_factor(batch, 5, gtsam.noiseModel.Unit.Create(3))
+    assert factor.error(values) < 1e-20  # rounding of 40 uT squared
+
+
+def test_blocks_equal_readings() -> None:
+    """Same error, same information, same solution; rounding of 60-row sums allows 1e-9."""
+    world, sensors = dipole_world(4), random_sensors(4, 2)
+    readings = as_magnetic(drive(4, sensors, world, count=60, noise=0.02))
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(len(readings), 3, 3)) + 3 * np.eye(3)
+    covariance = root @ root.transpose(0, 2, 1)
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    batch = BatchedReadings(world, readings)
+    single, stacked = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    for n in range(len(batch)):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance[n])
+        single.add(reading_factor(batch, n, noise))
+    for sensor in batch.sensors:
+        stacked.add(block_factor(batch, sensor, whitening))
+    values = random_values(4, 2)
+    assert single.error(values) == pytest.approx(stacked.error(values), rel=1e-9)
+    ordering = gtsam.Ordering()
+    for i in range(2):
+        ordering.push_back(T(i))
+        ordering.push_back(D(i))
+    H_single, g_single = single.linearize(values).hessian(ordering)
+    H_stacked, g_stacked = stacked.linearize(values).hessian(ordering)
+    np.testing.assert_allclose(H_single, H_stacked, rtol=1e-9, atol=1e-9 * H_single.max())
+    np.testing.assert_allclose(g_single, g_stacked, rtol=1e-9, atol=1e-9 * abs(g_single).max())
+    truth = gtsam.Values()
+    for i, s in enumerate(sensors):
+        truth.insert(T(i), s.t_lidar_mag + 0.05)
+        truth.insert(D(i), np.concatenate([np.eye(3).ravel(), np.zeros(3)]))
+    for i in range(2):
+        a = gtsam.LevenbergMarquardtOptimizer(single, truth).optimize()
+        b = gtsam.LevenbergMarquardtOptimizer(stacked, truth).optimize()
+        np.testing.assert_allclose(a.atPoint3(T(i)), b.atPoint3(T(i)), atol=1e-7)
+        np.testing.assert_allclose(a.atVector(D(i)), b.atVector(D(i)), atol=1e-6)
+        assert np.linalg.norm(a.atPoint3(T(i)) - sensors[i].t_lidar_mag) < 0.02

@@ -1,0 +1,97 @@
+"""Fields with closed forms and random drives through them, for tests that need an exact map."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import Distortion, FieldSample, FloatArray, KnownSensor, Readings
+
+DIPOLE_CONSTANT = 0.1  # mu_0 / 4 pi in uT m / A: B of a dipole of 1 A m^2 at 1 m is 0.1-0.2 uT
+
+
+@dataclass(frozen=True)
+class DipoleWorld:
+    """Point dipoles in a uniform field: exact values and gradients everywhere.
+
+    Attributes
+    ----------
+    uniform
+        Field without dipoles in uT, shape (3,).
+    positions, moments
+        Dipoles, metres and A m^2, shape (K, 3).
+    """
+
+    uniform: FloatArray
+    positions: FloatArray
+    moments: FloatArray
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
+        r = points[:, None, :] - self.positions
+        d = np.linalg.norm(r, axis=-1)[..., None]
+        m = np.broadcast_to(self.moments, r.shape)
+        mr = np.sum(m * r, axis=-1, keepdims=True)
+        field = DIPOLE_CONSTANT * np.sum(3 * r * mr / d**5 - m / d**3, axis=1)
+        rr = r[..., :, None] * r[..., None, :]
+        mixed = m[..., :, None] * r[..., None, :] + r[..., :, None] * m[..., None, :]
+        eye = np.eye(3)
+        d5, d7 = d[..., None] ** 5, d[..., None] ** 7
+        gradient = 3 * (mixed + mr[..., None] * eye) / d5 - 15 * rr * mr[..., None] / d7
+        return self.uniform + field, DIPOLE_CONSTANT * np.sum(gradient, axis=1)
+
+    def query(self, points: FloatArray) -> FieldSample:
+        """Return the exact field: no variance, inside everywhere."""
+        field, gradient = self.field_and_gradient(points)
+        return FieldSample(
+            field, gradient, np.zeros_like(field), np.ones(len(points), dtype=np.bool_)
+        )
+
+
+def dipole_world(seed: int, count: int = 40) -> DipoleWorld:
+    """Return dipoles under and over the floor of a 12 x 12 m hall."""
+    rng = np.random.default_rng(seed)
+    positions = rng.uniform([-6, -6, 0], [6, 6, 1], (count, 3))
+    positions[:, 2] = np.where(rng.random(count) < 0.5, -0.6, 2.5)
+    return DipoleWorld(np.array([22.0, 3.0, -38.0]), positions, rng.normal(0, 25, (count, 3)))
+
+
+def random_sensors(seed: int, count: int) -> tuple[KnownSensor, ...]:
+    """Return magnetometers within 0.6 m of the lidar with moderate random distortion."""
+    rng = np.random.default_rng(seed)
+    sensors = []
+    for index in range(count):
+        R = Rotation.from_rotvec(rng.normal(0, 0.1, 3)).as_matrix()
+        C = (np.eye(3) + rng.normal(0, 0.04, (3, 3))) @ R
+        t = rng.uniform(-0.6, 0.6, 3)
+        sensors.append(KnownSensor(f"mag_{index:02d}", t, Distortion(C, rng.normal(0, 15, 3))))
+    return tuple(sensors)
+
+
+def drive(
+    seed: int,
+    sensors: tuple[KnownSensor, ...],
+    world: DipoleWorld,
+    count: int = 200,
+    tilt: float = 0.15,
+    noise: float = 0.0,
+) -> Readings:
+    """Return readings of a drive that turns in all headings, tilts and heaves.
+
+    ``tilt`` is the standard deviation of roll and pitch in radians and, times a metre, of height;
+    ``noise`` is the standard deviation of the sensors in uT.
+    """
+    rng = np.random.default_rng(seed)
+    N = count * len(sensors)
+    angles = np.column_stack([rng.uniform(-np.pi, np.pi, N), rng.normal(0, tilt, (N, 2))])
+    R = Rotation.from_euler("ZYX", angles).as_matrix()
+    p = np.column_stack([rng.uniform(-4, 4, (N, 2)), 0.5 + rng.normal(0, tilt, N)])
+    sensor = np.repeat(np.arange(len(sensors)), count)
+    t = np.stack([s.t_lidar_mag for s in sensors])[sensor]
+    B, _ = world.field_and_gradient(np.einsum("nij,nj->ni", R, t) + p)
+    b = np.einsum("nji,nj->ni", R, B)
+    field = np.concatenate(
+        [s.distortion.apply(b[sensor == i]) for i, s in enumerate(sensors)]
+    ) + noise * rng.normal(size=(N, 3))
+    stamps = np.tile(np.arange(count) * 50_000_000, len(sensors))
+    return Readings(tuple(s.sensor for s in sensors), sensor, stamps, R, p, field)
