@@ -285,6 +285,11 @@ class KnownSensor:
     t_lidar_mag: FloatArray
     distortion: Distortion
 
+    @classmethod
+    def ideal(cls, sensor: str) -> "KnownSensor":
+        """Return a sensor without distortion at the lidar's origin."""
+        return cls(sensor, np.zeros(3), Distortion.identity())
+
 
 class SensorStatus(StrEnum):
     """How the solve of one sensor ended."""

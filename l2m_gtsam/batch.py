@@ -1,0 +1,179 @@
+"""Files in, files out: what the command line does, callable from Python."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+from l2m_gtsam.calibrate import calibrate
+from l2m_gtsam.config import Config
+from l2m_gtsam.data import CalibrationResult, Recording
+from l2m_gtsam.errors import OutputError
+from l2m_gtsam.mapping import map_recordings
+from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.qa.figures import calibration_figure, map_figure, save_figure
+from l2m_gtsam.simulate.bag_writer import BagKind, write_bag
+from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
+from l2m_gtsam.storage.bag import read_recording
+from l2m_gtsam.storage.calibration_file import (
+    read_known_sensors,
+    write_calibration,
+    write_known_sensors,
+)
+from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.map_file import load_map, save_map
+
+Progress = Callable[[str, float], None]
+
+CALIBRATION_FILE = "calibration.yaml"
+OVERVIEW_FILE = "overview.png"
+
+
+def build_map_file(
+    bags: Sequence[Path], out: Path, config: Config, suite: Path | None, progress: Progress
+) -> FieldMap:
+    """Build a map from mapping bags and write it.
+
+    Parameters
+    ----------
+    bags
+        One or several mapping bags.
+    out
+        Map file to write (`.npz`).
+    config
+        Configuration.
+    suite
+        File with the mapping suite's calibrations; ideal sensors at the lidar's origin if absent.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    known = None if suite is None else read_known_sensors(suite)
+    recordings = [_read(bag, config, progress) for bag in bags]
+    progress("building the map", 0.0)
+    field_map = map_recordings(recordings, known, config.mapping)
+    progress("building the map", 1.0)
+    state = field_map.to_state()
+    provenance = {
+        "bags": [vars(recording.source) for recording in recordings],
+        "suite": None if suite is None else vars(source_file(suite)),
+        "frame": recordings[0].trajectory.frame,
+        "config": config.model_dump(mode="json", include={"bag", "mapping"}),
+        "version": version("l2m-gtsam"),
+    }
+    _ensure_folder(out.parent)
+    save_map(out, replace(state, provenance={**state.provenance, **provenance}))
+    return field_map
+
+
+def load_field_map(path: Path) -> FieldMap:
+    """Return the map in a file, ready to be asked."""
+    return map_from_state(load_map(path))
+
+
+def plot_map_file(path: Path, out: Path, height: float | None) -> None:
+    """Draw a map at a height in metres (the middle of its readings if None) as a picture."""
+    _ensure_folder(out.parent)
+    save_figure(map_figure(load_field_map(path), height), out)
+
+
+def calibrate_bag(
+    bag: Path, map_path: Path, config: Config, out: Path, progress: Progress
+) -> CalibrationResult:
+    """Calibrate all magnetometers of a bag and write `calibration.yaml` and a picture.
+
+    Parameters
+    ----------
+    bag
+        A drive through the mapped place.
+    map_path
+        Map file.
+    config
+        Configuration.
+    out
+        Folder for the results, made if it is missing.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line; nothing is written then.
+    """
+    progress("loading the map", 0.0)
+    field_map = load_field_map(map_path)
+    progress("loading the map", 1.0)
+    recording = _read(bag, config, progress)
+    source = source_file(map_path)
+    result = calibrate(recording, field_map, config.calibration, source, progress)
+    result = replace(result, options=config.model_dump(mode="json"))
+    _ensure_folder(out)
+    write_calibration(out / CALIBRATION_FILE, result)
+    figure = calibration_figure(field_map, recording.trajectory, result, truth=())
+    save_figure(figure, out / OVERVIEW_FILE)
+    return result
+
+
+def simulate_bags(
+    out: Path, options: ScenarioOptions, kinds: Sequence[BagKind], progress: Progress
+) -> Scenario:
+    """Simulate a mapping and a calibration drive and write them as bags, with the truth.
+
+    Parameters
+    ----------
+    out
+        Folder for `mapping_*` and `calibration_*` bags, `suite.yaml` and `truth.yaml`.
+    options
+        The world and the drives.
+    kinds
+        Kinds of bag to write.
+    progress
+        Called with a stage and the fraction of it that is done.
+    """
+    scenario = simulate(options, progress)
+    _ensure_folder(out)
+    for index, kind in enumerate(kinds):
+        progress("writing bags", index / len(kinds))
+        write_bag(out / bag_name("mapping", kind), kind, scenario.mapping.recording)
+        write_bag(out / bag_name("calibration", kind), kind, scenario.calibration.recording)
+    progress("writing bags", 1.0)
+    facts = {"simulation": options.model_dump(mode="json")}
+    write_known_sensors(
+        out / "suite.yaml",
+        scenario.suite,
+        facts,
+        "The mapping suite's own calibrations: what `l2m map build --suite` needs.",
+    )
+    write_known_sensors(
+        out / "truth.yaml",
+        scenario.truth,
+        facts,
+        "The true positions and distortions of the sensors in the calibration drive.",
+    )
+    return scenario
+
+
+def bag_name(drive: str, kind: BagKind) -> str:
+    """Return the file or folder name of a simulated bag."""
+    suffix = {BagKind.ROS1: "_ros1.bag", BagKind.SQLITE3: "_sqlite3", BagKind.MCAP: "_mcap"}
+    return drive + suffix[kind]
+
+
+def _read(bag: Path, config: Config, progress: Progress) -> Recording:
+    def tell(done: int, total: int) -> None:
+        progress(f"reading {bag.name}", done / max(total, 1))
+
+    return read_recording(bag, config.bag, tell)
+
+
+def _ensure_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{folder}: cannot be made as a folder for results: {error.strerror}"
+        raise OutputError(msg) from error

@@ -1,0 +1,226 @@
+"""Recording + map + options -> calibration. Pure: no files, no terminal."""
+
+from importlib.metadata import version
+
+import numpy as np
+
+from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.data import (
+    CalibrationResult,
+    Distortion,
+    FloatArray,
+    Readings,
+    Recording,
+    SensorCalibration,
+    SensorStatus,
+    SourceFile,
+    SyncCounts,
+    Synchronised,
+)
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.graph.alternation import Progress
+from l2m_gtsam.graph.joint import SensorSolution
+from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.graph.optimise import Ending
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.solve.rotation import PolarRotation, polar_rotation
+from l2m_gtsam.sync import synchronise
+
+# A Newton step of a tenth of a standard deviation would still be worth taking.
+CONVERGED_SIGMAS = 0.1
+
+# Readings that vary less than this are stuck: a moving magnetometer's noise alone is larger.
+STUCK_UT = 1e-3
+
+VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
+
+
+def calibrate(
+    recording: Recording,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    map_source: SourceFile | None = None,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """Find where every magnetometer sits on the lidar and how it distorts the field.
+
+    Parameters
+    ----------
+    recording
+        A drive through the mapped place.
+    field_map
+        The magnetic map, in the frame of the recording's poses.
+    options
+        Synchronisation, starts and solve.
+    map_source
+        Where the map came from, for the record.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    SyncError
+        Readings and poses do not overlap.
+    CalibrationError
+        No sensor can be solved: the map does not cover the drive, or nothing was read.
+    """
+    synchronised = synchronise(recording, options.sync)
+    alive = _alive(synchronised.readings)
+    t_start = _starts(synchronised.readings.sensors, options)
+    solution = solve_one_key(alive, field_map, t_start, options.solve, progress)
+    sensors = _assess(synchronised, alive, solution, options)
+    if not solution.solved:
+        raise CalibrationError(_nothing_solved(recording, map_source, sensors))
+    return CalibrationResult(
+        sensors=sensors,
+        iterations=solution.steps,
+        bag=recording.source,
+        map=map_source,
+        options=options.model_dump(mode="json"),
+        versions={name: version(name) for name in VERSIONED},
+    )
+
+
+def _alive(readings: Readings) -> Readings:
+    """Return the readings of the sensors that are not stuck on one value."""
+    stuck = np.zeros(len(readings), dtype=np.bool_)
+    for index in range(len(readings.sensors)):
+        rows = readings.rows_of(index)
+        field = readings.field[rows]
+        stuck[rows] = len(field) > 0 and bool(np.ptp(field, axis=0).max() < STUCK_UT)
+    return readings.select(~stuck)
+
+
+def _starts(sensors: tuple[str, ...], options: CalibrationOptions) -> FloatArray:
+    """Return where each sensor's search starts, shape (S, 3), metres.
+
+    Raises
+    ------
+    CalibrationError
+        A start is given for a sensor that the recording does not have.
+    """
+    if unknown := sorted(set(options.start) - set(sensors)):
+        msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
+        raise CalibrationError(msg)
+    return np.array([options.start.get(name, (0.0, 0.0, 0.0)) for name in sensors])
+
+
+def _assess(
+    synchronised: Synchronised,
+    alive: Readings,
+    solution: OneKeySolution,
+    options: CalibrationOptions,
+) -> tuple[SensorCalibration, ...]:
+    """Return a verdict on every sensor of the recording."""
+    solved = {entry.sensor: entry for entry in solution.solved}
+    outside = np.bincount(alive.sensor[~solution.inside], minlength=len(alive.sensors))
+    sensors = []
+    for index, (name, counts) in enumerate(zip(alive.sensors, synchronised.counts, strict=True)):
+        if index in solved:
+            entry = _solved(name, solved[index], solution, counts, int(outside[index]))
+        else:
+            usable = alive.rows_of(index)
+            read = usable.stop - usable.start
+            entry = _unsolved(name, read, counts, int(outside[index]), options.solve.min_readings)
+        sensors.append(entry)
+    return tuple(sensors)
+
+
+def _solved(
+    name: str,
+    found: SensorSolution,
+    solution: OneKeySolution,
+    counts: SyncCounts,
+    outside: int,
+) -> SensorCalibration:
+    vector = solution.estimate.distortion[found.sensor]
+    distortion = Distortion.from_vector(vector)
+    status, message = _verdict(found, solution.ending)
+    try:
+        rotation = polar_rotation(distortion.C, found.covariance[3:12, 3:12])
+    except CalibrationError as error:
+        rotation = _no_rotation()
+        status, message = SensorStatus.FLIPPED_AXIS, str(error)
+    return SensorCalibration(
+        sensor=name,
+        status=status,
+        message=message,
+        t_lidar_mag=solution.estimate.t[found.sensor],
+        distortion=distortion,
+        R_lidar_mag=rotation.R_mag_lidar.T,
+        covariance=found.covariance,
+        rotation_covariance=rotation.covariance,
+        noise=float(solution.estimate.noise[found.sensor]),
+        residuals=found.figures,
+        undetermined=found.determinacy.names,
+        sync=counts,
+        outside_map=outside,
+    )
+
+
+def _verdict(found: SensorSolution, ending: Ending) -> tuple[SensorStatus, str]:
+    if found.remaining_sigmas > CONVERGED_SIGMAS:
+        return SensorStatus.NOT_CONVERGED, (
+            f"{ending.value}, {found.remaining_sigmas:.2g} standard deviations from the optimum"
+        )
+    if found.determinacy.names:
+        return SensorStatus.UNDETERMINED, (
+            f"this drive and map do not determine {'; '.join(found.determinacy.names)}"
+        )
+    return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings"
+
+
+def _unsolved(
+    name: str, usable: int, counts: SyncCounts, outside: int, needed: int
+) -> SensorCalibration:
+    status, message = (
+        SensorStatus.OUTSIDE_MAP,
+        (f"{outside} of {usable} readings lie outside the map, at least {needed} must lie inside"),
+    )
+    if usable < needed:
+        status, message = SensorStatus.NO_READINGS, _why_silent(usable, counts, needed)
+    rotation = _no_rotation()
+    return SensorCalibration(
+        sensor=name,
+        status=status,
+        message=message,
+        t_lidar_mag=np.full(3, np.nan),
+        distortion=Distortion(np.full((3, 3), np.nan), np.full(3, np.nan)),
+        R_lidar_mag=rotation.R_mag_lidar.T,
+        covariance=np.diag(np.full(15, np.inf)),
+        rotation_covariance=rotation.covariance,
+        noise=float("nan"),
+        residuals=None,
+        undetermined=(),
+        sync=counts,
+        outside_map=outside,
+    )
+
+
+def _why_silent(usable: int, counts: SyncCounts, needed: int) -> str:
+    if counts.kept >= needed:
+        return "the sensor reports one constant value: it is stuck"
+    return (
+        f"{usable} usable readings of {counts.received} received ({counts.not_finite} not finite, "
+        f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
+        f"{counts.thinned} at a place already read), at least {needed} are needed"
+    )
+
+
+def _no_rotation() -> PolarRotation:
+    return PolarRotation(np.full((3, 3), np.nan), np.diag(np.full(3, np.inf)))
+
+
+def _nothing_solved(
+    recording: Recording, map_source: SourceFile | None, sensors: tuple[SensorCalibration, ...]
+) -> str:
+    place = map_source.path if map_source else "the map"
+    if any(sensor.status is SensorStatus.OUTSIDE_MAP for sensor in sensors):
+        low, high = recording.trajectory.p.min(axis=0), recording.trajectory.p.max(axis=0)
+        return (
+            f"{place} does not cover the drive {recording.source.path}, which runs from "
+            f"({low[0]:.1f}, {low[1]:.1f}, {low[2]:.1f}) to ({high[0]:.1f}, {high[1]:.1f}, "
+            f"{high[2]:.1f}) m in frame {recording.trajectory.frame!r}: is it another place or "
+            "another map frame?"
+        )
+    return f"{recording.source.path}: no sensor can be solved: {sensors[0].message}"

@@ -1,0 +1,197 @@
+"""The command line: ``l2m``. Parsing and printing only; the work is done in ``batch``.
+
+Heavy modules are imported inside the commands, so that ``--help`` answers at once.
+"""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from l2m_gtsam.errors import L2MError
+
+if TYPE_CHECKING:
+    from l2m_gtsam.batch import Progress
+
+app = typer.Typer(
+    name="l2m",
+    help="Calibrate magnetometers against a LiDAR from one drive through a mapped field.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+map_app = typer.Typer(help="Build, describe and draw magnetic maps.", no_args_is_help=True)
+app.add_typer(map_app, name="map")
+
+BagArgument = Annotated[
+    Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
+]
+MapOption = Annotated[Path, typer.Option("--map", help="Map file made by `l2m map build`.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML configuration; see configs/.")
+]
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+
+
+def main() -> None:
+    """Run the command line; an error that a user can mend is one line and exit code 2."""
+    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    try:
+        app(arguments)
+    except L2MError as error:
+        if "--debug" in sys.argv[1:]:
+            raise
+        typer.echo(f"l2m: {error}", err=True)
+        sys.exit(2)
+
+
+@app.callback()
+def options(
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error (at any place).")
+    ] = False,
+) -> None:
+    """Calibrate magnetometers against a LiDAR from one drive through a mapped field."""
+
+
+@app.command()
+def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
+    """Say what is in a bag and what would be used of it, and why."""
+    from l2m_gtsam.config import load_config
+    from l2m_gtsam.qa.tables import bag_table
+    from l2m_gtsam.storage.inspect import inspect_bag
+
+    report = inspect_bag(bag, load_config(config).bag)
+    _print(bag_table(report))
+
+
+@app.command()
+def simulate(
+    out: OutOption,
+    seed: Annotated[int, typer.Option(help="Seed of world, drives and sensors.")] = 1,
+    kind: Annotated[
+        list[str] | None, typer.Option(help="ros1, sqlite3 or mcap; all three if not given.")
+    ] = None,
+) -> None:
+    """Simulate a warehouse, a mapping drive and a calibration drive, and write them as bags."""
+    from l2m_gtsam.batch import simulate_bags
+    from l2m_gtsam.errors import ConfigError
+    from l2m_gtsam.simulate.bag_writer import BagKind
+    from l2m_gtsam.simulate.scenario import ScenarioOptions
+
+    known = [each.value for each in BagKind]
+    if unknown := [each for each in kind or [] if each not in known]:
+        msg = f"--kind: unknown bag kind {unknown[0]!r}; accepted: {', '.join(known)}"
+        raise ConfigError(msg)
+    with _progress() as progress:
+        simulate_bags(
+            out, ScenarioOptions(seed=seed), [BagKind(k) for k in kind or known], progress
+        )
+    typer.echo(f"bags, suite.yaml and truth.yaml are in {out}")
+
+
+@app.command()
+def calibrate(
+    bag: BagArgument, map_path: MapOption, out: OutOption, config: ConfigOption = None
+) -> None:
+    """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
+    from l2m_gtsam.batch import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
+    from l2m_gtsam.config import load_config
+    from l2m_gtsam.qa.tables import calibration_table
+
+    with _progress() as progress:
+        result = calibrate_bag(bag, map_path, load_config(config), out, progress)
+    _print(calibration_table(result))
+    typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
+
+
+@app.command()
+def demo(
+    out: OutOption = Path("demo_out"),
+    seed: Annotated[int, typer.Option(help="Seed of world, drives and sensors.")] = 1,
+) -> None:
+    """Simulate, map and calibrate a warehouse, and compare with the truth."""
+    from l2m_gtsam.demo import run_demo
+    from l2m_gtsam.qa.tables import truth_table
+    from l2m_gtsam.simulate.scenario import ScenarioOptions
+
+    with _progress() as progress:
+        outcome = run_demo(out, ScenarioOptions(seed=seed), progress)
+    _print(truth_table(outcome.result, outcome.truth))
+    typer.echo(f"picture: {outcome.picture}; everything else is in {out}")
+
+
+@map_app.command("build")
+def map_build(
+    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Mapping bags.")],
+    out: Annotated[Path, typer.Option("--out", help="Map file to write (.npz).")],
+    config: ConfigOption = None,
+    suite: Annotated[
+        Path | None,
+        typer.Option(help="Calibrations of the mapping suite; ideal sensors if not given."),
+    ] = None,
+) -> None:
+    """Build a map from one or several bags of a calibrated mapping suite."""
+    from l2m_gtsam.batch import build_map_file
+    from l2m_gtsam.config import load_config
+    from l2m_gtsam.qa.tables import map_table
+
+    with _progress() as progress:
+        field_map = build_map_file(bags, out, load_config(config), suite, progress)
+    _print(map_table(field_map.summary()))
+    typer.echo(f"written: {out}")
+
+
+@map_app.command("info")
+def map_info(
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="Map file.")],
+) -> None:
+    """Say what a map is made of and what it covers."""
+    from l2m_gtsam.batch import load_field_map
+    from l2m_gtsam.qa.tables import map_table
+
+    _print(map_table(load_field_map(map_path).summary()))
+
+
+@map_app.command("plot")
+def map_plot(
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="Map file.")],
+    out: Annotated[Path, typer.Option("--out", help="Picture to write (.png).")],
+    height: Annotated[
+        float | None, typer.Option(help="Height in metres; the middle of the readings if absent.")
+    ] = None,
+) -> None:
+    """Draw strength and uncertainty of a map at one height."""
+    from l2m_gtsam.batch import plot_map_file
+
+    plot_map_file(map_path, out, height)
+    typer.echo(f"written: {out}")
+
+
+def _print(table: object) -> None:
+    """Print a table in the terminal's width, or unbroken where the output is not a terminal."""
+    from rich.console import Console
+
+    console = Console()
+    Console(width=None if console.is_terminal else 200, soft_wrap=False).print(table)
+
+
+@contextmanager
+def _progress() -> Iterator["Progress"]:
+    """Show one bar per stage on the error stream while it runs."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description:<28}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        stages: dict[str, TaskID] = {}
+
+        def tell(stage: str, fraction: float) -> None:
+            if stage not in stages:
+                stages[stage] = bars.add_task(stage, total=1.0)
+            bars.update(stages[stage], completed=fraction)
+
+        yield tell

@@ -1,0 +1,86 @@
+"""One configuration composed of the options beside each algorithm, read from YAML."""
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field, ValidationError
+
+from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.maps.build import MapOptions
+from l2m_gtsam.options import Options
+from l2m_gtsam.storage.bag import BagOptions
+from l2m_gtsam.storage.yaml_file import read_yaml
+from l2m_gtsam.sync import SyncOptions
+
+
+class MappingOptions(Options):
+    """How a map is built from mapping bags."""
+
+    sync: SyncOptions = SyncOptions(thin_distance_m=0.05, thin_angle_deg=10.0)
+    """Which readings enter; a map needs its readings spread in space, not in heading."""
+    model: MapOptions = MapOptions()
+    """The kind of map and its options."""
+
+
+class CalibrationOptions(Options):
+    """How a calibration is computed from a recording and a map."""
+
+    sync: SyncOptions = SyncOptions()
+    """Which readings enter, and how they get their poses."""
+    start: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
+    """Where to start the search for a sensor's `t_lidar_mag`, by sensor name, metres; the origin
+    of the lidar if not given."""
+    solve: OneKeyOptions = OneKeyOptions()
+    """The one-key solve."""
+
+
+class Config(Options):
+    """Everything that can be configured."""
+
+    bag: BagOptions = BagOptions()
+    """What is read from a recording."""
+    mapping: MappingOptions = MappingOptions()
+    """`l2m map build`."""
+    calibration: CalibrationOptions = CalibrationOptions()
+    """`l2m calibrate`."""
+
+
+def load_config(path: Path | None) -> Config:
+    """Return the configuration in a YAML file; defaults for what it leaves out.
+
+    Raises
+    ------
+    ConfigError
+        The file is missing or not YAML, or a key or value is not understood; the line names the
+        key and what is accepted.
+    """
+    if path is None:
+        return Config()
+    content = read_yaml(path, ConfigError)
+    try:
+        return Config.model_validate({} if content is None else content)
+    except ValidationError as error:
+        raise ConfigError(_explain(path, error)) from error
+
+
+def _explain(path: Path, error: ValidationError) -> str:
+    """Return one line about the first fault."""
+    fault = error.errors()[0]
+    key = ".".join(str(part) for part in fault["loc"]) or "the file"
+    if fault["type"] == "extra_forbidden":
+        accepted = ", ".join(_accepted(Config, fault["loc"][:-1]))
+        return f"{path}: unknown key {key!r}; accepted here: {accepted}"
+    return f"{path}: {key}: {fault['msg']}, got {fault['input']!r}"
+
+
+def _accepted(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the options at a location."""
+    for part in location:
+        inner: Any = model.model_fields[str(part)].annotation
+        candidates = [inner, *getattr(inner, "__args__", ())]
+        nested = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
+        if not nested:
+            return []
+        model = nested[0]
+    return sorted(model.model_fields)

@@ -1,0 +1,50 @@
+"""The demonstration: a simulated warehouse, mapped and calibrated, against its truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from l2m_gtsam.batch import (
+    OVERVIEW_FILE,
+    Progress,
+    bag_name,
+    build_map_file,
+    calibrate_bag,
+    simulate_bags,
+)
+from l2m_gtsam.config import Config
+from l2m_gtsam.data import CalibrationResult, KnownSensor
+from l2m_gtsam.qa.figures import calibration_figure, save_figure
+from l2m_gtsam.simulate.bag_writer import BagKind
+from l2m_gtsam.simulate.scenario import ScenarioOptions
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """What the demonstration found, what is true, and where the picture is."""
+
+    result: CalibrationResult
+    truth: tuple[KnownSensor, ...]
+    picture: Path
+
+
+def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonstration:
+    """Simulate two drives, build the map, calibrate, and draw the outcome beside the truth.
+
+    Parameters
+    ----------
+    out
+        Folder for everything that is made, the way a user's own files would lie.
+    options
+        The world and the drives.
+    progress
+        Called with a stage and the fraction of it that is done.
+    """
+    config, map_path = Config(), out / "map.npz"
+    scenario = simulate_bags(out, options, [BagKind.MCAP], progress)
+    mapping, drive = (out / bag_name(name, BagKind.MCAP) for name in ("mapping", "calibration"))
+    field_map = build_map_file([mapping], map_path, config, out / "suite.yaml", progress)
+    result = calibrate_bag(drive, map_path, config, out, progress)
+    picture = out / OVERVIEW_FILE
+    trajectory = scenario.calibration.recording.trajectory
+    save_figure(calibration_figure(field_map, trajectory, result, scenario.truth), picture)
+    return Demonstration(result, scenario.truth, picture)

@@ -1,0 +1,196 @@
+"""Pictures: the map, the drive through it, and the sensors on the vehicle."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from l2m_gtsam.data import (
+    CalibrationResult,
+    FieldSample,
+    FloatArray,
+    KnownSensor,
+    SensorCalibration,
+    Trajectory,
+)
+from l2m_gtsam.storage.atomic import atomic_path
+
+# Cells along the longer side of a map picture.
+CELLS = 240
+ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision
+
+
+class DrawableMap(Protocol):
+    """What a picture asks of a map."""
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Lowest and highest corner of the readings in metres, shape (2, 3)."""
+        ...
+
+    def query(self, points: FloatArray, /) -> FieldSample:
+        """Return field, variance and whether the map has data there."""
+        ...
+
+
+@dataclass(frozen=True)
+class MapSlice:
+    """A map at one height, as pictures.
+
+    Attributes
+    ----------
+    extent
+        Left, right, bottom, top in metres.
+    strength
+        Strength of the field in uT, NaN where the map has no data, shape (rows, columns).
+    sigma
+        Its standard deviation per axis in uT, NaN where the map has no data.
+    """
+
+    extent: tuple[float, float, float, float]
+    strength: FloatArray
+    sigma: FloatArray
+
+
+def slice_map(field_map: DrawableMap, height: float) -> MapSlice:
+    """Ask a map on a horizontal grid at a height in metres."""
+    low, high = field_map.bounds
+    cell = max(high[0] - low[0], high[1] - low[1]) / CELLS
+    x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    sample = field_map.query(np.column_stack([grid, np.full(len(grid), height)]))
+    sigma = np.sqrt(np.where(np.isfinite(sample.variance), sample.variance, np.nan).mean(axis=1))
+    return MapSlice(
+        (float(x[0]), float(x[-1]), float(y[0]), float(y[-1])),
+        np.linalg.norm(sample.field, axis=1).reshape(len(y), len(x)),
+        sigma.reshape(len(y), len(x)),
+    )
+
+
+def map_figure(field_map: DrawableMap, height: float | None) -> Figure:
+    """Draw strength and uncertainty of a map at a height (the middle of its readings if None)."""
+    level = float(field_map.bounds[:, 2].mean()) if height is None else height
+    cut = slice_map(field_map, level)
+    figure = _figure(12, 5)
+    for axes, image, label, colours in zip(
+        figure.subplots(1, 2, sharex=True, sharey=True),
+        (cut.strength, cut.sigma),
+        ("field strength (uT)", "standard deviation per axis (uT)"),
+        ("viridis", "cividis"),
+        strict=True,
+    ):
+        _draw_slice(figure, axes, image, cut.extent, label, colours)
+    figure.suptitle(f"Magnetic map at z = {level:.2f} m")
+    return figure
+
+
+def calibration_figure(
+    field_map: DrawableMap,
+    trajectory: Trajectory,
+    result: CalibrationResult,
+    truth: tuple[KnownSensor, ...],
+) -> Figure:
+    """Draw the map with the drive, and the sensors on the vehicle from above and from the side.
+
+    Parameters
+    ----------
+    field_map
+        The map.
+    trajectory
+        Poses of the lidar in the map.
+    result
+        The calibration; sensors that were not solved are left out.
+    truth
+        True sensors, where they are known.
+    """
+    figure = _figure(13, 6.5)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1), height_ratios=(1.5, 1))
+    place, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    side = figure.add_subplot(grid[1, 1], sharex=above)
+    # Where the sensors pass, not where the lidar does: their heights differ.
+    height = float(np.clip(np.median(trajectory.p[:, 2]), *field_map.bounds[:, 2]))
+    cut = slice_map(field_map, height)
+    _draw_slice(figure, place, cut.strength, cut.extent, "field strength (uT)", "viridis")
+    place.plot(*trajectory.p[:, :2].T, color="white", linewidth=2.2)
+    place.plot(*trajectory.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label="drive of the lidar")
+    place.set_title(f"map at z = {height:.2f} m and drive")
+    place.legend(loc="upper right")
+    solved = [s for s in result.sensors if s.residuals is not None]
+    _draw_vehicle(above, solved, truth, (0, 1))
+    _draw_vehicle(side, solved, truth, (0, 2))
+    above.set_title("sensors on the vehicle: from above (top), from the side (bottom)")
+    above.legend(loc="upper right", fontsize="small")
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png")
+
+
+def _figure(width: float, height: float) -> Figure:
+    return Figure(figsize=(width, height), layout="constrained", dpi=130)
+
+
+def _draw_slice(
+    figure: Figure,
+    axes: Axes,
+    image: FloatArray,
+    extent: tuple[float, float, float, float],
+    label: str,
+    colours: str,
+) -> None:
+    low, high = np.nanquantile(image, [0.01, 0.99]) if np.isfinite(image).any() else (0.0, 1.0)
+    drawn: ScalarMappable = axes.imshow(
+        image, origin="lower", extent=extent, cmap=colours, vmin=low, vmax=high
+    )
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", facecolor="0.93")
+    figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
+
+
+def _draw_vehicle(
+    axes: Axes,
+    sensors: list[SensorCalibration],
+    truth: tuple[KnownSensor, ...],
+    plane: tuple[int, int],
+) -> None:
+    names = "xyz"
+    rows = list(plane)
+    for known in truth:
+        axes.plot(*known.t_lidar_mag[rows], "+", color=TRUTH, markersize=10)
+    for sensor in sensors:
+        at = sensor.t_lidar_mag[rows]
+        axes.plot(*at, ".", color=ESTIMATE, markersize=5)
+        ellipse = _ellipse(at, sensor.covariance[np.ix_(rows, rows)])
+        if ellipse is not None:
+            axes.add_patch(ellipse)
+        axes.annotate(
+            sensor.sensor, tuple(at), xytext=(4, 4), textcoords="offset points", fontsize=7
+        )
+    axes.plot(0, 0, "s", color="0.4", markersize=8)
+    axes.annotate("lidar", (0, 0), xytext=(6, -10), textcoords="offset points", fontsize=7)
+    axes.plot([], [], ".", color=ESTIMATE, label="estimate, 95 % ellipse")
+    if truth:
+        axes.plot([], [], "+", color=TRUTH, label="truth")
+    axes.set(xlabel=f"{names[plane[0]]} (m)", ylabel=f"{names[plane[1]]} (m)")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.15)
+    axes.grid(alpha=0.3)
+
+
+def _ellipse(at: FloatArray, covariance: FloatArray) -> Ellipse | None:
+    """Return the region that holds the sensor in 95 % of cases; none where it is unbounded."""
+    if not np.isfinite(covariance).all():
+        return None
+    variances, directions = np.linalg.eigh(covariance)
+    width, height = 2 * np.sqrt(5.991 * variances)  # chi-square of two, 95 %
+    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
+    return Ellipse(
+        (float(at[0]), float(at[1])), width, height, angle=angle, color=ESTIMATE, alpha=0.35
+    )

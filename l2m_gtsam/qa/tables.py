@@ -1,0 +1,91 @@
+"""Results as tables in the terminal."""
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from l2m_gtsam.data import (
+    CalibrationResult,
+    FloatArray,
+    KnownSensor,
+    SensorCalibration,
+    SensorStatus,
+)
+
+
+def calibration_table(result: CalibrationResult) -> Table:
+    """Return one row per sensor: position, sigma, offset, scale, rotation, residual, status."""
+    table = Table(title="Calibration: B_meas = C @ B_lidar + H", title_justify="left")
+    table.add_column("sensor")
+    table.add_column("t_lidar_mag (m)", justify="right")
+    table.add_column("± (mm)", justify="right")
+    table.add_column("H (uT)", justify="right")
+    table.add_column("|C - R| max", justify="right")
+    table.add_column("rotation (deg)", justify="right")
+    table.add_column("residual (uT)", justify="right")
+    table.add_column("status")
+    for sensor in result.sensors:
+        table.add_row(*_calibration_row(sensor))
+    return table
+
+
+def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Table:
+    """Return truth, estimate, error and sigma of every sensor's position, and errors of C and H."""
+    table = Table(title="Truth and estimate", title_justify="left")
+    table.add_column("sensor")
+    for heading in ("true t (m)", "estimated t (m)", "error (mm)", "sigma (mm)"):
+        table.add_column(heading, justify="right")
+    table.add_column("|C error|", justify="right")
+    table.add_column("sigma", justify="right")
+    table.add_column("|H error| (uT)", justify="right")
+    table.add_column("sigma", justify="right")
+    for known in truth:
+        table.add_row(*_truth_row(known, result[known.sensor]))
+    return table
+
+
+def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
+    status = _status(sensor)
+    if sensor.residuals is None:
+        return (escape(sensor.sensor), *("-",) * 6, status)
+    distortion, R = sensor.distortion, sensor.R_lidar_mag.T
+    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    return (
+        escape(sensor.sensor),
+        _vector(sensor.t_lidar_mag, 3),
+        _vector(1e3 * sensor.t_sigma, 1),
+        _vector(distortion.H, 2),
+        f"{np.abs(distortion.C - R).max():.3f}",
+        f"{angle:.2f}",
+        f"{sensor.residuals.rms:.3f}",
+        status,
+    )
+
+
+def _truth_row(known: KnownSensor, sensor: SensorCalibration) -> tuple[str, ...]:
+    if sensor.residuals is None:
+        return (escape(known.sensor), _vector(known.t_lidar_mag, 3), *("-",) * 6, _status(sensor))
+    C_error = np.linalg.norm(sensor.distortion.C - known.distortion.C)
+    H_error = np.linalg.norm(sensor.distortion.H - known.distortion.H)
+    return (
+        escape(known.sensor),
+        _vector(known.t_lidar_mag, 3),
+        _vector(sensor.t_lidar_mag, 3),
+        _vector(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), 1),
+        _vector(1e3 * sensor.t_sigma, 1),
+        f"{C_error:.4f}",
+        f"{np.linalg.norm(sensor.C_sigma):.4f}",
+        f"{H_error:.3f}",
+        f"{np.linalg.norm(sensor.H_sigma):.3f}",
+    )
+
+
+def _vector(values: FloatArray, digits: int) -> str:
+    return " ".join(f"{value:{digits + 5}.{digits}f}" for value in values)
+
+
+def _status(sensor: SensorCalibration) -> str:
+    colour = "green" if sensor.status is SensorStatus.SOLVED else "yellow"
+    if sensor.status is SensorStatus.SOLVED:
+        return f"[{colour}]{sensor.status.value}[/]"
+    return f"[{colour}]{sensor.status.value}[/]: {escape(sensor.message)}"

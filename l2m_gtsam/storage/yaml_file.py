@@ -1,0 +1,55 @@
+"""YAML in and out, with plain values only."""
+
+from io import StringIO
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from l2m_gtsam.errors import L2MError
+from l2m_gtsam.storage.atomic import atomic_path
+
+# A calibration of a hundred sensors is under 1 MB; more than this is not ours.
+MAX_BYTES = 50_000_000
+
+
+def read_yaml(path: Path, error: type[L2MError]) -> Any:
+    """Return the plain content of a YAML file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    error
+        What to raise, with one line that names the file, if it cannot be read.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            msg = f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
+            raise error(msg)
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as reason:
+        why = "no such file" if isinstance(reason, FileNotFoundError) else "cannot be read as text"
+        msg = f"{path}: {why}"
+        raise error(msg) from reason
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, ValueError, RecursionError) as reason:
+        line = getattr(getattr(reason, "problem_mark", None), "line", None)
+        where = "" if line is None else f", line {line + 1}"
+        msg = f"{path}: not valid YAML{where}"
+        raise error(msg) from reason
+
+
+def write_yaml(path: Path, content: dict[str, Any], header: str) -> None:
+    """Write plain content with a comment on top; short lists of numbers stay on one line."""
+    yaml: Any = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.sort_base_mapping_type_on_output = False
+    yaml.width = 4096
+    stream = StringIO()
+    stream.write("".join(f"# {line}\n" for line in header.splitlines()))
+    yaml.dump(content, stream)
+    with atomic_path(path) as temporary:
+        temporary.write_text(stream.getvalue(), encoding="utf-8")

@@ -1,0 +1,85 @@
+"""Time association: interpolation, gaps, edges, thinning and the account of it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FieldSeries, Recording, SourceFile, Trajectory
+from l2m_gtsam.errors import SyncError
+from l2m_gtsam.sync import SyncOptions, synchronise
+
+KEEP_ALL = SyncOptions(thin_distance_m=0, thin_angle_deg=0)
+
+
+def at(seconds: float | np.ndarray) -> np.ndarray:
+    return np.asarray(np.round(np.asarray(seconds) * 1e9), dtype=np.int64)
+
+
+def turning_drive(stamps: np.ndarray, start_s: float = 1.7e9) -> Trajectory:
+    """1 m/s along x while turning 0.5 rad/s about z."""
+    R = Rotation.from_rotvec(np.outer(stamps, [0, 0, 0.5])).as_matrix()
+    p = np.outer(stamps, [1.0, 0, 0])
+    return Trajectory(at(start_s) + at(stamps), R, p, "map", "lidar")
+
+
+def series(stamps: np.ndarray, field: np.ndarray | None = None, name: str = "mag") -> FieldSeries:
+    field = np.tile([20.0, 0, -40], (len(stamps), 1)) if field is None else field
+    return FieldSeries(name, "/" + name, name, at(1.7e9) + at(stamps), field)
+
+
+def recording(trajectory: Trajectory, *sensors: FieldSeries) -> Recording:
+    return Recording(trajectory, sensors, SourceFile("drive.bag", "0"))
+
+
+def test_interpolation_is_exact_on_a_constant_motion() -> None:
+    poses = turning_drive(np.arange(0, 10, 0.1))
+    stamps = np.sort(np.random.default_rng(0).uniform(0, 9.9, 200))
+    readings = synchronise(recording(poses, series(stamps)), KEEP_ALL).readings
+    expected = turning_drive(stamps)
+    # ns stamps at 1 m/s and 0.5 rad/s limit the agreement to 1e-9.
+    np.testing.assert_allclose(readings.p_map_lidar, expected.p, atol=2e-9)
+    np.testing.assert_allclose(readings.R_map_lidar, expected.R, atol=2e-9)
+
+
+def test_everything_dropped_is_counted() -> None:
+    poses = turning_drive(np.concatenate([np.arange(0, 3, 0.1), np.arange(5, 8, 0.1)]))
+    stamps = np.array([-0.5, 0.0, 1.05, 2.0, 4.0, 6.0, 6.5, 7.9, 8.5])
+    field = np.tile([20.0, 0, -40], (9, 1))
+    field[6, 1] = np.nan
+    counts = synchronise(recording(poses, series(stamps, field)), KEEP_ALL).counts[0]
+    assert (counts.received, counts.not_finite, counts.outside_trajectory) == (9, 1, 2)
+    assert (counts.in_pose_gap, counts.thinned, counts.kept) == (1, 0, 5)
+
+
+def test_a_reading_on_a_pose_needs_no_neighbour() -> None:
+    poses = turning_drive(np.array([0.0, 10.0, 20.0]))
+    result = synchronise(recording(poses, series(np.array([0.0, 10.0, 15.0, 20.0]))), KEEP_ALL)
+    assert result.counts[0].kept == 3
+
+
+def test_thinning_keeps_one_reading_per_cell() -> None:
+    """A vehicle parked for 60 s of 100 s at 10 Hz: its readings fall into few cells."""
+    rng = np.random.default_rng(1)
+    stamps = np.arange(0, 100, 0.1)
+    x = np.clip(stamps - 30, 0, 40)  # parked, 40 m drive, parked
+    p = np.outer(x, [1.0, 0, 0]) + rng.normal(0, 1e-3, (1000, 3)) + 0.25
+    poses = Trajectory(at(1.7e9) + at(stamps), np.tile(np.eye(3), (1000, 1, 1)), p, "map", "lidar")
+    options = SyncOptions(thin_distance_m=0.5, thin_angle_deg=5)
+    result = synchronise(recording(poses, series(stamps)), options)
+    assert 79 <= result.counts[0].kept <= 83  # 40 m in cells of 0.5 m
+    assert result.counts[0].thinned == 1000 - result.counts[0].kept
+
+
+def test_sensors_are_one_batch() -> None:
+    poses = turning_drive(np.arange(0, 10, 0.1))
+    sensors = [series(np.arange(0, 9, 0.5), name=f"m{i}") for i in range(3)]
+    readings = synchronise(recording(poses, *sensors), KEEP_ALL).readings
+    assert readings.sensors == ("m0", "m1", "m2")
+    assert [readings.rows_of(i) for i in range(3)] == [slice(0, 18), slice(18, 36), slice(36, 54)]
+
+
+def test_other_clocks_are_named_in_one_line() -> None:
+    poses = turning_drive(np.arange(0, 10, 0.1), start_s=900.0)
+    with pytest.raises(SyncError, match=r"drive.bag: .*1700000000.000.*900.000") as error:
+        synchronise(recording(poses, series(np.arange(0, 9, 0.5))), KEEP_ALL)
+    assert "\n" not in str(error.value)
