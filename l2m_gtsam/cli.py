@@ -66,6 +66,9 @@ def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
 
     report = inspect_bag(bag, load_config(config).bag)
     _print(bag_table(report))
+    for obstacle in report.obstacles:
+        typer.echo(f"cannot be calibrated as it is: {obstacle}")
+    typer.echo("clock: record time less header stamp, median; |B|: lowest - median - highest")
 
 
 @app.command()
@@ -141,7 +144,7 @@ def map_build(
 
     with _progress() as progress:
         field_map = build_map_file(bags, out, load_config(config), suite, progress)
-    _print(map_table(field_map.summary()))
+    _print(map_table(field_map.summary))
     typer.echo(f"written: {out}")
 
 
@@ -153,7 +156,7 @@ def map_info(
     from l2m_gtsam.batch import load_field_map
     from l2m_gtsam.qa.tables import map_table
 
-    _print(map_table(load_field_map(map_path).summary()))
+    _print(map_table(load_field_map(map_path).summary))
 
 
 @map_app.command("plot")

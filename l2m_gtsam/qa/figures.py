@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,30 +11,17 @@ from matplotlib.patches import Ellipse
 
 from l2m_gtsam.data import (
     CalibrationResult,
-    FieldSample,
     FloatArray,
     KnownSensor,
     SensorCalibration,
     Trajectory,
 )
+from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.storage.atomic import atomic_path
 
 # Cells along the longer side of a map picture.
 CELLS = 240
 ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision
-
-
-class DrawableMap(Protocol):
-    """What a picture asks of a map."""
-
-    @property
-    def bounds(self) -> FloatArray:
-        """Lowest and highest corner of the readings in metres, shape (2, 3)."""
-        ...
-
-    def query(self, points: FloatArray, /) -> FieldSample:
-        """Return field, variance and whether the map has data there."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -57,9 +43,9 @@ class MapSlice:
     sigma: FloatArray
 
 
-def slice_map(field_map: DrawableMap, height: float) -> MapSlice:
+def slice_map(field_map: FieldMap, height: float) -> MapSlice:
     """Ask a map on a horizontal grid at a height in metres."""
-    low, high = field_map.bounds
+    low, high = field_map.summary.lower, field_map.summary.upper
     cell = max(high[0] - low[0], high[1] - low[1]) / CELLS
     x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -72,9 +58,9 @@ def slice_map(field_map: DrawableMap, height: float) -> MapSlice:
     )
 
 
-def map_figure(field_map: DrawableMap, height: float | None) -> Figure:
+def map_figure(field_map: FieldMap, height: float | None) -> Figure:
     """Draw strength and uncertainty of a map at a height (the middle of its readings if None)."""
-    level = float(field_map.bounds[:, 2].mean()) if height is None else height
+    level = _middle(field_map) if height is None else height
     cut = slice_map(field_map, level)
     figure = _figure(12, 5)
     for axes, image, label, colours in zip(
@@ -90,7 +76,7 @@ def map_figure(field_map: DrawableMap, height: float | None) -> Figure:
 
 
 def calibration_figure(
-    field_map: DrawableMap,
+    field_map: FieldMap,
     trajectory: Trajectory,
     result: CalibrationResult,
     truth: tuple[KnownSensor, ...],
@@ -112,8 +98,7 @@ def calibration_figure(
     grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1), height_ratios=(1.5, 1))
     place, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     side = figure.add_subplot(grid[1, 1], sharex=above)
-    # Where the sensors pass, not where the lidar does: their heights differ.
-    height = float(np.clip(np.median(trajectory.p[:, 2]), *field_map.bounds[:, 2]))
+    height = _middle(field_map)
     cut = slice_map(field_map, height)
     _draw_slice(figure, place, cut.strength, cut.extent, "field strength (uT)", "viridis")
     place.plot(*trajectory.p[:, :2].T, color="white", linewidth=2.2)
@@ -136,6 +121,11 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained", dpi=130)
+
+
+def _middle(field_map: FieldMap) -> float:
+    """Return the height in metres half way between the lowest and the highest reading."""
+    return float(field_map.summary.lower[2] + field_map.summary.upper[2]) / 2
 
 
 def _draw_slice(

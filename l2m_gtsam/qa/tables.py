@@ -11,6 +11,8 @@ from l2m_gtsam.data import (
     SensorCalibration,
     SensorStatus,
 )
+from l2m_gtsam.maps.field_map import MapSummary
+from l2m_gtsam.storage.inspect import BagReport, TopicReport
 
 
 def calibration_table(result: CalibrationResult) -> Table:
@@ -41,6 +43,53 @@ def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Ta
     table.add_column("sigma", justify="right")
     for known in truth:
         table.add_row(*_truth_row(known, result[known.sensor]))
+    return table
+
+
+def bag_table(report: BagReport) -> Table:
+    """Return one row per topic: type, frame, count, rate, gaps, NaN, strength, use."""
+    table = Table(title=escape(str(report.path)), title_justify="left")
+    for heading in ("topic", "type", "frame"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("count", "Hz", "gap (s)", "clock (s)", "NaN", "|B| (uT)"):
+        table.add_column(heading, justify="right")
+    table.add_column("use", overflow="fold")
+    for topic in report.topics:
+        table.add_row(*_topic_row(topic))
+    return table
+
+
+def _topic_row(topic: TopicReport) -> tuple[str, ...]:
+    found = topic.strength
+    field = "" if found is None else f"{found.low:.4g} - {found.median:.4g} - {found.high:.4g}"
+    return (
+        escape(topic.topic),
+        escape(topic.msgtype.replace("/msg/", "/")),
+        escape(", ".join(topic.frames)),
+        f"{topic.count:,}",
+        _number(topic.rate_hz, ".4g"),
+        _number(topic.longest_gap_s, ".3g"),
+        _number(topic.clock_offset_s, ".3g"),
+        _number(topic.nan_share, ".1%"),
+        field,
+        escape(topic.use),
+    )
+
+
+def _number(value: float, form: str) -> str:
+    return "" if np.isnan(value) else format(value, form)
+
+
+def map_table(summary: MapSummary) -> Table:
+    """Return what a map is made of and what it covers."""
+    table = Table("fact", "value", title="Magnetic map", title_justify="left")
+    table.add_row("kind", summary.kind)
+    table.add_row("readings given, rows kept", f"{summary.readings:,}, {summary.rows:,}")
+    for axis, low, high in zip("xyz", summary.lower, summary.upper, strict=True):
+        table.add_row(f"readings along {axis}", f"{low:.2f} to {high:.2f} m")
+    for name, value in summary.facts.items():
+        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+        table.add_row(escape(name), escape(shown))
     return table
 
 

@@ -1,0 +1,364 @@
+"""Read a drive out of a bag: the lidar's poses and every magnetometer's readings."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+from rosbags.interfaces import Connection
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FieldSeries, IntArray, Recording, RigidTransform, Trajectory
+from l2m_gtsam.errors import BagError, UnitsError
+from l2m_gtsam.options import Options
+from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.messages import (
+    FIELD_TYPE,
+    POSE_TYPES,
+    TF_TYPES,
+    FieldBuffer,
+    PoseBuffer,
+    header_ns,
+)
+from l2m_gtsam.storage.open_bag import Bag, Message, open_bag
+from l2m_gtsam.storage.tf import compose
+from l2m_gtsam.storage.units import MICROTESLA_PER, Unit, fault, is_turning, strength
+
+Progress = Callable[[int, int], None]
+
+# Clocks further apart than this are different clocks, not a late start.
+OTHER_CLOCK_NS = 3_600_000_000_000
+PROGRESS_EVERY = 2000
+
+
+class Stamps(StrEnum):
+    """Which time of a message counts."""
+
+    HEADER = "header"
+    RECORD = "record"
+
+
+class TfChain(Options):
+    """Two frames between which poses are composed."""
+
+    frame: str
+    """Reference frame, for example `map`."""
+    child_frame: str
+    """Tracked frame, for example `base_link`."""
+
+
+class FixedTransform(Options):
+    """A rigid transform as numbers."""
+
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Metres."""
+    quaternion_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """Rotation; of any length but zero."""
+
+    def rigid(self) -> RigidTransform:
+        """Return the transform as matrix and vector.
+
+        Raises
+        ------
+        BagError
+            The quaternion is all zero.
+        """
+        if not any(self.quaternion_xyzw):
+            msg = "bag.tracked_to_lidar: the quaternion is all zero, it must be a rotation"
+            raise BagError(msg)
+        R = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
+        return RigidTransform(R, np.array(self.translation))
+
+
+class BagOptions(Options):
+    """What is read from a recording, and how."""
+
+    fields: tuple[str, ...] = ("*",)
+    """Topics of type sensor_msgs/MagneticField, names or globs; the leading slash does not
+    matter."""
+    split_by_frame: bool = False
+    """Whether one topic carries several sensors, told apart by `header.frame_id`; sensors are
+    then named after their frame instead of their topic."""
+    poses: str | None = None
+    """Topic of the poses: Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped;
+    if not given, the only such topic of the bag, Odometry first."""
+    tf: TfChain | None = None
+    """Compose the poses from /tf and /tf_static instead."""
+    tracked_to_lidar: FixedTransform = FixedTransform()
+    """T_tracked_lidar: the lidar in the frame that the poses track."""
+    stamps: Stamps = Stamps.HEADER
+    """`header`, or `record` for the time at which the bag received a message."""
+    units: Unit = Unit.AUTO
+    """Unit of the readings: `auto` takes tesla, as ROS prescribes, and refuses a strength that
+    does not fit; or `tesla`, `millitesla`, `microtesla`, `nanotesla`, `gauss`, `milligauss`."""
+
+
+@dataclass
+class Buffers:
+    """Everything that one pass over a bag collects."""
+
+    fields: dict[str, FieldBuffer] = field(default_factory=dict)
+    poses: dict[str, PoseBuffer] = field(default_factory=dict)
+
+
+def read_recording(path: Path, options: BagOptions, progress: Progress | None = None) -> Recording:
+    """Read poses and readings in one pass; other topics are not decoded.
+
+    Parameters
+    ----------
+    path
+        Bag of any kind.
+    options
+        What to read.
+    progress
+        Called with the messages read and their number.
+
+    Raises
+    ------
+    BagError
+        The bag, a topic or the stamps are not usable; the line says what there is instead.
+    UnitsError
+        A field's strength does not fit its unit.
+    """
+    with open_bag(path) as bag:
+        fields = select_fields(bag, options)
+        poses = select_poses(bag, options)
+        buffers = _read(bag, [*fields, *poses], options, progress)
+    series = _all_series(path, buffers, options)
+    trajectory = _trajectory(path, buffers, options)
+    _check_clocks(path, trajectory, series)
+    return Recording(trajectory, series, source_file(path))
+
+
+def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:
+    """Read the magnetometers alone.
+
+    Raises
+    ------
+    BagError
+        The bag has no usable magnetic readings.
+    UnitsError
+        A field's strength does not fit its unit.
+    """
+    with open_bag(path) as bag:
+        buffers = _read(bag, select_fields(bag, options), options, None)
+    return _all_series(path, buffers, options)
+
+
+def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
+    """Read poses alone.
+
+    Raises
+    ------
+    BagError
+        The bag has no usable poses.
+    """
+    with open_bag(path) as bag:
+        buffers = _read(bag, select_poses(bag, options), options, None)
+    return _trajectory(path, buffers, options)
+
+
+def select_fields(bag: Bag, options: BagOptions) -> list[Connection]:
+    """Return the connections whose readings are used.
+
+    Raises
+    ------
+    BagError
+        A pattern matches nothing, or a topic of another type.
+    """
+    available = [c for c in bag.connections if c.msgtype == FIELD_TYPE]
+    chosen: list[Connection] = []
+    for pattern in options.fields:
+        found = [c for c in available if matches(c.topic, pattern)]
+        if not found:
+            raise BagError(_no_field(bag, pattern, available))
+        chosen.extend(c for c in found if c not in chosen)
+    return chosen
+
+
+def select_poses(bag: Bag, options: BagOptions) -> list[Connection]:
+    """Return the connections that the poses come from.
+
+    Raises
+    ------
+    BagError
+        No such topic, another type, or several candidates.
+    """
+    if options.tf is not None:
+        chosen = [c for c in bag.connections if c.msgtype in TF_TYPES]
+        if not chosen:
+            raise BagError(f"{bag.path}: no /tf in the bag, but `bag.tf` asks for a chain")
+        return chosen
+    available = [c for c in bag.connections if c.msgtype in POSE_TYPES]
+    if options.poses is not None:
+        return _named_poses(bag, options.poses, available)
+    for msgtype in POSE_TYPES:
+        topics = sorted({c.topic for c in available if c.msgtype == msgtype})
+        if len(topics) == 1:
+            return [c for c in available if c.topic == topics[0]]
+        if topics:
+            raise BagError(
+                f"{bag.path}: several topics carry poses, choose one with `bag.poses`: "
+                f"{', '.join(topics)}"
+            )
+    raise BagError(
+        f"{bag.path}: no poses in the bag; needed is a topic of one of the types "
+        f"{', '.join(POSE_TYPES)}, or a /tf chain named by `bag.tf`; there are: "
+        f"{listed(bag.connections)}"
+    )
+
+
+def matches(topic: str, pattern: str) -> bool:
+    """Return whether a topic fits a name or glob, whatever their leading slashes."""
+    return fnmatchcase(topic.lstrip("/"), pattern.lstrip("/"))
+
+
+def listed(connections: Iterable[Connection]) -> str:
+    """Return topics with their types, at most ten."""
+    topics = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
+    more = f" and {len(topics) - 10} more" if len(topics) > 10 else ""
+    return (", ".join(topics[:10]) or "(none)") + more
+
+
+def sensor_name(topic: str, frame: str, options: BagOptions) -> str:
+    """Return a sensor's name: its topic without the leading slash, or its frame."""
+    return frame if options.split_by_frame else topic.lstrip("/")
+
+
+def _no_field(bag: Bag, pattern: str, available: list[Connection]) -> str:
+    others = [c for c in bag.connections if matches(c.topic, pattern)]
+    if others and pattern != "*":
+        return (
+            f"{bag.path}: topic {others[0].topic} is of type {others[0].msgtype}, magnetic "
+            f"readings must be {FIELD_TYPE}; of that type there are: {listed(available)}"
+        )
+    asked = "" if pattern == "*" else f" that matches {pattern!r}"
+    there = available or bag.connections
+    return f"{bag.path}: no topic of type {FIELD_TYPE}{asked}; there are: {listed(there)}"
+
+
+def _named_poses(bag: Bag, name: str, available: list[Connection]) -> list[Connection]:
+    chosen = [c for c in available if matches(c.topic, name)]
+    if chosen:
+        return chosen
+    others = [c for c in bag.connections if matches(c.topic, name)]
+    if others:
+        raise BagError(
+            f"{bag.path}: topic {others[0].topic} is of type {others[0].msgtype}, poses must be "
+            f"one of {', '.join(POSE_TYPES)}"
+        )
+    raise BagError(
+        f"{bag.path}: no topic {name!r} for the poses; with poses there are: {listed(available)}"
+    )
+
+
+def _read(
+    bag: Bag, connections: list[Connection], options: BagOptions, progress: Progress | None
+) -> Buffers:
+    """Make one pass over the bag."""
+    buffers = Buffers()
+    total = sum(c.msgcount for c in connections)
+    for done, message in enumerate(bag.messages(connections)):
+        if progress is not None and done % PROGRESS_EVERY == 0:
+            progress(done, total)
+        if message.connection.msgtype == FIELD_TYPE:
+            _add_field(buffers, message, options)
+        elif message.connection.msgtype in TF_TYPES:
+            _add_transforms(buffers, message, options)
+        else:
+            _add_pose(buffers, message, options)
+    if progress is not None:
+        progress(total, total)
+    return buffers
+
+
+def _add_field(buffers: Buffers, message: Message, options: BagOptions) -> None:
+    content, topic = message.content, message.connection.topic
+    frame = content.header.frame_id
+    name = sensor_name(topic, frame, options)
+    buffer = buffers.fields.setdefault(name, FieldBuffer(topic, frame))
+    buffer.add(_stamp(message, content, options), content.magnetic_field)
+
+
+def _add_pose(buffers: Buffers, message: Message, options: BagOptions) -> None:
+    content = message.content
+    pose = POSE_TYPES[message.connection.msgtype](content)
+    child = pose.child_frame or "lidar"
+    buffer = buffers.poses.setdefault("", PoseBuffer(content.header.frame_id, child))
+    buffer.add(_stamp(message, content, options), pose.position, pose.orientation)
+
+
+def _add_transforms(buffers: Buffers, message: Message, options: BagOptions) -> None:
+    static = "tf_static" in message.connection.topic
+    for item in message.content.transforms:
+        parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
+        buffer = buffers.poses.setdefault(child, PoseBuffer(parent, child, static=static))
+        stamp = _stamp(message, item, options)
+        buffer.add(stamp, item.transform.translation, item.transform.rotation)
+
+
+def _stamp(message: Message, stamped: object, options: BagOptions) -> int:
+    return message.record_ns if options.stamps is Stamps.RECORD else header_ns(stamped)
+
+
+def _trajectory(path: Path, buffers: Buffers, options: BagOptions) -> Trajectory:
+    """Return the poses of the lidar."""
+    try:
+        links = {child: buffer.link() for child, buffer in buffers.poses.items()}
+    except ValueError as error:
+        raise BagError(f"{path}: poses: {error}") from error
+    if options.tf is not None:
+        tracked = compose(links, options.tf.frame, options.tf.child_frame, str(path))
+    elif not links:
+        raise BagError(f"{path}: the topic of the poses has no messages")
+    else:
+        link = links[""]
+        tracked = Trajectory(link.stamp_ns, link.R, link.p, link.parent, link.child)
+    _check_stamps(path, "poses", tracked.stamp_ns)
+    fixed = options.tracked_to_lidar.rigid()
+    return replace(tracked, R=tracked.R @ fixed.R, p=tracked.R @ fixed.t + tracked.p)
+
+
+def _all_series(path: Path, buffers: Buffers, options: BagOptions) -> tuple[FieldSeries, ...]:
+    """Return every sensor's readings, in order of name."""
+    series = tuple(
+        _series(path, name, buffer, options) for name, buffer in sorted(buffers.fields.items())
+    )
+    if not any(np.isfinite(each.field).all(axis=1).any() for each in series):
+        names = ", ".join(each.topic for each in series) or "the chosen topics"
+        raise BagError(f"{path}: no finite reading in {names}")
+    return series
+
+
+def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> FieldSeries:
+    """Return one sensor's readings in uT, in order of time."""
+    stamps, first = np.unique(buffer.stamps(), return_index=True)
+    values = buffer.field()[first] * MICROTESLA_PER[options.units]
+    _check_stamps(path, f"topic {buffer.topic}", stamps)
+    if wrong := fault(strength(values), is_turning(values), options.units):
+        raise UnitsError(f"{path}: topic {buffer.topic}: {wrong}")
+    return FieldSeries(name, buffer.topic, buffer.frame, stamps, values)
+
+
+def _check_stamps(path: Path, what: str, stamps: IntArray) -> None:
+    if len(stamps) and stamps[-1] == 0:
+        raise BagError(
+            f"{path}: {what}: all header stamps are 0; use the record time instead with "
+            "`bag.stamps: record`"
+        )
+
+
+def _check_clocks(path: Path, poses: Trajectory, series: tuple[FieldSeries, ...]) -> None:
+    for each in series:
+        if not len(each) or not len(poses):
+            continue
+        apart = max(each.stamp_ns[0] - poses.stamp_ns[-1], poses.stamp_ns[0] - each.stamp_ns[-1])
+        if apart > OTHER_CLOCK_NS:
+            raise BagError(
+                f"{path}: topic {each.topic} runs from {each.stamp_ns[0] * 1e-9:.3f} to "
+                f"{each.stamp_ns[-1] * 1e-9:.3f} s, the poses from {poses.stamp_ns[0] * 1e-9:.3f} "
+                f"to {poses.stamp_ns[-1] * 1e-9:.3f} s: their header stamps are of different "
+                "clocks (simulated and record time?); try `bag.stamps: record`"
+            )

@@ -1,0 +1,197 @@
+"""Say what is in a bag, and what would be used of it and why."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Connection
+
+from l2m_gtsam.data import IntArray
+from l2m_gtsam.errors import L2MError
+from l2m_gtsam.storage.bag import BagOptions, select_fields, select_poses
+from l2m_gtsam.storage.messages import (
+    FIELD_TYPE,
+    POSE_TYPES,
+    TF_TYPES,
+    FieldBuffer,
+    StampBuffer,
+    header_ns,
+)
+from l2m_gtsam.storage.open_bag import Bag, open_bag
+from l2m_gtsam.storage.units import MICROTESLA_PER, Strength, fault, is_turning, strength
+
+
+@dataclass(frozen=True)
+class TopicReport:
+    """What is known of one topic.
+
+    Attributes
+    ----------
+    topic, msgtype
+        Name and type.
+    frames
+        Frames of its headers; empty where messages were not decoded.
+    count
+        Messages.
+    rate_hz
+        One over the median time between header stamps; of topics that are not decoded, messages
+        over the time of the bag.
+    longest_gap_s
+        Longest time between messages.
+    span_s
+        First and last header stamp in seconds.
+    clock_offset_s
+        Median of record time less header stamp in seconds.
+    nan_share
+        Share of readings with a NaN axis; NaN for other types.
+    strength
+        |B| in uT, for magnetic fields.
+    use
+        What would be used of it, and why, or why not.
+    """
+
+    topic: str
+    msgtype: str
+    frames: tuple[str, ...]
+    count: int
+    rate_hz: float
+    longest_gap_s: float
+    span_s: tuple[float, float]
+    clock_offset_s: float
+    nan_share: float
+    strength: Strength | None
+    use: str
+
+
+@dataclass(frozen=True)
+class BagReport:
+    """What is in a bag: its topics, and what stands in the way of using it, if anything."""
+
+    path: Path
+    topics: tuple[TopicReport, ...]
+    obstacles: tuple[str, ...]
+
+
+@dataclass
+class _Collected:
+    stamps: StampBuffer = field(default_factory=StampBuffer)
+    frames: set[str] = field(default_factory=set)
+    readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
+
+
+def inspect_bag(path: Path, options: BagOptions) -> BagReport:
+    """Look at every topic; only those that could be used are decoded.
+
+    Raises
+    ------
+    BagError
+        The bag cannot be opened or read.
+    """
+    with open_bag(path) as bag:
+        fields, no_fields = _selected(select_fields, bag, options)
+        poses, no_poses = _selected(select_poses, bag, options)
+        usable = [c for c in bag.connections if _is_usable(c)]
+        collected: dict[str, _Collected] = {}
+        for message in bag.messages(usable):
+            into = collected.setdefault(message.connection.topic, _Collected())
+            _collect(into, message.content, message.connection.msgtype, message.record_ns)
+        uses = {c.topic: "magnetic readings" for c in fields}
+        uses |= {c.topic: f"poses ({_why_poses(options)})" for c in poses}
+        topics, duration = _by_topic(bag), max(bag.duration_s, 1e-9)
+        reports = [
+            _report(topic, connections, collected.get(topic), uses.get(topic), duration, options)
+            for topic, connections in topics.items()
+        ]
+    obstacles = [reason for reason in (no_fields, no_poses) if reason]
+    obstacles += [
+        f"{r.topic}: {r.use}" for r in reports if r.use.startswith("refused") and r.topic in uses
+    ]
+    return BagReport(path, tuple(reports), tuple(obstacles))
+
+
+def _selected(select: Any, bag: Bag, options: BagOptions) -> tuple[list[Connection], str]:
+    """Return what a selection chooses, or why it cannot."""
+    try:
+        return select(bag, options), ""
+    except L2MError as error:
+        return [], str(error)
+
+
+def _is_usable(connection: Connection) -> bool:
+    return connection.msgtype in (FIELD_TYPE, *POSE_TYPES, *TF_TYPES)
+
+
+def _why_poses(options: BagOptions) -> str:
+    if options.tf is not None:
+        return f"chain {options.tf.frame} to {options.tf.child_frame}"
+    return "named by bag.poses" if options.poses is not None else "the only topic of its kind"
+
+
+def _by_topic(bag: Bag) -> dict[str, list[Connection]]:
+    topics: dict[str, list[Connection]] = {}
+    for connection in sorted(bag.connections, key=lambda c: c.topic):
+        topics.setdefault(connection.topic, []).append(connection)
+    return topics
+
+
+def _collect(into: _Collected, content: Any, msgtype: str, record_ns: int) -> None:
+    for stamped in content.transforms if msgtype in TF_TYPES else (content,):
+        into.stamps.add(header_ns(stamped), record_ns)
+        into.frames.add(stamped.header.frame_id)
+    if msgtype == FIELD_TYPE:
+        into.readings.add(record_ns, content.magnetic_field)
+
+
+def _report(
+    topic: str,
+    connections: list[Connection],
+    found: _Collected | None,
+    use: str | None,
+    duration_s: float,
+    options: BagOptions,
+) -> TopicReport:
+    msgtype = connections[0].msgtype
+    found = found or _Collected()
+    header, record = found.stamps.header(), found.stamps.record()
+    gaps = np.diff(np.unique(header)).astype(np.float64) * 1e-9
+    count = sum(c.msgcount for c in connections)
+    values = found.readings.field() * MICROTESLA_PER[options.units]
+    measured = strength(values) if msgtype == FIELD_TYPE else None
+    return TopicReport(
+        topic=topic,
+        msgtype=msgtype,
+        frames=tuple(sorted(found.frames)),
+        count=count,
+        rate_hz=float(1 / np.median(gaps)) if len(gaps) else count / duration_s,
+        longest_gap_s=float(gaps.max()) if len(gaps) else float("nan"),
+        span_s=_span(header),
+        clock_offset_s=float(np.median(record - header)) * 1e-9 if len(header) else float("nan"),
+        nan_share=float(np.mean(~np.isfinite(values).all(axis=1))) if len(values) else float("nan"),
+        strength=measured,
+        use=_use(use, measured, is_turning(values), options, msgtype),
+    )
+
+
+def _span(stamps: IntArray) -> tuple[float, float]:
+    if not len(stamps):
+        return (float("nan"), float("nan"))
+    return (float(stamps.min()) * 1e-9, float(stamps.max()) * 1e-9)
+
+
+def _use(
+    use: str | None, measured: Strength | None, turning: bool, options: BagOptions, msgtype: str
+) -> str:
+    if measured is not None:
+        wrong = fault(measured, turning, options.units)
+        if wrong:
+            return f"refused: {wrong}"
+    if use is not None:
+        return use
+    if msgtype == FIELD_TYPE:
+        return "not chosen by bag.fields"
+    if msgtype in POSE_TYPES:
+        return "poses, not used: another topic is preferred or must be chosen with bag.poses"
+    if msgtype in TF_TYPES:
+        return "transforms, used when bag.tf names a chain"
+    return "not needed"

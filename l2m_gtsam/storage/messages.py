@@ -1,0 +1,128 @@
+"""What is taken out of messages: one table of types, and buffers that grow without objects."""
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.storage.tf import Link
+
+FIELD_TYPE = "sensor_msgs/msg/MagneticField"
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")
+
+
+@dataclass(frozen=True)
+class RawPose:
+    """A pose as it stands in a message."""
+
+    position: Any
+    orientation: Any
+    child_frame: str
+
+
+# Types that carry poses, in the order of preference when a bag has several.
+POSE_TYPES: dict[str, Callable[[Any], RawPose]] = {
+    "nav_msgs/msg/Odometry": lambda m: RawPose(
+        m.pose.pose.position, m.pose.pose.orientation, m.child_frame_id
+    ),
+    "geometry_msgs/msg/PoseStamped": lambda m: RawPose(m.pose.position, m.pose.orientation, ""),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: RawPose(
+        m.pose.pose.position, m.pose.pose.orientation, ""
+    ),
+    "geometry_msgs/msg/TransformStamped": lambda m: RawPose(
+        m.transform.translation, m.transform.rotation, m.child_frame_id
+    ),
+}
+
+
+def header_ns(message: Any) -> int:
+    """Return the header's stamp in nanoseconds."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+@dataclass
+class StampBuffer:
+    """Times of messages as they come, nanoseconds."""
+
+    header_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    record_ns: "array[int]" = field(default_factory=lambda: array("q"))
+
+    def add(self, header: int, record: int) -> None:
+        """Append the two times of one message."""
+        self.header_ns.append(header)
+        self.record_ns.append(record)
+
+    def header(self) -> IntArray:
+        """Return the header stamps, shape (N,)."""
+        return np.array(self.header_ns, dtype=np.int64)
+
+    def record(self) -> IntArray:
+        """Return the record times, shape (N,)."""
+        return np.array(self.record_ns, dtype=np.int64)
+
+
+@dataclass
+class FieldBuffer:
+    """Readings of one sensor as they come."""
+
+    topic: str
+    frame: str
+    stamp_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def add(self, stamp_ns: int, vector: Any) -> None:
+        """Append one reading."""
+        self.stamp_ns.append(stamp_ns)
+        self.values.extend((vector.x, vector.y, vector.z))
+
+    def stamps(self) -> IntArray:
+        """Return the stamps, shape (N,)."""
+        return np.array(self.stamp_ns, dtype=np.int64)
+
+    def field(self) -> FloatArray:
+        """Return the readings as they were written, shape (N, 3)."""
+        return np.array(self.values, dtype=np.float64).reshape(-1, 3)
+
+
+@dataclass
+class PoseBuffer:
+    """Poses of one body as they come."""
+
+    frame: str
+    child_frame: str
+    static: bool = False
+    stamp_ns: "array[int]" = field(default_factory=lambda: array("q"))
+    values: "array[float]" = field(default_factory=lambda: array("d"))
+
+    def add(self, stamp_ns: int, position: Any, orientation: Any) -> None:
+        """Append one pose."""
+        p, q = position, orientation
+        self.stamp_ns.append(stamp_ns)
+        self.values.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+
+    def link(self) -> Link:
+        """Return the finite poses in order of time, the first of each stamp.
+
+        Raises
+        ------
+        ValueError
+            An orientation has no direction (all zero).
+        """
+        rows = np.array(self.values, dtype=np.float64).reshape(-1, 7)
+        stamps = np.array(self.stamp_ns, dtype=np.int64)
+        finite = np.isfinite(rows).all(axis=1)
+        stamps, first = np.unique(stamps[finite], return_index=True)
+        rows = rows[finite][first]
+        length = np.linalg.norm(rows[:, 3:], axis=1)
+        if np.any(length < 1e-6):
+            raise ValueError("an orientation is all zero, it must be a unit quaternion")
+        R = Rotation.from_quat(rows[:, 3:]).as_matrix().reshape(-1, 3, 3)
+        if self.static:  # the last one published holds, whenever
+            return Link(self.frame, self.child_frame, stamps[:0], R[-1:], rows[-1:, :3])
+        return Link(self.frame, self.child_frame, stamps, R, rows[:, :3])
