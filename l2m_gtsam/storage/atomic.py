@@ -1,7 +1,7 @@
-"""Files that are whole or not there."""
+"""Files appear under their name when they are complete, or not at all."""
 
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,25 +11,40 @@ from l2m_gtsam.errors import OutputError
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path`` that takes its name when the block ends well.
+    """Give a temporary file to write, and rename it to ``path`` when the block ends well.
+
+    The temporary file stands in the same folder, so that the rename is one step of the file
+    system. When the block fails it is removed, and what was under ``path`` before stays.
+
+    Parameters
+    ----------
+    path
+        Name that the complete file gets.
+
+    Yields
+    ------
+    Path
+        An empty file to write to.
 
     Raises
     ------
     OutputError
-        The folder cannot be written to.
+        The folder is missing or the file cannot be written.
     """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        handle, name = tempfile.mkstemp(
-            prefix=f".{path.name}.", suffix=path.suffix, dir=path.parent
-        )
-    except OSError as error:
-        msg = f"{path}: cannot be written: {error.strerror}"
-        raise OutputError(msg) from error
-    os.close(handle)
-    temporary = Path(name)
-    try:
+        temporary.touch(exist_ok=False)
         yield temporary
-        temporary.chmod(0o644)
+        _flush(temporary)
         temporary.replace(path)
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    """Have the content on the disk before the name points to it."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())

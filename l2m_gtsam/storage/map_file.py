@@ -1,10 +1,18 @@
-"""Map files: ``.npz`` without pickle, versioned, with a checksum over everything."""
+"""Maps as ``.npz`` files: plain arrays, a version, a checksum, no pickle.
+
+The file is a zip archive of ``.npy`` members: ``header`` (JSON as bytes: format, version, kind,
+options, provenance), ``checksum`` (SHA-256) and one ``arrays/<name>`` per array. Members are
+stored uncompressed with a fixed date, so that the same map gives the same bytes.
+"""
 
 import hashlib
 import json
 import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,81 +23,183 @@ from l2m_gtsam.storage.atomic import atomic_path
 
 FORMAT = "l2m-map"
 VERSION = 1
-HEADER, CHECKSUM = "header", "checksum"
-# A warehouse with everything is under 100 MB; a file that unpacks to more is not ours.
+HEADER, CHECKSUM, ARRAYS = "header.npy", "checksum.npy", "arrays/"
+# Booleans, integers, unsigned, floating and complex numbers; anything else could hide objects.
+NUMERIC = "biufc"
 MAX_BYTES = 2 << 30
+
+Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def save_map(path: Path, state: MapState) -> None:
-    """Write a map; the same state gives the same bytes.
+    """Write a map; `load_map` gives it back equal.
+
+    Parameters
+    ----------
+    path
+        File to write (``.npz``).
+    state
+        The map. Options and provenance must be plain values (JSON); tuples come back as lists.
 
     Raises
     ------
+    MapError
+        An array is not numeric, or options or provenance are not plain values.
     OutputError
         The file cannot be written.
     """
-    header = {
+    header = _encode_header(path, state)
+    arrays = {name: np.asarray(array, order="C") for name, array in state.arrays.items()}
+    if unfit := [name for name, array in arrays.items() if array.dtype.kind not in NUMERIC]:
+        msg = f"{path}: array {unfit[0]!r} is not numeric and cannot be part of a map file"
+        raise MapError(msg)
+    members = {
+        HEADER: header,
+        CHECKSUM: _checksum(header, arrays),
+        **{f"{ARRAYS}{name}.npy": arrays[name] for name in sorted(arrays)},
+    }
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+        for name, array in members.items():
+            # A bare ZipInfo has a fixed date.
+            with archive.open(zipfile.ZipInfo(name), "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def load_map(path: Path, max_bytes: int = MAX_BYTES) -> MapState:
+    """Return the map in a file.
+
+    Parameters
+    ----------
+    path
+        The file.
+    max_bytes
+        Largest content accepted, as declared by the archive, before anything is unpacked.
+
+    Raises
+    ------
+    MapError
+        The file is missing, is something else, is damaged, is from a newer version or is too
+        large.
+    """
+    with _translated(path), zipfile.ZipFile(path) as archive:
+        _refuse_foreign(path, archive)
+        _refuse_large(path, archive, max_bytes)
+        header = _read_member(archive, HEADER)
+        content = _decode_header(path, header)
+        arrays = {
+            name.removeprefix(ARRAYS).removesuffix(".npy"): _read_member(archive, name)
+            for name in archive.namelist()
+            if name.startswith(ARRAYS)
+        }
+        checksum = _read_member(archive, CHECKSUM)
+    if checksum.tobytes() != _checksum(header, arrays).tobytes():
+        msg = f"{path}: damaged: the checksum does not fit the content; build the map again"
+        raise MapError(msg)
+    return MapState(content["kind"], arrays, content["options"], content["provenance"])
+
+
+def _encode_header(path: Path, state: MapState) -> npt.NDArray[np.uint8]:
+    content = {
         "format": FORMAT,
         "version": VERSION,
         "kind": state.kind,
         "options": state.options,
         "provenance": state.provenance,
     }
-    text = json.dumps(header, sort_keys=True).encode()
-    arrays = {
-        HEADER: np.frombuffer(text, dtype=np.uint8),
-        CHECKSUM: np.frombuffer(_checksum(text, state.arrays), dtype=np.uint8),
-        **{f"array/{name}": array for name, array in sorted(state.arrays.items())},
-    }
-    with atomic_path(path) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **arrays)
-
-
-def load_map(path: Path) -> MapState:
-    """Return the map in a file.
-
-    Raises
-    ------
-    MapError
-        No such file, not a map, damaged, or of a newer version.
-    """
-    if not path.is_file():
-        raise MapError(f"{path}: no such map file; make one with `l2m map build`")
     try:
-        contents = _read_arrays(path)
-        text = contents.pop(HEADER).tobytes()
-        stated = contents.pop(CHECKSUM).tobytes()
-        header = json.loads(text)
-        recognised = header["format"] == FORMAT
-    except MapError:
-        raise
-    except Exception as error:  # zipfile and numpy raise many kinds on damaged input
-        raise MapError(f"{path}: not a map file of this program, or damaged") from error
-    if not recognised:
-        raise MapError(f"{path}: not a map file of this program")
-    if header["version"] != VERSION:
-        raise MapError(
-            f"{path}: map version {header['version']}, this program reads version {VERSION}; "
-            "build the map anew or update the program"
+        text = json.dumps(content, sort_keys=True)
+    except (TypeError, ValueError) as error:
+        msg = f"{path}: options and provenance of a map must be plain values: {error}"
+        raise MapError(msg) from error
+    return np.frombuffer(text.encode(), dtype=np.uint8)
+
+
+def _decode_header(path: Path, header: npt.NDArray[Any]) -> dict[str, Any]:
+    content = json.loads(header.tobytes())
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise MapError(_foreign(path))
+    if content.get("version") != VERSION:
+        msg = (
+            f"{path}: map file of version {content.get('version')!r}, this program reads version "
+            f"{VERSION}; build the map again or use the program that wrote it"
         )
-    arrays = {name.removeprefix("array/"): array for name, array in contents.items()}
-    if _checksum(text, arrays) != stated:
-        raise MapError(f"{path}: the checksum does not match, the file is damaged; build it anew")
-    return MapState(header["kind"], arrays, header["options"], header["provenance"])
+        raise MapError(msg)
+    parts = {"kind": str, "options": dict, "provenance": dict}
+    if not all(isinstance(content.get(key), kind) for key, kind in parts.items()):
+        raise MapError(_foreign(path))
+    return content
 
 
-def _read_arrays(path: Path) -> dict[str, npt.NDArray[Any]]:
-    with zipfile.ZipFile(path) as archive:
-        unpacked = sum(entry.file_size for entry in archive.infolist())
-    if unpacked > MAX_BYTES:
-        raise MapError(f"{path}: unpacks to {unpacked / 1e9:.1f} GB, not a map of this program")
-    with np.load(path, allow_pickle=False) as archive:
-        return {name: archive[name] for name in archive.files}
+def _checksum(header: npt.NDArray[Any], arrays: Arrays) -> npt.NDArray[np.uint8]:
+    """Return the SHA-256 over the header and over name, type, shape and bytes of each array."""
+    digest = hashlib.sha256(header.tobytes())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
+        digest.update(np.asarray(array, order="C").data)
+    return np.frombuffer(digest.digest(), dtype=np.uint8)
 
 
-def _checksum(header: bytes, arrays: dict[str, npt.NDArray[Any]]) -> bytes:
-    digest = hashlib.sha256(header)
-    for name, array in sorted(arrays.items()):
-        digest.update(f"\0{name}\0{array.dtype.str}\0{array.shape}\0".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.digest()
+def _read_member(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
+    """Read one array; what its header declares must be what the archive holds."""
+    with archive.open(name) as member:
+        shape, fortran, dtype = _read_array_header(member)
+        declared = archive.getinfo(name).file_size - member.tell()
+        if dtype.kind not in NUMERIC or fortran or _bytes_of(shape, dtype) != declared:
+            msg = f"array {name!r} is not what it declares to be"
+            raise ValueError(msg)
+        return np.frombuffer(bytearray(member.read()), dtype=dtype).reshape(shape)
+
+
+def _read_array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    if np.lib.format.read_magic(member) != (1, 0):
+        msg = "unknown version of an array"
+        raise ValueError(msg)
+    return np.lib.format.read_array_header_1_0(member)
+
+
+def _bytes_of(shape: tuple[int, ...], dtype: np.dtype[Any]) -> int:
+    """Return the size that a shape needs, in whole numbers that cannot overflow."""
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    return size
+
+
+def _refuse_foreign(path: Path, archive: zipfile.ZipFile) -> None:
+    if not {HEADER, CHECKSUM} <= set(archive.namelist()):
+        raise MapError(_foreign(path))
+
+
+def _refuse_large(path: Path, archive: zipfile.ZipFile, max_bytes: int) -> None:
+    declared = sum(info.file_size for info in archive.infolist())
+    if declared > max_bytes:
+        msg = (
+            f"{path}: declares {declared / 1e6:,.0f} MB of content; at most "
+            f"{max_bytes / 1e6:,.0f} MB are accepted"
+        )
+        raise MapError(msg)
+
+
+def _foreign(path: Path) -> str:
+    return f"{path}: not a map file of this program; accepted: an .npz made by `l2m map build`"
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """Turn what zip, numpy and JSON raise on bad files into one line."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        msg = f"{path}: no such file; make a map with `l2m map build`"
+        raise MapError(msg) from error
+    except OSError as error:
+        msg = f"{path}: cannot be read: {error.strerror or error}"
+        raise MapError(msg) from error
+    except zipfile.BadZipFile as error:
+        whole = "CRC" not in str(error)
+        msg = _foreign(path) if whole else f"{path}: damaged: {error}; build the map again"
+        raise MapError(msg) from error
+    except (ValueError, EOFError, KeyError, NotImplementedError, RuntimeError, zlib.error) as error:
+        msg = f"{path}: damaged map file: {error}; build the map again"
+        raise MapError(msg) from error

@@ -77,9 +77,9 @@ def test_uncertainty_is_honest_where_the_map_is_exact() -> None:
             nees.append(e @ np.linalg.solve(found.covariance, e))
             noises.append(solution.estimate.noise[found.sensor])
     count = len(nees)
-    low, high = chi2.ppf([0.0005, 0.9995], 15 * count) / count
+    band = [float(chi2.ppf(p, 15 * count)) / count for p in (0.0005, 0.9995)]
     assert count == 120
-    assert low < np.mean(nees) < high
+    assert band[0] < np.mean(nees) < band[1]
     # Fifteen parameters take 15 of 600 degrees of freedom: 1.3 % below 0.2 uT.
     assert np.mean(noises) == pytest.approx(0.2 * np.sqrt(1 - 15 / 600), rel=0.01)
 

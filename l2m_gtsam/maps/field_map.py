@@ -1,0 +1,98 @@
+"""What the application asks of a map, whatever its kind."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from l2m_gtsam.data import FieldSample, FloatArray, MapState
+
+
+@dataclass(frozen=True)
+class MapSummary:
+    """What `l2m map info` prints.
+
+    Attributes
+    ----------
+    kind
+        Name of the map kind.
+    readings
+        Readings that the map was given.
+    rows
+        Rows that it kept of them after thinning.
+    lower, upper
+        Corners of the box around them in the map frame in metres, shape (3,).
+    facts
+        What else is worth knowing of this kind, by name with unit: plain values.
+    """
+
+    kind: str
+    readings: int
+    rows: int
+    lower: FloatArray
+    upper: FloatArray
+    facts: dict[str, Any]
+
+
+class FieldMap(Protocol):
+    """A magnetic field learnt from readings, in the map frame."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the map kind, as in the registry of ``build``."""
+        ...
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map."""
+        ...
+
+    def query(self, points: FloatArray) -> FieldSample:
+        """Return field, gradient and variance at points, shape (N, 3), in metres.
+
+        Points without data nearby are not ``inside``: NaN, with infinite variance.
+
+        Raises
+        ------
+        MapError
+            If a point is not finite or the shape is wrong.
+        """
+        ...
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, also outside of the map.
+
+        Never NaN: away from data the field returns to its mean, so that an optimiser may leave
+        the map in a trial step. ``gradient[n, i, j]`` = dB_i/dx_j.
+
+        Raises
+        ------
+        MapError
+            If a point is not finite or the shape is wrong.
+        """
+        ...
+
+    def variance(self, points: FloatArray) -> FloatArray:
+        """Return the posterior variance per axis in uT^2, shape (N, 3), also outside of the map.
+
+        Raises
+        ------
+        MapError
+            If a point is not finite or the shape is wrong.
+        """
+        ...
+
+    def to_state(self) -> MapState:
+        """Return the map as plain arrays and facts."""
+        ...
+
+
+def masked(sample: FieldSample) -> FieldSample:
+    """Return a sample that says nothing where the map has no data: NaN and infinite variance."""
+    inside = sample.inside
+    return FieldSample(
+        np.where(inside[:, None], sample.field, np.nan),
+        np.where(inside[:, None, None], sample.gradient, np.nan),
+        np.where(inside[:, None], sample.variance, np.inf),
+        inside,
+    )

@@ -1,0 +1,99 @@
+"""The squared-exponential kernel on points in space, arranged so that BLAS does the work.
+
+    k(x, y) = s^2 exp(-|x - y|^2 / 2 l^2)
+
+All points here are *scaled*: taken from a centre near the data and divided by the length scale,
+so that k = s^2 exp(x.y - |x|^2 / 2 - |y|^2 / 2). The exponent is one matrix product of five
+features per point, and value and gradient of a posterior mean are a second one:
+
+    mean_i     = sum_j k_j alpha_ji
+    dmean_i/dx = -(1/l) sum_j (x - y_j) k_j alpha_ji = (1/l) (K [alpha_i y] - x mean_i)
+
+The three axes of the field share the kernel, hence one matrix is factorised instead of three and
+the variance is isotropic: the vertical axis is usually the roughest and the sigmas of the three
+are an average. The mean of each axis is a constant outside the kernel.
+"""
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+
+FURTHEST = 1e6
+"""Points are pulled to this distance, in length scales, where every kernel is zero anyway."""
+
+
+def scaled(points: FloatArray, centre: FloatArray, length_scale: float) -> FloatArray:
+    """Return points relative to a centre in units of the length scale.
+
+    Parameters
+    ----------
+    points
+        Positions in metres, shape (N, 3).
+    centre
+        Position in metres, shape (3,), close to the data: the exponent loses digits with the
+        square of the distance to it.
+    length_scale
+        Metres.
+    """
+    return np.clip((points - centre) / length_scale, -FURTHEST, FURTHEST)
+
+
+def kernel_matrix(x: FloatArray, y: FloatArray, signal: float) -> FloatArray:
+    """Return the kernel between scaled points, shape (N, M), in the unit of ``signal`` squared.
+
+    Parameters
+    ----------
+    x, y
+        Scaled points, shapes (N, 3) and (M, 3).
+    signal
+        Prior standard deviation s in uT.
+    """
+    rows = np.column_stack([x, -0.5 * np.sum(x * x, axis=1), np.ones(len(x))])
+    offset = 2 * np.log(signal) - 0.5 * np.sum(y * y, axis=1)
+    columns = np.column_stack([y, np.ones(len(y)), offset])
+    K = rows @ columns.T
+    np.exp(K, out=K)
+    return np.asarray(K)
+
+
+def mean_weights(alpha: FloatArray, y: FloatArray) -> FloatArray:
+    """Return [alpha, alpha (x) y], shape (M, 12): what ``mean_and_gradient`` multiplies.
+
+    Parameters
+    ----------
+    alpha
+        Weights of the training readings per axis, shape (M, 3).
+    y
+        Scaled training points, shape (M, 3).
+    """
+    outer = alpha[:, :, None] * y[:, None, :]
+    return np.hstack([alpha, outer.reshape(len(y), 9)])
+
+
+def mean_and_gradient(
+    K: FloatArray, weights: FloatArray, x: FloatArray, length_scale: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the posterior mean without its constant and its gradient.
+
+    Parameters
+    ----------
+    K
+        Kernel between the points and the training points, shape (N, M).
+    weights
+        From ``mean_weights``, shape (M, 12).
+    x
+        Scaled points, shape (N, 3).
+    length_scale
+        Metres.
+
+    Returns
+    -------
+    mean
+        uT, shape (N, 3).
+    gradient
+        ``gradient[n, i, j]`` = dmean_i/dx_j in uT/m, shape (N, 3, 3).
+    """
+    sums = K @ weights
+    mean = sums[:, :3]
+    moments = sums[:, 3:].reshape(-1, 3, 3)
+    return mean, (moments - mean[:, :, None] * x[:, None, :]) / length_scale

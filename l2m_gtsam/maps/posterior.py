@@ -1,0 +1,125 @@
+"""A Gaussian process conditioned on the readings near one block, ready for batches of points."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
+
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.hyperparameters import Hyperparameters, not_definite
+from l2m_gtsam.maps.kernel import kernel_matrix, mean_and_gradient, mean_weights, scaled
+from l2m_gtsam.maps.training import TrainingSet
+
+
+@dataclass(frozen=True)
+class KernelRows:
+    """The kernel between points and training readings.
+
+    Attributes
+    ----------
+    x
+        Scaled points, shape (N, 3).
+    K
+        Kernel in square microtesla, shape (N, M).
+    """
+
+    x: FloatArray
+    K: FloatArray
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What a block needs to answer.
+
+    Attributes
+    ----------
+    hyperparameters
+        Kernel and noise.
+    centre
+        Origin of the scaled points in metres, shape (3,).
+    y
+        Scaled training points, shape (M, 3).
+    weights
+        Of ``mean_weights``, shape (M, 12).
+    noise_variance
+        Of each reading in square microtesla, shape (M,).
+    factor
+        Lower Cholesky factor of the readings' covariance in microtesla, shape (M, M), or None
+        where memory is short: then it is computed again for each batch that asks for variances.
+    """
+
+    hyperparameters: Hyperparameters
+    centre: FloatArray
+    y: FloatArray
+    weights: FloatArray
+    noise_variance: FloatArray
+    factor: FloatArray | None
+
+    def rows(self, points: FloatArray) -> KernelRows:
+        """Return the kernel rows of points in metres, shape (N, 3)."""
+        x = scaled(points, self.centre, self.hyperparameters.length_scale)
+        return KernelRows(x, kernel_matrix(x, self.y, self.hyperparameters.signal))
+
+    def mean_and_gradient(self, rows: KernelRows) -> tuple[FloatArray, FloatArray]:
+        """Return the residual's mean (N, 3) in uT and its gradient (N, 3, 3) in uT/m."""
+        return mean_and_gradient(rows.K, self.weights, rows.x, self.hyperparameters.length_scale)
+
+    def variance(self, rows: KernelRows) -> FloatArray:
+        """Return the posterior variance of each axis in square microtesla, shape (N,)."""
+        factor = self.factor
+        if factor is None:
+            factor = factorise(self.y, self.noise_variance, self.hyperparameters)
+        V = solve_triangular(factor, rows.K.T, lower=True, check_finite=False)
+        explained = np.einsum("mn,mn->n", V, V)
+        return np.asarray(np.maximum(self.hyperparameters.signal**2 - explained, 0.0))
+
+    def within(self, rows: KernelRows, reach: float) -> BoolArray:
+        """Return whether the nearest reading lies within ``reach`` length scales, shape (N,)."""
+        least = self.hyperparameters.signal**2 * np.exp(-0.5 * reach**2)
+        return np.asarray(rows.K.max(axis=1) >= least)
+
+    def without_factor(self) -> "Posterior":
+        """Return the same posterior in less memory."""
+        return replace(self, factor=None)
+
+
+def condition(
+    readings: TrainingSet, mean: FloatArray, hyperparameters: Hyperparameters
+) -> Posterior:
+    """Return the process conditioned on readings, by one Cholesky factorisation.
+
+    Parameters
+    ----------
+    readings
+        Of the block and its margin.
+    mean
+        Prior mean per axis in microtesla, shape (3,).
+    hyperparameters
+        Kernel and noise.
+
+    Raises
+    ------
+    MapError
+        If the covariance of the readings is not positive definite.
+    """
+    lower, upper = readings.points.min(axis=0), readings.points.max(axis=0)
+    centre = 0.5 * (lower + upper)
+    y = scaled(readings.points, centre, hyperparameters.length_scale)
+    noise_variance = hyperparameters.noise**2 / readings.weight
+    factor = factorise(y, noise_variance, hyperparameters)
+    alpha = cho_solve((factor, True), readings.field - mean, check_finite=False)
+    return Posterior(hyperparameters, centre, y, mean_weights(alpha, y), noise_variance, factor)
+
+
+def factorise(
+    y: FloatArray, noise_variance: FloatArray, hyperparameters: Hyperparameters
+) -> FloatArray:
+    """Return the lower Cholesky factor of the covariance of readings, shape (M, M)."""
+    K = kernel_matrix(y, y, hyperparameters.signal)
+    K[np.diag_indices_from(K)] += noise_variance
+    try:
+        # The transpose of a symmetric matrix is itself, in the order that LAPACK overwrites.
+        return np.asarray(cholesky(K.T, lower=True, overwrite_a=True, check_finite=False))
+    except LinAlgError:
+        raise MapError(not_definite(hyperparameters)) from None

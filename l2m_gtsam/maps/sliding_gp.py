@@ -1,0 +1,225 @@
+"""Sliding Gaussian process regression: square blocks, each solved with the readings nearby.
+
+The map of the paper (L2M-Calib, section "Prebuilt Multimodal Magnetic-LiDAR Map"): the area is
+partitioned into blocks, and each is interpolated by a Gaussian process over the readings in it
+and in a margin around it. All blocks share hyperparameters and prior mean, so that the map tends
+to the dense process as the margin grows.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.grid import Grid, grid_over
+from l2m_gtsam.maps.posterior import Posterior, condition
+from l2m_gtsam.maps.trained import (
+    GPOptions,
+    Trained,
+    options_from_state,
+    train,
+    trained_from_state,
+    trained_summary,
+    trained_to_state,
+)
+from l2m_gtsam.maps.training import checked_points
+
+KIND = "sliding_gp"
+MOST_IN_BLOCK = 6000  # rows; the factor of such a block takes 290 MB
+FACTOR_MEMORY = 512e6  # bytes of factors that are kept for variances
+BATCH = 256  # points whose kernel rows are in memory, and about in cache, at once
+
+
+class SlidingGPOptions(GPOptions):
+    """Options of the sliding Gaussian process; lengths are in length scales."""
+
+    block: float = Field(default=2.5, ge=0.5)
+    """Edge of a block."""
+
+    margin: float = Field(default=2.0, gt=0, le=10)
+    """Readings this far around a block take part in it. At 2 the step from block to block is a
+    tenth of the posterior's standard deviation."""
+
+    @model_validator(mode="after")
+    def _reach_within_margin(self) -> Self:
+        if self.reach > self.margin:
+            raise ValueError(f"reach {self.reach:g} must not exceed margin {self.margin:g}")
+        return self
+
+
+@dataclass(frozen=True)
+class Visit:
+    """Points that one block answers for, as many as fit a batch.
+
+    Attributes
+    ----------
+    block
+        Index of the block.
+    rows
+        Indices of the points, shape (K,).
+    """
+
+    block: int
+    rows: IntArray
+
+
+@dataclass(frozen=True)
+class SlidingGP:
+    """A field map of Gaussian processes on square blocks.
+
+    Attributes
+    ----------
+    trained
+        Training readings and hyperparameters.
+    options
+        Effective options.
+    mean
+        Prior mean per axis in microtesla, shape (3,).
+    grid
+        Where the blocks lie.
+    blocks
+        One posterior per block of the grid.
+    """
+
+    trained: Trained
+    options: SlidingGPOptions
+    mean: FloatArray
+    grid: Grid
+    blocks: tuple[Posterior, ...]
+
+    @classmethod
+    def fit(
+        cls, points: FloatArray, field: FloatArray, options: SlidingGPOptions | None = None
+    ) -> "SlidingGP":
+        """Return the map of readings.
+
+        Parameters
+        ----------
+        points
+            Positions of the readings in the map frame in metres, shape (N, 3).
+        field
+            Readings in the map frame in microtesla, shape (N, 3).
+        options
+            Defaults where absent.
+
+        Raises
+        ------
+        MapError
+            If no map can be made of the readings.
+        """
+        options = SlidingGPOptions() if options is None else options
+        return cls.condition(train(points, field, options), options)
+
+    @classmethod
+    def condition(cls, trained: Trained, options: SlidingGPOptions) -> "SlidingGP":
+        """Return the map of readings whose hyperparameters are known.
+
+        Raises
+        ------
+        MapError
+            If a block holds too many readings or its covariance cannot be factorised.
+        """
+        unit, readings = trained.hyperparameters.length_scale, trained.readings
+        grid = grid_over(readings.points, options.block * unit, options.reach * unit)
+        members = grid.members(readings.points, options.margin * unit)
+        check_sizes(members, grid.size)
+        blocks = tuple(posteriors(trained, members))
+        return cls(trained, options, readings.mean, grid, blocks)
+
+    @classmethod
+    def from_state(cls, state: MapState) -> "SlidingGP":
+        """Return the map that ``to_state`` took apart.
+
+        Raises
+        ------
+        MapError
+            If the state is damaged.
+        """
+        options = options_from_state(state, SlidingGPOptions)
+        return cls.condition(trained_from_state(state), options)
+
+    @property
+    def kind(self) -> str:
+        """Name of the map kind."""
+        return KIND
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map."""
+        sizes = [len(block.y) for block in self.blocks]
+        facts = {
+            "blocks": len(sizes),
+            "block (m)": self.grid.size,
+            "readings in a block (median)": int(np.median(sizes)),
+            "readings in a block (most)": max(sizes),
+        }
+        return trained_summary(KIND, self.trained, facts)
+
+    def query(self, points: FloatArray) -> FieldSample:
+        """Return field, gradient and variance; see ``FieldMap``."""
+        points = checked_points(points)
+        N = len(points)
+        field, gradient = np.empty((N, 3)), np.empty((N, 3, 3))
+        variance, inside = np.empty((N, 3)), np.empty(N, dtype=np.bool_)
+        for visit in self._visits(points):
+            block, at = self.blocks[visit.block], visit.rows
+            rows = block.rows(points[at])
+            field[at], gradient[at] = block.mean_and_gradient(rows)
+            variance[at] = block.variance(rows)[:, None]
+            inside[at] = block.within(rows, self.options.reach)
+        return masked(FieldSample(field + self.mean, gradient, variance, inside))
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Return field and gradient, also outside; see ``FieldMap``."""
+        points = checked_points(points)
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        for visit in self._visits(points):
+            block, at = self.blocks[visit.block], visit.rows
+            field[at], gradient[at] = block.mean_and_gradient(block.rows(points[at]))
+        return field + self.mean, gradient
+
+    def variance(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis, also outside; see ``FieldMap``."""
+        points = checked_points(points)
+        variance = np.empty((len(points), 3))
+        for visit in self._visits(points):
+            block, at = self.blocks[visit.block], visit.rows
+            variance[at] = block.variance(block.rows(points[at]))[:, None]
+        return variance
+
+    def to_state(self) -> MapState:
+        """Return the map as plain arrays and facts."""
+        return trained_to_state(KIND, self.trained, self.options)
+
+    def _visits(self, points: FloatArray) -> Iterator[Visit]:
+        """Yield every point once, block by block and batch by batch."""
+        owner = self.grid.block_of(points)
+        order = np.argsort(owner, kind="stable")
+        edges = np.flatnonzero(np.diff(owner[order])) + 1
+        for group in np.split(order, edges):
+            for start in range(0, len(group), BATCH):
+                yield Visit(int(owner[group[0]]), group[start : start + BATCH])
+
+
+def check_sizes(members: list[IntArray], block: float) -> None:
+    """Refuse blocks whose factor would not fit in memory."""
+    most = max(len(rows) for rows in members)
+    if most > MOST_IN_BLOCK:
+        raise MapError(
+            f"a map block of {block:.3g} m holds {most} training readings with its margin, at "
+            f"most {MOST_IN_BLOCK} are allowed; a larger spacing or a smaller block is needed"
+        )
+
+
+def posteriors(trained: Trained, members: list[IntArray]) -> Iterator[Posterior]:
+    """Yield the posterior of each block, with its factor as long as memory lasts."""
+    mean, used = trained.readings.mean, 0
+    for rows in members:
+        posterior = condition(trained.readings[rows], mean, trained.hyperparameters)
+        used += 8 * len(rows) ** 2
+        yield posterior if used <= FACTOR_MEMORY else posterior.without_factor()

@@ -1,0 +1,194 @@
+"""What every Gaussian-process map is made of: training readings and hyperparameters."""
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, TypeAdapter, ValidationError
+
+from l2m_gtsam.data import FloatArray, MapState
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.field_map import MapSummary
+from l2m_gtsam.maps.hyperparameters import (
+    NAMES,
+    Hyperparameters,
+    LearningOptions,
+    LikelihoodFit,
+    learn,
+)
+from l2m_gtsam.maps.training import ThinningOptions, TrainingSet, thinned, training_set
+from l2m_gtsam.options import Options
+
+
+class GPOptions(Options):
+    """What every Gaussian-process map can be told; lengths are in length scales."""
+
+    hyperparameters: Hyperparameters | None = None
+    """Fixed hyperparameters; learnt from the marginal likelihood where absent."""
+
+    learning: LearningOptions = LearningOptions()
+    """The sample they are learnt from."""
+
+    thinning: ThinningOptions = ThinningOptions()
+    """How close readings are merged."""
+
+    reach: float = Field(default=0.83, gt=0)
+    """A point is inside the map when a training reading is this near. At sqrt(log 2) = 0.83
+    length scales one noise-free reading explains half of the prior variance."""
+
+
+AnyGPOptions = TypeVar("AnyGPOptions", bound=GPOptions)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where a trained process came from.
+
+    Attributes
+    ----------
+    readings
+        Readings before thinning.
+    learning
+        How learning ended; absent where the hyperparameters were given.
+    """
+
+    readings: int
+    learning: LikelihoodFit | None
+
+
+ORIGIN = TypeAdapter(Origin)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A training set and the hyperparameters to condition it with."""
+
+    readings: TrainingSet
+    hyperparameters: Hyperparameters
+    origin: Origin
+
+    @property
+    def noise_variance(self) -> FloatArray:
+        """Variance of the noise of each row in square microtesla, shape (N,)."""
+        return self.hyperparameters.noise**2 / self.readings.weight
+
+
+def train(points: FloatArray, field: FloatArray, options: GPOptions) -> Trained:
+    """Return readings with hyperparameters, thinned.
+
+    Parameters
+    ----------
+    points
+        Positions in the map frame in metres, shape (N, 3).
+    field
+        Readings in the map frame in microtesla, shape (N, 3).
+    options
+        Of the map.
+
+    Raises
+    ------
+    MapError
+        If no map can be made of the readings.
+    """
+    readings = training_set(points, field)
+    learning = None
+    hyperparameters = options.hyperparameters
+    if hyperparameters is None:
+        learning = learn(readings, options.learning, options.thinning)
+        hyperparameters = learning.hyperparameters
+    kept = thinned(readings, hyperparameters.length_scale, options.thinning)
+    return Trained(kept, hyperparameters, Origin(len(readings), learning))
+
+
+def trained_to_state(kind: str, trained: Trained, options: GPOptions) -> MapState:
+    """Return a map as its training rows: factors are cheaper to compute again than to store."""
+    values = trained.hyperparameters.model_dump()
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "points": trained.readings.points,
+        "field": trained.readings.field,
+        "weight": trained.readings.weight,
+        "hyperparameters": np.array([values[name] for name in NAMES]),
+    }
+    origin = ORIGIN.dump_python(trained.origin, mode="json")
+    return MapState(kind, arrays, options.model_dump(mode="json"), origin)
+
+
+def trained_from_state(state: MapState) -> Trained:
+    """Return what ``trained_to_state`` took apart; the state may come from an untrusted file.
+
+    Raises
+    ------
+    MapError
+        If an array or an entry is missing, of the wrong shape, or makes no sense.
+    """
+    values = state_array(state, "hyperparameters")
+    if values.shape != (len(NAMES),):
+        raise MapError(f"map array hyperparameters has shape {values.shape}; (3,) is needed")
+    try:
+        hyperparameters = Hyperparameters(**dict(zip(NAMES, values.tolist(), strict=True)))
+        origin = ORIGIN.validate_python(state.provenance)
+    except ValidationError as error:
+        raise MapError(f"map state is damaged: {first_complaint(error)}") from None
+    arrays = (state_array(state, name) for name in ("points", "field", "weight"))
+    return Trained(training_set(*arrays), hyperparameters, origin)
+
+
+def options_from_state(state: MapState, model: type[AnyGPOptions]) -> AnyGPOptions:
+    """Return the options of a state.
+
+    Raises
+    ------
+    MapError
+        If they are not options of this kind.
+    """
+    try:
+        return model.model_validate(state.options)
+    except ValidationError as error:
+        raise MapError(f"map options are damaged: {first_complaint(error)}") from None
+
+
+def state_array(state: MapState, name: str) -> FloatArray:
+    """Return a numeric array of a state as float64.
+
+    Raises
+    ------
+    MapError
+        If it is missing or not numeric.
+    """
+    array = state.arrays.get(name)
+    if array is None or array.dtype.kind not in "fiu":
+        raise MapError(f"map state of kind {state.kind} needs a numeric array {name}")
+    return np.asarray(array, dtype=np.float64)
+
+
+def first_complaint(error: ValidationError) -> str:
+    """Return the first complaint of pydantic as one line."""
+    detail = error.errors()[0]
+    return f"{'.'.join(str(part) for part in detail['loc'])}: {detail['msg']}"
+
+
+def trained_summary(kind: str, trained: Trained, facts: dict[str, Any]) -> MapSummary:
+    """Return the figures of a map, with what its kind adds."""
+    points, learning = trained.readings.points, trained.origin.learning
+    return MapSummary(
+        kind=kind,
+        readings=trained.origin.readings,
+        rows=len(points),
+        lower=points.min(axis=0),
+        upper=points.max(axis=0),
+        facts={
+            "length scale (m)": trained.hyperparameters.length_scale,
+            "signal (uT)": trained.hyperparameters.signal,
+            "noise of a reading (uT)": trained.hyperparameters.noise,
+            "hyperparameters": "given" if learning is None else describe(learning),
+            **facts,
+        },
+    )
+
+
+def describe(learning: LikelihoodFit) -> str:
+    """Return how learning ended in a few words."""
+    if learning.at_bound:
+        return f"learnt, not determined by the data: {', '.join(learning.at_bound)}"
+    return "learnt" if learning.converged else f"learnt, not converged: {learning.message}"

@@ -1,0 +1,145 @@
+"""The readings that a map is trained on: checked, and thinned to what they can tell."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.options import Options
+
+FEWEST = 10
+FURTHEST = 1e8  # metres from the origin of the map, where float64 still holds a micrometre
+STRONGEST = 1e6  # microtesla, one tesla
+LEAST_EXTENT = 0.01  # metres
+LEAST_CUBES = 10  # along the longest side, so that thinning never eats a small data set
+
+
+class ThinningOptions(Options):
+    """How readings that lie close together are merged."""
+
+    spacing: float = Field(default=0.33, ge=0, le=1)
+    """Edge, in length scales, of the cubes over which readings are averaged; 0 keeps them all.
+    At a third the map is as accurate as at a seventh, with a fifth of the rows."""
+
+    independent: int = Field(default=10, ge=1)
+    """The most readings of one cube that count as independent: their errors share the pose and
+    the disturbances of one passage, so that a vehicle at rest must not count a thousand fold."""
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """Positions and readings in the map frame.
+
+    Attributes
+    ----------
+    points
+        Positions in metres, shape (N, 3).
+    field
+        Readings in microtesla, shape (N, 3).
+    weight
+        How many independent readings each row is worth, shape (N,): the variance of its noise is
+        that of one reading divided by it.
+    """
+
+    points: FloatArray
+    field: FloatArray
+    weight: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, rows: IntArray) -> "TrainingSet":
+        return TrainingSet(self.points[rows], self.field[rows], self.weight[rows])
+
+    @property
+    def mean(self) -> FloatArray:
+        """Mean of the rows per axis in microtesla, shape (3,)."""
+        return np.asarray(self.field.mean(axis=0))
+
+
+def checked_points(points: FloatArray) -> FloatArray:
+    """Return points as float64 after checking that they are finite and of shape (N, 3).
+
+    Raises
+    ------
+    MapError
+        If they are not.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise MapError(f"map points have shape {points.shape}; (N, 3) is needed")
+    bad = ~np.isfinite(points).all(axis=1)
+    if bad.any():
+        raise MapError(f"map point {int(bad.argmax())} of {len(points)} is not finite")
+    return points
+
+
+def training_set(
+    points: FloatArray, field: FloatArray, weight: FloatArray | None = None
+) -> TrainingSet:
+    """Return readings as a training set after checking that a map can be made from them.
+
+    Parameters
+    ----------
+    points
+        Positions in the map frame in metres, shape (N, 3).
+    field
+        Readings in the map frame in microtesla, shape (N, 3).
+    weight
+        How many independent readings each row is worth, shape (N,); one by default.
+
+    Raises
+    ------
+    MapError
+        If shapes disagree, a value is not finite, or there is too little to make a map from.
+    """
+    points = checked_points(points)
+    field = np.asarray(field, dtype=np.float64)
+    weight = np.ones(len(points)) if weight is None else np.asarray(weight, dtype=np.float64)
+    if field.shape != points.shape or weight.shape != points.shape[:1]:
+        raise MapError(
+            f"map training readings have shape {field.shape} and weights {weight.shape}; "
+            f"{len(points)} points need {points.shape} and {points.shape[:1]}"
+        )
+    bad = ~(np.isfinite(field).all(axis=1) & np.isfinite(weight) & (weight > 0))
+    if bad.any():
+        raise MapError(f"map training reading {int(bad.argmax())} of {len(points)} is not finite")
+    if len(points) < FEWEST:
+        raise MapError(f"a map needs at least {FEWEST} training readings, got {len(points)}")
+    if np.abs(points).max() > FURTHEST:
+        raise MapError(f"map training positions exceed {FURTHEST:g} m: are they in metres?")
+    if np.abs(field).max() > STRONGEST:
+        raise MapError(f"map training readings exceed {STRONGEST:g} uT: are they in microtesla?")
+    if np.ptp(points, axis=0).max() < LEAST_EXTENT:
+        raise MapError("all map training readings were taken at one point; a drive is needed")
+    return TrainingSet(points, field, weight)
+
+
+def thinned(readings: TrainingSet, length_scale: float, options: ThinningOptions) -> TrainingSet:
+    """Return the readings averaged over the cubes of a grid.
+
+    Position and field are averaged alike, so what a cube loses is the curvature of the field
+    within it: for an edge of a third of the length scale, about 0.01 of the signal.
+
+    Parameters
+    ----------
+    readings
+        Readings as they were taken, each of weight one.
+    length_scale
+        Metres.
+    options
+        Edge of the cubes and the most that one is worth.
+    """
+    if options.spacing == 0.0:
+        return readings
+    lower = readings.points.min(axis=0)
+    extent = float(np.ptp(readings.points, axis=0).max())
+    edge = min(options.spacing * length_scale, extent / LEAST_CUBES)
+    cubes = np.floor((readings.points - lower) / edge)
+    _, owner = np.unique(cubes.astype(np.int64), axis=0, return_inverse=True)
+    count = np.bincount(owner).astype(np.float64)
+    columns = np.hstack([readings.points, readings.field]).T
+    means = np.column_stack([np.bincount(owner, column) for column in columns]) / count[:, None]
+    return TrainingSet(means[:, :3], means[:, 3:], np.minimum(count, options.independent))

@@ -1,0 +1,1 @@
+"""Seeded worlds, vehicles and sensors, written as real bags."""

@@ -1,0 +1,115 @@
+"""What a vehicle's sensors record while it drives."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.simulate.drive import Motion
+from l2m_gtsam.simulate.sensors import (
+    NoiseOptions,
+    SamplingOptions,
+    measured_poses,
+    read_field,
+    sample_stamps,
+    sensor_points,
+)
+from l2m_gtsam.simulate.world import SteelWorld
+
+Progress = Callable[[str, float], None]
+"""Called with the name of a stage and the share of it that is done, 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """A vehicle on its drive.
+
+    Attributes
+    ----------
+    name
+        Name of the drive.
+    sensors
+        Its magnetometers.
+    motion
+        Where its lidar truly is.
+    sampling, noise
+        When and how well it measures.
+    """
+
+    name: str
+    sensors: tuple[KnownSensor, ...]
+    motion: Motion
+    sampling: SamplingOptions
+    noise: NoiseOptions
+
+
+@dataclass(frozen=True)
+class SimulatedDrive:
+    """One drive: what was recorded, and the true motion behind it."""
+
+    recording: Recording
+    motion: Motion
+
+
+def record(
+    vehicle: Vehicle, world: SteelWorld, rng: np.random.Generator, progress: Progress
+) -> SimulatedDrive:
+    """Return what a vehicle records on its drive through a world.
+
+    Every source has its own clock phase and jitter; stamps are the true times of measurement.
+
+    Parameters
+    ----------
+    vehicle
+        The vehicle on its drive.
+    world
+        Source of the field.
+    rng
+        Source of randomness.
+    progress
+        Told after every sensor.
+
+    Raises
+    ------
+    ConfigError
+        A sensor would pass through steel.
+    """
+    motion, sampling = vehicle.motion, vehicle.sampling
+    stamps = sample_stamps(sampling, sampling.pose_rate, motion.duration, rng)
+    trajectory = measured_poses(motion.at(motion.start_ns + stamps), vehicle.noise, rng)
+    series: list[FieldSeries] = []
+    for sensor in vehicle.sensors:
+        progress(f"simulate {vehicle.name} drive", len(series) / len(vehicle.sensors))
+        series.append(_record_sensor(vehicle, sensor, world, rng))
+    progress(f"simulate {vehicle.name} drive", 1.0)
+    source = SourceFile(f"simulated {vehicle.name} drive", _digest(trajectory, series))
+    return SimulatedDrive(Recording(trajectory, tuple(series), source), motion)
+
+
+def _record_sensor(
+    vehicle: Vehicle, sensor: KnownSensor, world: SteelWorld, rng: np.random.Generator
+) -> FieldSeries:
+    """Return what one sensor records, on a topic and in a frame of its own name."""
+    motion, sampling = vehicle.motion, vehicle.sampling
+    stamps = sample_stamps(sampling, sampling.field_rate, motion.duration, rng)
+    poses = motion.at(motion.start_ns + stamps)
+    if world.inside(sensor_points(poses, sensor)).any():
+        raise ConfigError(
+            f"{vehicle.name} drive: sensor {sensor.sensor} would pass through steel; leave more "
+            "clearance between route and racks, or place the sensor nearer to the lidar"
+        )
+    field = read_field(world, poses, sensor, vehicle.noise, rng)
+    return FieldSeries(sensor.sensor, f"/{sensor.sensor}", sensor.sensor, poses.stamp_ns, field)
+
+
+def _digest(trajectory: Trajectory, series: list[FieldSeries]) -> str:
+    """Return the SHA-256 of all arrays of a recording."""
+    digest = hashlib.sha256()
+    for array in (trajectory.stamp_ns, trajectory.R, trajectory.p):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    for entry in series:
+        digest.update(entry.stamp_ns.tobytes() + entry.field.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,175 @@
+"""Magnetometers on a vehicle: where they sit, how they distort, what they read."""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, Trajectory
+from l2m_gtsam.options import Options
+from l2m_gtsam.simulate.world import SteelWorld
+
+NANOSECONDS = 1e9
+
+
+class NoiseOptions(Options):
+    """Noise of readings and poses."""
+
+    field: Annotated[float, Field(ge=0)] = 0.1
+    """Standard deviation of a reading per axis in microtesla. The RM3100's data sheet states
+    15 nT at 200 cycles, with steps of 13 nT; a vehicle's currents make up the rest."""
+    position: Annotated[float, Field(ge=0)] = 0.003
+    """Standard deviation of a pose's position per axis in metres."""
+    rotation: Annotated[float, Field(ge=0)] = 0.05
+    """Standard deviation of a pose's rotation per axis in degrees."""
+
+
+class ArrayOptions(Options):
+    """The array of magnetometers to be calibrated, on rings about the lidar's vertical axis."""
+
+    count: Annotated[int, Field(ge=1, le=100)] = 12
+    """Number of magnetometers."""
+    inner_radius: Annotated[float, Field(gt=0)] = 0.30
+    """Distance of every other sensor from the lidar's vertical axis in metres."""
+    outer_radius: Annotated[float, Field(gt=0)] = 0.45
+    """Distance of the other sensors from the lidar's vertical axis in metres."""
+    heights: Annotated[tuple[float, ...], Field(min_length=1)] = (-0.10, -0.25, -0.40)
+    """Heights relative to the lidar in metres that the sensors take in turn."""
+    placing: Annotated[float, Field(ge=0)] = 0.02
+    """Largest random shift of each sensor's place along each axis in metres."""
+    misalignment: Annotated[float, Field(ge=0)] = 3.0
+    """Standard deviation of the mounting rotation about each axis in degrees."""
+    scale: Annotated[float, Field(ge=0)] = 0.03
+    """Standard deviation of each axis' scale error."""
+    soft_iron: Annotated[float, Field(ge=0)] = 0.02
+    """Standard deviation of the coupling between each two axes by soft iron."""
+    offset: Annotated[float, Field(ge=0)] = 20.0
+    """Largest offset per axis in microtesla: hard iron and electronics."""
+
+
+class SuiteOptions(Options):
+    """The mapping vehicle's own magnetometers, known and free of distortion."""
+
+    lateral: Annotated[tuple[float, ...], Field(min_length=1)] = (-0.4, 0.0, 0.4)
+    """Positions to the left of the lidar in metres."""
+    heights: Annotated[tuple[float, ...], Field(min_length=1)] = (-0.5, -0.2, 0.1)
+    """Heights relative to the lidar in metres; two at least show the map a vertical gradient."""
+
+
+class SamplingOptions(Options):
+    """When poses and readings are taken."""
+
+    pose_rate: Annotated[float, Field(gt=0)] = 20.0
+    """Poses per second."""
+    field_rate: Annotated[float, Field(gt=0)] = 20.0
+    """Readings per second of each magnetometer."""
+    jitter: Annotated[float, Field(ge=0, lt=0.5)] = 0.1
+    """Largest deviation of a stamp from its regular time, as a share of the interval."""
+
+
+def random_array(options: ArrayOptions, rng: np.random.Generator) -> tuple[KnownSensor, ...]:
+    """Return magnetometers at varied places with random distortions.
+
+    C is a symmetric positive matrix (scale errors on its diagonal, soft iron beside it) times a
+    small mounting rotation, so that the rotation is exactly the polar factor of C.
+
+    Parameters
+    ----------
+    options
+        Spread of places and distortions.
+    rng
+        Source of randomness.
+    """
+    return tuple(
+        KnownSensor(f"mag_{index:02d}", place, _random_distortion(options, rng))
+        for index, place in enumerate(_random_places(options, rng))
+    )
+
+
+def mapping_suite(options: SuiteOptions) -> tuple[KnownSensor, ...]:
+    """Return ideal magnetometers in an upright grid across the vehicle."""
+    places = [(0.0, y, z) for z in options.heights for y in options.lateral]
+    return tuple(
+        KnownSensor(f"suite_{index:02d}", np.array(place), Distortion.identity())
+        for index, place in enumerate(places)
+    )
+
+
+def sample_stamps(
+    options: SamplingOptions, rate: float, duration: float, rng: np.random.Generator
+) -> IntArray:
+    """Return jittered stamps from 0 to ``duration`` seconds, in nanoseconds, ascending.
+
+    The first stamp lies at a random share of the interval: sources are not synchronised.
+    """
+    regular = np.arange(int(duration * rate)) + rng.uniform()
+    jitter = rng.uniform(-options.jitter, options.jitter, len(regular))
+    seconds = np.clip((regular + jitter) / rate, 0.0, duration)
+    return np.unique(np.round(seconds * NANOSECONDS).astype(np.int64))
+
+
+def read_field(
+    world: SteelWorld,
+    poses: Trajectory,
+    sensor: KnownSensor,
+    noise: NoiseOptions,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Return what a sensor reads along true poses, ``C R^T B(R t + p) + H`` plus noise.
+
+    Parameters
+    ----------
+    world
+        Source of the field.
+    poses
+        True poses of the lidar in the map, one per reading.
+    sensor
+        Place and distortion.
+    noise
+        White noise of the reading.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    Readings in the sensor's frame in microtesla, shape (N, 3).
+    """
+    field = world.field(sensor_points(poses, sensor))
+    b_lidar = np.einsum("nij,ni->nj", poses.R, field)
+    exact = sensor.distortion.apply(b_lidar)
+    return exact + rng.normal(0.0, noise.field, exact.shape)
+
+
+def sensor_points(poses: Trajectory, sensor: KnownSensor) -> FloatArray:
+    """Return a sensor's positions in the map along poses in metres, shape (N, 3)."""
+    return np.asarray(poses.R @ sensor.t_lidar_mag + poses.p)
+
+
+def measured_poses(poses: Trajectory, noise: NoiseOptions, rng: np.random.Generator) -> Trajectory:
+    """Return poses as odometry would report them: true ones with white noise."""
+    turn = rng.normal(0.0, np.deg2rad(noise.rotation), (len(poses), 3))
+    shift = rng.normal(0.0, noise.position, (len(poses), 3))
+    R = poses.R @ Rotation.from_rotvec(turn).as_matrix()
+    return Trajectory(poses.stamp_ns, R, poses.p + shift, poses.frame, poses.child_frame)
+
+
+def _random_places(options: ArrayOptions, rng: np.random.Generator) -> FloatArray:
+    """Return positions in the lidar frame in metres, shape (count, 3)."""
+    index = np.arange(options.count)
+    angle = 2 * np.pi * index / options.count
+    radius = np.where(index % 2 == 0, options.outer_radius, options.inner_radius)
+    height = np.resize(options.heights, options.count)
+    places = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
+    return places + rng.uniform(-options.placing, options.placing, places.shape)
+
+
+def _random_distortion(options: ArrayOptions, rng: np.random.Generator) -> Distortion:
+    """Return a random C and H."""
+    R_mag_lidar = Rotation.from_rotvec(
+        rng.normal(0.0, np.deg2rad(options.misalignment), 3)
+    ).as_matrix()
+    coupling = np.triu(rng.normal(0.0, options.soft_iron, (3, 3)), 1)
+    stretch = np.diag(1 + rng.normal(0.0, options.scale, 3)) + coupling + coupling.T
+    offset = rng.uniform(-options.offset, options.offset, 3)
+    return Distortion(stretch @ R_mag_lidar, offset)
