@@ -13,7 +13,7 @@ from l2m_gtsam.mapping import map_recordings
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.qa.figures import calibration_figure, map_figure, save_figure
-from l2m_gtsam.simulate.bag_writer import BagKind, write_bag
+from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.calibration_file import (
@@ -139,8 +139,9 @@ def simulate_bags(
     _ensure_folder(out)
     for index, kind in enumerate(kinds):
         progress("writing bags", index / len(kinds))
-        write_bag(out / bag_name("mapping", kind), kind, scenario.mapping.recording)
-        write_bag(out / bag_name("calibration", kind), kind, scenario.calibration.recording)
+        for name, drive in (("mapping", scenario.mapping), ("calibration", scenario.calibration)):
+            path = out / bag_name(name, kind)
+            write_bag(path, kind, drive.recording, BagOptions(noise=options.noise))
     progress("writing bags", 1.0)
     facts = {"simulation": options.model_dump(mode="json")}
     write_known_sensors(

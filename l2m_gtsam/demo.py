@@ -40,8 +40,8 @@ def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonst
         Called with a stage and the fraction of it that is done.
     """
     config, map_path = Config(), out / "map.npz"
-    scenario = simulate_bags(out, options, [BagKind.MCAP], progress)
     mapping, drive = (out / bag_name(name, BagKind.MCAP) for name in ("mapping", "calibration"))
+    scenario = simulate_bags(out, options, [BagKind.MCAP], progress)
     field_map = build_map_file([mapping], map_path, config, out / "suite.yaml", progress)
     result = calibrate_bag(drive, map_path, config, out, progress)
     picture = out / OVERVIEW_FILE

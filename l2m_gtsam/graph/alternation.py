@@ -33,7 +33,10 @@ class OneKeyOptions(Options):
     """`block` (one factor per sensor, fast) or `reading` (one per reading)."""
     max_steps: int = 100
     """Largest number of alternations (the paper's 100)."""
-    graph_iterations: int = 3
+    alternation_readings: int = 400
+    """Readings of each sensor that take part in the alternation, spread evenly over the drive: it
+    only has to come near. The joint graph uses all."""
+    graph_iterations: int = 2
     """Linearisations of the translation graph between two closed forms."""
     settled_m: float = 1e-3
     """The alternation ends when no sensor moves further than this; the joint graph takes over."""
@@ -72,6 +75,7 @@ def alternate(
 ) -> Alternated:
     """Alternate closed form and translation graph until no sensor moves further than settled."""
     estimate, furthest = start, options.settled_m
+    readings = spread(readings, max(options.alternation_readings, options.min_readings))
     for step in range(1, options.max_steps + 1):
         view = observe(readings, field_map, estimate, options.min_readings)
         if not view.sensors:
@@ -83,6 +87,16 @@ def alternate(
         if move <= options.settled_m:
             break
     return Alternated(estimate, step)
+
+
+def spread(readings: Readings, most: int) -> Readings:
+    """Return at most so many readings of each sensor, evenly over its own."""
+    keep = np.zeros(len(readings), dtype=np.bool_)
+    for sensor in range(len(readings.sensors)):
+        rows = np.arange(len(readings))[readings.rows_of(sensor)]
+        count = min(most, len(rows))
+        keep[rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]] = True
+    return readings.select(keep)
 
 
 def fit_distortions(view: View, estimate: Estimate, options: OneKeyOptions) -> Estimate:

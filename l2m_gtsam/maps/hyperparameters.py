@@ -29,8 +29,8 @@ AXES = 3
 ROUNDS = 3  # thinning depends on the length scale and the length scale on what was thinned
 SETTLED = 1.25  # ratio of length scales between rounds below which thinning hardly changes
 SPREAD = 4  # readings are drawn from this many times as many nearest ones, see draw_neighbourhoods
-LEAST_SIGNAL = 1e-3  # uT
-SHORTEST = 2e-3  # m
+LEAST_SIGNAL = 1e-3  # uT, below which readings do not vary
+SHORTEST = 2e-3  # m, the least length scale that is tried
 BOUND_TOLERANCE = 1e-6  # in the logarithm
 PAIRED = 1500  # readings whose pairs give the start: a million distances
 
@@ -237,9 +237,7 @@ def maximise(
 
     x0 = np.clip(x0, low, high)
     end = minimize(cost, x0, jac=True, method="L-BFGS-B", bounds=Bounds(low, high))
-    on_bound = np.minimum(end.x - low, high - end.x) < LEAST_SIGNAL = 1e-3  # uT
-SHORTEST = 2e-3  # m
-BOUND_TOLERANCE
+    on_bound = np.minimum(end.x - low, high - end.x) < BOUND_TOLERANCE
     at_bound = tuple(name for name, on in zip(NAMES, on_bound, strict=True) if on)
     return LikelihoodFit(
         hyperparameters=from_log(end.x),
@@ -261,8 +259,8 @@ def log_bounds(readings: TrainingSet, start: Hyperparameters) -> FloatArray:
     """Return lower and upper bounds of the logarithms, shape (2, 3).
 
     A length scale below half the distance of neighbouring readings, or beyond a few times the
-    extent, leaves no trace in the data; a noise below 1e-4 of the signal leaves too few digits
-    for the factorisation.
+    extent, leaves no trace in the data; a noise below 1e-4 of the signal leaves the factorisation
+    too few digits.
     """
     nearest, _ = cKDTree(readings.points).query(readings.points, k=[2])
     extent = float(np.linalg.norm(np.ptp(readings.points, axis=0)))

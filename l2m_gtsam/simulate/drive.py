@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
@@ -22,10 +22,10 @@ SWAY_WAVES = 6  # sinusoids that make up each of roll, pitch and heave
 class DriveOptions(Options):
     """How fast and how steadily a vehicle drives."""
 
-    speed: Annotated[float, Field(gt=0)] = 0.9
+    speed: Annotated[float, Field(gt=0)] = 1.0
     """Speed on straights in metres per second."""
-    yaw_rate: Annotated[float, Field(gt=0)] = 0.8
-    """Largest yaw rate in turns, about, in radians per second; the vehicle slows down for it."""
+    yaw_rate: Annotated[float, Field(gt=0)] = 1.0
+    """Largest yaw rate in radians per second; the vehicle slows down in turns to keep it."""
     acceleration: Annotated[float, Field(gt=0)] = 0.4
     """Acceleration at the start and braking at the end, in metres per second squared."""
     rounding: Annotated[float, Field(gt=0)] = 0.3
@@ -131,8 +131,10 @@ def _speed(options: DriveOptions, travelled: FloatArray, yaw: FloatArray) -> Flo
     """Return the speed in metres per second at each place of a path, shape (P,)."""
     bend = np.abs(np.gradient(yaw, travelled))
     wanted = options.speed / np.maximum(1.0, bend * options.speed / options.yaw_rate)
-    # Braking before a bend takes about as long a way as the bend's own rounding.
-    steady = gaussian_filter1d(wanted, options.rounding / PATH_STEP, mode="nearest")
+    # The least within the smoothing's reach first, so that the mean stays below every limit.
+    reach = int(np.ceil(2 * options.rounding / PATH_STEP))
+    least = minimum_filter1d(wanted, 2 * reach + 1, mode="nearest")
+    steady = gaussian_filter1d(least, reach / 2, mode="nearest", radius=reach)
     from_end = np.minimum(travelled, travelled[-1] - travelled)
     # A creep of 5 cm/s instead of rest, where the time would not end.
     ramp = np.sqrt(0.05**2 + 2 * options.acceleration * from_end)

@@ -54,9 +54,9 @@ class ScenarioOptions(Options):
     """Noise of both drives."""
     mapping_route: MappingRouteOptions = MappingRouteOptions()
     """Where the mapping vehicle drives."""
-    mapping_drive: DriveOptions = DriveOptions(speed=1.5, yaw_rate=1.0)
+    mapping_drive: DriveOptions = DriveOptions(speed=1.5, yaw_rate=1.5)
     """How the mapping vehicle drives."""
-    mapping_sampling: SamplingOptions = SamplingOptions(field_rate=10.0)
+    mapping_sampling: SamplingOptions = SamplingOptions(field_rate=8.0)
     """When the mapping vehicle measures."""
     calibration_route: CalibrationRouteOptions = CalibrationRouteOptions()
     """Where the vehicle with the array drives."""

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import OutputError
-from l2m_gtsam.simulate import bag_writer
 from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.recorder import SimulatedDrive
@@ -128,7 +129,7 @@ def test_messages_stand_in_record_order(
     tmp_path: Path, drive: SimulatedDrive, kind: BagKind, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written: list[int] = []
-    for writer in (bag_writer.Ros1Writer, bag_writer.Ros2Writer):
+    for writer in (Ros1Writer, Ros2Writer):
         plain = writer.write
 
         def spy(self: Any, connection: Any, timestamp: int, data: Any, plain: Any = plain) -> None:
@@ -173,8 +174,8 @@ def test_a_failed_write_leaves_nothing(
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(bag_writer.Ros1Writer, "write", full)
-    monkeypatch.setattr(bag_writer.Ros2Writer, "write", full)
+    monkeypatch.setattr(Ros1Writer, "write", full)
+    monkeypatch.setattr(Ros2Writer, "write", full)
     path = bag_path(tmp_path, kind)
     with pytest.raises(OutputError, match=f"{path.name} cannot be written: No space left"):
         write_bag(path, kind, drive.recording)

@@ -10,8 +10,9 @@ from pydantic import ValidationError
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
+from l2m_gtsam.simulate.recorder import SimulatedDrive
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
-from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, SimulatedDrive, simulate
+from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.simulate.sensors import (
     ArrayOptions,
     NoiseOptions,
@@ -20,6 +21,7 @@ from l2m_gtsam.simulate.sensors import (
     random_array,
     sample_stamps,
 )
+from l2m_gtsam.simulate.warehouse import SectionOptions, WarehouseOptions
 
 SMALL: dict[str, Any] = {
     "floor_plan": FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
@@ -166,9 +168,11 @@ def test_progress_runs_from_nothing_to_all() -> None:
 
 
 def test_a_sensor_that_would_hit_steel_is_refused() -> None:
-    wide = SuiteOptions(lateral=(0.0, 1.5))
+    # Lanes lie 1.05 m from the rack's face, uprights of 0.6 m just behind it.
+    wide = {**SMALL, "suite": SuiteOptions(lateral=(0.0, 1.3), heights=(0.0,))}
+    thick = WarehouseOptions(upright=SectionOptions(breadth=0.6, height=0.6, fill=0.1))
     with pytest.raises(ConfigError, match="suite_01 would pass through steel"):
-        simulate(ScenarioOptions(**{**SMALL, "suite": wide}))
+        simulate(ScenarioOptions(warehouse=thick, **wide))
 
 
 @pytest.mark.parametrize(
