@@ -12,13 +12,13 @@ from functools import partial
 
 import gtsam
 import numpy as np
-from l2m_factors import BatchedReadings, D, MagneticReadings, T, block_factor, reading_factor
 from rich.console import Console
 from rich.table import Table
 from scipy.optimize import least_squares
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
+from l2m_factors import BatchedReadings, D, MagneticReadings, T, block_factor, reading_factor
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.one_key import solve_one_key

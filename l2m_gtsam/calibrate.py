@@ -147,7 +147,7 @@ def _solved(
         message=message,
         t_lidar_mag=solution.estimate.t[found.sensor],
         distortion=distortion,
-        R_lidar_mag=rotation.R_mag_lidar.T,
+        R_lidar_mag=np.ascontiguousarray(rotation.R_mag_lidar.T),
         covariance=found.covariance,
         rotation_covariance=rotation.covariance,
         noise=float(solution.estimate.noise[found.sensor]),

@@ -10,7 +10,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 KINDS = ("ros1", "sqlite3", "mcap")
@@ -89,7 +89,11 @@ class Entry:
 
 def ros(kind: str) -> Ros:
     """Return the messages of a kind of bag."""
-    return Ros(get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE))
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    if kind == "ros1":  # rosbags ships Noetic without tf2_msgs
+        layout = "geometry_msgs/TransformStamped[] transforms"
+        store.register(get_types_from_msg(layout, "tf2_msgs/msg/TFMessage"))
+    return Ros(store)
 
 
 def write(folder: Path, kind: str, entries: list[Entry], name: str = "bag") -> Path:

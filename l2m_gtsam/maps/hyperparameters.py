@@ -202,7 +202,7 @@ def start_from_pairs(readings: TrainingSet, seed: int) -> Hyperparameters:
     """
     rng = np.random.default_rng(seed)
     rows = rng.permutation(len(readings))[:PAIRED]
-    signal = float(np.sqrt(readings.field.var(axis=0).mean()))
+    signal = spread(readings)
     if signal < LEAST_SIGNAL:
         raise MapError("all map training readings are equal; a field that varies is needed")
     extent = float(np.ptp(readings.points, axis=0).max())
@@ -218,6 +218,11 @@ def start_from_pairs(readings: TrainingSet, seed: int) -> Hyperparameters:
     return Hyperparameters(length_scale=length_scale, signal=signal, noise=noise)
 
 
+def spread(readings: TrainingSet) -> float:
+    """Return the standard deviation of the readings over the three axes in microtesla."""
+    return float(np.sqrt(readings.field.var(axis=0).mean()))
+
+
 def maximise(
     readings: TrainingSet,
     start: Hyperparameters,
@@ -228,7 +233,7 @@ def maximise(
     sample = thinned(readings, start.length_scale, thinning)
     drawn = draw_neighbourhoods(sample, options)
     x0 = np.log([start.length_scale, start.signal, start.noise])
-    low, high = log_bounds(sample, start)
+    low, high = log_bounds(sample)
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
         parts = [log_likelihood(near, from_log(x)) for near in drawn]
@@ -255,19 +260,18 @@ def from_log(x: FloatArray) -> Hyperparameters:
     return Hyperparameters(**dict(zip(NAMES, np.exp(x).tolist(), strict=True)))
 
 
-def log_bounds(readings: TrainingSet, start: Hyperparameters) -> FloatArray:
+def log_bounds(readings: TrainingSet) -> FloatArray:
     """Return lower and upper bounds of the logarithms, shape (2, 3).
 
     A length scale below half the distance of neighbouring readings, or beyond a few times the
     extent, leaves no trace in the data; a noise below 1e-4 of the signal leaves the factorisation
-    too few digits.
+    too few digits. Signal and noise are measured against the spread of the readings.
     """
     nearest, _ = cKDTree(readings.points).query(readings.points, k=[2])
     extent = float(np.linalg.norm(np.ptp(readings.points, axis=0)))
     closest = max(0.5 * float(np.median(nearest)), 1e-4 * extent, SHORTEST)
-    signal = start.signal
-    low = [closest, 1e-2 * signal, 1e-3 * signal]
-    high = [3 * extent, 10 * signal, 10 * signal]
+    low = [closest, 1e-2 * spread(readings), 1e-3 * spread(readings)]
+    high = [3 * extent, 10 * spread(readings), 10 * spread(readings)]
     return np.log([low, high])
 
 

@@ -35,7 +35,8 @@ def scaled(points: FloatArray, centre: FloatArray, length_scale: float) -> Float
     length_scale
         Metres.
     """
-    return np.clip((points - centre) / length_scale, -FURTHEST, FURTHEST)
+    furthest = FURTHEST * length_scale
+    return np.clip(points - centre, -furthest, furthest) / length_scale
 
 
 def kernel_matrix(x: FloatArray, y: FloatArray, signal: float) -> FloatArray:

@@ -31,7 +31,7 @@ from l2m_gtsam.maps.training import checked_points
 
 KIND = "sliding_gp"
 MOST_IN_BLOCK = 6000  # rows; the factor of such a block takes 290 MB
-FACTOR_MEMORY = 512e6  # bytes of factors that are kept for variances
+FACTOR_MEMORY = 1e9  # bytes of factors that are kept for variances
 BATCH = 256  # points whose kernel rows are in memory, and about in cache, at once
 
 

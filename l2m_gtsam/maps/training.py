@@ -105,7 +105,10 @@ def training_set(
         )
     bad = ~(np.isfinite(field).all(axis=1) & np.isfinite(weight) & (weight > 0))
     if bad.any():
-        raise MapError(f"map training reading {int(bad.argmax())} of {len(points)} is not finite")
+        raise MapError(
+            f"map training reading {int(bad.argmax())} of {len(points)} is not finite and of "
+            "positive weight"
+        )
     if len(points) < FEWEST:
         raise MapError(f"a map needs at least {FEWEST} training readings, got {len(points)}")
     if np.abs(points).max() > FURTHEST:

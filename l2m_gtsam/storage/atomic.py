@@ -3,7 +3,7 @@
 import os
 import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from l2m_gtsam.errors import OutputError
@@ -41,7 +41,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
         msg = f"{path}: cannot be written: {error.strerror or error}"
         raise OutputError(msg) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

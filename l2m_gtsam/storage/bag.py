@@ -1,5 +1,6 @@
 """Read a drive out of a bag: the lidar's poses and every magnetometer's readings."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -7,6 +8,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
+from pydantic import model_validator
 from rosbags.interfaces import Connection
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +25,7 @@ from l2m_gtsam.storage.messages import (
     header_ns,
 )
 from l2m_gtsam.storage.open_bag import Bag, Message, open_bag
-from l2m_gtsam.storage.tf import compose
+from l2m_gtsam.storage.tf import Link, ancestors, compose
 from l2m_gtsam.storage.units import MICROTESLA_PER, Unit, fault, is_turning, strength
 
 Progress = Callable[[int, int], None]
@@ -94,13 +96,23 @@ class BagOptions(Options):
     """Unit of the readings: `auto` takes tesla, as ROS prescribes, and refuses a strength that
     does not fit; or `tesla`, `millitesla`, `microtesla`, `nanotesla`, `gauss`, `milligauss`."""
 
+    @model_validator(mode="after")
+    def _one_source_of_poses(self) -> "BagOptions":
+        if self.poses is not None and self.tf is not None:
+            raise ValueError("give `poses` or `tf`, not both")
+        return self
+
 
 @dataclass
 class Buffers:
-    """Everything that one pass over a bag collects."""
+    """Everything that one pass over a bag collects.
 
-    fields: dict[str, FieldBuffer] = field(default_factory=dict)
-    poses: dict[str, PoseBuffer] = field(default_factory=dict)
+    Fields by topic and frame, poses of a topic by frame and child frame, links of tf by child.
+    """
+
+    fields: dict[tuple[str, str], FieldBuffer] = field(default_factory=dict)
+    poses: dict[tuple[str, str], PoseBuffer] = field(default_factory=dict)
+    links: dict[str, PoseBuffer] = field(default_factory=dict)
 
 
 def read_recording(path: Path, options: BagOptions, progress: Progress | None = None) -> Recording:
@@ -126,7 +138,7 @@ def read_recording(path: Path, options: BagOptions, progress: Progress | None = 
         fields = select_fields(bag, options)
         poses = select_poses(bag, options)
         buffers = _read(bag, [*fields, *poses], options, progress)
-    series = _all_series(path, buffers, options)
+    series = _all_series(path, buffers, fields, options)
     trajectory = _trajectory(path, buffers, options)
     _check_clocks(path, trajectory, series)
     return Recording(trajectory, series, source_file(path))
@@ -143,8 +155,9 @@ def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:
         A field's strength does not fit its unit.
     """
     with open_bag(path) as bag:
-        buffers = _read(bag, select_fields(bag, options), options, None)
-    return _all_series(path, buffers, options)
+        fields = select_fields(bag, options)
+        buffers = _read(bag, fields, options, None)
+    return _all_series(path, buffers, fields, options)
 
 
 def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
@@ -222,9 +235,33 @@ def listed(connections: Iterable[Connection]) -> str:
     return (", ".join(topics[:10]) or "(none)") + more
 
 
-def sensor_name(topic: str, frame: str, options: BagOptions) -> str:
-    """Return a sensor's name: its topic without the leading slash, or its frame."""
-    return frame if options.split_by_frame else topic.lstrip("/")
+def several_frames(topic: str, frames: Iterable[str]) -> str:
+    """Return what is wrong with one topic that carries readings in several frames."""
+    return (
+        f"{topic} carries readings in several frames ({', '.join(sorted(frames)[:10])}); set "
+        "`bag.split_by_frame: true` if they are different sensors"
+    )
+
+
+def sensor_names(
+    keys: Iterable[tuple[str, str]], options: BagOptions
+) -> dict[tuple[str, str], str]:
+    """Name the sensors, by topic and frame: the topic without its leading slash, or the frame.
+
+    A frame that several topics share, or none, does not tell sensors apart: then the topic does,
+    with the frame after it.
+    """
+    keys = list(keys)
+    frames = Counter(frame for _, frame in keys)
+    by_topic = {(topic, frame): topic.lstrip("/") for topic, frame in keys}
+    if not options.split_by_frame:
+        return by_topic
+    return {
+        (topic, frame): frame.lstrip("/")
+        if frame and frames[frame] == 1
+        else "/".join(filter(None, (by_topic[topic, frame], frame.lstrip("/"))))
+        for topic, frame in keys
+    }
 
 
 def _no_field(bag: Bag, pattern: str, available: list[Connection]) -> str:
@@ -277,16 +314,19 @@ def _read(
 def _add_field(buffers: Buffers, message: Message, options: BagOptions) -> None:
     content, topic = message.content, message.connection.topic
     frame = content.header.frame_id
-    name = sensor_name(topic, frame, options)
-    buffer = buffers.fields.setdefault(name, FieldBuffer(topic, frame))
+    if (topic, frame) not in buffers.fields:
+        buffers.fields[topic, frame] = FieldBuffer(topic, frame)
+    buffer = buffers.fields[topic, frame]
     buffer.add(_stamp(message, content, options), content.magnetic_field)
 
 
 def _add_pose(buffers: Buffers, message: Message, options: BagOptions) -> None:
     content = message.content
     pose = POSE_TYPES[message.connection.msgtype](content)
-    child = pose.child_frame or "lidar"
-    buffer = buffers.poses.setdefault("", PoseBuffer(content.header.frame_id, child))
+    ends = content.header.frame_id, pose.child_frame or "lidar"
+    if ends not in buffers.poses:
+        buffers.poses[ends] = PoseBuffer(*ends)
+    buffer = buffers.poses[ends]
     buffer.add(_stamp(message, content, options), pose.position, pose.orientation)
 
 
@@ -294,7 +334,7 @@ def _add_transforms(buffers: Buffers, message: Message, options: BagOptions) -> 
     static = "tf_static" in message.connection.topic
     for item in message.content.transforms:
         parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
-        buffer = buffers.poses.setdefault(child, PoseBuffer(parent, child, static=static))
+        buffer = buffers.links.setdefault(child, PoseBuffer(parent, child, static=static))
         stamp = _stamp(message, item, options)
         buffer.add(stamp, item.transform.translation, item.transform.rotation)
 
@@ -306,30 +346,66 @@ def _stamp(message: Message, stamped: object, options: BagOptions) -> int:
 def _trajectory(path: Path, buffers: Buffers, options: BagOptions) -> Trajectory:
     """Return the poses of the lidar."""
     try:
-        links = {child: buffer.link() for child, buffer in buffers.poses.items()}
+        tracked = _composed(path, buffers, options.tf) if options.tf else _single(path, buffers)
     except ValueError as error:
         raise BagError(f"{path}: poses: {error}") from error
-    if options.tf is not None:
-        tracked = compose(links, options.tf.frame, options.tf.child_frame, str(path))
-    elif not links:
-        raise BagError(f"{path}: the topic of the poses has no messages")
-    else:
-        link = links[""]
-        tracked = Trajectory(link.stamp_ns, link.R, link.p, link.parent, link.child)
     _check_stamps(path, "poses", tracked.stamp_ns)
     fixed = options.tracked_to_lidar.rigid()
     return replace(tracked, R=tracked.R @ fixed.R, p=tracked.R @ fixed.t + tracked.p)
 
 
-def _all_series(path: Path, buffers: Buffers, options: BagOptions) -> tuple[FieldSeries, ...]:
-    """Return every sensor's readings, in order of name."""
+def _single(path: Path, buffers: Buffers) -> Trajectory:
+    """Return the poses of the one body that a topic tracks."""
+    if not buffers.poses:
+        raise BagError(f"{path}: the topic of the poses has no messages")
+    if len(buffers.poses) > 1:
+        ends = ", ".join(f"{parent} > {child}" for parent, child in sorted(buffers.poses)[:10])
+        raise BagError(f"{path}: the topic of the poses must track one body, it tracks: {ends}")
+    (buffer,) = buffers.poses.values()
+    link = buffer.link()
+    return Trajectory(link.stamp_ns, link.R, link.p, link.parent, link.child)
+
+
+def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:
+    """Return the poses of a chain; a fault in a link beside it does not matter."""
+    frame, child_frame = chain.frame.lstrip("/"), chain.child_frame.lstrip("/")
+    parents = {child: buffer.frame for child, buffer in buffers.links.items()}
+    needed = ancestors(parents, frame) | ancestors(parents, child_frame)
+    links: dict[str, Link] = {}
+    for child, buffer in buffers.links.items():
+        try:
+            links[child] = buffer.link()
+        except ValueError:
+            if child in needed:
+                raise
+    return compose(links, frame, child_frame, str(path))
+
+
+def _all_series(
+    path: Path, buffers: Buffers, fields: list[Connection], options: BagOptions
+) -> tuple[FieldSeries, ...]:
+    """Return every sensor's readings, in order of name; a silent topic is a sensor, too."""
+    heard = {topic for topic, _ in buffers.fields}
+    silent = {(c.topic, ""): FieldBuffer(c.topic, "") for c in fields if c.topic not in heard}
+    found = {**buffers.fields, **silent}
+    if not options.split_by_frame:
+        _check_frames(path, list(found))
+    names = sensor_names(found, options)
     series = tuple(
-        _series(path, name, buffer, options) for name, buffer in sorted(buffers.fields.items())
+        _series(path, names[key], found[key], options)
+        for key in sorted(found, key=lambda key: names[key])
     )
     if not any(np.isfinite(each.field).all(axis=1).any() for each in series):
-        names = ", ".join(each.topic for each in series) or "the chosen topics"
-        raise BagError(f"{path}: no finite reading in {names}")
+        topics = ", ".join(each.topic for each in series) or "the chosen topics"
+        raise BagError(f"{path}: no finite reading in {topics}")
     return series
+
+
+def _check_frames(path: Path, keys: list[tuple[str, str]]) -> None:
+    for topic, count in Counter(topic for topic, _ in keys).items():
+        if count > 1:
+            frames = [frame for each, frame in keys if each == topic]
+            raise BagError(f"{path}: {several_frames(topic, frames)}")
 
 
 def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> FieldSeries:

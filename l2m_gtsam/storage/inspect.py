@@ -9,7 +9,7 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.storage.bag import BagOptions, select_fields, select_poses
+from l2m_gtsam.storage.bag import BagOptions, select_fields, select_poses, several_frames
 from l2m_gtsam.storage.messages import (
     FIELD_TYPE,
     POSE_TYPES,
@@ -169,7 +169,9 @@ def _report(
         clock_offset_s=float(np.median(record - header)) * 1e-9 if len(header) else float("nan"),
         nan_share=float(np.mean(~np.isfinite(values).all(axis=1))) if len(values) else float("nan"),
         strength=measured,
-        use=_use(use, measured, is_turning(values), options, msgtype),
+        use=f"refused: {several_frames(topic, found.frames)}"
+        if msgtype == FIELD_TYPE and len(found.frames) > 1 and not options.split_by_frame
+        else _use(use, measured, is_turning(values), options, msgtype),
     )
 
 

@@ -7,6 +7,7 @@ stored uncompressed with a fixed date, so that the same map gives the same bytes
 
 import hashlib
 import json
+import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -65,15 +66,13 @@ def save_map(path: Path, state: MapState) -> None:
                 np.lib.format.write_array(member, array, allow_pickle=False)
 
 
-def load_map(path: Path, max_bytes: int = MAX_BYTES) -> MapState:
+def load_map(path: Path) -> MapState:
     """Return the map in a file.
 
     Parameters
     ----------
     path
         The file.
-    max_bytes
-        Largest content accepted, as declared by the archive, before anything is unpacked.
 
     Raises
     ------
@@ -82,8 +81,8 @@ def load_map(path: Path, max_bytes: int = MAX_BYTES) -> MapState:
         large.
     """
     with _translated(path), zipfile.ZipFile(path) as archive:
+        _refuse_large(path, archive)
         _refuse_foreign(path, archive)
-        _refuse_large(path, archive, max_bytes)
         header = _read_member(archive, HEADER)
         content = _decode_header(path, header)
         arrays = {
@@ -93,7 +92,7 @@ def load_map(path: Path, max_bytes: int = MAX_BYTES) -> MapState:
         }
         checksum = _read_member(archive, CHECKSUM)
     if checksum.tobytes() != _checksum(header, arrays).tobytes():
-        msg = f"{path}: damaged: the checksum does not fit the content; build the map again"
+        msg = f"{path}: the checksum does not match, the file is damaged; build the map again"
         raise MapError(msg)
     return MapState(content["kind"], arrays, content["options"], content["provenance"])
 
@@ -120,7 +119,7 @@ def _decode_header(path: Path, header: npt.NDArray[Any]) -> dict[str, Any]:
         raise MapError(_foreign(path))
     if content.get("version") != VERSION:
         msg = (
-            f"{path}: map file of version {content.get('version')!r}, this program reads version "
+            f"{path}: map version {content.get('version')!r}, this program reads version "
             f"{VERSION}; build the map again or use the program that wrote it"
         )
         raise MapError(msg)
@@ -136,7 +135,7 @@ def _checksum(header: npt.NDArray[Any], arrays: Arrays) -> npt.NDArray[np.uint8]
     for name in sorted(arrays):
         array = arrays[name]
         digest.update(json.dumps([name, array.dtype.str, array.shape]).encode())
-        digest.update(np.asarray(array, order="C").data)
+        digest.update(np.asarray(array, order="C").reshape(-1).view(np.uint8).data)
     return np.frombuffer(digest.digest(), dtype=np.uint8)
 
 
@@ -171,18 +170,22 @@ def _refuse_foreign(path: Path, archive: zipfile.ZipFile) -> None:
         raise MapError(_foreign(path))
 
 
-def _refuse_large(path: Path, archive: zipfile.ZipFile, max_bytes: int) -> None:
+def _refuse_large(path: Path, archive: zipfile.ZipFile) -> None:
+    """Refuse what the archive's own directory says is too much, before anything is unpacked."""
     declared = sum(info.file_size for info in archive.infolist())
-    if declared > max_bytes:
+    if declared > MAX_BYTES:
         msg = (
-            f"{path}: declares {declared / 1e6:,.0f} MB of content; at most "
-            f"{max_bytes / 1e6:,.0f} MB are accepted"
+            f"{path}: unpacks to {declared / 1e9:.1f} GB, not a map of this program; at most "
+            f"{MAX_BYTES / 1e9:.1f} GB are accepted"
         )
         raise MapError(msg)
 
 
 def _foreign(path: Path) -> str:
-    return f"{path}: not a map file of this program; accepted: an .npz made by `l2m map build`"
+    return (
+        f"{path}: not a map file of this program, or damaged; accepted: an .npz made by "
+        "`l2m map build`"
+    )
 
 
 @contextmanager
@@ -191,15 +194,19 @@ def _translated(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        msg = f"{path}: no such file; make a map with `l2m map build`"
+        msg = f"{path}: no such map file; make one with `l2m map build`"
         raise MapError(msg) from error
     except OSError as error:
         msg = f"{path}: cannot be read: {error.strerror or error}"
         raise MapError(msg) from error
-    except zipfile.BadZipFile as error:
-        whole = "CRC" not in str(error)
-        msg = _foreign(path) if whole else f"{path}: damaged: {error}; build the map again"
-        raise MapError(msg) from error
-    except (ValueError, EOFError, KeyError, NotImplementedError, RuntimeError, zlib.error) as error:
-        msg = f"{path}: damaged map file: {error}; build the map again"
-        raise MapError(msg) from error
+    except (
+        zipfile.BadZipFile,
+        ValueError,
+        EOFError,
+        KeyError,
+        NotImplementedError,
+        RuntimeError,
+        struct.error,
+        zlib.error,
+    ) as error:
+        raise MapError(_foreign(path)) from error

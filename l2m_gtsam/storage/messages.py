@@ -112,11 +112,13 @@ class PoseBuffer:
         Raises
         ------
         ValueError
-            An orientation has no direction (all zero).
+            An orientation has no direction (all zero), or no pose is finite.
         """
         rows = np.array(self.values, dtype=np.float64).reshape(-1, 7)
         stamps = np.array(self.stamp_ns, dtype=np.int64)
         finite = np.isfinite(rows).all(axis=1)
+        if not finite.any():
+            raise ValueError("no pose is finite")
         stamps, first = np.unique(stamps[finite], return_index=True)
         rows = rows[finite][first]
         length = np.linalg.norm(rows[:, 3:], axis=1)

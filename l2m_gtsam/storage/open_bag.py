@@ -1,18 +1,29 @@
-"""Open a bag of any kind, and turn whatever is wrong with it into one line."""
+"""Open a bag of any kind, and turn whatever is wrong with it into one line.
 
-from collections.abc import Iterator, Sequence
+rosbags is used below its ``AnyReader``, which parses the definitions of every topic, refuses the
+bag when one of them is odd, and uses default types only when no topic carries a definition. Here
+only the types that are read are parsed, each from the bag's own definition where it has one.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
+from rosbags.interfaces import Connection, MessageDefinition, MessageDefinitionFormat
+from rosbags.rosbag1 import Reader as Ros1Reader
+from rosbags.rosbag2 import Reader as Ros2Reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from l2m_gtsam.errors import BagError
+from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
 
 ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3 or an .mcap file"
+# mcap counts nanoseconds unsigned, everything else in 63 bits.
+LATEST_NS = (1 << 63) - 1
 
 
 @dataclass(frozen=True)
@@ -27,10 +38,9 @@ class Message:
 class Bag:
     """An open bag: what it holds, and its messages one by one."""
 
-    def __init__(self, path: Path, reader: AnyReader) -> None:
+    def __init__(self, path: Path, reader: Ros1Reader | Ros2Reader) -> None:
         self.path = path
         self._reader = reader
-        self._default = get_typestore(Stores.ROS1_NOETIC if not reader.is2 else Stores.ROS2_JAZZY)
 
     @property
     def connections(self) -> Sequence[Connection]:
@@ -48,28 +58,44 @@ class Bag:
         Raises
         ------
         BagError
-            The bag is damaged.
+            The bag is damaged, or holds fewer messages than its index promises.
         """
         if not connections:
             return
-        stream = self._reader.messages(connections=connections)
+        decoders = {c.id: self._decoder(c) for c in connections}
+        stream, received = self._reader.messages(list(connections)), 0
         while True:
             try:
                 connection, record_ns, raw = next(stream)
-                content = self._decode(raw, connection.msgtype)
+                content = decoders[connection.id](raw)
             except StopIteration:
-                return
+                break
             except Exception as error:
                 raise BagError(_damaged(self.path, error)) from error
+            if record_ns > LATEST_NS:
+                raise BagError(f"{self.path}: damaged: a message is recorded at {record_ns} ns")
+            received += 1
             yield Message(connection, record_ns, content)
+        if received < (promised := sum(c.msgcount for c in connections)):
+            raise BagError(
+                f"{self.path}: truncated: its index promises {promised} messages on the topics "
+                f"that are read, {received} are there; record it again or reindex it"
+            )
 
-    def _decode(self, raw: bytes, msgtype: str) -> Any:
-        # A bag may define some of its types and not others.
-        if msgtype in self._reader.typestore.fielddefs:
-            return self._reader.deserialize(raw, msgtype)
-        if self._reader.is2:
-            return self._default.deserialize_cdr(raw, msgtype)
-        return self._default.deserialize_ros1(raw, msgtype)
+    def _decoder(self, connection: Connection) -> Callable[[bytes], Any]:
+        # tf/tfMessage, which ROS1 used before tf2, has the layout of its successor.
+        msgtype = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
+        is_ros1 = isinstance(self._reader, Ros1Reader)
+        try:
+            store = _typestore(is_ros1, msgtype, connection.msgdef)
+        except Exception as error:
+            reason = " ".join(str(error).split())[:120]
+            raise BagError(
+                f"{self.path}: the definition of {msgtype} on {connection.topic} cannot be "
+                f"understood ({reason})"
+            ) from error
+        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        return lambda raw: decode(raw, msgtype)
 
 
 @contextmanager
@@ -84,8 +110,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     if not path.exists():
         raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
     try:
-        # Only used by rosbags when no type at all is defined in the bag.
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader = Ros1Reader(path) if path.suffix == ".bag" else Ros2Reader(path)
         reader.open()
     except Exception as error:
         raise BagError(_damaged(path, error)) from error
@@ -100,3 +125,24 @@ def open_bag(path: Path) -> Iterator[Bag]:
 def _damaged(path: Path, error: Exception) -> str:
     reason = " ".join(str(error).split())[:200] or type(error).__name__
     return f"{path}: not a readable bag ({reason}); it may be truncated; accepted: {ACCEPTED}"
+
+
+@cache
+def _default_typestore(is_ros1: bool) -> Typestore:
+    """Return ROS's own types; those read here have one layout in all distributions."""
+    if not is_ros1:
+        return get_typestore(Stores.ROS2_JAZZY)
+    store = get_typestore(Stores.ROS1_NOETIC)
+    # rosbags ships Noetic's common messages without tf2_msgs.
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_TYPE))
+    return store
+
+
+def _typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typestore:
+    """Return the bag's own definition of a type, or ROS's where it has none as text."""
+    if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
+        return _default_typestore(is_ros1)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition.data, msgtype))
+    store.get_msgdef(msgtype)
+    return store

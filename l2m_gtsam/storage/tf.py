@@ -97,6 +97,15 @@ def compose(links: dict[str, Link], frame: str, child_frame: str, where: str) ->
     return Trajectory(stamps, R, p, frame, child_frame)
 
 
+def ancestors(parents: dict[str, str], frame: str) -> set[str]:
+    """Return a frame and all above it that have a parent; stops where a chain bites its tail."""
+    found: set[str] = set()
+    while frame in parents and frame not in found:
+        found.add(frame)
+        frame = parents[frame]
+    return found
+
+
 def _chain(links: dict[str, Link], frame: str, child_frame: str, where: str) -> list[Link]:
     """Return the links from ``frame`` down to ``child_frame``, over their common ancestor."""
     down, up = _ancestry(links, child_frame), _ancestry(links, frame)

@@ -16,6 +16,8 @@ EARTH_UT = 50.0
 # A strength that is constant to this, relative, over many readings was normalised.
 CONSTANT = 1e-6
 ENOUGH_READINGS = 20
+# Readings that differ by less, relative, are a sensor that stands still, whatever its rounding.
+TURNED = 1e-3
 
 
 class Unit(StrEnum):
@@ -62,9 +64,11 @@ def strength(field: FloatArray) -> Strength:
 
 
 def is_turning(field: FloatArray) -> bool:
-    """Return whether readings, shape (N, 3), differ at all: a stuck sensor is not a direction."""
+    """Return whether readings, shape (N, 3), turn: a stuck sensor is not a direction."""
     finite = field[np.isfinite(field).all(axis=1)]
-    return bool(len(finite)) and bool(np.ptp(finite, axis=0).max() > 0)
+    if not len(finite):
+        return False
+    return bool(np.ptp(finite, axis=0).max() > TURNED * np.abs(finite).max())
 
 
 def fault(found: Strength, turning: bool, unit: Unit) -> str | None:
