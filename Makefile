@@ -2,6 +2,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 export MPLBACKEND := Agg
+# Blocks of a few hundred readings are too small for BLAS threads.
+export OPENBLAS_NUM_THREADS ?= 1
 
 .PHONY: demo test study benchmark lock clean
 

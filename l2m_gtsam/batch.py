@@ -105,10 +105,10 @@ def calibrate_bag(
     L2MError
         Whatever is wrong with the input, in one line; nothing is written then.
     """
+    recording = _read(bag, config, progress)
     progress("loading the map", 0.0)
     field_map = load_field_map(map_path)
     progress("loading the map", 1.0)
-    recording = _read(bag, config, progress)
     source = source_file(map_path)
     result = calibrate(recording, field_map, config.calibration, source, progress)
     result = replace(result, options=config.model_dump(mode="json"))

@@ -3,6 +3,7 @@
 Heavy modules are imported inside the commands, so that ``--help`` answers at once.
 """
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,6 +39,9 @@ OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results."
 
 def main() -> None:
     """Run the command line; an error that a user can mend is one line and exit code 2."""
+    # Blocks of a few hundred readings are too small for threads, which then only wait for each
+    # other; has to be said before numpy is imported.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     try:
         app(arguments)
@@ -118,12 +122,13 @@ def demo(
 ) -> None:
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     from l2m_gtsam.demo import run_demo
-    from l2m_gtsam.qa.tables import truth_table
+    from l2m_gtsam.qa.tables import honesty_note, truth_table
     from l2m_gtsam.simulate.scenario import ScenarioOptions
 
     with _progress() as progress:
         outcome = run_demo(out, ScenarioOptions(seed=seed), progress)
     _print(truth_table(outcome.result, outcome.truth))
+    typer.echo(honesty_note(outcome.result, outcome.truth))
     typer.echo(f"picture: {outcome.picture}; everything else is in {out}")
 
 

@@ -19,9 +19,10 @@ LEAST_CUBES = 10  # along the longest side, so that thinning never eats a small 
 class ThinningOptions(Options):
     """How readings that lie close together are merged."""
 
-    spacing: float = Field(default=0.33, ge=0, le=1)
+    spacing: float = Field(default=0.15, ge=0, le=1)
     """Edge, in length scales, of the cubes over which readings are averaged; 0 keeps them all.
-    At a third the map is as accurate as at a seventh, with a fifth of the rows."""
+    On smooth fields a third is as accurate with half the rows; beside steel posts it doubles the
+    error (0.21 against 0.11 uT in the simulated warehouse)."""
 
     independent: int = Field(default=10, ge=1)
     """The most readings of one cube that count as independent: their errors share the pose and

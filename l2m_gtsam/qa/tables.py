@@ -46,6 +46,22 @@ def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Ta
     return table
 
 
+def honesty_note(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> str:
+    """Return how the errors of all positions compare with their sigmas, as a sentence."""
+    ratios = [
+        (result[known.sensor].t_lidar_mag - known.t_lidar_mag) / result[known.sensor].t_sigma
+        for known in truth
+        if result[known.sensor].residuals is not None
+    ]
+    if not ratios:
+        return "no sensor was solved"
+    rms = float(np.sqrt(np.mean(np.square(ratios))))
+    return (
+        f"errors of t are {rms:.1f} times their sigmas (rms, 1 is honest): the sliding GP's own "
+        "errors are correlated along the drive, and its sigmas count them as independent"
+    )
+
+
 def bag_table(report: BagReport) -> Table:
     """Return one row per topic: type, frame, count, rate, gaps, NaN, strength, use."""
     table = Table(title=escape(str(report.path)), title_justify="left")

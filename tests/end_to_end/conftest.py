@@ -1,4 +1,4 @@
-"""A small simulated warehouse on disk, made once for all tests of the command line."""
+"""The demonstration on disk, made once for all tests of the command line."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ class Finished:
     err: str
 
 
-def l2m(*arguments: str | Path, check: bool = True) -> Finished:
+def l2m(*arguments: str | Path, fails: bool = False) -> Finished:
     """Run ``l2m`` as a user would, in a process of its own."""
     command = [sys.executable, "-c", "from l2m_gtsam.cli import main; main()"]
     environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1"}
@@ -30,26 +30,43 @@ def l2m(*arguments: str | Path, check: bool = True) -> Finished:
         check=False,
         timeout=300,
     )
-    if check and run.returncode:
-        pytest.fail(f"l2m {' '.join(map(str, arguments))} failed:\n{run.stdout}\n{run.stderr}")
+    if bool(run.returncode) != fails:
+        pytest.fail(f"l2m {' '.join(map(str, arguments))}:\n{run.stdout}\n{run.stderr}")
     return Finished(run.returncode, run.stdout, run.stderr)
 
 
+def complaint(*arguments: str | Path) -> str:
+    """Run ``l2m`` on bad input and return its one line; anything else fails the test."""
+    run = l2m(*arguments, fails=True)
+    # progress bars of stages that went well may stand above the line
+    lines = [line for line in run.err.splitlines() if line.startswith("l2m: ")]
+    assert run.code == 2
+    assert len(lines) == 1
+    assert run.err.splitlines()[-1] == lines[0]
+    assert "Traceback" not in run.err
+    return lines[0]
+
+
 @dataclass(frozen=True)
-class Warehouse:
-    """Where the simulated files are."""
+class Demo:
+    """What ``l2m demo`` made and printed."""
 
     folder: Path
-    map: Path
+    out: str
+
+    @property
+    def drive(self) -> Path:
+        """The calibration bag."""
+        return self.folder / "calibration_mcap"
+
+    @property
+    def map(self) -> Path:
+        """The map file."""
+        return self.folder / "map.npz"
 
 
 @pytest.fixture(scope="session")
-def warehouse(tmp_path_factory: pytest.TempPathFactory) -> Warehouse:
-    """Simulated bags of all three kinds and the map of the mapping drive."""
-    folder = tmp_path_factory.mktemp("warehouse")
-    l2m("simulate", "--out", folder)
-    map_path = folder / "map.npz"
-    l2m(
-        "map", "build", folder / "mapping_mcap", "--suite", folder / "suite.yaml", "--out", map_path
-    )
-    return Warehouse(folder, map_path)
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
+    """Run the demonstration with its defaults."""
+    folder = tmp_path_factory.mktemp("demo")
+    return Demo(folder, l2m("demo", "--out", folder).out)
