@@ -97,7 +97,7 @@ def calibration_figure(
     figure = _figure(13, 6.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1), height_ratios=(1.5, 1))
     place, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
-    side = figure.add_subplot(grid[1, 1], sharex=above)
+    side = figure.add_subplot(grid[1, 1])
     height = _middle(field_map)
     cut = slice_map(field_map, height)
     _draw_slice(figure, place, cut.strength, cut.extent, "field strength (uT)", "viridis")
@@ -108,8 +108,9 @@ def calibration_figure(
     solved = [s for s in result.sensors if s.residuals is not None]
     _draw_vehicle(above, solved, truth, (0, 1))
     _draw_vehicle(side, solved, truth, (0, 2))
-    above.set_title("sensors on the vehicle: from above (top), from the side (bottom)")
-    above.legend(loc="upper right", fontsize="small")
+    above.set_title("sensors on the vehicle, from above")
+    side.set_title("from the side")
+    above.legend(loc="lower left", bbox_to_anchor=(0, 1.08), ncols=2, fontsize="small")
     return figure
 
 
@@ -170,7 +171,7 @@ def _draw_vehicle(
         axes.plot([], [], "+", color=TRUTH, label="truth")
     axes.set(xlabel=f"{names[plane[0]]} (m)", ylabel=f"{names[plane[1]]} (m)")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.15)
+    axes.margins(0.2)
     axes.grid(alpha=0.3)
 
 
