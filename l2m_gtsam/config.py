@@ -9,7 +9,7 @@ from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
-from l2m_gtsam.storage.bag import BagOptions
+from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
 from l2m_gtsam.sync import SyncOptions
 

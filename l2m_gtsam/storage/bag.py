@@ -1,20 +1,16 @@
 """Read a drive out of a bag: the lidar's poses and every magnetometer's readings."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
-from pydantic import model_validator
 from rosbags.interfaces import Connection
-from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FieldSeries, IntArray, Recording, RigidTransform, Trajectory
+from l2m_gtsam.data import FieldSeries, IntArray, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
-from l2m_gtsam.options import Options
+from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.messages import (
     FIELD_TYPE,
@@ -25,82 +21,20 @@ from l2m_gtsam.storage.messages import (
     header_ns,
 )
 from l2m_gtsam.storage.open_bag import Bag, Message, open_bag
+from l2m_gtsam.storage.selection import (
+    select_fields,
+    select_poses,
+    sensor_names,
+    several_frames,
+)
 from l2m_gtsam.storage.tf import Link, ancestors, compose
-from l2m_gtsam.storage.units import MICROTESLA_PER, Unit, fault, is_turning, strength
+from l2m_gtsam.storage.units import MICROTESLA_PER, fault, is_turning, strength
 
 Progress = Callable[[int, int], None]
 
 # Clocks further apart than this are different clocks, not a late start.
 OTHER_CLOCK_NS = 3_600_000_000_000
 PROGRESS_EVERY = 2000
-
-
-class Stamps(StrEnum):
-    """Which time of a message counts."""
-
-    HEADER = "header"
-    RECORD = "record"
-
-
-class TfChain(Options):
-    """Two frames between which poses are composed."""
-
-    frame: str
-    """Reference frame, for example `map`."""
-    child_frame: str
-    """Tracked frame, for example `base_link`."""
-
-
-class FixedTransform(Options):
-    """A rigid transform as numbers."""
-
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Metres."""
-    quaternion_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Rotation; of any length but zero."""
-
-    def rigid(self) -> RigidTransform:
-        """Return the transform as matrix and vector.
-
-        Raises
-        ------
-        BagError
-            The quaternion is all zero.
-        """
-        if not any(self.quaternion_xyzw):
-            msg = "bag.tracked_to_lidar: the quaternion is all zero, it must be a rotation"
-            raise BagError(msg)
-        R = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
-        return RigidTransform(R, np.array(self.translation))
-
-
-class BagOptions(Options):
-    """What is read from a recording, and how."""
-
-    fields: tuple[str, ...] = ("*",)
-    """Topics of type sensor_msgs/MagneticField, names or globs; the leading slash does not
-    matter."""
-    split_by_frame: bool = False
-    """Whether one topic carries several sensors, told apart by `header.frame_id`; sensors are
-    then named after their frame instead of their topic."""
-    poses: str | None = None
-    """Topic of the poses: Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped;
-    if not given, the only such topic of the bag, Odometry first."""
-    tf: TfChain | None = None
-    """Compose the poses from /tf and /tf_static instead."""
-    tracked_to_lidar: FixedTransform = FixedTransform()
-    """T_tracked_lidar: the lidar in the frame that the poses track."""
-    stamps: Stamps = Stamps.HEADER
-    """`header`, or `record` for the time at which the bag received a message."""
-    units: Unit = Unit.AUTO
-    """Unit of the readings: `auto` takes tesla, as ROS prescribes, and refuses a strength that
-    does not fit; or `tesla`, `millitesla`, `microtesla`, `nanotesla`, `gauss`, `milligauss`."""
-
-    @model_validator(mode="after")
-    def _one_source_of_poses(self) -> "BagOptions":
-        if self.poses is not None and self.tf is not None:
-            raise ValueError("give `poses` or `tf`, not both")
-        return self
 
 
 @dataclass
@@ -171,124 +105,6 @@ def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
     with open_bag(path) as bag:
         buffers = _read(bag, select_poses(bag, options), options, None)
     return _trajectory(path, buffers, options)
-
-
-def select_fields(bag: Bag, options: BagOptions) -> list[Connection]:
-    """Return the connections whose readings are used.
-
-    Raises
-    ------
-    BagError
-        A pattern matches nothing, or a topic of another type.
-    """
-    available = [c for c in bag.connections if c.msgtype == FIELD_TYPE]
-    chosen: list[Connection] = []
-    for pattern in options.fields:
-        found = [c for c in available if matches(c.topic, pattern)]
-        if not found:
-            raise BagError(_no_field(bag, pattern, available))
-        chosen.extend(c for c in found if c not in chosen)
-    return chosen
-
-
-def select_poses(bag: Bag, options: BagOptions) -> list[Connection]:
-    """Return the connections that the poses come from.
-
-    Raises
-    ------
-    BagError
-        No such topic, another type, or several candidates.
-    """
-    if options.tf is not None:
-        chosen = [c for c in bag.connections if c.msgtype in TF_TYPES]
-        if not chosen:
-            raise BagError(f"{bag.path}: no /tf in the bag, but `bag.tf` asks for a chain")
-        return chosen
-    available = [c for c in bag.connections if c.msgtype in POSE_TYPES]
-    if options.poses is not None:
-        return _named_poses(bag, options.poses, available)
-    for msgtype in POSE_TYPES:
-        topics = sorted({c.topic for c in available if c.msgtype == msgtype})
-        if len(topics) == 1:
-            return [c for c in available if c.topic == topics[0]]
-        if topics:
-            raise BagError(
-                f"{bag.path}: several topics carry poses, choose one with `bag.poses`: "
-                f"{', '.join(topics)}"
-            )
-    raise BagError(
-        f"{bag.path}: no poses in the bag; needed is a topic of one of the types "
-        f"{', '.join(POSE_TYPES)}, or a /tf chain named by `bag.tf`; there are: "
-        f"{listed(bag.connections)}"
-    )
-
-
-def matches(topic: str, pattern: str) -> bool:
-    """Return whether a topic fits a name or glob, whatever their leading slashes."""
-    return fnmatchcase(topic.lstrip("/"), pattern.lstrip("/"))
-
-
-def listed(connections: Iterable[Connection]) -> str:
-    """Return topics with their types, at most ten."""
-    topics = sorted({f"{c.topic} ({c.msgtype})" for c in connections})
-    more = f" and {len(topics) - 10} more" if len(topics) > 10 else ""
-    return (", ".join(topics[:10]) or "(none)") + more
-
-
-def several_frames(topic: str, frames: Iterable[str]) -> str:
-    """Return what is wrong with one topic that carries readings in several frames."""
-    return (
-        f"{topic} carries readings in several frames ({', '.join(sorted(frames)[:10])}); set "
-        "`bag.split_by_frame: true` if they are different sensors"
-    )
-
-
-def sensor_names(
-    keys: Iterable[tuple[str, str]], options: BagOptions
-) -> dict[tuple[str, str], str]:
-    """Name the sensors, by topic and frame: the topic without its leading slash, or the frame.
-
-    A frame that several topics share, or none, does not tell sensors apart: then the topic does,
-    with the frame after it.
-    """
-    keys = list(keys)
-    frames = Counter(frame for _, frame in keys)
-    by_topic = {(topic, frame): topic.lstrip("/") for topic, frame in keys}
-    if not options.split_by_frame:
-        return by_topic
-    return {
-        (topic, frame): frame.lstrip("/")
-        if frame and frames[frame] == 1
-        else "/".join(filter(None, (by_topic[topic, frame], frame.lstrip("/"))))
-        for topic, frame in keys
-    }
-
-
-def _no_field(bag: Bag, pattern: str, available: list[Connection]) -> str:
-    others = [c for c in bag.connections if matches(c.topic, pattern)]
-    if others and pattern != "*":
-        return (
-            f"{bag.path}: topic {others[0].topic} is of type {others[0].msgtype}, magnetic "
-            f"readings must be {FIELD_TYPE}; of that type there are: {listed(available)}"
-        )
-    asked = "" if pattern == "*" else f" that matches {pattern!r}"
-    there = available or bag.connections
-    return f"{bag.path}: no topic of type {FIELD_TYPE}{asked}; there are: {listed(there)}"
-
-
-def _named_poses(bag: Bag, name: str, available: list[Connection]) -> list[Connection]:
-    chosen = [c for c in available if matches(c.topic, name)]
-    if chosen:
-        return chosen
-    others = [c for c in bag.connections if matches(c.topic, name)]
-    if others:
-        raise BagError(
-            f"{bag.path}: topic {others[0].topic} is of type {others[0].msgtype}, poses must be "
-            f"one of {', '.join(POSE_TYPES)}"
-        )
-    raise BagError(
-        f"{bag.path}: no topic {name!r} for the poses; with poses there are: {listed(available)}"
-    )
 
 
 def _read(

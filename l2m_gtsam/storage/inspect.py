@@ -9,7 +9,7 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.storage.bag import BagOptions, select_fields, select_poses, several_frames
+from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.messages import (
     FIELD_TYPE,
     POSE_TYPES,
@@ -19,6 +19,7 @@ from l2m_gtsam.storage.messages import (
     header_ns,
 )
 from l2m_gtsam.storage.open_bag import Bag, open_bag
+from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
 from l2m_gtsam.storage.units import MICROTESLA_PER, Strength, fault, is_turning, strength
 
 
@@ -107,7 +108,29 @@ def inspect_bag(path: Path, options: BagOptions) -> BagReport:
     obstacles += [
         f"{r.topic}: {r.use}" for r in reports if r.use.startswith("refused") and r.topic in uses
     ]
-    return BagReport(path, tuple(reports), tuple(obstacles))
+    # a static transform holds from any time on
+    used = [r for r in reports if r.topic in uses and "tf_static" not in r.topic]
+    return BagReport(path, tuple(reports), (*obstacles, *_clock_obstacles(used, options)))
+
+
+def _clock_obstacles(used: list[TopicReport], options: BagOptions) -> list[str]:
+    """Return what is wrong with the header stamps of the topics that would be used."""
+    if options.stamps is Stamps.RECORD:
+        return []
+    advice = "use the record time with `bag.stamps: record`"
+    found = [
+        f"{r.topic}: all header stamps are 0; {advice}" for r in used if r.span_s == (0.0, 0.0)
+    ]
+    moving = [r for r in used if np.isfinite(r.span_s[0]) and r.span_s[1] > 0]
+    latest_start = max(moving, key=lambda r: r.span_s[0], default=None)
+    earliest_end = min(moving, key=lambda r: r.span_s[1], default=None)
+    if latest_start and earliest_end and latest_start.span_s[0] > earliest_end.span_s[1]:
+        found.append(
+            f"{latest_start.topic} starts at {latest_start.span_s[0]:.3f} s, after "
+            f"{earliest_end.topic} ends at {earliest_end.span_s[1]:.3f} s; if their clocks differ, "
+            f"{advice}"
+        )
+    return found
 
 
 def _selected(select: Any, bag: Bag, options: BagOptions) -> tuple[list[Connection], str]:

@@ -83,10 +83,10 @@ def fault(found: Strength, turning: bool, unit: Unit) -> str | None:
     unit
         The unit that was assumed; only `AUTO` is judged by strength.
     """
-    if not found.readings or found.high == 0.0:
-        return None  # dead, not in a wrong unit: the calibration says so of this sensor alone
-    many = found.readings >= ENOUGH_READINGS
-    if many and turning and found.high - found.low <= CONSTANT * found.median:
+    constant = found.high - found.low <= CONSTANT * found.median
+    if not found.readings or (constant and not turning):
+        return None  # dead or stuck, not in a wrong unit: the calibration says so of it alone
+    if constant and found.readings >= ENOUGH_READINGS:
         return (
             f"every reading is {found.median * 1e-6:.4g} long, as read in tesla: directions "
             "without a strength (no unit at all), which cannot be calibrated; record the raw field"

@@ -10,15 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import BagError, L2MError, UnitsError
-from l2m_gtsam.storage.bag import (
-    BagOptions,
-    FixedTransform,
-    Stamps,
-    TfChain,
-    read_fields,
-    read_recording,
-    read_trajectory,
-)
+from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
+from l2m_gtsam.storage.bag_options import BagOptions, FixedTransform, Stamps, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.units import Unit
 from tests.bags import KINDS, Entry, ros, write
@@ -324,10 +317,34 @@ def test_inspect_tells_what_would_be_used(tmp_path: Path) -> None:
 
 
 def test_inspect_reports_instead_of_refusing(tmp_path: Path) -> None:
-    content = [e for e in entries("mcap", field=lambda k: 1e4 * EARTH) if e.topic == "/mag"]
+    content = [
+        e for e in entries("mcap", field=lambda k: 1e4 * EARTH * (1 + k / 100)) if e.topic == "/mag"
+    ]
     report = inspect_bag(write(tmp_path, "mcap", content), BagOptions())
     assert any("no poses in the bag" in line for line in report.obstacles)
     assert any("units: gauss" in line for line in report.obstacles)
+
+
+def test_inspect_sees_clocks_that_cannot_work(tmp_path: Path) -> None:
+    zero = write(tmp_path, "mcap", entries("mcap", field_start=0), "zero")
+    (line,) = inspect_bag(zero, BagOptions()).obstacles
+    assert line.startswith("/mag: all header stamps are 0")
+    other = write(tmp_path, "mcap", entries("mcap", pose_start=900_000_000_000), "other")
+    (line,) = inspect_bag(other, BagOptions()).obstacles
+    assert "/mag starts at 1700000000.000 s, after /pose ends at 902.900 s" in line
+    assert inspect_bag(other, BagOptions(stamps=Stamps.RECORD)).obstacles == ()
+
+
+def test_a_stuck_sensor_does_not_stop_the_bag(tmp_path: Path) -> None:
+    """One constant value, of any size, is no unit; the calibration reports the sensor."""
+    content = entries("mcap", topics=("/good", "/stuck"))
+    make = ros("mcap")
+    for k, entry in enumerate(content):
+        if entry.topic == "/stuck":
+            reading = make.magnetic(entry.record_ns, [3e-6, 0, 0], "stuck")
+            content[k] = Entry("/stuck", entry.msgtype, entry.record_ns, reading)
+    found = read_recording(write(tmp_path, "mcap", content), BagOptions())
+    assert [s.sensor for s in found.series] == ["good", "stuck"]
 
 
 # ---- recordings that others made -----------------------------------------------------------

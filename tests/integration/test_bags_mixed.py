@@ -12,13 +12,8 @@ from pydantic import ValidationError
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.storage.bag import (
-    BagOptions,
-    TfChain,
-    read_fields,
-    read_recording,
-    read_trajectory,
-)
+from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
+from l2m_gtsam.storage.bag_options import BagOptions, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
 from tests.bags import KINDS, Entry, ros, write
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.storage.bag import BagOptions, TfChain
+from l2m_gtsam.storage.bag_options import BagOptions, TfChain
 from l2m_gtsam.storage.inspect import BagReport, TopicReport, inspect_bag
 
 
