@@ -22,6 +22,7 @@ from l2m_gtsam.storage.calibration_file import (
     write_known_sensors,
 )
 from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.inspect import BagReport, inspect_bag
 from l2m_gtsam.storage.map_file import load_map, save_map
 
 Progress = Callable[[str, float], None]
@@ -71,15 +72,24 @@ def build_map_file(
     return field_map
 
 
-def load_field_map(path: Path) -> FieldMap:
+def load_field_map(path: Path, progress: Progress) -> FieldMap:
     """Return the map in a file, ready to be asked."""
-    return map_from_state(load_map(path))
+    progress("loading the map", 0.0)
+    field_map = map_from_state(load_map(path))
+    progress("loading the map", 1.0)
+    return field_map
 
 
-def plot_map_file(path: Path, out: Path, height: float | None) -> None:
+def plot_map_file(path: Path, out: Path, height: float | None, progress: Progress) -> None:
     """Draw a map at a height in metres (the middle of its readings if None) as a picture."""
+    field_map = load_field_map(path, progress)
     _ensure_folder(out.parent)
-    save_figure(map_figure(load_field_map(path), height), out)
+    save_figure(map_figure(field_map, height), out)
+
+
+def inspect_file(bag: Path, config: Config, progress: Progress) -> BagReport:
+    """Return what is in a bag and what would be used of it."""
+    return inspect_bag(bag, config.bag, _counter(f"reading {bag.name}", progress))
 
 
 def calibrate_bag(
@@ -106,9 +116,7 @@ def calibrate_bag(
         Whatever is wrong with the input, in one line; nothing is written then.
     """
     recording = _read(bag, config, progress)
-    progress("loading the map", 0.0)
-    field_map = load_field_map(map_path)
-    progress("loading the map", 1.0)
+    field_map = load_field_map(map_path, progress)
     source = source_file(map_path)
     result = calibrate(recording, field_map, config.calibration, source, progress)
     result = replace(result, options=config.model_dump(mode="json"))
@@ -166,10 +174,12 @@ def bag_name(drive: str, kind: BagKind) -> str:
 
 
 def _read(bag: Path, config: Config, progress: Progress) -> Recording:
-    def tell(done: int, total: int) -> None:
-        progress(f"reading {bag.name}", done / max(total, 1))
+    return read_recording(bag, config.bag, _counter(f"reading {bag.name}", progress))
 
-    return read_recording(bag, config.bag, tell)
+
+def _counter(stage: str, progress: Progress) -> Callable[[int, int], None]:
+    """Return what a reader calls with the messages read and their number."""
+    return lambda done, total: progress(stage, done / max(total, 1))
 
 
 def _ensure_folder(folder: Path) -> None:

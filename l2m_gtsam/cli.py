@@ -64,11 +64,12 @@ def options(
 @app.command()
 def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
     """Say what is in a bag and what would be used of it, and why."""
+    from l2m_gtsam.batch import inspect_file
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import bag_table
-    from l2m_gtsam.storage.inspect import inspect_bag
 
-    report = inspect_bag(bag, load_config(config).bag)
+    with _progress() as progress:
+        report = inspect_file(bag, load_config(config), progress)
     _print(bag_table(report))
     for obstacle in report.obstacles:
         typer.echo(f"cannot be calibrated as it is: {obstacle}")
@@ -161,7 +162,9 @@ def map_info(
     from l2m_gtsam.batch import load_field_map
     from l2m_gtsam.qa.tables import map_table
 
-    _print(map_table(load_field_map(map_path).summary))
+    with _progress() as progress:
+        field_map = load_field_map(map_path, progress)
+    _print(map_table(field_map.summary))
 
 
 @map_app.command("plot")
@@ -175,7 +178,8 @@ def map_plot(
     """Draw strength and uncertainty of a map at one height."""
     from l2m_gtsam.batch import plot_map_file
 
-    plot_map_file(map_path, out, height)
+    with _progress() as progress:
+        plot_map_file(map_path, out, height, progress)
     typer.echo(f"written: {out}")
 
 

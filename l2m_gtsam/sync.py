@@ -1,6 +1,7 @@
 """Bring readings and poses together in time, and keep what says something new."""
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation, Slerp
 
 from l2m_gtsam.data import (
@@ -21,13 +22,13 @@ from l2m_gtsam.options import Options
 class SyncOptions(Options):
     """How readings get their poses and which of them are kept."""
 
-    max_pose_gap_s: float = 0.5
+    max_pose_gap_s: float = Field(default=0.5, gt=0)
     """Readings between two poses further apart than this are dropped; poses are never
     extrapolated."""
-    thin_distance_m: float = 0.02
+    thin_distance_m: float = Field(default=0.02, ge=0)
     """Of readings whose poses fall into one cell of this size (and of `thin_angle_deg`) the first
     is kept: a parked vehicle adds no information about the map. 0 keeps all."""
-    thin_angle_deg: float = 2.0
+    thin_angle_deg: float = Field(default=2.0, ge=0)
     """Size of a cell in rotation."""
 
 

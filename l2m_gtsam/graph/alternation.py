@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.calibration import Estimate, FactorForm, batch_readings, reading_graph
@@ -31,21 +32,21 @@ class OneKeyOptions(Options):
     """The inner step for C and H."""
     factors: FactorForm = FactorForm.BLOCK
     """`block` (one factor per sensor, fast) or `reading` (one per reading)."""
-    max_steps: int = 100
+    max_steps: int = Field(default=100, ge=1)
     """Largest number of alternations (the paper's 100)."""
-    alternation_readings: int = 400
+    alternation_readings: int = Field(default=400, ge=5)
     """Readings of each sensor that take part in the alternation, spread evenly over the drive: it
     only has to come near. The joint graph uses all."""
-    graph_iterations: int = 2
+    graph_iterations: int = Field(default=2, ge=1)
     """Linearisations of the translation graph between two closed forms."""
-    settled_m: float = 1e-3
+    settled_m: float = Field(default=1e-3, gt=0)
     """The alternation ends when no sensor moves further than this; the joint graph takes over."""
-    joint_iterations: int = 50
+    joint_iterations: int = Field(default=50, ge=1)
     """Largest number of linearisations of a joint optimisation."""
-    sensor_noise_ut: float | None = None
+    sensor_noise_ut: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     """Standard deviation of the sensors' noise; estimated for each sensor if not given."""
-    min_readings: int = 30
-    """A sensor with fewer readings inside the map is not solved."""
+    min_readings: int = Field(default=30, ge=5)
+    """A sensor with fewer readings inside the map is not solved; five have 15 components."""
     rank: RankOptions = RankOptions()
     """When a direction counts as determined."""
 

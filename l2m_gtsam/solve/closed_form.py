@@ -16,6 +16,7 @@ from enum import StrEnum
 from typing import assert_never
 
 import numpy as np
+from pydantic import Field
 
 from l2m_gtsam.data import Distortion, FloatArray
 from l2m_gtsam.errors import CalibrationError
@@ -57,7 +58,7 @@ class ClosedFormOptions(Options):
     as the published norm amounts to."""
     ridge: RidgeRule = RidgeRule.FIXED
     """`fixed` (at `ridge_strength`), `gcv` or `l_curve`."""
-    ridge_strength: float = 1e-9
+    ridge_strength: float = Field(default=1e-9, ge=0, allow_inf_nan=False)
     """Fixed ridge relative to the spread of the field. The default only stops directions that the
     data leave open from running away; it moves C by a billionth."""
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 from scipy.linalg import qr
 
 from l2m_gtsam.data import BoolArray, FloatArray
@@ -18,11 +19,11 @@ PARAMETERS = (
 class RankOptions(Options):
     """When a direction counts as determined: its sigma, with nothing else known, is below these."""
 
-    useful_t_m: float = 0.3
+    useful_t_m: float = Field(default=0.3, gt=0)
     """Metres."""
-    useful_C: float = 0.3
+    useful_C: float = Field(default=0.3, gt=0)
     """Entries of C, without unit."""
-    useful_H_ut: float = 15.0
+    useful_H_ut: float = Field(default=15.0, gt=0)
     """Microtesla."""
 
     def scale(self) -> FloatArray:

@@ -1,7 +1,6 @@
 """Read a drive out of a bag: the lidar's poses and every magnetometer's readings."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from l2m_gtsam.storage.messages import (
     PoseBuffer,
     header_ns,
 )
-from l2m_gtsam.storage.open_bag import Bag, Message, open_bag
+from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
 from l2m_gtsam.storage.selection import (
     select_fields,
     select_poses,
@@ -30,11 +29,8 @@ from l2m_gtsam.storage.selection import (
 from l2m_gtsam.storage.tf import Link, ancestors, compose
 from l2m_gtsam.storage.units import MICROTESLA_PER, fault, is_turning, strength
 
-Progress = Callable[[int, int], None]
-
 # Clocks further apart than this are different clocks, not a late start.
 OTHER_CLOCK_NS = 3_600_000_000_000
-PROGRESS_EVERY = 2000
 
 
 @dataclass
@@ -112,18 +108,13 @@ def _read(
 ) -> Buffers:
     """Make one pass over the bag."""
     buffers = Buffers()
-    total = sum(c.msgcount for c in connections)
-    for done, message in enumerate(bag.messages(connections)):
-        if progress is not None and done % PROGRESS_EVERY == 0:
-            progress(done, total)
+    for message in bag.messages(connections, progress):
         if message.connection.msgtype == FIELD_TYPE:
             _add_field(buffers, message, options)
         elif message.connection.msgtype in TF_TYPES:
             _add_transforms(buffers, message, options)
         else:
             _add_pose(buffers, message, options)
-    if progress is not None:
-        progress(total, total)
     return buffers
 
 

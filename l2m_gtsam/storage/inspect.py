@@ -18,7 +18,7 @@ from l2m_gtsam.storage.messages import (
     StampBuffer,
     header_ns,
 )
-from l2m_gtsam.storage.open_bag import Bag, open_bag
+from l2m_gtsam.storage.open_bag import Bag, Progress, open_bag
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
 from l2m_gtsam.storage.units import MICROTESLA_PER, Strength, fault, is_turning, strength
 
@@ -81,8 +81,17 @@ class _Collected:
     readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
 
 
-def inspect_bag(path: Path, options: BagOptions) -> BagReport:
+def inspect_bag(path: Path, options: BagOptions, progress: Progress | None = None) -> BagReport:
     """Look at every topic; only those that could be used are decoded.
+
+    Parameters
+    ----------
+    path
+        Bag of any kind.
+    options
+        What a calibration would read.
+    progress
+        Called with the messages read and their number.
 
     Raises
     ------
@@ -94,7 +103,7 @@ def inspect_bag(path: Path, options: BagOptions) -> BagReport:
         poses, no_poses = _selected(select_poses, bag, options)
         usable = [c for c in bag.connections if _is_usable(c)]
         collected: dict[str, _Collected] = {}
-        for message in bag.messages(usable):
+        for message in bag.messages(usable, progress):
             into = collected.setdefault(message.connection.topic, _Collected())
             _collect(into, message.content, message.connection.msgtype, message.record_ns)
         uses = {c.topic: "magnetic readings" for c in fields}

@@ -24,6 +24,9 @@ from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
 ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3 or an .mcap file"
 # mcap counts nanoseconds unsigned, everything else in 63 bits.
 LATEST_NS = (1 << 63) - 1
+PROGRESS_EVERY = 2000
+
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,17 @@ class Bag:
         """Time between the first and the last record in seconds."""
         return self._reader.duration * 1e-9
 
-    def messages(self, connections: Sequence[Connection]) -> Iterator[Message]:
+    def messages(
+        self, connections: Sequence[Connection], progress: Progress | None = None
+    ) -> Iterator[Message]:
         """Yield the messages of these connections in order of record time.
+
+        Parameters
+        ----------
+        connections
+            Connections of this bag.
+        progress
+            Called now and then with the messages read and their number.
 
         Raises
         ------
@@ -64,7 +76,10 @@ class Bag:
             return
         decoders = {c.id: self._decoder(c) for c in connections}
         stream, received = self._reader.messages(list(connections)), 0
+        promised = sum(c.msgcount for c in connections)
         while True:
+            if progress is not None and received % PROGRESS_EVERY == 0:
+                progress(received, promised)
             try:
                 connection, record_ns, raw = next(stream)
                 content = decoders[connection.id](raw)
@@ -76,7 +91,9 @@ class Bag:
                 raise BagError(f"{self.path}: damaged: a message is recorded at {record_ns} ns")
             received += 1
             yield Message(connection, record_ns, content)
-        if received < (promised := sum(c.msgcount for c in connections)):
+        if progress is not None:
+            progress(received, promised)
+        if received < promised:
             raise BagError(
                 f"{self.path}: truncated: its index promises {promised} messages on the topics "
                 f"that are read, {received} are there; record it again or reindex it"
