@@ -1,18 +1,19 @@
 """Files in, files out: what the command line does, callable from Python."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import CalibrationResult, Recording
-from l2m_gtsam.errors import OutputError
+from l2m_gtsam.data import CalibrationResult, MapState, Recording
+from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.mapping import map_recordings
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.qa.figures import calibration_figure, map_figure, save_figure
+from l2m_gtsam.qa.tables import MapDescription
 from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.bag import read_recording
@@ -31,9 +32,17 @@ CALIBRATION_FILE = "calibration.yaml"
 OVERVIEW_FILE = "overview.png"
 
 
+@dataclass(frozen=True)
+class BuiltMap:
+    """A map and what its file says of it."""
+
+    field_map: FieldMap
+    description: MapDescription
+
+
 def build_map_file(
     bags: Sequence[Path], out: Path, config: Config, suite: Path | None, progress: Progress
-) -> FieldMap:
+) -> BuiltMap:
     """Build a map from mapping bags and write it.
 
     Parameters
@@ -68,21 +77,28 @@ def build_map_file(
         "version": version("l2m-gtsam"),
     }
     _ensure_folder(out.parent)
-    save_map(out, replace(state, provenance={**state.provenance, **provenance}))
-    return field_map
+    state = replace(state, provenance={**state.provenance, **provenance})
+    save_map(out, state)
+    return BuiltMap(field_map, MapDescription(field_map.summary, state.provenance))
 
 
-def load_field_map(path: Path, progress: Progress) -> FieldMap:
-    """Return the map in a file, ready to be asked."""
+def map_of(state: MapState, progress: Progress) -> FieldMap:
+    """Return the map that a file holds, ready to be asked."""
     progress("loading the map", 0.0)
-    field_map = map_from_state(load_map(path))
+    field_map = map_from_state(state)
     progress("loading the map", 1.0)
     return field_map
 
 
+def describe_map_file(path: Path, progress: Progress) -> MapDescription:
+    """Return what a map file holds and where it came from."""
+    state = load_map(path)
+    return MapDescription(map_of(state, progress).summary, state.provenance)
+
+
 def plot_map_file(path: Path, out: Path, height: float | None, progress: Progress) -> None:
     """Draw a map at a height in metres (the middle of its readings if None) as a picture."""
-    field_map = load_field_map(path, progress)
+    field_map = map_of(load_map(path), progress)
     _ensure_folder(out.parent)
     save_figure(map_figure(field_map, height), out)
 
@@ -116,15 +132,28 @@ def calibrate_bag(
         Whatever is wrong with the input, in one line; nothing is written then.
     """
     recording = _read(bag, config, progress)
-    field_map = load_field_map(map_path, progress)
+    state = load_map(map_path)
+    field_map, map_frame = map_of(state, progress), state.provenance.get("frame")
     source = source_file(map_path)
+    _check_frame(map_path, map_frame, recording)
     result = calibrate(recording, field_map, config.calibration, source, progress)
     result = replace(result, options=config.model_dump(mode="json"))
+    figure = calibration_figure(field_map, recording.trajectory, result, truth=())
     _ensure_folder(out)
     write_calibration(out / CALIBRATION_FILE, result)
-    figure = calibration_figure(field_map, recording.trajectory, result, truth=())
     save_figure(figure, out / OVERVIEW_FILE)
     return result
+
+
+def _check_frame(map_path: Path, map_frame: object, recording: Recording) -> None:
+    """Raise a MapError if map and drive are said to be in different frames."""
+    if map_frame not in (None, recording.trajectory.frame):
+        msg = (
+            f"{map_path} is in frame {map_frame!r}, the poses of {recording.source.path} are in "
+            f"{recording.trajectory.frame!r}; if both mean the same, say so with "
+            f"`bag.frame: {map_frame}`"
+        )
+        raise MapError(msg)
 
 
 def simulate_bags(

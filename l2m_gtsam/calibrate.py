@@ -21,16 +21,12 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
 from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.view import QueryableMap
-from l2m_gtsam.solve.rotation import PolarRotation, polar_rotation
-from l2m_gtsam.sync import synchronise
+from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
+from l2m_gtsam.sync import stuck_sensors, synchronise
 
 # A Newton step of a tenth of a standard deviation would still be worth taking.
 CONVERGED_SIGMAS = 0.1
-
-# Readings that vary less than this are stuck: a moving magnetometer's noise alone is larger.
-STUCK_UT = 1e-3
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 
@@ -65,7 +61,8 @@ def calibrate(
         No sensor can be solved: the map does not cover the drive, or nothing was read.
     """
     synchronised = synchronise(recording, options.sync)
-    alive = _alive(synchronised.readings)
+    stuck = stuck_sensors(synchronised.readings)
+    alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
     t_start = _starts(synchronised.readings.sensors, options)
     solution = solve_one_key(alive, field_map, t_start, options.solve, progress)
     sensors = _assess(synchronised, alive, solution, options)
@@ -79,16 +76,6 @@ def calibrate(
         options=options.model_dump(mode="json"),
         versions={name: version(name) for name in VERSIONED},
     )
-
-
-def _alive(readings: Readings) -> Readings:
-    """Return the readings of the sensors that are not stuck on one value."""
-    stuck = np.zeros(len(readings), dtype=np.bool_)
-    for index in range(len(readings.sensors)):
-        rows = readings.rows_of(index)
-        field = readings.field[rows]
-        stuck[rows] = len(field) > 0 and bool(np.ptp(field, axis=0).max() < STUCK_UT)
-    return readings.select(~stuck)
 
 
 def _starts(sensors: tuple[str, ...], options: CalibrationOptions) -> FloatArray:
@@ -135,12 +122,18 @@ def _solved(
 ) -> SensorCalibration:
     vector = solution.estimate.distortion[found.sensor]
     distortion = Distortion.from_vector(vector)
-    status, message = _verdict(found, solution.ending)
-    try:
-        rotation = polar_rotation(distortion.C, found.covariance[3:12, 3:12])
-    except CalibrationError as error:
-        rotation = _no_rotation()
-        status, message = SensorStatus.FLIPPED_AXIS, str(error)
+    status, message = _verdict(found, solution)
+    rotation = _no_rotation()
+    if axis := dead_axis(distortion.C):
+        status = SensorStatus.DEAD_AXIS
+        message = f"the sensor's {axis} axis does not follow the field; check its wiring"
+    else:
+        try:
+            rotation = polar_rotation(distortion.C, found.covariance[3:12, 3:12])
+        except CalibrationError as error:
+            # the sign of a C that is not known says nothing about the axes
+            if status is SensorStatus.SOLVED:
+                status, message = SensorStatus.FLIPPED_AXIS, str(error)
     return SensorCalibration(
         sensor=name,
         status=status,
@@ -158,10 +151,13 @@ def _solved(
     )
 
 
-def _verdict(found: SensorSolution, ending: Ending) -> tuple[SensorStatus, str]:
+def _verdict(found: SensorSolution, solution: OneKeySolution) -> tuple[SensorStatus, str]:
+    if not solution.settled:
+        return SensorStatus.NOT_CONVERGED, "estimate and weights still change, round after round"
     if found.remaining_sigmas > CONVERGED_SIGMAS:
         return SensorStatus.NOT_CONVERGED, (
-            f"{ending.value}, {found.remaining_sigmas:.2g} standard deviations from the optimum"
+            f"{solution.ending.value}, {found.remaining_sigmas:.2g} standard deviations from the "
+            "optimum"
         )
     if found.determinacy.names:
         return SensorStatus.UNDETERMINED, (
@@ -202,8 +198,9 @@ def _why_silent(usable: int, counts: SyncCounts, needed: int) -> str:
         return "the sensor reports one constant value: it is stuck"
     return (
         f"{usable} usable readings of {counts.received} received ({counts.not_finite} not finite, "
-        f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
-        f"{counts.thinned} at a place already read), at least {needed} are needed"
+        f"{counts.repeated} repeated, {counts.outside_trajectory} without a pose, "
+        f"{counts.in_pose_gap} in a gap between poses, {counts.thinned} at a place already read), "
+        f"at least {needed} are needed"
     )
 
 

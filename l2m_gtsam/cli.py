@@ -149,8 +149,8 @@ def map_build(
     from l2m_gtsam.qa.tables import map_table
 
     with _progress() as progress:
-        field_map = build_map_file(bags, out, load_config(config), suite, progress)
-    _print(map_table(field_map.summary))
+        built = build_map_file(bags, out, load_config(config), suite, progress)
+    _print(map_table(built.description))
     typer.echo(f"written: {out}")
 
 
@@ -159,12 +159,12 @@ def map_info(
     map_path: Annotated[Path, typer.Argument(metavar="MAP", help="Map file.")],
 ) -> None:
     """Say what a map is made of and what it covers."""
-    from l2m_gtsam.batch import load_field_map
+    from l2m_gtsam.batch import describe_map_file
     from l2m_gtsam.qa.tables import map_table
 
     with _progress() as progress:
-        field_map = load_field_map(map_path, progress)
-    _print(map_table(field_map.summary))
+        description = describe_map_file(map_path, progress)
+    _print(map_table(description))
 
 
 @map_app.command("plot")

@@ -32,14 +32,6 @@ class RigidTransform:
     R: FloatArray
     t: FloatArray
 
-    @classmethod
-    def identity(cls) -> "RigidTransform":
-        """Return the transform that changes nothing."""
-        return cls(np.eye(3), np.zeros(3))
-
-    def __matmul__(self, other: "RigidTransform") -> "RigidTransform":
-        return RigidTransform(self.R @ other.R, self.R @ other.t + self.t)
-
     def inverse(self) -> "RigidTransform":
         """Return the transform from a to b."""
         return RigidTransform(self.R.T, -self.R.T @ self.t)
@@ -84,7 +76,7 @@ class FieldSeries:
     topic, frame
         Where it came from.
     stamp_ns
-        Times in nanoseconds, shape (N,).
+        Times in nanoseconds, ascending; a stamp may be repeated, shape (N,).
     field
         Magnetic field in microtesla, shape (N, 3); NaN marks a missing axis.
     """
@@ -169,6 +161,7 @@ class SyncCounts:
 
     received: int
     not_finite: int
+    repeated: int
     outside_trajectory: int
     in_pose_gap: int
     thinned: int
@@ -299,6 +292,7 @@ class SensorStatus(StrEnum):
     NOT_CONVERGED = "not_converged"
     NO_READINGS = "no_readings"
     OUTSIDE_MAP = "outside_map"
+    DEAD_AXIS = "dead_axis"
     FLIPPED_AXIS = "flipped_axis"
 
 

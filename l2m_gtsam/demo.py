@@ -42,9 +42,9 @@ def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonst
     config, map_path = Config(), out / "map.npz"
     mapping, drive = (out / bag_name(name, BagKind.MCAP) for name in ("mapping", "calibration"))
     scenario = simulate_bags(out, options, [BagKind.MCAP], progress)
-    field_map = build_map_file([mapping], map_path, config, out / "suite.yaml", progress)
+    built = build_map_file([mapping], map_path, config, out / "suite.yaml", progress)
     result = calibrate_bag(drive, map_path, config, out, progress)
     picture = out / OVERVIEW_FILE
     trajectory = scenario.calibration.recording.trajectory
-    save_figure(calibration_figure(field_map, trajectory, result, scenario.truth), picture)
+    save_figure(calibration_figure(built.field_map, trajectory, result, scenario.truth), picture)
     return Demonstration(result, scenario.truth, picture)

@@ -9,7 +9,7 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.sync import synchronise
+from l2m_gtsam.sync import stuck_sensors, synchronise
 
 
 def map_recordings(
@@ -44,10 +44,21 @@ def map_recordings(
     points, fields = [], []
     for recording in recordings:
         readings = synchronise(recording, options.sync).readings
+        _refuse_stuck(readings, recording)
         known = [_known(name, suite, recording) for name in readings.sensors]
         points.append(sensor_positions(readings, known))
         fields.append(map_fields(readings, known))
     return build_map(np.concatenate(points), np.concatenate(fields), options.model)
+
+
+def _refuse_stuck(readings: Readings, recording: Recording) -> None:
+    """Raise a MapError for a sensor that reports one constant value: it would poison the map."""
+    if stuck := [readings.sensors[index] for index in stuck_sensors(readings)]:
+        msg = (
+            f"{recording.source.path}: the sensor {stuck[0]!r} is stuck on one value; choose the "
+            "others with `bag.fields`"
+        )
+        raise MapError(msg)
 
 
 def sensor_positions(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:

@@ -27,9 +27,13 @@ class SyncOptions(Options):
     extrapolated."""
     thin_distance_m: float = Field(default=0.02, ge=0)
     """Of readings whose poses fall into one cell of this size (and of `thin_angle_deg`) the first
-    is kept: a parked vehicle adds no information about the map. 0 keeps all."""
+    is kept: a parked vehicle adds no information about the map. 0 does not look at the place."""
     thin_angle_deg: float = Field(default=2.0, ge=0)
-    """Size of a cell in rotation."""
+    """Size of a cell in rotation; 0 does not look at it. With both 0 every reading is kept."""
+
+
+# Readings that vary less than this are stuck: a moving magnetometer's noise alone is larger.
+STUCK_UT = 1e-3
 
 
 def synchronise(recording: Recording, options: SyncOptions) -> Synchronised:
@@ -53,21 +57,40 @@ def synchronise(recording: Recording, options: SyncOptions) -> Synchronised:
 def _synchronise_one(
     trajectory: Trajectory, index: int, series: FieldSeries, options: SyncOptions
 ) -> tuple[Readings, SyncCounts]:
-    finite = np.isfinite(series.field).all(axis=1)
+    finite = np.asarray(np.isfinite(series.field).all(axis=1))
+    repeated = _repeated(series.stamp_ns, finite)
     spanned = _spanned(trajectory.stamp_ns, series.stamp_ns)
     near = _bracket_ns(trajectory.stamp_ns, series.stamp_ns) <= options.max_pose_gap_s * 1e9
-    keep = finite & spanned & near
+    fresh = finite & ~repeated
+    keep = fresh & spanned & near
     readings = _with_poses(trajectory, index, series.stamp_ns[keep], series.field[keep])
     new = _first_in_cell(readings, options)
     counts = SyncCounts(
         received=len(series),
         not_finite=int(np.sum(~finite)),
-        outside_trajectory=int(np.sum(finite & ~spanned)),
-        in_pose_gap=int(np.sum(finite & spanned & ~near)),
+        repeated=int(np.sum(repeated)),
+        outside_trajectory=int(np.sum(fresh & ~spanned)),
+        in_pose_gap=int(np.sum(fresh & spanned & ~near)),
         thinned=int(np.sum(~new)),
         kept=int(np.sum(new)),
     )
     return readings.select(new), counts
+
+
+def _repeated(stamp_ns: IntArray, finite: BoolArray) -> BoolArray:
+    """Mark finite readings whose stamp a finite reading before them already has."""
+    repeated = np.ones(len(stamp_ns), dtype=np.bool_)
+    rows = np.flatnonzero(finite)
+    _, first = np.unique(stamp_ns[rows], return_index=True)
+    repeated[rows[first]] = False
+    return repeated & finite
+
+
+def stuck_sensors(readings: Readings) -> list[int]:
+    """Return the indices of the sensors that report one constant value."""
+    fields = [readings.field[readings.rows_of(i)] for i in range(len(readings.sensors))]
+    spreads = [np.ptp(field, axis=0).max() if len(field) else np.inf for field in fields]
+    return [index for index, spread in enumerate(spreads) if spread < STUCK_UT]
 
 
 def _spanned(pose_ns: IntArray, stamp_ns: IntArray) -> BoolArray:
@@ -102,11 +125,14 @@ def _with_poses(
 
 def _first_in_cell(readings: Readings, options: SyncOptions) -> BoolArray:
     """Mark the first reading of every cell of position and rotation."""
-    if options.thin_distance_m <= 0 or options.thin_angle_deg <= 0:
+    sizes = options.thin_distance_m, float(np.deg2rad(options.thin_angle_deg))
+    values = readings.p_map_lidar, readings.R_map_lidar[:, :, :2].reshape(-1, 6)
+    parts = [value / size for value, size in zip(values, sizes, strict=True) if size > 0]
+    if not parts:
         return np.ones(len(readings), dtype=np.bool_)
-    axes = readings.R_map_lidar[:, :, :2].reshape(-1, 6) / np.deg2rad(options.thin_angle_deg)
-    cells = np.hstack([readings.p_map_lidar / options.thin_distance_m, axes])
-    _, first = np.unique(np.floor(cells).astype(np.int64), axis=0, return_index=True)
+    # Rounded, not floored: a vehicle at rest at the origin must not sit on the edge of cells.
+    cells = np.rint(np.hstack(parts)).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
     keep = np.zeros(len(readings), dtype=np.bool_)
     keep[first] = True
     return keep

@@ -36,15 +36,17 @@ def distortion_prior(sensor: int, C0: FloatArray, sigma: float) -> gtsam.CustomF
 
 
 def held_directions(sensor: int, directions: FloatArray, at: FloatArray) -> gtsam.CustomFactor:
-    """Return a factor that keeps directions which the data cannot determine where they are.
+    """Return a unit prior along directions which the data cannot determine.
+
+    It holds them where they are as long as the readings say less than the prior.
 
     Parameters
     ----------
     sensor
         Index of the sensor.
     directions
-        Rows of unit length in the 15-vector (t, C row by row, H), scaled by the caller so that
-        one is a large change, shape (K, 15).
+        Rows over the 15-vector (t, C row by row, H), each scaled so that one is a step of one
+        standard deviation, shape (K, 15).
     at
         The 15-vector at which they are held.
     """

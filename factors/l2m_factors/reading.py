@@ -79,10 +79,11 @@ class BatchedReadings:
         return stamp + values.atVector(keys[1]).tobytes() if self._fixed is None else stamp
 
     def _evaluate(self, values: gtsam.Values) -> None:
-        # A sensor without values, as when one factor is used alone, comes out as NaN.
+        # A sensor without values, as when one factor is used alone, is evaluated at zero; nobody
+        # asks for it, because its stamp is not kept.
         count = self._sensors[-1] + 1
-        t = np.full((count, 3), np.nan)
-        distortion = np.full((count, 12), np.nan) if self._fixed is None else self._fixed
+        t = np.zeros((count, 3))
+        distortion = np.zeros((count, 12)) if self._fixed is None else self._fixed
         present = [s for s in self._sensors if values.exists(self._keys[s][0])]
         for sensor in present:
             t[sensor] = values.atPoint3(self._keys[sensor][0])

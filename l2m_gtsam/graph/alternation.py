@@ -3,9 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from pydantic import Field
 
+from l2m_factors import T
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.calibration import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.graph.optimise import Optimizer, optimise
@@ -21,6 +23,11 @@ from l2m_gtsam.solve.noise import estimate_noise
 from l2m_gtsam.solve.rank import RankOptions
 
 Progress = Callable[[str, float], None]
+
+# Readings of a sensor without which no step of the alternation is taken: five have 15 components.
+FEWEST = 5
+# Weak tie of each T(i) to where it is, for directions without any gradient: metres.
+TIE_M = 10.0
 
 
 class OneKeyOptions(Options):
@@ -43,7 +50,7 @@ class OneKeyOptions(Options):
     """The alternation ends when no sensor moves further than this; the joint graph takes over."""
     joint_iterations: int = Field(default=50, ge=1)
     """Largest number of linearisations of a joint optimisation."""
-    sensor_noise_ut: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    sensor_noise_ut: float | None = Field(default=None, gt=0)
     """Standard deviation of the sensors' noise; estimated for each sensor if not given."""
     min_readings: int = Field(default=30, ge=5)
     """A sensor with fewer readings inside the map is not solved; five have 15 components."""
@@ -63,7 +70,8 @@ def start_estimate(t_start: FloatArray, options: OneKeyOptions) -> Estimate:
     """Return ideal sensors at these positions, shape (S, 3), metres."""
     count = len(t_start)
     ideal = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
-    noise = np.full(count, options.sensor_noise_ut or 1.0)  # replaced by the first closed form
+    unknown = options.sensor_noise_ut is None  # then the first closed form replaces it
+    noise = np.full(count, 1.0 if unknown else options.sensor_noise_ut)
     return Estimate(t_start, np.tile(ideal, (count, 1)), noise, np.zeros(count))
 
 
@@ -78,7 +86,7 @@ def alternate(
     estimate, furthest = start, options.settled_m
     readings = spread(readings, max(options.alternation_readings, options.min_readings))
     for step in range(1, options.max_steps + 1):
-        view = observe(readings, field_map, estimate, options.min_readings)
+        view = observe(readings, field_map, estimate, FEWEST)
         if not view.sensors:
             return Alternated(estimate, step)
         moved = move_sensors(view, field_map, fit_distortions(view, estimate, options), options)
@@ -125,6 +133,9 @@ def move_sensors(
     batch = batch_readings(view.readings, field_map, estimate.distortion)
     graph = reading_graph(batch, covariance, options.factors)
     start = estimate.positions(view.sensors)
+    tie = gtsam.noiseModel.Isotropic.Sigma(3, TIE_M)
+    for sensor in view.sensors:
+        graph.add(gtsam.PriorFactorPoint3(T(sensor), estimate.t[sensor], tie))
     optimised = optimise(graph, start, options.optimizer, options.graph_iterations)
     return estimate.updated(optimised.values, view.sensors)
 

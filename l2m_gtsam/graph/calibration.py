@@ -6,6 +6,7 @@ from enum import StrEnum
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from l2m_factors import (
     BatchedReadings,
@@ -147,8 +148,40 @@ def whitened_jacobian(
     return np.asarray(jacobian)
 
 
-def sensor_covariance(marginals: gtsam.Marginals, sensor: int) -> FloatArray:
-    """Return the covariance of (t, C row by row, H) of one sensor, shape (15, 15)."""
-    joint = marginals.jointMarginalCovariance([T(sensor), D(sensor)])
+def sensor_covariances(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, sensors: list[int]
+) -> dict[int, FloatArray]:
+    """Return the marginal covariance of (t, C row by row, H) of each sensor, shape (15, 15).
+
+    Where one direction is thousands of times better known than another, GTSAM's marginals, which
+    are made by Cholesky, call the system indeterminate; QR of the same factors still has it.
+    """
+    linear = graph.linearize(values)
+    try:
+        marginals = gtsam.Marginals(linear, values)
+    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException has no Python type
+        if "ndetermina" not in str(error):
+            raise
+        return {sensor: _covariance_by_qr(linear, sensor) for sensor in sensors}
+    return {sensor: _marginal_covariance(marginals, sensor) for sensor in sensors}
+
+
+def _marginal_covariance(marginals: gtsam.Marginals, sensor: int) -> FloatArray:
     keys = (T(sensor), D(sensor))
+    joint = marginals.jointMarginalCovariance(list(keys))
     return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
+
+
+def _covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensor: int) -> FloatArray:
+    ordering = gtsam.Ordering()
+    ordering.push_back(T(sensor))
+    ordering.push_back(D(sensor))
+    own = gtsam.GaussianFactorGraph()
+    for index in range(linear.size()):
+        if set(linear.at(index).keys()) <= {T(sensor), D(sensor)}:
+            own.push_back(linear.at(index))
+    jacobian, _ = own.jacobian(ordering)
+    scale = 1 / np.linalg.norm(jacobian, axis=0)
+    triangular = np.asarray(np.linalg.qr(jacobian * scale, mode="r"))
+    root = scale[:, None] * solve_triangular(triangular, np.eye(15))
+    return np.asarray(root @ root.T)

@@ -13,7 +13,7 @@ from l2m_gtsam.graph.calibration import (
     batch_readings,
     prior_graph,
     reading_graph,
-    sensor_covariance,
+    sensor_covariances,
     whitened_jacobian,
 )
 from l2m_gtsam.graph.optimise import Ending, optimise
@@ -129,21 +129,21 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
 def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
     """Return covariance and figures of every sensor at the optimum of its own weights."""
     values = estimate.values(problem.view.sensors)
-    marginals = gtsam.Marginals(problem.graph, values)
-    step = problem.graph.linearize(values).optimize()
+    covariances = sensor_covariances(problem.graph, values, problem.view.sensors)
+    gradients = problem.graph.linearize(values).gradientAtZero()
     W = whitening(problem.covariance)
     solutions = []
     for s in problem.view.sensors:
         rows, test = problem.batch.rows_of(s), problem.determinacies[s]
         residual = problem.batch.residuals(values, s).residual[rows]
-        remaining = problem.jacobians[s] @ np.concatenate([step.at(T(s)), step.at(D(s))])
+        gradient = np.concatenate([gradients.at(T(s)), gradients.at(D(s))])
         solutions.append(
             SensorSolution(
                 sensor=s,
-                covariance=_with_infinities(sensor_covariance(marginals, s), test),
+                covariance=_with_infinities(covariances[s], test),
                 figures=residual_figures(residual, W[rows]),
                 determinacy=test,
-                remaining_sigmas=float(np.linalg.norm(remaining)),
+                remaining_sigmas=float(np.sqrt(gradient @ covariances[s] @ gradient)),
             )
         )
     return tuple(solutions)

@@ -33,7 +33,7 @@ class OneKeySolution:
     Attributes
     ----------
     estimate
-        Values of all S sensors; those not solved stay at the start.
+        Values of all S sensors; what stands for one that is not solved means nothing.
     solved
         Solutions of the sensors that have enough readings inside the map.
     inside
@@ -42,6 +42,8 @@ class OneKeySolution:
         Alternations taken.
     ending
         How the last joint optimisation ended.
+    settled
+        Whether estimate and weights agree: another round would repeat the last.
     """
 
     estimate: Estimate
@@ -49,6 +51,7 @@ class OneKeySolution:
     inside: BoolArray
     steps: int
     ending: Ending
+    settled: bool
 
 
 def solve_one_key(
@@ -75,10 +78,10 @@ def solve_one_key(
     """
     tell = progress or (lambda stage, fraction: None)
     near = alternate(readings, field_map, start_estimate(t_start, options), options, tell)
-    estimate, ending = near.estimate, Ending.TOLERANCE
+    estimate, ending, settled = near.estimate, Ending.TOLERANCE, False
     view = observe(readings, field_map, estimate, options.min_readings)
     if not view.sensors:
-        return OneKeySolution(estimate, (), view.inside, near.steps, ending)
+        return OneKeySolution(estimate, (), view.inside, near.steps, ending, settled)
     for round_ in range(MAX_ROUNDS):
         tell("joint graph", round_ / MAX_ROUNDS)
         problem = joint_problem(view, field_map, estimate, options)
@@ -91,8 +94,8 @@ def solve_one_key(
         if moved > REOBSERVE_M:
             view = observe(readings, field_map, estimate, options.min_readings)
     tell("joint graph", 1.0)
-    solved = sensor_solutions(problem, estimate)
-    return OneKeySolution(estimate, solved, view.inside, near.steps, ending)
+    solved = sensor_solutions(joint_problem(view, field_map, estimate, options), estimate)
+    return OneKeySolution(estimate, solved, view.inside, near.steps, ending, settled)
 
 
 def _noise_settled(before: Estimate, after: Estimate) -> bool:

@@ -1,5 +1,8 @@
 """Results as tables in the terminal."""
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
@@ -57,8 +60,8 @@ def honesty_note(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> s
         return "no sensor was solved"
     rms = float(np.sqrt(np.mean(np.square(ratios))))
     return (
-        f"errors of t are {rms:.1f} times their sigmas (rms, 1 is honest): the sliding GP's own "
-        "errors are correlated along the drive, and its sigmas count them as independent"
+        f"errors of t are {rms:.1f} times their sigmas (rms, 1 is honest): the map's own errors "
+        "are correlated along the drive, and the sigmas count them as independent"
     )
 
 
@@ -96,8 +99,17 @@ def _number(value: float, form: str) -> str:
     return "" if np.isnan(value) else format(value, form)
 
 
-def map_table(summary: MapSummary) -> Table:
-    """Return what a map is made of and what it covers."""
+@dataclass(frozen=True)
+class MapDescription:
+    """A map's figures and where it came from: plain values of its file."""
+
+    summary: MapSummary
+    provenance: dict[str, Any]
+
+
+def map_table(description: MapDescription) -> Table:
+    """Return what a map is made of, what it covers and where it came from."""
+    summary = description.summary
     table = Table("fact", "value", title="Magnetic map", title_justify="left")
     table.add_row("kind", summary.kind)
     table.add_row("readings given, rows kept", f"{summary.readings:,}, {summary.rows:,}")
@@ -106,6 +118,10 @@ def map_table(summary: MapSummary) -> Table:
     for name, value in summary.facts.items():
         shown = f"{value:.4g}" if isinstance(value, float) else str(value)
         table.add_row(escape(name), escape(shown))
+    for name in ("frame", "version"):
+        table.add_row(name, escape(str(description.provenance.get(name, "unknown"))))
+    for source in description.provenance.get("bags", []):
+        table.add_row("made from", escape(", ".join(str(value) for value in source.values())))
     return table
 
 

@@ -39,8 +39,8 @@ class Determinacy:
     Attributes
     ----------
     held
-        Rows that span what is not determined, in parameters divided by their scale,
-        orthonormal there, shape (K, 15).
+        Rows over the parameters that span what is not determined, shape (K, 15): a prior of unit
+        variance on each holds it.
     names
         One name per undetermined direction: the parameters that take part in it.
     touched
@@ -73,7 +73,9 @@ def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
     simple = _simple_basis(weak)
     names = tuple(_name(row) for row in simple)
     touched = np.sum(weak**2, axis=0) > 1e-4  # a share of one per cent in length
-    return Determinacy(weak / options.scale(), names, touched)
+    # Stiff enough to be factorised beside the best determined direction.
+    stiffness = max(1.0, 1e-5 * float(s[0]))
+    return Determinacy(stiffness * weak / options.scale(), names, touched)
 
 
 def _simple_basis(rows: FloatArray) -> FloatArray:

@@ -60,7 +60,29 @@ def polar_rotation(C: FloatArray, covariance: FloatArray) -> PolarRotation:
             skew[axis, 3 * row + j] += R[row, i]
             skew[axis, 3 * row + i] -= R[row, j]
     J = R @ np.linalg.solve(np.trace(P) * np.eye(3) - P, skew)
-    return PolarRotation(R, J @ covariance @ J.T)
+    return PolarRotation(R, _propagated(J, covariance))
+
+
+def _propagated(J: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return ``J covariance J^T``; what rests on an infinite variance is infinite itself."""
+    unknown = np.isinf(np.diag(covariance))
+    finite = np.where(unknown[:, None] | unknown, 0.0, covariance)
+    result = J @ finite @ J.T
+    # 1e-9 separates a part that is zero but for rounding from one that is not.
+    open_ = np.abs(J[:, unknown]).max(axis=1, initial=0.0) > 1e-9
+    result[open_, :] = 0.0
+    result[:, open_] = 0.0
+    result[open_, open_] = np.inf
+    return np.asarray(result)
+
+
+def dead_axis(C: FloatArray) -> str | None:
+    """Return the sensor axis that does not follow the field, if one does not.
+
+    Its row of C is less than a tenth of the longest: scale and soft iron stay well above that.
+    """
+    gain = np.linalg.norm(C, axis=1)
+    return AXES[int(np.argmin(gain))] if gain.min() < 0.1 * gain.max() else None
 
 
 def flipped_axis(C: FloatArray) -> str:

@@ -37,12 +37,13 @@ OTHER_CLOCK_NS = 3_600_000_000_000
 class Buffers:
     """Everything that one pass over a bag collects.
 
-    Fields by topic and frame, poses of a topic by frame and child frame, links of tf by child.
+    Fields by topic and frame, poses of a topic by frame and child frame, links of tf by
+    parent and child.
     """
 
     fields: dict[tuple[str, str], FieldBuffer] = field(default_factory=dict)
     poses: dict[tuple[str, str], PoseBuffer] = field(default_factory=dict)
-    links: dict[str, PoseBuffer] = field(default_factory=dict)
+    links: dict[tuple[str, str], PoseBuffer] = field(default_factory=dict)
 
 
 def read_recording(path: Path, options: BagOptions, progress: Progress | None = None) -> Recording:
@@ -141,7 +142,9 @@ def _add_transforms(buffers: Buffers, message: Message, options: BagOptions) -> 
     static = "tf_static" in message.connection.topic
     for item in message.content.transforms:
         parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
-        buffer = buffers.links.setdefault(child, PoseBuffer(parent, child, static=static))
+        if (parent, child) not in buffers.links:
+            buffers.links[parent, child] = PoseBuffer(parent, child, static=static)
+        buffer = buffers.links[parent, child]
         stamp = _stamp(message, item, options)
         buffer.add(stamp, item.transform.translation, item.transform.rotation)
 
@@ -158,7 +161,12 @@ def _trajectory(path: Path, buffers: Buffers, options: BagOptions) -> Trajectory
         raise BagError(f"{path}: poses: {error}") from error
     _check_stamps(path, "poses", tracked.stamp_ns)
     fixed = options.tracked_to_lidar.rigid()
-    return replace(tracked, R=tracked.R @ fixed.R, p=tracked.R @ fixed.t + tracked.p)
+    return replace(
+        tracked,
+        R=tracked.R @ fixed.R,
+        p=tracked.R @ fixed.t + tracked.p,
+        frame=options.frame or tracked.frame,
+    )
 
 
 def _single(path: Path, buffers: Buffers) -> Trajectory:
@@ -176,16 +184,20 @@ def _single(path: Path, buffers: Buffers) -> Trajectory:
 def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:
     """Return the poses of a chain; a fault in a link beside it does not matter."""
     frame, child_frame = chain.frame.lstrip("/"), chain.child_frame.lstrip("/")
-    parents = {child: buffer.frame for child, buffer in buffers.links.items()}
+    parents = {child: parent for parent, child in buffers.links}
     needed = ancestors(parents, frame) | ancestors(parents, child_frame)
     links: dict[str, Link] = {}
-    for child, buffer in buffers.links.items():
+    for (parent, child), buffer in buffers.links.items():
+        if child in needed and child in links:
+            raise ValueError(
+                f"tf gives {child!r} two parents, {links[child].parent!r} and {parent!r}"
+            )
         try:
             links[child] = buffer.link()
         except ValueError:
             if child in needed:
                 raise
-    return compose(links, frame, child_frame, str(path))
+    return compose(links, frame, child_frame, chain.max_gap_s, str(path))
 
 
 def _all_series(
@@ -217,8 +229,8 @@ def _check_frames(path: Path, keys: list[tuple[str, str]]) -> None:
 
 def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> FieldSeries:
     """Return one sensor's readings in uT, in order of time."""
-    stamps, first = np.unique(buffer.stamps(), return_index=True)
-    values = buffer.field()[first] * MICROTESLA_PER[options.units]
+    order = np.argsort(buffer.stamps(), kind="stable")
+    stamps, values = buffer.stamps()[order], buffer.field()[order] * MICROTESLA_PER[options.units]
     _check_stamps(path, f"topic {buffer.topic}", stamps)
     if wrong := fault(strength(values), is_turning(values), options.units):
         raise UnitsError(f"{path}: topic {buffer.topic}: {wrong}")

@@ -1,9 +1,10 @@
 """What is read from a recording, and how."""
 
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import RigidTransform
@@ -26,6 +27,8 @@ class TfChain(Options):
     """Reference frame, for example `map`."""
     child_frame: str
     """Tracked frame, for example `base_link`."""
+    max_gap_s: float = Field(default=1.0, gt=0)
+    """No pose is made where two transforms of a link in the chain are further apart."""
 
 
 class FixedTransform(Options):
@@ -54,7 +57,7 @@ class FixedTransform(Options):
 class BagOptions(Options):
     """What is read from a recording, and how."""
 
-    fields: tuple[str, ...] = ("*",)
+    fields: Annotated[tuple[str, ...], Field(min_length=1)] = ("*",)
     """Topics of type sensor_msgs/MagneticField, names or globs; the leading slash does not
     matter."""
     split_by_frame: bool = False
@@ -67,6 +70,8 @@ class BagOptions(Options):
     """Compose the poses from /tf and /tf_static instead."""
     tracked_to_lidar: FixedTransform = FixedTransform()
     """T_tracked_lidar: the lidar in the frame that the poses track."""
+    frame: str | None = None
+    """Name to give the frame that the poses are in, where the bag calls the map's otherwise."""
     stamps: Stamps = Stamps.HEADER
     """`header`, or `record` for the time at which the bag received a message."""
     units: Unit = Unit.AUTO

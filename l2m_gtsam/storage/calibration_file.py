@@ -1,10 +1,10 @@
 """``calibration.yaml``: everything about each sensor, with formulas and units inside."""
 
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import (
@@ -35,7 +35,7 @@ MODEL = {
     "t_lidar_mag": "position of the sensor in the lidar frame",
     "rotation": (
         "C = R_mag_lidar @ P with P symmetric positive (proper polar factor); "
-        "q_lidar_mag is the transpose of R_mag_lidar as a quaternion x, y, z, w"
+        "R_lidar_mag is its transpose; quaternions are x, y, z, w"
     ),
     "rotation_covariance": "of the error e in the mag frame: true = exp(e) @ R_mag_lidar",
     "covariance_order": "t_x t_y t_z C_xx C_xy C_xz C_yx C_yy C_yz C_zx C_zy C_zz H_x H_y H_z",
@@ -44,6 +44,7 @@ MODEL = {
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
+Row15 = Annotated[list[float], Field(min_length=15, max_length=15)]
 
 
 class _Lenient(BaseModel):
@@ -53,13 +54,35 @@ class _Lenient(BaseModel):
 
 
 class _Known(_Lenient):
-    t_lidar_mag: Vector = (0.0, 0.0, 0.0)
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    t_lidar_mag: Vector
     C: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     H: Vector = (0.0, 0.0, 0.0)
+
+    @field_validator("C")
+    @classmethod
+    def _invertible(cls, C: Matrix) -> Matrix:
+        if np.linalg.cond(np.array(C)) > 1e6:  # gains a million apart are no magnetometer's
+            raise ValueError("C cannot be inverted, so that its readings say nothing of the field")
+        return C
 
 
 class _KnownFile(_Lenient):
     sensors: dict[str, _Known] = Field(min_length=1)
+
+    @field_validator("sensors", mode="before")
+    @classmethod
+    def _known_ones(cls, sensors: Any) -> Any:
+        """Leave out what a calibration could not solve: it is not known."""
+        if not isinstance(sensors, dict):
+            return sensors
+        solved = SensorStatus.SOLVED.value
+        return {
+            name: entry
+            for name, entry in sensors.items()
+            if not isinstance(entry, dict) or entry.get("status", solved) == solved
+        }
 
 
 class _Residuals(_Lenient):
@@ -75,6 +98,7 @@ class _Residuals(_Lenient):
 class _Counts(_Lenient):
     received: int
     not_finite: int
+    repeated: int
     outside_trajectory: int
     in_pose_gap: int
     thinned: int
@@ -88,7 +112,7 @@ class _Sensor(_Lenient):
     C: Matrix
     H: Vector
     R_lidar_mag: Matrix
-    covariance: list[list[float]]
+    covariance: Annotated[list[Row15], Field(min_length=15, max_length=15)]
     rotation_covariance: Matrix
     noise: float
     residuals: _Residuals | None
@@ -178,7 +202,8 @@ def write_known_sensors(
 def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     """Return the sensors of a truth, of a mapping suite or of a calibration, by name.
 
-    What an entry leaves out is ideal: at the lidar's origin, C = I, H = 0.
+    Without C and H an entry is free of distortion: C = I, H = 0. Sensors that a calibration could
+    not solve are left out.
 
     Raises
     ------

@@ -61,7 +61,9 @@ class Link:
         return Link(self.child, self.parent, self.stamp_ns, R, p)
 
 
-def compose(links: dict[str, Link], frame: str, child_frame: str, where: str) -> Trajectory:
+def compose(
+    links: dict[str, Link], frame: str, child_frame: str, max_gap_s: float, where: str
+) -> Trajectory:
     """Return the poses of ``child_frame`` in ``frame`` at the stamps of the fastest link between.
 
     Parameters
@@ -70,6 +72,8 @@ def compose(links: dict[str, Link], frame: str, child_frame: str, where: str) ->
         Links by child frame.
     frame, child_frame
         Ends of the chain.
+    max_gap_s
+        Stamps within a longer gap of any moving link get no pose, in seconds.
     where
         Name of the bag, for errors.
 
@@ -89,12 +93,21 @@ def compose(links: dict[str, Link], frame: str, child_frame: str, where: str) ->
     end = min(int(link.stamp_ns[-1]) for link in moving)
     fastest = max(moving, key=lambda link: len(link.stamp_ns)).stamp_ns
     stamps = fastest[(fastest >= start) & (fastest <= end)]
+    for link in moving:
+        stamps = stamps[_bracket_ns(link.stamp_ns, stamps) <= max_gap_s * 1e9]
     R, p = np.broadcast_to(np.eye(3), (len(stamps), 3, 3)), np.zeros((len(stamps), 3))
     for link in chain:
         step = link.at(stamps)
         p = p + np.einsum("nij,nj->ni", R, step.p)
         R = R @ step.R
     return Trajectory(stamps, R, p, frame, child_frame)
+
+
+def _bracket_ns(link_ns: IntArray, stamps: IntArray) -> IntArray:
+    """Return the time between the two transforms around each stamp, 0 on a transform."""
+    after = np.searchsorted(link_ns, stamps)
+    before = np.searchsorted(link_ns, stamps, side="right") - 1
+    return np.asarray(link_ns[after] - link_ns[before])
 
 
 def ancestors(parents: dict[str, str], frame: str) -> set[str]:

@@ -76,6 +76,45 @@ def mixed(world: DipoleWorld, sensors: tuple[KnownSensor, ...]) -> CalibrationRe
     return calibrate(replace(recording, series=tuple(series)), world, CalibrationOptions(), source)
 
 
+def test_a_dead_axis_is_named(world: DipoleWorld, sensors: tuple[KnownSensor, ...]) -> None:
+    """One axis without signal has no polar factor worth reporting."""
+    recording = recorded_drive(world, sensors[:1])
+    field = recording.series[0].field.copy()
+    field[:, 1] = 3.0 + 0.05 * np.sin(np.arange(len(field)))
+    series = (replace(recording.series[0], field=field),)
+    found = calibrate(replace(recording, series=series), world, CalibrationOptions())["mag_00"]
+    assert found.status is SensorStatus.DEAD_AXIS
+    assert "y axis does not follow the field" in found.message
+    assert np.isnan(found.R_lidar_mag).all()
+
+
+def test_what_planar_motion_leaves_open_is_named_in_result_and_file(
+    world: DipoleWorld, tmp_path: Path
+) -> None:
+    """A vertical field that never varies: C's third column against H, infinite variance for it."""
+    flat = DipoleWorld(world.uniform, world.positions, world.moments * 0)
+    sensor = KnownSensor("m", np.zeros(3), Distortion.identity())
+    recording = recorded_drive(flat, (sensor,))
+    headings = np.outer(0.5 * np.arange(len(recording.trajectory)), [0, 0, 1])
+    yaw = Rotation.from_rotvec(headings).as_matrix()
+    b = np.einsum("nji,j->ni", yaw, flat.uniform)
+    series = (replace(recording.series[0], field=b + 0.0),)
+    planar = replace(recording, series=series, trajectory=replace(recording.trajectory, R=yaw))
+    result = calibrate(planar, flat, CalibrationOptions())
+    found = result["m"]
+    assert found.status is SensorStatus.UNDETERMINED
+    for name in ("t_x", "t_y", "t_z", "C_xz with H_x", "C_yz with H_y", "C_zz with H_z"):
+        assert name in found.undetermined
+    assert np.isinf(found.t_sigma).all()
+    assert np.isinf(found.C_sigma[:, 2]).all()
+    assert np.isfinite(found.C_sigma[:, :2]).all()
+    rotation_sigma = np.sqrt(np.diag(found.rotation_covariance))
+    assert np.isinf(rotation_sigma[:2]).all()
+    assert np.isfinite(rotation_sigma[2])  # heading follows from the horizontal field alone
+    write_calibration(tmp_path / "c.yaml", result)
+    assert_equal(read_calibration(tmp_path / "c.yaml"), result)
+
+
 def test_good_sensors_are_solved_beside_bad_ones(
     mixed: CalibrationResult, sensors: tuple[KnownSensor, ...]
 ) -> None:
@@ -164,7 +203,10 @@ def test_known_sensors_round_trip(sensors: tuple[KnownSensor, ...], tmp_path: Pa
 
 def test_a_calibration_serves_as_a_suite(mixed: CalibrationResult, tmp_path: Path) -> None:
     write_calibration(tmp_path / "c.yaml", mixed)
-    known = read_known_sensors(tmp_path / "c.yaml")["mag_00"]
+    suite = read_known_sensors(tmp_path / "c.yaml")
+    assert len(suite) == 9
+    assert "mag_03" not in suite
+    known = suite["mag_00"]
     np.testing.assert_array_equal(known.t_lidar_mag, mixed["mag_00"].t_lidar_mag)
     np.testing.assert_array_equal(known.distortion.C, mixed["mag_00"].distortion.C)
 
@@ -175,6 +217,12 @@ def test_a_calibration_serves_as_a_suite(mixed: CalibrationResult, tmp_path: Pat
         ("sensors: {}", "sensors"),
         ("hello", "the file"),
         ("sensors: {a: {t_lidar_mag: [1, 2]}}", "sensors.a.t_lidar_mag"),
+        ("sensors: {a: {t: [1, 2, 3]}}", "sensors.a.t_lidar_mag: Field required"),
+        ("sensors: {a: {t_lidar_mag: [1, 2, .nan]}}", "finite number"),
+        (
+            "sensors: {a: {t_lidar_mag: [0, 0, 0], C: [[0, 0, 0], [0, 1, 0], [0, 0, 1]]}}",
+            "C cannot be inverted",
+        ),
         ("a: [1", "not valid YAML"),
         ("!!python/object/apply:os.getcwd []", "not valid YAML"),
     ],

@@ -51,6 +51,26 @@ def test_everything_dropped_is_counted() -> None:
     assert (counts.in_pose_gap, counts.thinned, counts.kept) == (1, 0, 5)
 
 
+def test_repeated_stamps_are_counted_and_the_finite_one_is_kept() -> None:
+    poses = turning_drive(np.arange(0, 3, 0.1))
+    stamps = np.array([0.5, 0.5, 0.5, 1.0, 1.0])
+    field = np.tile([20.0, 0, -40], (5, 1))
+    field[0, 0] = np.nan
+    result = synchronise(recording(poses, series(stamps, field)), KEEP_ALL)
+    counts = result.counts[0]
+    assert (counts.received, counts.not_finite, counts.repeated, counts.kept) == (5, 1, 2, 2)
+
+
+def test_a_vehicle_at_rest_at_the_origin_keeps_one_reading() -> None:
+    """Cells are centred on zero, where parked vehicles stand: jitter must not cross an edge."""
+    rng = np.random.default_rng(2)
+    stamps = np.arange(0, 100, 0.1)
+    R = Rotation.from_rotvec(rng.normal(0, 1e-4, (1000, 3))).as_matrix()
+    p = rng.normal(0, 1e-3, (1000, 3))
+    poses = Trajectory(at(1.7e9) + at(stamps), R, p, "map", "lidar")
+    assert synchronise(recording(poses, series(stamps)), SyncOptions()).counts[0].kept == 1
+
+
 def test_a_reading_on_a_pose_needs_no_neighbour() -> None:
     poses = turning_drive(np.array([0.0, 10.0, 20.0]))
     result = synchronise(recording(poses, series(np.array([0.0, 10.0, 15.0, 20.0]))), KEEP_ALL)
@@ -62,7 +82,7 @@ def test_thinning_keeps_one_reading_per_cell() -> None:
     rng = np.random.default_rng(1)
     stamps = np.arange(0, 100, 0.1)
     x = np.clip(stamps - 30, 0, 40)  # parked, 40 m drive, parked
-    p = np.outer(x, [1.0, 0, 0]) + rng.normal(0, 1e-3, (1000, 3)) + 0.25
+    p = np.outer(x, [1.0, 0, 0]) + rng.normal(0, 1e-3, (1000, 3))
     poses = Trajectory(at(1.7e9) + at(stamps), np.tile(np.eye(3), (1000, 1, 1)), p, "map", "lidar")
     options = SyncOptions(thin_distance_m=0.5, thin_angle_deg=5)
     result = synchronise(recording(poses, series(stamps)), options)
