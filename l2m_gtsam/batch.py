@@ -63,6 +63,7 @@ def build_map_file(
     L2MError
         Whatever is wrong with the input, in one line.
     """
+    _check_outputs(out, suffix=".npz")
     known = None if suite is None else read_known_sensors(suite)
     recordings = [_read(bag, config, progress) for bag in bags]
     progress("building the map", 0.0)
@@ -98,6 +99,7 @@ def describe_map_file(path: Path, progress: Progress) -> MapDescription:
 
 def plot_map_file(path: Path, out: Path, height: float | None, progress: Progress) -> None:
     """Draw a map at a height in metres (the middle of its readings if None) as a picture."""
+    _check_outputs(out, suffix=".png")
     field_map = map_of(load_map(path), progress)
     _ensure_folder(out.parent)
     save_figure(map_figure(field_map, height), out)
@@ -131,6 +133,7 @@ def calibrate_bag(
     L2MError
         Whatever is wrong with the input, in one line; nothing is written then.
     """
+    _check_outputs(out / CALIBRATION_FILE, out / OVERVIEW_FILE)
     recording = _read(bag, config, progress)
     state = load_map(map_path)
     field_map, map_frame = map_of(state, progress), state.provenance.get("frame")
@@ -209,6 +212,17 @@ def _read(bag: Path, config: Config, progress: Progress) -> Recording:
 def _counter(stage: str, progress: Progress) -> Callable[[int, int], None]:
     """Return what a reader calls with the messages read and their number."""
     return lambda done, total: progress(stage, done / max(total, 1))
+
+
+def _check_outputs(*files: Path, suffix: str | None = None) -> None:
+    """Raise an OutputError, before any work is done, for files that cannot be written."""
+    for file in files:
+        if suffix is not None and file.suffix != suffix:
+            raise OutputError(f"{file}: the name must end in {suffix}")
+        if file.exists() and not file.is_file():
+            raise OutputError(f"{file}: exists and is not a regular file; choose another --out")
+        if file.parent.exists() and not file.parent.is_dir():
+            raise OutputError(f"{file.parent}: is a file, --out needs a folder; choose another")
 
 
 def _ensure_folder(folder: Path) -> None:

@@ -15,6 +15,8 @@ import typer
 from l2m_gtsam.errors import L2MError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from l2m_gtsam.batch import Progress
 
 app = typer.Typer(
@@ -79,7 +81,7 @@ def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
 @app.command()
 def simulate(
     out: OutOption,
-    seed: Annotated[int, typer.Option(help="Seed of world, drives and sensors.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of world, drives and sensors.")] = 1,
     kind: Annotated[
         list[str] | None, typer.Option(help="ros1, sqlite3 or mcap; all three if not given.")
     ] = None,
@@ -109,17 +111,19 @@ def calibrate(
     from l2m_gtsam.batch import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import calibration_table
+    from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
     with _progress() as progress:
         result = calibrate_bag(bag, map_path, load_config(config), out, progress)
     _print(calibration_table(result))
+    typer.echo(UNCERTAINTY)
     typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
 
 
 @app.command()
 def demo(
     out: OutOption = Path("demo_out"),
-    seed: Annotated[int, typer.Option(help="Seed of world, drives and sensors.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of world, drives and sensors.")] = 1,
 ) -> None:
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     from l2m_gtsam.demo import run_demo
@@ -183,12 +187,15 @@ def map_plot(
     typer.echo(f"written: {out}")
 
 
-def _print(table: object) -> None:
-    """Print a table in the terminal's width, or unbroken where the output is not a terminal."""
+def _print(table: "Table") -> None:
+    """Print a table as wide as its numbers need: a narrow terminal wraps, it cuts no digits."""
     from rich.console import Console
+    from rich.measure import Measurement
 
     console = Console()
-    Console(width=None if console.is_terminal else 200, soft_wrap=False).print(table)
+    wide = console.options.update(width=1000)
+    needed = Measurement.get(console, wide, table).minimum
+    Console(width=max(needed, console.width if console.is_terminal else 200)).print(table)
 
 
 @contextmanager

@@ -39,7 +39,8 @@ def map_recordings(
     """
     frames = sorted({recording.trajectory.frame for recording in recordings})
     if len(frames) > 1:
-        msg = f"the recordings' poses are in different frames ({', '.join(frames)}); one is needed"
+        named = ", ".join(f"{r.source.path} in {r.trajectory.frame!r}" for r in recordings)
+        msg = f"the recordings' poses are in different frames: {named}; one map frame is needed"
         raise MapError(msg)
     points, fields = [], []
     for recording in recordings:

@@ -16,6 +16,7 @@ from l2m_gtsam.data import (
     SensorCalibration,
     Trajectory,
 )
+from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.storage.atomic import atomic_path
 
@@ -59,9 +60,22 @@ def slice_map(field_map: FieldMap, height: float) -> MapSlice:
 
 
 def map_figure(field_map: FieldMap, height: float | None) -> Figure:
-    """Draw strength and uncertainty of a map at a height (the middle of its readings if None)."""
+    """Draw strength and uncertainty of a map at a height (the middle of its readings if None).
+
+    Raises
+    ------
+    MapError
+        The map has no data at this height.
+    """
     level = _middle(field_map) if height is None else height
     cut = slice_map(field_map, level)
+    if not np.isfinite(cut.strength).any():
+        low, high = field_map.summary.lower[2], field_map.summary.upper[2]
+        msg = (
+            f"the map has no data at z = {level:g} m, its readings run from {low:.2f} to "
+            f"{high:.2f} m"
+        )
+        raise MapError(msg)
     figure = _figure(12, 5)
     for axes, image, label, colours in zip(
         figure.subplots(1, 2, sharex=True, sharey=True),

@@ -22,12 +22,17 @@ def calibration_table(result: CalibrationResult) -> Table:
     """Return one row per sensor: position, sigma, offset, scale, rotation, residual, status."""
     table = Table(title="Calibration: B_meas = C @ B_lidar + H", title_justify="left")
     table.add_column("sensor")
-    table.add_column("t_lidar_mag (m)", justify="right")
-    table.add_column("± (mm)", justify="right")
-    table.add_column("H (uT)", justify="right")
-    table.add_column("|C - R| max", justify="right")
-    table.add_column("rotation (deg)", justify="right")
-    table.add_column("residual (uT)", justify="right")
+    for heading in (
+        "t_lidar_mag (m)",
+        "± (mm)",
+        "H (uT)",
+        "|C - R| max",
+        "rotation (deg)",
+        "|residual| rms (uT)",
+        "readings used",
+        "outside map",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("status")
     for sensor in result.sensors:
         table.add_row(*_calibration_row(sensor))
@@ -39,11 +44,9 @@ def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Ta
     table = Table(title="Truth and estimate", title_justify="left")
     table.add_column("sensor")
     for heading in ("true t (m)", "estimated t (m)", "error (mm)", "sigma (mm)"):
-        table.add_column(heading, justify="right")
-    table.add_column("|C error|", justify="right")
-    table.add_column("sigma", justify="right")
-    table.add_column("|H error| (uT)", justify="right")
-    table.add_column("sigma", justify="right")
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("|C error|", "sigma", "|H error| (uT)", "sigma"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for known in truth:
         table.add_row(*_truth_row(known, result[known.sensor]))
     return table
@@ -128,7 +131,7 @@ def map_table(description: MapDescription) -> Table:
 def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
     status = _status(sensor)
     if sensor.residuals is None:
-        return (escape(sensor.sensor), *("-",) * 6, status)
+        return (escape(sensor.sensor), *("-",) * 7, f"{sensor.outside_map:,}", status)
     distortion, R = sensor.distortion, sensor.R_lidar_mag.T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
     return (
@@ -139,6 +142,8 @@ def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
         f"{np.abs(distortion.C - R).max():.3f}",
         f"{angle:.2f}",
         f"{sensor.residuals.rms:.3f}",
+        f"{sensor.residuals.readings:,}",
+        f"{sensor.outside_map:,}",
         status,
     )
 

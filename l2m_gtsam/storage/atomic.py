@@ -31,6 +31,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
     OutputError
         The folder is missing or the file cannot be written.
     """
+    if path.exists() and not path.is_file():
+        msg = f"{path}: cannot be written: it exists and is not a regular file"
+        raise OutputError(msg)
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         temporary.touch(exist_ok=False)

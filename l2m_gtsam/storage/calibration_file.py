@@ -27,7 +27,13 @@ VERSION = 1
 HEADER = """Calibration of magnetometers against a LiDAR, written by l2m_gtsam.
 Formulas, frames and units stand under `model`; each sensor has its own entry under `sensors`."""
 
+UNCERTAINTY = (
+    "sigmas count the map's errors as independent from reading to reading; where the map is less "
+    "sure than the sensor they are too small"
+)
+
 MODEL = {
+    "uncertainty": UNCERTAINTY,
     "measurement": "B_meas = C @ B_lidar + H",
     "correction": "B_lidar = inv(C) @ (B_meas - H)",
     "units": {"B": "uT", "H": "uT", "C": "1", "t": "m", "rotation": "rad", "noise": "uT"},

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Connection
 
-from l2m_gtsam.data import IntArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
 from l2m_gtsam.storage.messages import (
@@ -117,6 +117,9 @@ def inspect_bag(path: Path, options: BagOptions, progress: Progress | None = Non
     obstacles += [
         f"{r.topic}: {r.use}" for r in reports if r.use.startswith("refused") and r.topic in uses
     ]
+    fields_used = [r for r in reports if r.topic in uses and r.strength is not None]
+    if fields_used and not any(r.strength.readings for r in fields_used if r.strength):
+        obstacles.append("no finite reading in any of the magnetic topics")
     # a static transform holds from any time on
     used = [r for r in reports if r.topic in uses and "tf_static" not in r.topic]
     return BagReport(path, tuple(reports), (*obstacles, *_clock_obstacles(used, options)))
@@ -195,7 +198,7 @@ def _report(
         msgtype=msgtype,
         frames=tuple(sorted(found.frames)),
         count=count,
-        rate_hz=float(1 / np.median(gaps)) if len(gaps) else count / duration_s,
+        rate_hz=_rate(gaps, count, duration_s),
         longest_gap_s=float(gaps.max()) if len(gaps) else float("nan"),
         span_s=_span(header),
         clock_offset_s=float(np.median(record - header)) * 1e-9 if len(header) else float("nan"),
@@ -205,6 +208,13 @@ def _report(
         if msgtype == FIELD_TYPE and len(found.frames) > 1 and not options.split_by_frame
         else _use(use, measured, is_turning(values), options, msgtype),
     )
+
+
+def _rate(gaps: FloatArray, count: int, duration_s: float) -> float:
+    """Return the rate of a topic in Hz; one message has none."""
+    if len(gaps):
+        return float(1 / np.median(gaps))
+    return count / duration_s if count > 1 else float("nan")
 
 
 def _span(stamps: IntArray) -> tuple[float, float]:
@@ -221,7 +231,8 @@ def _use(
         if wrong:
             return f"refused: {wrong}"
     if use is not None:
-        return use
+        silent = measured is not None and not measured.readings
+        return f"{use}, but none is finite: the sensor is dead" if silent else use
     if msgtype == FIELD_TYPE:
         return "not chosen by bag.fields"
     if msgtype in POSE_TYPES:

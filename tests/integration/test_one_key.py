@@ -9,9 +9,11 @@ from scipy.stats import chi2
 from l2m_gtsam.data import FieldSample, FloatArray, KnownSensor
 from l2m_gtsam.graph import one_key
 from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.calibration import FactorForm
+from l2m_gtsam.graph.calibration import FactorForm, _covariance_by_qr, sensor_covariances
+from l2m_gtsam.graph.joint import joint_problem
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.optimise import Optimizer
+from l2m_gtsam.graph.view import observe
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from tests.worlds import DipoleWorld, dipole_world, drive, random_sensors
 
@@ -168,3 +170,20 @@ def test_world_is_immutable_for_the_solver() -> None:
     second = solve_one_key(kept, world, np.zeros((2, 3)), OneKeyOptions())
     np.testing.assert_array_equal(first.estimate.t, second.estimate.t)
     np.testing.assert_array_equal(first.estimate.distortion, second.estimate.distortion)
+
+
+def test_both_ways_to_a_covariance_agree() -> None:
+    """GTSAM's marginals and the QR that stands in for them, relative to the sigmas."""
+    world, sensors = dipole_world(10), random_sensors(10, 2)
+    readings = drive(10, sensors, world, count=150, noise=0.2)
+    options = OneKeyOptions()
+    estimate = solve_one_key(readings, world, np.zeros((2, 3)), options).estimate
+    problem = joint_problem(observe(readings, world, estimate, 30), world, estimate, options)
+    values = estimate.values([0, 1])
+    marginals = sensor_covariances(problem.graph, values, [0, 1])
+    for sensor, covariance in marginals.items():
+        other = _covariance_by_qr(problem.graph.linearize(values), sensor)
+        sigma = np.sqrt(np.diag(covariance))
+        np.testing.assert_allclose(
+            other / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-6
+        )
