@@ -8,6 +8,8 @@ import gtsam
 # Smallest decrease of the error that counts, relative and absolute: tight, because a step more
 # costs little and what remains is judged afterwards in standard deviations.
 TOLERANCE = 1e-10
+# Relative rise of the error that the seams of a map explain: measured 3e-5.
+SEAM_RISE = 1e-3
 
 
 class Optimizer(StrEnum):
@@ -57,6 +59,27 @@ def optimise(
         return Optimised(start, Ending.SINGULAR)
     spent = engine.iterations() >= max_iterations
     return Optimised(values, Ending.ITERATION_LIMIT if spent else Ending.TOLERANCE)
+
+
+def polish(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, steps: int) -> gtsam.Values:
+    """Take Gauss-Newton steps to where the gradient vanishes, without asking the error.
+
+    A map of blocks leaves small steps in the error where readings cross from block to block. A
+    descent stops at them, a third of a standard deviation early in the simulated warehouse; the
+    gradient does not see them. A rise of the error beyond what such steps make is refused.
+    """
+    params = gtsam.GaussNewtonParams()
+    _limit(params, steps)
+    engine = gtsam.GaussNewtonOptimizer(graph, values, params)
+    try:
+        for _ in range(steps):
+            engine.iterate()
+    except RuntimeError as error:  # as above
+        if "ndetermina" not in str(error):
+            raise
+        return values
+    worst = (1 + SEAM_RISE) * graph.error(values) + SEAM_RISE
+    return engine.values() if graph.error(engine.values()) <= worst else values
 
 
 def _engine(
