@@ -94,7 +94,9 @@ def solve_one_key(
         if moved > REOBSERVE_M:
             view = observe(readings, field_map, estimate, options.min_readings)
     tell("joint graph", 1.0)
-    solved = sensor_solutions(joint_problem(view, field_map, estimate, options), estimate)
+    if not settled:  # the weights of the last round are not those of its result
+        problem = joint_problem(view, field_map, estimate, options)
+    solved = sensor_solutions(problem, estimate)
     return OneKeySolution(estimate, solved, view.inside, near.steps, ending, settled)
 
 
