@@ -66,8 +66,6 @@ class JointProblem:
         Covariance that the map contributes to each residual in uT^2, shape (N, 3, 3).
     covariance
         Covariance of each residual in uT^2, shape (N, 3, 3).
-    jacobians
-        Whitened derivatives by the 15 parameters of each sensor, shape (3 n, 15).
     determinacies
         Rank test of each sensor.
     graph
@@ -78,7 +76,6 @@ class JointProblem:
     batch: BatchedReadings
     map_share: FloatArray
     covariance: FloatArray
-    jacobians: dict[int, FloatArray]
     determinacies: dict[int, Determinacy]
     graph: gtsam.NonlinearFactorGraph
 
@@ -104,7 +101,7 @@ def joint_problem(
     tests = {s: determinacy(J, options.rank) for s, J in jacobians.items()}
     graph = reading_graph(batch, covariance, options.factors)
     graph.push_back(prior_graph(estimate, {s: test.held for s, test in tests.items()}))
-    return JointProblem(view, batch, share, covariance, jacobians, tests, graph)
+    return JointProblem(view, batch, share, covariance, tests, graph)
 
 
 def joint_step(problem: JointProblem, estimate: Estimate, options: OneKeyOptions) -> JointStep:
