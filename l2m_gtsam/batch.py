@@ -4,13 +4,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import CalibrationResult, MapState, Recording
+from l2m_gtsam.data import CalibrationResult, FloatArray, KnownSensor, MapState, Recording
 from l2m_gtsam.errors import MapError, OutputError
-from l2m_gtsam.mapping import map_recordings
+from l2m_gtsam.mapping import (
+    compare_recordings,
+    map_recordings,
+    refuse_structure,
+    update_map,
+)
 from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.qa.figures import calibration_figure, map_figure, save_figure
 from l2m_gtsam.qa.tables import MapDescription
@@ -22,6 +31,8 @@ from l2m_gtsam.storage.calibration_file import (
     write_calibration,
     write_known_sensors,
 )
+from l2m_gtsam.storage.cloud import read_cloud, write_cloud
+from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
 from l2m_gtsam.storage.map_file import load_map, save_map
@@ -30,6 +41,7 @@ Progress = Callable[[str, float], None]
 
 CALIBRATION_FILE = "calibration.yaml"
 OVERVIEW_FILE = "overview.png"
+SUITE_FILE, TRUTH_FILE, STRUCTURE_FILE = "suite.yaml", "truth.yaml", "structure.ply"
 
 
 @dataclass(frozen=True)
@@ -40,8 +52,45 @@ class BuiltMap:
     description: MapDescription
 
 
+@dataclass(frozen=True)
+class Structure:
+    """A structure cloud in the map frame in metres, shape (M, 3), and where it came from."""
+
+    points: FloatArray
+    provenance: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Mapping bags and what was given with them.
+
+    Attributes
+    ----------
+    recordings
+        One per bag.
+    suite
+        Sensors of the mapping suite by name; absent where all are ideal.
+    structure
+        What a LiDAR saw, if that was given.
+    """
+
+    recordings: list[Recording]
+    suite: dict[str, KnownSensor] | None
+    structure: Structure | None
+
+    @property
+    def cloud(self) -> FloatArray | None:
+        """Points of the structure in metres, shape (M, 3), if there is one."""
+        return None if self.structure is None else self.structure.points
+
+
 def build_map_file(
-    bags: Sequence[Path], out: Path, config: Config, suite: Path | None, progress: Progress
+    bags: Sequence[Path],
+    out: Path,
+    config: Config,
+    suite: Path | None,
+    progress: Progress,
+    structure: str | None = None,
 ) -> BuiltMap:
     """Build a map from mapping bags and write it.
 
@@ -57,6 +106,9 @@ def build_map_file(
         File with the mapping suite's calibrations; ideal sensors at the lidar's origin if absent.
     progress
         Called with a stage and the fraction of it that is done.
+    structure
+        What a LiDAR saw: a `.pcd`, `.ply` or `.npz` file in the map frame, else the name of a
+        PointCloud2 topic of the bags.
 
     Raises
     ------
@@ -64,23 +116,190 @@ def build_map_file(
         Whatever is wrong with the input, in one line.
     """
     _check_outputs(out, suffix=".npz")
-    known = None if suite is None else read_known_sensors(suite)
-    recordings = [_read(bag, config, progress) for bag in bags]
+    if structure is not None:
+        refuse_structure(config.mapping.model.kind)
+    survey = _read_survey(bags, config, suite, structure, progress)
     progress("building the map", 0.0)
-    field_map = map_recordings(recordings, known, config.mapping)
+    field_map = map_recordings(survey.recordings, survey.suite, config.mapping, survey.cloud)
     progress("building the map", 1.0)
-    state = field_map.to_state()
     provenance = {
-        "bags": [vars(recording.source) for recording in recordings],
+        "bags": [vars(recording.source) for recording in survey.recordings],
         "suite": None if suite is None else vars(source_file(suite)),
-        "frame": recordings[0].trajectory.frame,
+        "structure": None if survey.structure is None else survey.structure.provenance,
+        "frame": survey.recordings[0].trajectory.frame,
         "config": config.model_dump(mode="json", include={"bag", "mapping"}),
         "version": version("l2m-gtsam"),
     }
-    _ensure_folder(out.parent)
+    return _save_map(out, field_map, provenance)
+
+
+def update_map_file(
+    map_path: Path,
+    bags: Sequence[Path],
+    out: Path,
+    config: Config,
+    suite: Path | None,
+    progress: Progress,
+) -> BuiltMap:
+    """Add the readings of more mapping bags to a map, which keeps its kind and its prior.
+
+    Parameters
+    ----------
+    map_path
+        Map file; it stays as it is unless it is also `out`.
+    bags
+        One or several mapping bags that are not in the map yet, in its frame.
+    out
+        Map file to write (`.npz`).
+    config
+        Configuration, of which only what is read and synchronised counts.
+    suite
+        File with the mapping suite's calibrations; ideal sensors at the lidar's origin if absent.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    _check_outputs(out, suffix=".npz")
+    state = load_map(map_path)
+    known = _known_bags(map_path, state.provenance)
+    field_map = map_of(state, progress)
+    survey = _read_survey(bags, config, suite, None, progress)
+    for recording in survey.recordings:
+        _check_frame(map_path, state.provenance.get("frame"), recording)
+        _check_new(map_path, known, recording)
+    progress("updating the map", 0.0)
+    updated = update_map(field_map, survey.recordings, survey.suite, config.mapping)
+    progress("updating the map", 1.0)
+    added = [vars(recording.source) for recording in survey.recordings]
+    update = {
+        "bags": added,
+        "suite": None if suite is None else vars(source_file(suite)),
+        "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
+        "version": version("l2m-gtsam"),
+    }
+    provenance = {
+        **state.provenance,
+        **updated.to_state().provenance,
+        "bags": [*known, *added],
+        "updates": [*_list_of(state.provenance, "updates"), update],
+        "frame": survey.recordings[0].trajectory.frame,
+    }
+    return _save_map(out, updated, provenance)
+
+
+def compare_map_kinds(
+    bags: Sequence[Path],
+    config: Config,
+    suite: Path | None,
+    structure: str | None,
+    progress: Progress,
+) -> MapComparison:
+    """Compare the kinds of maps that mapping bags could become, on held-out places.
+
+    Parameters
+    ----------
+    bags, config, suite, structure, progress
+        As in ``build_map_file``; the structure only serves the kind that can use it.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    if structure is not None:
+        refuse_structure(*config.mapping.compare.kinds)
+    survey = _read_survey(bags, config, suite, structure, progress)
+    return compare_recordings(
+        survey.recordings, survey.suite, config.mapping, survey.cloud, progress
+    )
+
+
+def _read_survey(
+    bags: Sequence[Path],
+    config: Config,
+    suite: Path | None,
+    structure: str | None,
+    progress: Progress,
+) -> Survey:
+    """Return everything that a map is made of; files before bags, which take longer."""
+    known = None if suite is None else read_known_sensors(suite)
+    options = config.mapping.structure
+    is_file = structure is not None and _names_file(structure)
+    cloud = _structure_file(Path(structure or ""), options) if is_file else None
+    recordings = [_read(bag, config, progress) for bag in bags]
+    if structure is not None and not is_file:
+        cloud = _structure_topic(structure, bags, recordings, config, progress)
+    return Survey(recordings, known, cloud)
+
+
+def _names_file(structure: str) -> bool:
+    """Return whether a file is meant: names of topics have no dots."""
+    return Path(structure).suffix != "" or Path(structure).is_file()
+
+
+def _structure_file(path: Path, options: CloudTopicOptions) -> Structure:
+    return Structure(read_cloud(path, options.edge), vars(source_file(path)))
+
+
+def _structure_topic(
+    topic: str,
+    bags: Sequence[Path],
+    recordings: Sequence[Recording],
+    config: Config,
+    progress: Progress,
+) -> Structure:
+    """Return what the scans of all bags saw, placed by their poses."""
+    clouds = [
+        read_cloud_topic(
+            bag,
+            topic,
+            recording.trajectory,
+            config.mapping.structure,
+            config.bag.stamps,
+            _counter(f"reading {topic} of {bag.name}", progress),
+        )
+        for bag, recording in zip(bags, recordings, strict=True)
+    ]
+    provenance = {
+        "topic": topic,
+        "scans": sum(cloud.scans for cloud in clouds),
+        "scans_without_pose": sum(cloud.without_pose for cloud in clouds),
+    }
+    return Structure(np.concatenate([cloud.points for cloud in clouds]), provenance)
+
+
+def _save_map(out: Path, field_map: FieldMap, provenance: dict[str, Any]) -> BuiltMap:
+    """Write a map with where it came from, besides what it says of itself."""
+    state = field_map.to_state()
     state = replace(state, provenance={**state.provenance, **provenance})
+    _ensure_folder(out.parent)
     save_map(out, state)
     return BuiltMap(field_map, MapDescription(field_map.summary, state.provenance))
+
+
+def _known_bags(map_path: Path, provenance: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the bags that a map was made from; the file may have been tampered with."""
+    bags = _list_of(provenance, "bags")
+    if not all(isinstance(bag, dict) for bag in bags):
+        raise MapError(f"{map_path}: its list of bags is damaged; build the map again")
+    return bags
+
+
+def _list_of(provenance: dict[str, Any], name: str) -> list[Any]:
+    entries = provenance.get(name)
+    return entries if isinstance(entries, list) else []
+
+
+def _check_new(map_path: Path, known: Sequence[dict[str, Any]], recording: Recording) -> None:
+    """Raise a MapError for a recording that a map has: twice, it would count as two witnesses."""
+    if recording.source.sha256 in [bag.get("sha256") for bag in known]:
+        raise MapError(
+            f"{map_path} was made from {recording.source.path} already; give bags that are new"
+        )
 
 
 def map_of(state: MapState, progress: Progress) -> FieldMap:
@@ -167,7 +386,8 @@ def simulate_bags(
     Parameters
     ----------
     out
-        Folder for `mapping_*` and `calibration_*` bags, `suite.yaml` and `truth.yaml`.
+        Folder for `mapping_*` and `calibration_*` bags, `suite.yaml`, `truth.yaml` and
+        `structure.ply`, what a LiDAR sees of the steel.
     options
         The world and the drives.
     kinds
@@ -183,15 +403,16 @@ def simulate_bags(
             path = out / bag_name(name, kind)
             write_bag(path, kind, drive.recording, BagOptions(noise=options.noise))
     progress("writing bags", 1.0)
+    write_cloud(out / STRUCTURE_FILE, scenario.cloud)
     facts = {"simulation": options.model_dump(mode="json")}
     write_known_sensors(
-        out / "suite.yaml",
+        out / SUITE_FILE,
         scenario.suite,
         facts,
         "The mapping suite's own calibrations: what `l2m map build --suite` needs.",
     )
     write_known_sensors(
-        out / "truth.yaml",
+        out / TRUTH_FILE,
         scenario.truth,
         facts,
         "The true positions and distortions of the sensors in the calibration drive.",

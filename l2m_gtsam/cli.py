@@ -26,16 +26,33 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
-map_app = typer.Typer(help="Build, describe and draw magnetic maps.", no_args_is_help=True)
+map_app = typer.Typer(
+    help="Build, update, compare, describe and draw magnetic maps.", no_args_is_help=True
+)
 app.add_typer(map_app, name="map")
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
 ]
+MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="Map file.")]
 MapOption = Annotated[Path, typer.Option("--map", help="Map file made by `l2m map build`.")]
 ConfigOption = Annotated[
     Path | None, typer.Option("--config", help="YAML configuration; see configs/.")
 ]
+BagsArgument = Annotated[list[Path], typer.Argument(metavar="BAG...", help="Mapping bags.")]
+SuiteOption = Annotated[
+    Path | None,
+    typer.Option("--suite", help="Calibrations of the mapping suite; ideal sensors if not given."),
+]
+StructureOption = Annotated[
+    str | None,
+    typer.Option(
+        "--structure",
+        metavar="CLOUD",
+        help="What the LiDAR saw: .pcd, .ply or .npz in the map frame, or a PointCloud2 topic.",
+    ),
+]
+MapFileOption = Annotated[Path, typer.Option("--out", help="Map file to write (.npz).")]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
 
 
@@ -54,8 +71,21 @@ def main() -> None:
         sys.exit(2)
 
 
+def _version(wanted: bool) -> None:
+    """Print the version and end."""
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"l2m {version('l2m-gtsam')}")
+        raise typer.Exit
+
+
 @app.callback()
 def options(
+    show_version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
+    ] = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show the traceback of an error (at any place).")
     ] = False,
@@ -100,7 +130,7 @@ def simulate(
         simulate_bags(
             out, ScenarioOptions(seed=seed), [BagKind(k) for k in kind or known], progress
         )
-    typer.echo(f"bags, suite.yaml and truth.yaml are in {out}")
+    typer.echo(f"bags, suite.yaml, structure.ply and truth.yaml are in {out}")
 
 
 @app.command()
@@ -139,13 +169,11 @@ def demo(
 
 @map_app.command("build")
 def map_build(
-    bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Mapping bags.")],
-    out: Annotated[Path, typer.Option("--out", help="Map file to write (.npz).")],
+    bags: BagsArgument,
+    out: MapFileOption,
     config: ConfigOption = None,
-    suite: Annotated[
-        Path | None,
-        typer.Option(help="Calibrations of the mapping suite; ideal sensors if not given."),
-    ] = None,
+    suite: SuiteOption = None,
+    structure: StructureOption = None,
 ) -> None:
     """Build a map from one or several bags of a calibrated mapping suite."""
     from l2m_gtsam.batch import build_map_file
@@ -153,15 +181,49 @@ def map_build(
     from l2m_gtsam.qa.tables import map_table
 
     with _progress() as progress:
-        built = build_map_file(bags, out, load_config(config), suite, progress)
+        built = build_map_file(bags, out, load_config(config), suite, progress, structure)
     _print(map_table(built.description))
     typer.echo(f"written: {out}")
 
 
-@map_app.command("info")
-def map_info(
-    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="Map file.")],
+@map_app.command("update")
+def map_update(
+    map_path: MapArgument,
+    bags: BagsArgument,
+    out: MapFileOption,
+    config: ConfigOption = None,
+    suite: SuiteOption = None,
 ) -> None:
+    """Add bags to a map, which keeps its kind, its options and what it learnt as its prior."""
+    from l2m_gtsam.batch import update_map_file
+    from l2m_gtsam.config import load_config
+    from l2m_gtsam.qa.tables import map_table
+
+    with _progress() as progress:
+        updated = update_map_file(map_path, bags, out, load_config(config), suite, progress)
+    _print(map_table(updated.description))
+    typer.echo(f"written: {out}")
+
+
+@map_app.command("compare")
+def map_compare(
+    bags: BagsArgument,
+    config: ConfigOption = None,
+    suite: SuiteOption = None,
+    structure: StructureOption = None,
+) -> None:
+    """Say which kind of map predicts places best that it has not seen."""
+    from l2m_gtsam.batch import compare_map_kinds
+    from l2m_gtsam.config import load_config
+    from l2m_gtsam.qa.comparison import comparison_table
+
+    with _progress() as progress:
+        comparison = compare_map_kinds(bags, load_config(config), suite, structure, progress)
+    _print(comparison_table(comparison))
+
+
+@map_app.command("info")
+def map_info(map_path: MapArgument) -> None:
     """Say what a map is made of and what it covers."""
     from l2m_gtsam.batch import describe_map_file
     from l2m_gtsam.qa.tables import map_table
@@ -173,7 +235,7 @@ def map_info(
 
 @map_app.command("plot")
 def map_plot(
-    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="Map file.")],
+    map_path: MapArgument,
     out: Annotated[Path, typer.Option("--out", help="Picture to write (.png).")],
     height: Annotated[
         float | None, typer.Option(help="Height in metres; the middle of the readings if absent.")

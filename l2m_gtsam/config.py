@@ -8,8 +8,10 @@ from pydantic import BaseModel, Field, ValidationError
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.maps.build import MapOptions
+from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
 from l2m_gtsam.sync import SyncOptions
 
@@ -21,6 +23,10 @@ class MappingOptions(Options):
     """Which readings enter; a map needs its readings spread in space, not in heading."""
     model: MapOptions = MapOptions()
     """The kind of map and its options."""
+    structure: CloudTopicOptions = CloudTopicOptions(edge=0.05)
+    """How a structure cloud is read: from a file, which is in the map frame, only `edge` counts."""
+    compare: CompareOptions = CompareOptions()
+    """How `l2m map compare` holds readings out."""
 
 
 class CalibrationOptions(Options):
@@ -41,7 +47,7 @@ class Config(Options):
     bag: BagOptions = BagOptions()
     """What is read from a recording."""
     mapping: MappingOptions = MappingOptions()
-    """`l2m map build`."""
+    """`l2m map build`, `l2m map update` and `l2m map compare`."""
     calibration: CalibrationOptions = CalibrationOptions()
     """`l2m calibrate`."""
 

@@ -5,6 +5,8 @@ from pathlib import Path
 
 from l2m_gtsam.batch import (
     OVERVIEW_FILE,
+    STRUCTURE_FILE,
+    SUITE_FILE,
     Progress,
     bag_name,
     build_map_file,
@@ -42,7 +44,8 @@ def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonst
     config, map_path = Config(), out / "map.npz"
     mapping, drive = (out / bag_name(name, BagKind.MCAP) for name in ("mapping", "calibration"))
     scenario = simulate_bags(out, options, [BagKind.MCAP], progress)
-    built = build_map_file([mapping], map_path, config, out / "suite.yaml", progress)
+    cloud = str(out / STRUCTURE_FILE)
+    built = build_map_file([mapping], map_path, config, out / SUITE_FILE, progress, cloud)
     result = calibrate_bag(drive, map_path, config, out, progress)
     picture = out / OVERVIEW_FILE
     trajectory = scenario.calibration.recording.trajectory

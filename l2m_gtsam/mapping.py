@@ -1,6 +1,6 @@
 """Recordings of a mapping suite -> map. Pure: no files, no terminal."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -8,14 +8,20 @@ from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import build_map
+from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.sync import stuck_sensors, synchronise
+from l2m_gtsam.maps.harmonic.harmonic_map import KIND as HARMONIC
+from l2m_gtsam.maps.training import TrainingSet, training_set
+from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise
+
+Progress = Callable[[str, float], None]
 
 
 def map_recordings(
     recordings: Sequence[Recording],
     suite: Mapping[str, KnownSensor] | None,
     options: MappingOptions,
+    cloud: FloatArray | None = None,
 ) -> FieldMap:
     """Build a map from one or several drives of a suite whose calibration is known.
 
@@ -28,15 +34,102 @@ def map_recordings(
         the lidar's origin.
     options
         Which readings enter, and the kind of map.
+    cloud
+        Structure that a LiDAR saw: points of the map frame in metres, shape (M, 3).
 
     Raises
     ------
     MapError
-        Recordings in different frames, a sensor that the suite does not list, or no map from
-        these readings.
+        Recordings in different frames, a sensor that the suite does not list, no map from
+        these readings, or a kind that has no use for a structure cloud.
     SyncError
         Readings and poses of a recording do not overlap.
     """
+    readings = suite_readings(recordings, suite, options.sync)
+    return build_map(readings.points, readings.field, options.model, cloud)
+
+
+def update_map(
+    field_map: FieldMap,
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    options: MappingOptions,
+) -> FieldMap:
+    """Return a map with the readings of more drives; its kind and its prior stay as they are.
+
+    Parameters
+    ----------
+    field_map
+        In the frame of the recordings' poses.
+    recordings, suite
+        As in ``map_recordings``.
+    options
+        Which readings enter.
+
+    Raises
+    ------
+    MapError, SyncError
+        As in ``map_recordings``.
+    """
+    readings = suite_readings(recordings, suite, options.sync)
+    return field_map.updated(readings.points, readings.field)
+
+
+def compare_recordings(
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    options: MappingOptions,
+    cloud: FloatArray | None,
+    progress: Progress,
+) -> MapComparison:
+    """Compare the kinds of maps that drives of a suite could become, each with its options.
+
+    Parameters
+    ----------
+    recordings, suite
+        As in ``map_recordings``.
+    options
+        Which readings enter, the options of each kind, and how readings are held out.
+    cloud
+        Structure in the map frame in metres, shape (M, 3), for the kind that can use it.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    MapError, SyncError
+        As in ``map_recordings``, or the readings fill too few patches.
+    """
+    readings = suite_readings(recordings, suite, options.sync)
+    built = dict.fromkeys(options.compare.kinds, 0)
+
+    def build(points: FloatArray, field: FloatArray, kind: str) -> FieldMap:
+        stage = f"building {kind} maps"
+        progress(stage, built[kind] / options.compare.folds)
+        model = options.model.model_copy(update={"kind": kind})
+        field_map = build_map(points, field, model, cloud if kind == HARMONIC else None)
+        built[kind] += 1
+        progress(stage, built[kind] / options.compare.folds)
+        return field_map
+
+    return compare_maps(readings.points, readings.field, options.compare, build)
+
+
+def refuse_structure(*kinds: str) -> None:
+    """Raise a MapError if no map of these kinds has a use for a structure cloud."""
+    if HARMONIC not in kinds:
+        raise MapError(
+            f"maps of kind {', '.join(kinds)} cannot use a structure cloud; leave --structure out "
+            f"or choose the kind {HARMONIC}"
+        )
+
+
+def suite_readings(
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    sync: SyncOptions,
+) -> TrainingSet:
+    """Return what a suite read, in the map frame; see ``map_recordings``."""
     frames = sorted({recording.trajectory.frame for recording in recordings})
     if len(frames) > 1:
         named = ", ".join(f"{r.source.path} in {r.trajectory.frame!r}" for r in recordings)
@@ -44,12 +137,12 @@ def map_recordings(
         raise MapError(msg)
     points, fields = [], []
     for recording in recordings:
-        readings = synchronise(recording, options.sync).readings
+        readings = synchronise(recording, sync).readings
         _refuse_stuck(readings, recording)
         known = [_known(name, suite, recording) for name in readings.sensors]
         points.append(sensor_positions(readings, known))
         fields.append(map_fields(readings, known))
-    return build_map(np.concatenate(points), np.concatenate(fields), options.model)
+    return training_set(np.concatenate(points), np.concatenate(fields))
 
 
 def _refuse_stuck(readings: Readings, recording: Recording) -> None:

@@ -2,7 +2,8 @@
 
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.field_map import FieldMap
-from l2m_factors.keys import D, T
+from l2m_factors.keys import D, M, T
+from l2m_factors.map_weights import map_weights_prior, uncertain_block_factor
 from l2m_factors.priors import distortion_prior, held_directions
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
@@ -11,6 +12,7 @@ __all__ = [
     "BatchedReadings",
     "D",
     "FieldMap",
+    "M",
     "MagneticReadings",
     "ReadingResiduals",
     "T",
@@ -18,6 +20,8 @@ __all__ = [
     "block_factor",
     "distortion_prior",
     "held_directions",
+    "map_weights_prior",
     "reading_factor",
     "reading_residuals",
+    "uncertain_block_factor",
 ]

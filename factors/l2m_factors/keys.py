@@ -11,3 +11,8 @@ def T(sensor: int) -> int:
 def D(sensor: int) -> int:
     """Return the key of this sensor's distortion: Vector 12, C row by row, then H in uT."""
     return int(gtsam.symbol("D", sensor))
+
+
+def M(tile: int) -> int:
+    """Return the key of the map's error in this tile: Vector of its modes, unit variance each."""
+    return int(gtsam.symbol("M", tile))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 
 import gtsam
 import numpy as np
@@ -30,9 +31,20 @@ FEWEST = 5
 TIE_M = 10.0
 
 
+class Uncertainty(StrEnum):
+    """What is said of the map's errors."""
+
+    FULL = "full"
+    INDEPENDENT = "independent"
+
+
 class OneKeyOptions(Options):
     """How a calibration is solved."""
 
+    uncertainty: Uncertainty = Uncertainty.FULL
+    """`full` (the map's errors are shared by readings near each other, as they are in truth; for
+    maps that know them, the harmonic one) or `independent` (each reading has its own; sigmas come
+    out up to twenty times too small)."""
     optimizer: Optimizer = Optimizer.LM
     """`lm` (Levenberg-Marquardt) or `gn` (Gauss-Newton, as in the paper)."""
     closed_form: ClosedFormOptions = ClosedFormOptions()

@@ -141,7 +141,7 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         solutions.append(
             SensorSolution(
                 sensor=s,
-                covariance=_with_infinities(covariances[s], test),
+                covariance=with_infinities(covariances[s], test),
                 figures=residual_figures(residual, W[rows]),
                 determinacy=test,
                 remaining_sigmas=float(np.sqrt(gradient @ covariances[s] @ gradient)),
@@ -150,7 +150,7 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
     return tuple(solutions)
 
 
-def _with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
+def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
     """Return the covariance without the made-up figures of directions that were held."""
     honest = covariance.copy()
     honest[test.touched, :] = 0.0

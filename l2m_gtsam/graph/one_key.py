@@ -12,10 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions, Progress, alternate, start_estimate
+from l2m_gtsam.graph.alternation import (
+    OneKeyOptions,
+    Progress,
+    Uncertainty,
+    alternate,
+    start_estimate,
+)
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.joint import SensorSolution, joint_problem, joint_step, sensor_solutions
 from l2m_gtsam.graph.optimise import Ending
+from l2m_gtsam.graph.uncertain import UncertainMap, solve_uncertain
 from l2m_gtsam.graph.view import QueryableMap, observe
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
@@ -96,6 +103,13 @@ def solve_one_key(
     tell("joint graph", 1.0)
     if not settled:  # the weights of the last round are not those of its result
         problem = joint_problem(view, field_map, estimate, options)
+    if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
+        tell("map uncertainty", 0.0)
+        full = solve_uncertain(view, field_map, field_map, estimate, problem.determinacies, options)
+        tell("map uncertainty", 1.0)
+        return OneKeySolution(
+            full.estimate, full.solved, view.inside, near.steps, ending, settled and full.settled
+        )
     solved = sensor_solutions(problem, estimate)
     return OneKeySolution(estimate, solved, view.inside, near.steps, ending, settled)
 

@@ -7,8 +7,11 @@ from pydantic import field_validator
 
 from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.bilinear import BilinearMap, BilinearOptions
 from l2m_gtsam.maps.dense_gp import DenseGP, DenseGPOptions
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from l2m_gtsam.options import Options
 
@@ -16,11 +19,18 @@ from l2m_gtsam.options import Options
 class MapOptions(Options):
     """Which kind of map to build, and the options of each kind."""
 
-    kind: str = "sliding_gp"
-    """Name of the kind: sliding_gp (the paper's), or dense_gp (slow, for small maps)."""
+    kind: str = "harmonic"
+    """Name of the kind: harmonic (obeys Maxwell's equations), sliding_gp (the paper's), bilinear
+    (the paper's baseline), or dense_gp (slow, for small maps)."""
+
+    harmonic: HarmonicOptions = HarmonicOptions()
+    """Used where the kind is harmonic."""
 
     sliding_gp: SlidingGPOptions = SlidingGPOptions()
     """Used where the kind is sliding_gp."""
+
+    bilinear: BilinearOptions = BilinearOptions()
+    """Used where the kind is bilinear."""
 
     dense_gp: DenseGPOptions = DenseGPOptions()
     """Used where the kind is dense_gp."""
@@ -40,23 +50,58 @@ class MapKind:
     Attributes
     ----------
     fit
-        From positions and readings in the map frame, (N, 3) each, in metres and microtesla.
+        From positions and readings in the map frame, (N, 3) each, in metres and microtesla, and
+        the LiDAR's structure cloud if there is one, in metres, (M, 3).
     load
         From a stored state.
     """
 
-    fit: Callable[[FloatArray, FloatArray, MapOptions], FieldMap]
+    fit: Callable[[FloatArray, FloatArray, MapOptions, FloatArray | None], FieldMap]
     load: Callable[[MapState], FieldMap]
 
 
+def without_structure(
+    fit: Callable[[FloatArray, FloatArray, MapOptions], FieldMap],
+) -> Callable[[FloatArray, FloatArray, MapOptions, FloatArray | None], FieldMap]:
+    """Return the fit of a kind that has no use for a structure cloud and says so."""
+
+    def checked(
+        points: FloatArray, field: FloatArray, options: MapOptions, cloud: FloatArray | None
+    ) -> FieldMap:
+        if cloud is not None:
+            raise MapError(
+                f"a map of kind {options.kind} cannot use a structure cloud; leave it out or "
+                "choose `mapping.model.kind: harmonic`"
+            )
+        return fit(points, field, options)
+
+    return checked
+
+
 KINDS = {
-    "sliding_gp": MapKind(lambda p, b, o: SlidingGP.fit(p, b, o.sliding_gp), SlidingGP.from_state),
-    "dense_gp": MapKind(lambda p, b, o: DenseGP.fit(p, b, o.dense_gp), DenseGP.from_state),
+    "harmonic": MapKind(
+        lambda p, b, o, c: HarmonicMap.fit(p, b, o.harmonic, c), HarmonicMap.from_state
+    ),
+    "sliding_gp": MapKind(
+        without_structure(lambda p, b, o: SlidingGP.fit(p, b, o.sliding_gp)), SlidingGP.from_state
+    ),
+    "bilinear": MapKind(
+        without_structure(lambda p, b, o: BilinearMap.fit(p, b, o.bilinear)),
+        BilinearMap.from_state,
+    ),
+    "dense_gp": MapKind(
+        without_structure(lambda p, b, o: DenseGP.fit(p, b, o.dense_gp)), DenseGP.from_state
+    ),
 }
 """Every kind of map. A new kind is its own file, its line here and its options above."""
 
 
-def build_map(points: FloatArray, field: FloatArray, options: MapOptions | None = None) -> FieldMap:
+def build_map(
+    points: FloatArray,
+    field: FloatArray,
+    options: MapOptions | None = None,
+    cloud: FloatArray | None = None,
+) -> FieldMap:
     """Return a map of readings.
 
     Parameters
@@ -67,14 +112,16 @@ def build_map(points: FloatArray, field: FloatArray, options: MapOptions | None 
         Readings in the map frame in microtesla, shape (N, 3).
     options
         Defaults where absent.
+    cloud
+        Structure that a LiDAR saw: points of the map frame in metres, shape (M, 3).
 
     Raises
     ------
     MapError
-        If no map can be made of the readings.
+        If no map can be made of the readings, or the kind has no use for a structure cloud.
     """
     options = MapOptions() if options is None else options
-    return KINDS[options.kind].fit(points, field, options)
+    return KINDS[options.kind].fit(points, field, options, cloud)
 
 
 def map_from_state(state: MapState) -> FieldMap:

@@ -18,6 +18,7 @@ from l2m_gtsam.maps.hyperparameters import not_definite
 from l2m_gtsam.maps.trained import (
     GPOptions,
     Trained,
+    extended,
     options_from_state,
     train,
     trained_from_state,
@@ -159,6 +160,14 @@ class DenseGP:
             V = solve_triangular(self.factor, covariance(self.trained, batch).T, lower=True)
             variances.append(np.maximum(prior - np.sum(V**2, axis=0), 0.0))
         return np.repeat(np.concatenate(variances)[:, None], 3, axis=1)
+
+    def updated(self, points: FloatArray, field: FloatArray, /) -> "DenseGP":
+        """Return the map with more readings and the same hyperparameters; see ``FieldMap``.
+
+        The prior mean is that of all readings, as in a map that was given them at once.
+        """
+        trained = extended(self.trained, points, field, self.options)
+        return self.condition(trained, self.options)
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""

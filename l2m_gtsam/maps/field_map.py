@@ -82,6 +82,16 @@ class FieldMap(Protocol):
         """
         ...
 
+    def updated(self, points: FloatArray, field: FloatArray, /) -> "FieldMap":
+        """Return the map with more readings, shapes (N, 3) in metres and uT, and the same prior.
+
+        Raises
+        ------
+        MapError
+            If the readings are not fit for a map.
+        """
+        ...
+
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""
         ...

@@ -72,7 +72,11 @@ def grid_over(points: FloatArray, size: float, reach: float) -> Grid:
     MapError
         If there would be too many blocks.
     """
-    origin = points[:, :2].min(axis=0)
+    return grid_from(points[:, :2].min(axis=0), points, size, reach)
+
+
+def grid_from(origin: FloatArray, points: FloatArray, size: float, reach: float) -> Grid:
+    """Return the blocks of ``grid_over`` counted from a given corner of cell (0, 0), metres."""
     own = np.unique(np.floor((points[:, :2] - origin) / size).astype(np.int64), axis=0)
     if len(own) > MOST_BLOCKS:
         raise MapError(

@@ -21,6 +21,7 @@ from l2m_gtsam.maps.posterior import Posterior, condition
 from l2m_gtsam.maps.trained import (
     GPOptions,
     Trained,
+    extended,
     options_from_state,
     train,
     trained_from_state,
@@ -191,6 +192,14 @@ class SlidingGP:
             block, at = self.blocks[visit.block], visit.rows
             variance[at] = block.variance(block.rows(points[at]))[:, None]
         return variance
+
+    def updated(self, points: FloatArray, field: FloatArray, /) -> "SlidingGP":
+        """Return the map with more readings and the same hyperparameters; see ``FieldMap``.
+
+        The prior mean is that of all readings, as in a map that was given them at once.
+        """
+        trained = extended(self.trained, points, field, self.options)
+        return self.condition(trained, self.options)
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""

@@ -1,6 +1,6 @@
 """What every Gaussian-process map is made of: training readings and hyperparameters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,7 +17,13 @@ from l2m_gtsam.maps.hyperparameters import (
     LikelihoodFit,
     learn,
 )
-from l2m_gtsam.maps.training import ThinningOptions, TrainingSet, thinned, training_set
+from l2m_gtsam.maps.training import (
+    ThinningOptions,
+    TrainingSet,
+    joined,
+    thinned,
+    training_set,
+)
 from l2m_gtsam.options import Options
 
 
@@ -38,7 +44,7 @@ class GPOptions(Options):
     length scales one noise-free reading explains half of the prior variance."""
 
 
-AnyGPOptions = TypeVar("AnyGPOptions", bound=GPOptions)
+AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 
 @dataclass(frozen=True)
@@ -101,6 +107,37 @@ def train(points: FloatArray, field: FloatArray, options: GPOptions) -> Trained:
     return Trained(kept, hyperparameters, Origin(len(readings), learning))
 
 
+def extended(
+    trained: Trained, points: FloatArray, field: FloatArray, options: GPOptions
+) -> Trained:
+    """Return the same hyperparameters with more readings, thinned together with the old ones.
+
+    Where a cube held more readings than count as independent, new ones in it weigh as much as
+    those that counted: the others are forgotten.
+
+    Parameters
+    ----------
+    trained
+        What the map knew.
+    points
+        Positions of the new readings in the map frame in metres, shape (N, 3).
+    field
+        New readings in the map frame in microtesla, shape (N, 3).
+    options
+        Of the map.
+
+    Raises
+    ------
+    MapError
+        If the readings are not fit for a map.
+    """
+    new = training_set(points, field)
+    together = joined(trained.readings, new)
+    kept = thinned(together, trained.hyperparameters.length_scale, options.thinning)
+    origin = replace(trained.origin, readings=trained.origin.readings + len(new))
+    return replace(trained, readings=kept, origin=origin)
+
+
 def trained_to_state(kind: str, trained: Trained, options: GPOptions) -> MapState:
     """Return a map as its training rows: factors are cheaper to compute again than to store."""
     values = trained.hyperparameters.model_dump()
@@ -134,7 +171,7 @@ def trained_from_state(state: MapState) -> Trained:
     return Trained(training_set(*arrays), hyperparameters, origin)
 
 
-def options_from_state(state: MapState, model: type[AnyGPOptions]) -> AnyGPOptions:
+def options_from_state(state: MapState, model: type[AnyOptions]) -> AnyOptions:
     """Return the options of a state.
 
     Raises

@@ -138,12 +138,37 @@ def thinned(readings: TrainingSet, length_scale: float, options: ThinningOptions
     """
     if options.spacing == 0.0:
         return readings
-    lower = readings.points.min(axis=0)
     extent = float(np.ptp(readings.points, axis=0).max())
     edge = min(options.spacing * length_scale, extent / LEAST_CUBES)
-    cubes = np.floor((readings.points - lower) / edge)
+    return merged(readings, edge, options.independent)
+
+
+def merged(readings: TrainingSet, edge: float, independent: int) -> TrainingSet:
+    """Return the readings averaged over cubes of an edge in metres, cut at its multiples.
+
+    Merging what is merged already changes nothing, so that readings can be added later.
+
+    Parameters
+    ----------
+    readings
+        Readings as they were taken, or averages of earlier ones.
+    edge
+        Of the cubes in metres.
+    independent
+        The most that the readings of one cube are worth.
+    """
+    cubes = np.floor(readings.points / edge)
     _, owner = np.unique(cubes.astype(np.int64), axis=0, return_inverse=True)
-    count = np.bincount(owner).astype(np.float64)
-    columns = np.hstack([readings.points, readings.field]).T
-    means = np.column_stack([np.bincount(owner, column) for column in columns]) / count[:, None]
-    return TrainingSet(means[:, :3], means[:, 3:], np.minimum(count, options.independent))
+    worth = np.bincount(owner, readings.weight)
+    columns = (np.hstack([readings.points, readings.field]) * readings.weight[:, None]).T
+    means = np.column_stack([np.bincount(owner, column) for column in columns]) / worth[:, None]
+    return TrainingSet(means[:, :3], means[:, 3:], np.minimum(worth, independent))
+
+
+def joined(first: TrainingSet, second: TrainingSet) -> TrainingSet:
+    """Return the readings of both."""
+    return TrainingSet(
+        np.concatenate([first.points, second.points]),
+        np.concatenate([first.field, second.field]),
+        np.concatenate([first.weight, second.weight]),
+    )

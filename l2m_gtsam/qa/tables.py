@@ -123,9 +123,18 @@ def map_table(description: MapDescription) -> Table:
         table.add_row(escape(name), escape(shown))
     for name in ("frame", "version"):
         table.add_row(name, escape(str(description.provenance.get(name, "unknown"))))
-    for source in description.provenance.get("bags", []):
+    for source in _bags(description.provenance):
         table.add_row("made from", escape(", ".join(str(value) for value in source.values())))
+    if isinstance(structure := description.provenance.get("structure"), dict):
+        facts = (f"{name.replace('_', ' ')} {value}" for name, value in structure.items())
+        table.add_row("structure", escape(", ".join(facts)))
     return table
+
+
+def _bags(provenance: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the bags in a map file, which may have been tampered with."""
+    bags = provenance.get("bags")
+    return [each for each in bags if isinstance(each, dict)] if isinstance(bags, list) else []
 
 
 def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:

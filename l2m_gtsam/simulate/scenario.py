@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.drive import DriveOptions, drive
 from l2m_gtsam.simulate.earth import EarthOptions, earth_field
@@ -27,6 +27,7 @@ from l2m_gtsam.simulate.sensors import (
     mapping_suite,
     random_array,
 )
+from l2m_gtsam.simulate.structure import StructureOptions, structure_cloud
 from l2m_gtsam.simulate.warehouse import WarehouseOptions, build_warehouse
 from l2m_gtsam.simulate.world import SteelWorld
 
@@ -44,6 +45,8 @@ class ScenarioOptions(Options):
     """The hall and its racks."""
     warehouse: WarehouseOptions = WarehouseOptions()
     """The steel in the hall."""
+    structure: StructureOptions = StructureOptions()
+    """What a LiDAR sees of it."""
     earth: EarthOptions = EarthOptions()
     """The Earth's field."""
     suite: SuiteOptions = SuiteOptions()
@@ -78,6 +81,8 @@ class Scenario:
         Racks and aisles.
     world
         All steel and the Earth's field.
+    cloud
+        Points that a LiDAR sees of the steel, in the map frame in metres, shape (N, 3).
     mapping
         The drive of the mapping suite.
     calibration
@@ -91,6 +96,7 @@ class Scenario:
     options: ScenarioOptions
     plan: FloorPlan
     world: SteelWorld
+    cloud: FloatArray
     mapping: SimulatedDrive
     calibration: SimulatedDrive
     suite: tuple[KnownSensor, ...]
@@ -113,8 +119,8 @@ def simulate(options: ScenarioOptions, progress: Progress | None = None) -> Scen
         A drive would take a sensor through steel.
     """
     # One stream per part: another array leaves the world and the mapping drive as they are.
-    steel, array, mapping, calibration = (
-        np.random.default_rng(seed) for seed in np.random.SeedSequence(options.seed).spawn(4)
+    steel, array, mapping, calibration, lidar = (
+        np.random.default_rng(seed) for seed in np.random.SeedSequence(options.seed).spawn(5)
     )
     plan = plan_floor(options.floor_plan)
     world = build_warehouse(options.warehouse, plan, earth_field(options.earth), steel)
@@ -124,6 +130,7 @@ def simulate(options: ScenarioOptions, progress: Progress | None = None) -> Scen
         options=options,
         plan=plan,
         world=world,
+        cloud=structure_cloud(world, options.structure, lidar),
         mapping=record(_mapper(options, plan, suite, mapping), world, mapping, report),
         calibration=record(_rover(options, plan, truth, calibration), world, calibration, report),
         suite=suite,

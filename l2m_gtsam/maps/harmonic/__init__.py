@@ -1,0 +1,1 @@
+"""The harmonic map: potentials that obey Maxwell's equations, tile by tile."""

@@ -1,0 +1,90 @@
+"""All families of features of one tile, in the map frame."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.family import Family, WeightPrior
+from l2m_gtsam.maps.harmonic.frame import TileFrame
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+
+BATCH = 512  # points whose features are in memory, and about in cache, at once
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Features of a tile: m weights in the order of the families.
+
+    Attributes
+    ----------
+    frame
+        The tile's box.
+    families
+        Each with its own prior.
+    """
+
+    frame: TileFrame
+    families: tuple[Family, ...]
+
+    def __len__(self) -> int:
+        return sum(len(family) for family in self.families)
+
+    def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
+        """Return the prior of all weights."""
+        priors = [family.prior(hyperparameters) for family in self.families]
+        log_variance = np.concatenate([prior.log_variance for prior in priors])
+        slopes: dict[str, FloatArray] = {}
+        for columns, prior in zip(self.columns(), priors, strict=True):
+            for name, slope in prior.slopes.items():
+                slopes.setdefault(name, np.zeros(len(self)))[columns] = slope
+        return WeightPrior(log_variance, slopes)
+
+    def features(self, points: FloatArray) -> FloatArray:
+        """Return the field of each weight in the map frame, uT per unit, shape (N, 3, m)."""
+        local = self.frame.localise(points)
+        F = np.concatenate([family.features(local) for family in self.families], axis=2)
+        if np.array_equal(self.frame.R_map_tile, np.eye(3)):
+            return F
+        return np.asarray(np.einsum("ij,njm->nim", self.frame.R_map_tile, F, optimize=True))
+
+    def field_and_gradient(
+        self, points: FloatArray, weights: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        R = self.frame.R_map_tile
+        for at in batches(len(points)):
+            local = self.frame.localise(points[at])
+            parts = [
+                family.field_and_gradient(local, weights[columns])
+                for family, columns in zip(self.families, self.columns(), strict=True)
+            ]
+            field[at] = sum(part[0] for part in parts) @ R.T
+            gradient[at] = R @ sum(part[1] for part in parts) @ R.T
+        return field, gradient
+
+    def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return the potential phi with ``B = grad phi`` in uT m, shape (N,)."""
+        phi = np.empty(len(points))
+        for at in batches(len(points)):
+            local = self.frame.localise(points[at])
+            phi[at] = sum(
+                family.potential(local, weights[columns])
+                for family, columns in zip(self.families, self.columns(), strict=True)
+            )
+        return phi
+
+    def columns(self) -> Iterator[slice]:
+        """Yield the columns of each family."""
+        start = 0
+        for family in self.families:
+            yield slice(start, start + len(family))
+            start += len(family)
+
+
+def batches(count: int) -> Iterator[slice]:
+    """Yield slices that cover so many points."""
+    for start in range(0, count, BATCH):
+        yield slice(start, min(start + BATCH, count))

@@ -1,0 +1,86 @@
+r"""Sources at places where steel stands: point dipoles, in combinations that readings can see.
+
+.. math::
+    \phi = -\frac{m \cdot r}{r^3}, \quad B = \frac{3 r (m \cdot r)}{r^5} - \frac{m}{r^3}
+
+with moments m in uT m^3.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.family import WeightPrior
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+
+
+@dataclass(frozen=True)
+class Dipoles:
+    """Sources of one structure.
+
+    Attributes
+    ----------
+    positions
+        Sources in the tile's frame in metres, shape (K, 3).
+    combinations
+        Orthonormal combinations of the 3 K moments, one weight each, shape (3 K, m). They leave
+        out what no reading can see, so that the prior of a weight is that of a moment.
+    strength
+        Standard deviation of this structure's moments over the map's ``structure_scale``.
+    """
+
+    positions: FloatArray
+    combinations: FloatArray
+    strength: float = 1.0
+
+    def __len__(self) -> int:
+        return int(self.combinations.shape[1])
+
+    def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
+        """Return the prior of the weights; see ``Family``."""
+        log_variance = 2 * np.log(hyperparameters.structure_scale * self.strength)
+        count = len(self)
+        return WeightPrior(np.full(count, log_variance), {"structure_scale": np.full(count, 2.0)})
+
+    def features(self, points: FloatArray) -> FloatArray:
+        """Return the field of each combination; see ``Family``."""
+        moments = moment_features(points, self.positions)
+        return np.asarray(moments @ self.combinations)
+
+    def field_and_gradient(
+        self, points: FloatArray, weights: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return field and gradient; see ``Family``."""
+        m = self._moments(weights)
+        r, d = separations(points, self.positions)
+        mr = np.einsum("nki,ki->nk", r, m)
+        d3, d5, d7 = d**-3, d**-5, d**-7
+        field = np.einsum("nki,nk->ni", r, 3 * mr * d5) - d3 @ m
+        mixed = np.einsum("nki,kj,nk->nij", r, m, 3 * d5)
+        outer = np.einsum("nki,nkj,nk->nij", r, r, -15 * mr * d7)
+        trace = np.einsum("nk,nk->n", 3 * mr, d5)
+        gradient = mixed + mixed.transpose(0, 2, 1) + outer + trace[:, None, None] * np.eye(3)
+        return field, gradient
+
+    def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
+        """Return the potential; see ``Family``."""
+        r, d = separations(points, self.positions)
+        return np.asarray(-np.einsum("nki,ki,nk->n", r, self._moments(weights), d**-3))
+
+    def _moments(self, weights: FloatArray) -> FloatArray:
+        return np.asarray((self.combinations @ weights).reshape(-1, 3))
+
+
+def separations(points: FloatArray, sources: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return vectors (N, K, 3) from sources to points and their lengths (N, K), in metres."""
+    r = points[:, None, :] - sources
+    return r, np.sqrt(np.einsum("nki,nki->nk", r, r))
+
+
+def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:
+    """Return the field of unit moments at sources, source by source, shape (N, 3, 3 K)."""
+    r, d = separations(points, sources)
+    T = r[..., :, None] * (3 * r / d[..., None] ** 5)[..., None, :]
+    T[..., range(3), range(3)] -= (d**-3)[..., None]
+    return np.asarray(T.transpose(0, 2, 1, 3).reshape(len(points), 3, -1))

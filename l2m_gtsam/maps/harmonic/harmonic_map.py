@@ -1,0 +1,242 @@
+"""A map of harmonic potentials: tiles of floor and ceiling modes, uniform field and sources."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, MapState
+from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
+from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
+from l2m_gtsam.maps.harmonic.learnt import (
+    HarmonicOptions,
+    Learnt,
+    learn_map,
+    learnt_from_state,
+    learnt_to_state,
+)
+from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
+from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.training import checked_points, training_set
+
+KIND = "harmonic"
+
+
+@dataclass(frozen=True)
+class Visit:
+    """Points that one tile has a share in.
+
+    Attributes
+    ----------
+    tile
+        Index of the tile.
+    rows
+        Indices of the points, shape (K,).
+    share
+        How much the tile says at each; over all tiles they sum to one, shape (K,).
+    """
+
+    tile: int
+    rows: IntArray
+    share: FloatArray
+
+
+@dataclass(frozen=True)
+class HarmonicMap:
+    """A field map of harmonic potentials on blending tiles.
+
+    Attributes
+    ----------
+    learnt
+        Readings, prior, sources and tiling.
+    options
+        Effective options.
+    tiles
+        One for each cell of the tiling.
+    """
+
+    learnt: Learnt
+    options: HarmonicOptions
+    tiles: tuple[Tile, ...]
+
+    @classmethod
+    def fit(
+        cls,
+        points: FloatArray,
+        field: FloatArray,
+        options: HarmonicOptions | None = None,
+        cloud: FloatArray | None = None,
+    ) -> "HarmonicMap":
+        """Return the map of readings.
+
+        Parameters
+        ----------
+        points
+            Positions of the readings in the map frame in metres, shape (N, 3).
+        field
+            Readings in the map frame in microtesla, shape (N, 3).
+        options
+            Defaults where absent.
+        cloud
+            Points of the structure that a LiDAR saw, in the map frame in metres, shape (M, 3).
+
+        Raises
+        ------
+        MapError
+            If no map can be made of the readings.
+        """
+        options = HarmonicOptions() if options is None else options
+        sources = NO_SOURCES
+        if cloud is not None:
+            sources = candidate_sources(checked_points(cloud), points, options.structure)
+        return cls.condition(learn_map(points, field, sources, options), options)
+
+    @classmethod
+    def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
+        """Return the map whose prior is known: every tile solved."""
+        return cls(learnt, options, solve_tiles(learnt, {}))
+
+    def errors_over(self, points: FloatArray, /) -> ErrorModes:
+        """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
+        return error_modes(self.learnt, self.tiles, checked_points(points), self.options.errors)
+
+    def updated(self, points: FloatArray, field: FloatArray) -> "HarmonicMap":
+        """Return the map with more readings and the same prior; see ``FieldMap``.
+
+        Only tiles that the new readings take part in are solved again.
+        """
+        new = training_set(points, field)
+        learnt = self.learnt.extended(new, self.options)
+        box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap
+        away, _ = cKDTree(new.points[:, :2]).query(learnt.tiling.grid.centres, p=np.inf)
+        touched = np.asarray(away) <= box
+        old = {tuple(cell): i for i, cell in enumerate(self.learnt.tiling.grid.cells.tolist())}
+        kept = {
+            index: self.tiles[old[tuple(cell)]]
+            for index, cell in enumerate(learnt.tiling.grid.cells.tolist())
+            if not touched[index] and tuple(cell) in old
+        }
+        return HarmonicMap(learnt, self.options, solve_tiles(learnt, kept))
+
+    @classmethod
+    def from_state(cls, state: MapState) -> "HarmonicMap":
+        """Return the map that ``to_state`` took apart.
+
+        Raises
+        ------
+        MapError
+            If the state is damaged.
+        """
+        learnt, options = learnt_from_state(state)
+        return cls.condition(learnt, options)
+
+    def to_state(self) -> MapState:
+        """Return the map as plain arrays and facts."""
+        return learnt_to_state(KIND, self.learnt, self.options)
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map."""
+        learnt, points = self.learnt, self.learnt.readings.points
+        h, weights = learnt.hyperparameters, [len(tile.basis) for tile in self.tiles]
+        shown = int(np.count_nonzero(learnt.strengths))
+        return MapSummary(
+            kind=KIND,
+            readings=learnt.origin.readings,
+            rows=len(points),
+            lower=points.min(axis=0),
+            upper=points.max(axis=0),
+            facts={
+                "noise of a reading (uT)": h.noise,
+                "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
+                "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
+                "shortest wave (m)": 2 * np.pi / learnt.resolution.floor,
+                "structures": f"{shown} shown by the readings of {len(learnt.strengths)}",
+                "tiles": len(weights),
+                "tile (m)": learnt.tiling.grid.size,
+                "weights in a tile (median)": int(np.median(weights)),
+            },
+        )
+
+    @property
+    def kind(self) -> str:
+        """Name of the map kind."""
+        return KIND
+
+    def query(self, points: FloatArray) -> FieldSample:
+        """Return field, gradient and variance; see ``FieldMap``."""
+        points = checked_points(points)
+        field, gradient = self.field_and_gradient(points)
+        variance, prior = np.zeros_like(points), np.zeros_like(points)
+        for visit in self._visits(points):
+            tile, at, share = self.tiles[visit.tile], visit.rows, visit.share[:, None]
+            variance[at] += share * tile.variance(points[at])
+            prior[at] += share * tile.prior_variance(points[at])
+        explained = variance.sum(axis=1) <= 0.5 * prior.sum(axis=1)
+        return masked(FieldSample(field, gradient, variance, self._near(points) & explained))
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Return field and gradient, also outside; see ``FieldMap``."""
+        points = checked_points(points)
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        for visit in self._visits(points):
+            at, share = visit.rows, visit.share
+            b, g = self.tiles[visit.tile].field_and_gradient(points[at])
+            field[at] += share[:, None] * b
+            gradient[at] += share[:, None, None] * g
+        return field, gradient
+
+    def variance(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis, also outside; see ``FieldMap``."""
+        points = checked_points(points)
+        variance = np.zeros_like(points)
+        for visit in self._visits(points):
+            at = visit.rows
+            variance[at] += visit.share[:, None] * self.tiles[visit.tile].variance(points[at])
+        return variance
+
+    def _near(self, points: FloatArray) -> BoolArray:
+        away, _ = cKDTree(self.learnt.readings.points).query(
+            points, distance_upper_bound=self.options.reach
+        )
+        return np.isfinite(away)
+
+    def _visits(self, points: FloatArray) -> Iterator[Visit]:
+        owner = self.learnt.tiling.grid.block_of(points)
+        total = np.zeros(len(points))
+        found = []
+        reach = 0.5 * self.learnt.tiling.grid.size + self.learnt.tiling.blend
+        tree = cKDTree(points[:, :2])
+        for tile, rows in enumerate(
+            tree.query_ball_point(self.learnt.tiling.grid.centres, reach, p=np.inf)
+        ):
+            rows = np.asarray(rows, dtype=np.int64)
+            share = self.learnt.tiling.shares(points[rows], tile)
+            total[rows] += share
+            found.append((rows, share))
+        for tile, (rows, share) in enumerate(found):
+            lonely = np.flatnonzero((total <= 0) & (owner == tile))
+            rows, share = np.append(rows, lonely), np.append(share, np.ones(len(lonely)))
+            total[lonely] = 1.0
+            some = share > 0
+            if some.any():
+                yield Visit(tile, rows[some], share[some] / total[rows[some]])
+
+
+def solve_tiles(learnt: Learnt, kept: Mapping[int, Tile]) -> tuple[Tile, ...]:
+    """Return all tiles, those that are kept as they are."""
+    members = learnt.members
+
+    def tile(index: int) -> Tile:
+        if index in kept:
+            return kept[index]
+        basis = learnt.basis(index, members[index])
+        normal = normal_of(basis, learnt.readings[members[index]])
+        prior = basis.prior(learnt.hyperparameters)
+        weights = condition(normal, prior.log_variance, learnt.hyperparameters.noise)
+        return Tile(basis, weights, learnt.hyperparameters, learnt.resolution)
+
+    return tuple(in_threads(tile, range(len(learnt.tiling))))

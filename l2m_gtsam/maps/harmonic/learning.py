@@ -1,0 +1,220 @@
+"""Learning the hyperparameters: the marginal likelihood of a few windows of the survey."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+from scipy.optimize import Bounds, minimize
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.evidence import Normal, evidence, normal_of
+from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of, within
+from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
+from l2m_gtsam.maps.harmonic.structure import Sources
+from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.harmonic.tiling import (
+    Resolution,
+    Tiling,
+    TilingOptions,
+    resolution_of,
+    surveyed_area,
+    tiling_of,
+)
+from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.options import Options
+
+ROUNDS = 3  # learning is repeated while it asks for finer modes than it looked at
+FINER = 1.15
+BOUND_TOLERANCE = 1e-6
+FURTHEST = np.log(300.0)  # from where a search starts
+
+
+class LearningOptions(Options):
+    """The windows of the survey that are looked at."""
+
+    windows: int = Field(default=4, ge=1)
+    """Number of windows, spread over the survey."""
+    modes: int = Field(default=450, ge=50)
+    """About how many modes a window has; smaller windows learn faster."""
+    readings: int = Field(default=3000, ge=100)
+    """The most readings of one window, drawn at random."""
+    seed: int = Field(default=0, ge=0)
+    """Seed of the draw."""
+
+
+@dataclass(frozen=True)
+class LearningEnd:
+    """How learning ended.
+
+    Attributes
+    ----------
+    hyperparameters
+        Where the likelihood is largest.
+    log_likelihood
+        Sum over the windows, nats.
+    readings
+        Readings in all windows.
+    converged
+        Whether the search ended at a maximum inside the bounds.
+    at_bound
+        Names of hyperparameters that ended on a bound: the data do not determine them.
+    """
+
+    hyperparameters: Hyperparameters
+    log_likelihood: float
+    readings: int
+    converged: bool
+    at_bound: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A piece of the survey whose likelihood is computed exactly."""
+
+    basis: Basis
+    normal: Normal
+
+
+def learn(
+    readings: TrainingSet,
+    sources: Sources,
+    tiling: TilingOptions,
+    share: float,
+    options: LearningOptions,
+) -> LearningEnd:
+    """Return the hyperparameters that make the readings most likely.
+
+    Parameters
+    ----------
+    readings
+        Of the whole survey.
+    sources
+        Candidate sources.
+    tiling
+        Surroundings of the windows.
+    share
+        Of ``resolution_of``.
+    options
+        Of the windows.
+    """
+    density = float(readings.weight.sum()) / surveyed_area(readings.points)
+    guess = starting_point(readings)
+    for _ in range(ROUNDS):
+        looked_at = resolution_of(guess, density, share)
+        windows = draw_windows(readings, sources, looked_at, tiling, options)
+        end = maximise(windows, guess)
+        needed = resolution_of(end.hyperparameters, density, share)
+        guess = end.hyperparameters
+        if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
+            break
+    return end
+
+
+def starting_point(readings: TrainingSet) -> Hyperparameters:
+    """Return where the search starts: what the readings vary by, and sources of usual depth."""
+    spread = float(np.sqrt(readings.field.var(axis=0).mean())) + 1e-2
+    return Hyperparameters(
+        floor_scale=spread, ceiling_scale=0.3 * spread, noise=max(0.03 * spread, 0.05)
+    )
+
+
+def draw_windows(
+    readings: TrainingSet,
+    sources: Sources,
+    resolution: Resolution,
+    options: TilingOptions,
+    learning: LearningOptions,
+) -> list[Window]:
+    """Return windows on the survey, as far from each other as they can be."""
+    tiling = tiling_of(readings.points, resolution, options, learning.modes, reach=0.0)
+    members = tiling.grid.members(readings.points, tiling.overlap)
+    rng = np.random.default_rng(learning.seed)
+    windows = []
+    for tile in spread_tiles(tiling, [len(rows) for rows in members], learning.windows):
+        rows = rng.permutation(members[tile])[: learning.readings]
+        windows.append(window_of(readings[np.sort(rows)], sources, tiling, tile, resolution))
+    return windows
+
+
+def window_of(
+    readings: TrainingSet, sources: Sources, tiling: Tiling, tile: int, resolution: Resolution
+) -> Window:
+    """Return a tile's readings as a window, with every structure in it at the common strength."""
+    centre = tiling.grid.centres[tile]
+    everything = sources.split()
+    structures = [everything[s] for s in within(sources, centre, tiling.edge)]
+    even = np.ones(len(structures))
+    basis = basis_of(readings, centre, tiling.edge, resolution, structures, even, COARSE)
+    return Window(basis, normal_of(basis, readings))
+
+
+def spread_tiles(tiling: Tiling, counts: Sequence[int], number: int) -> list[int]:
+    """Return tiles far from each other among those with many readings."""
+    rich = np.flatnonzero(np.asarray(counts) >= np.median(counts))
+    centres = tiling.grid.centres[rich]
+    chosen = [int(np.argmax(np.asarray(counts)[rich]))]
+    away = np.full(len(rich), np.inf)
+    while len(chosen) < min(number, len(rich)):
+        away = np.minimum(away, np.linalg.norm(centres - centres[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(away)))
+    return [int(rich[c]) for c in chosen]
+
+
+def maximise(windows: Sequence[Window], start: Hyperparameters) -> LearningEnd:
+    """Return the maximum of the windows' summed likelihood, from a start."""
+    names = learnable(windows)
+    x0 = np.log([getattr(start, name) for name in names])
+    low, high = np.log([BOUNDS[name] for name in names]).T
+    low, high = np.maximum(low, x0 - FURTHEST), np.minimum(high, x0 + FURTHEST)
+
+    def cost(x: FloatArray) -> tuple[float, FloatArray]:
+        trial = start.model_copy(update=dict(zip(names, np.exp(x).tolist(), strict=True)))
+        parts = in_threads(lambda window: log_likelihood(window, trial), windows)
+        gradient = np.sum(
+            [[part.slopes.get(name, 0.0) for name in names] for part in parts], axis=0
+        )
+        return -sum(part.value for part in parts), -gradient
+
+    end = minimize(
+        cost,
+        x0,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=Bounds(low, high),
+        options={"maxiter": 60, "ftol": 1e-8},
+    )
+    on_bound = np.minimum(end.x - low, high - end.x) < BOUND_TOLERANCE
+    at_bound = tuple(name for name, on in zip(names, on_bound, strict=True) if on)
+    return LearningEnd(
+        hyperparameters=start.model_copy(
+            update=dict(zip(names, np.exp(end.x).tolist(), strict=True))
+        ),
+        log_likelihood=-float(end.fun),
+        readings=sum(window.normal.rows for window in windows) // 3,
+        converged=bool(end.success) and not at_bound,
+        at_bound=at_bound,
+    )
+
+
+def learnable(windows: Sequence[Window]) -> list[str]:
+    """Return the hyperparameters that some window's prior depends on, and the noise."""
+    slopes = [window.basis.prior(Hyperparameters()).slopes for window in windows]
+    return [name for name in BOUNDS if name == "noise" or any(name in each for each in slopes)]
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """A log likelihood in nats and its slopes by the logarithms of hyperparameters."""
+
+    value: float
+    slopes: dict[str, float]
+
+
+def log_likelihood(window: Window, hyperparameters: Hyperparameters) -> Likelihood:
+    """Return how likely a window's readings are."""
+    prior = window.basis.prior(hyperparameters)
+    result = evidence(window.normal, prior.log_variance, hyperparameters.noise)
+    slopes = {name: float(result.by_log_variance @ slope) for name, slope in prior.slopes.items()}
+    return Likelihood(result.value, {**slopes, "noise": result.by_log_noise})

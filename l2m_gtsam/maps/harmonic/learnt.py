@@ -1,0 +1,276 @@
+"""What a harmonic map knows before any tile is solved: readings, prior, sources, tiling."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, TypeAdapter, ValidationError
+
+from l2m_gtsam.data import FloatArray, IntArray, MapState
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.grid import grid_from
+from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
+from l2m_gtsam.maps.harmonic.evidence import normal_of
+from l2m_gtsam.maps.harmonic.furnish import COARSE, FINE, basis_of, within
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions, learn
+from l2m_gtsam.maps.harmonic.strengths import learn_strengths
+from l2m_gtsam.maps.harmonic.structure import Sources, StructureOptions
+from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.harmonic.tiling import (
+    Resolution,
+    Tiling,
+    TilingOptions,
+    resolution_of,
+    surveyed_area,
+    tiling_of,
+)
+from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
+from l2m_gtsam.maps.training import TrainingSet, joined, merged, training_set
+from l2m_gtsam.options import Options
+
+
+class HarmonicOptions(Options):
+    """Options of the harmonic map; lengths in metres."""
+
+    hyperparameters: Hyperparameters | None = None
+    """Fixed hyperparameters; learnt from the marginal likelihood where absent."""
+    learning: LearningOptions = LearningOptions()
+    """The windows they are learnt from; one set serves the whole map."""
+    structure: StructureOptions = StructureOptions()
+    """How a LiDAR's point cloud becomes sources."""
+    tiling: TilingOptions = TilingOptions()
+    """The surroundings of a tile."""
+    errors: ErrorOptions = ErrorOptions()
+    """How finely the map's error over a drive is told."""
+    merge: float = Field(default=0.05, gt=0)
+    """Readings within cubes of this edge are averaged."""
+    independent: int = Field(default=10, ge=1)
+    """The most that the readings of one cube are worth: their errors share the pose and the
+    disturbances of one passage."""
+    modes: int = Field(default=1000, ge=50)
+    """About how many modes a tile has; tiles are as large as that allows."""
+    mode_share: float = Field(default=0.05, gt=0, lt=1)
+    """A mode is kept if the readings could reduce its prior variance by this share; what is left
+    out counts as variance."""
+    reach: float = Field(default=0.5, gt=0)
+    """A point is inside the map when a reading is this near and the readings explain at least
+    half of the prior variance there."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the map came from.
+
+    Attributes
+    ----------
+    readings
+        Readings before they were merged.
+    learning
+        How learning ended; absent where the hyperparameters were given.
+    """
+
+    readings: int
+    learning: LearningEnd | None
+
+
+ORIGIN = TypeAdapter(Origin)
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """Everything that the tiles follow from.
+
+    Attributes
+    ----------
+    readings
+        Training readings, merged.
+    hyperparameters
+        Of the prior, shared by all tiles.
+    sources
+        Candidate sources.
+    strengths
+        Of each structure among them; 0 where the readings show none.
+    tiling
+        Where the tiles lie.
+    resolution
+        Largest wave numbers of the modes.
+    origin
+        For the record.
+    """
+
+    readings: TrainingSet
+    hyperparameters: Hyperparameters
+    sources: Sources
+    strengths: FloatArray
+    tiling: Tiling
+    resolution: Resolution
+    origin: Origin
+
+    @property
+    def members(self) -> list[IntArray]:
+        """Rows of the readings that take part in each tile."""
+        return self.tiling.grid.members(self.readings.points, self.tiling.overlap)
+
+    def basis(self, tile: int, rows: IntArray, visible: float = FINE) -> Basis:
+        """Return the basis of a tile for its readings; ``visible`` is that of ``dipoles_of``."""
+        centre, edge = self.tiling.grid.centres[tile], self.tiling.edge
+        near = within(self.sources, centre, edge)
+        split = self.sources.split()
+        return basis_of(
+            self.readings[rows],
+            centre,
+            edge,
+            self.resolution,
+            [split[s] for s in near],
+            self.strengths[near],
+            visible,
+        )
+
+    def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
+        """Return the same prior and tiles, with more readings and the tiles that they need."""
+        readings = merged(joined(self.readings, new), options.merge, options.independent)
+        grid, reach = self.tiling.grid, min(options.reach, 0.49 * self.tiling.grid.size)
+        wider = grid_from(grid.origin, readings.points, grid.size, reach)
+        return replace(
+            self,
+            readings=readings,
+            tiling=replace(self.tiling, grid=wider),
+            origin=replace(self.origin, readings=self.origin.readings + len(new)),
+        )
+
+
+def learn_map(
+    points: FloatArray, field: FloatArray, sources: Sources, options: HarmonicOptions
+) -> Learnt:
+    """Return what readings and sources teach.
+
+    Parameters
+    ----------
+    points
+        Positions of the readings in the map frame in metres, shape (N, 3).
+    field
+        Readings in the map frame in microtesla, shape (N, 3).
+    sources
+        Where steel can be.
+    options
+        Of the map.
+
+    Raises
+    ------
+    MapError
+        If no map can be made of the readings.
+    """
+    raw = training_set(points, field)
+    readings = merged(raw, options.merge, options.independent)
+    learning = None
+    hyperparameters = options.hyperparameters
+    if hyperparameters is None:
+        learning = learn(readings, sources, options.tiling, options.mode_share, options.learning)
+        hyperparameters = learning.hyperparameters
+    even = np.ones(len(sources.split()))
+    plain = laid_out(readings, hyperparameters, sources, even, options, Origin(len(raw), learning))
+    return with_strengths(plain)
+
+
+def laid_out(
+    readings: TrainingSet,
+    hyperparameters: Hyperparameters,
+    sources: Sources,
+    strengths: FloatArray,
+    options: HarmonicOptions,
+    origin: Origin,
+) -> Learnt:
+    """Return readings and prior with the tiles that suit them."""
+    density = float(readings.weight.sum()) / surveyed_area(readings.points)
+    resolution = resolution_of(hyperparameters, density, options.mode_share)
+    tiling = tiling_of(readings.points, resolution, options.tiling, options.modes, options.reach)
+    return Learnt(readings, hyperparameters, sources, strengths, tiling, resolution, origin)
+
+
+def with_strengths(plain: Learnt) -> Learnt:
+    """Return the same with the strength of every structure, learnt in the tile it stands in."""
+    middles = structure_middles(plain.sources)
+    if not len(middles):
+        return plain
+    home, members = plain.tiling.grid.block_of(middles), plain.members
+
+    def found(tile: int) -> dict[int, float]:
+        basis = plain.basis(tile, members[tile], COARSE)
+        normal = normal_of(basis, plain.readings[members[tile]])
+        near = within(plain.sources, plain.tiling.grid.centres[tile], plain.tiling.edge)
+        strengths = learn_strengths(basis, normal, plain.hyperparameters)
+        return dict(zip(near, strengths, strict=True))
+
+    strengths = plain.strengths.copy()
+    tiles = np.unique(home).tolist()
+    for tile, each in zip(tiles, in_threads(found, tiles), strict=True):
+        for structure, strength in each.items():
+            if home[structure] == tile:
+                strengths[structure] = strength
+    return replace(plain, strengths=strengths)
+
+
+def structure_middles(sources: Sources) -> FloatArray:
+    """Return the middle of each structure in metres, shape (S, 3)."""
+    return np.array([each.positions.mean(axis=0) for each in sources.split()]).reshape(-1, 3)
+
+
+def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapState:
+    """Return a map as what its tiles follow from: far smaller than their covariances."""
+    values = learnt.hyperparameters.model_dump()
+    arrays: dict[str, npt.NDArray[Any]] = {
+        "points": learnt.readings.points,
+        "field": learnt.readings.field,
+        "weight": learnt.readings.weight,
+        "hyperparameters": np.array([values[name] for name in sorted(values)]),
+        "sources": learnt.sources.positions,
+        "structure": learnt.sources.structure,
+        "strengths": learnt.strengths,
+    }
+    origin = ORIGIN.dump_python(learnt.origin, mode="json")
+    return MapState(kind, arrays, options.model_dump(mode="json"), origin)
+
+
+def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
+    """Return what ``learnt_to_state`` took apart; the state may come from an untrusted file.
+
+    Raises
+    ------
+    MapError
+        If an array or an entry is missing, of the wrong shape, or makes no sense.
+    """
+    options = options_from_state(state, HarmonicOptions)
+    try:
+        values = dict(
+            zip(
+                sorted(Hyperparameters.model_fields),
+                state_array(state, "hyperparameters").tolist(),
+                strict=True,
+            )
+        )
+        hyperparameters = Hyperparameters(**values)
+        origin = ORIGIN.validate_python(state.provenance)
+    except ValidationError as error:
+        raise MapError(f"map state is damaged: {first_complaint(error)}") from None
+    except (TypeError, ValueError):
+        raise MapError("map array hyperparameters is not of the shape that is needed") from None
+    readings = training_set(*(state_array(state, name) for name in ("points", "field", "weight")))
+    sources, strengths = sources_from_state(state)
+    learnt = laid_out(readings, hyperparameters, sources, strengths, options, origin)
+    return learnt, options
+
+
+def sources_from_state(state: MapState) -> tuple[Sources, FloatArray]:
+    """Return the sources of a state and the strengths of their structures, after checks."""
+    positions, number, strengths = (
+        state_array(state, name) for name in ("sources", "structure", "strengths")
+    )
+    structure = number.astype(np.int64)
+    fits = positions.shape == (len(structure), 3) and np.isfinite(positions).all()
+    numbered = np.array_equal(np.unique(structure), np.arange(len(strengths)))
+    if not (fits and numbered and np.isfinite(strengths).all() and (strengths >= 0).all()):
+        raise MapError("map sources are damaged: positions, structures and strengths disagree")
+    return Sources(positions, structure), strengths

@@ -1,0 +1,368 @@
+"""A magnetic potential on a regular grid: field and gradient for solvers that ask a lot.
+
+The interpolant is a B-spline of degree 7 on every axis: six times continuously differentiable, so
+that neither the field nor its gradient steps from cell to cell. Field and gradient are the exact
+derivatives of this one scalar, which makes the gradient symmetric. A spline that meets the values
+at the nodes would need a solve over the whole grid, and a strong source beside it would ring
+everywhere. Here the coefficients come from a short symmetric filter of the values instead (a
+quasi-interpolant, after C. de Boor and G. J. Fix, "Spline approximation by quasiinterpolants",
+1973): polynomials of degree 7 are still reproduced, and a node is felt no further than 8 cells
+away.
+
+The error of the field falls with the seventh power of the spacing and that of its gradient with
+the sixth. Where the field varies by 30 uT, 0.005 uT and 0.02 uT/m are met with a spacing of 0.09 of
+the distance to a dipole, or of 0.7 / k for a wave of number k.
+
+A grid lives in the frame in which it was made; here that of its tile.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import comb, factorial
+
+import numpy as np
+from numba import njit
+from scipy import ndimage
+
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.training import checked_points
+
+DEGREE = 7
+WIDTH = DEGREE + 1  # coefficients per axis that a point needs
+BELOW = DEGREE // 2  # of them, those below the node at the lower side of the point's cell
+HALF_TAPS = 4  # values to each side that a coefficient needs
+MOST_NODES = 20_000_000  # 160 MB of coefficients, and as much again while they are computed
+BLOCK = 16  # cells of a block in x and y: its coefficients fit the processor's cache
+AROUND = WIDTH - 1 + 2 * HALF_TAPS  # nodes per axis that a cell needs beside its own
+EDGE = 1e-9  # cells: rounding of a place that is just within reach
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes: corners in metres, shape (3,)."""
+
+    lower: FloatArray
+    upper: FloatArray
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Nodes of a regular grid.
+
+    Attributes
+    ----------
+    lower
+        Node (0, 0, 0) in metres, shape (3,).
+    spacing
+        Edge of a cell in metres.
+    needed
+        Nodes whose potential is asked for, shape (nx, ny, nz); what the others get is not used.
+    """
+
+    lower: FloatArray
+    spacing: float
+    needed: BoolArray
+
+    @property
+    def axes(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Coordinates of the nodes along x, y and z in metres."""
+        x, y, z = (
+            start + self.spacing * np.arange(count)
+            for start, count in zip(self.lower, self.needed.shape, strict=True)
+        )
+        return x, y, z
+
+
+Potential = Callable[[Lattice], FloatArray]
+
+
+@dataclass(frozen=True)
+class PotentialGrid:
+    """A spline of a potential whose gradient is the field.
+
+    Attributes
+    ----------
+    lower
+        Place of coefficient (0, 0, 0) in metres, shape (3,).
+    spacing
+        Edge of a cell in metres.
+    coefficients
+        Of the spline in uT m, shape (nx, ny, nz); NaN where the potential is not known.
+    """
+
+    lower: FloatArray
+    spacing: float
+    coefficients: FloatArray
+
+    def covers(self, points: FloatArray) -> BoolArray:
+        """Return whether the grid holds all that a point needs, shape (N,).
+
+        Parameters
+        ----------
+        points
+            Metres, shape (N, 3).
+
+        Raises
+        ------
+        MapError
+            If a point is not finite or the shape is wrong.
+        """
+        cells = self._cells(points)
+        covered = np.empty(len(cells), dtype=np.bool_)
+        covered_cells(cells, self.coefficients, covered)
+        return covered
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m; NaN where not covered.
+
+        ``gradient[n, i, j]`` = dB_i/dx_j, symmetric to the last digit.
+
+        Parameters
+        ----------
+        points
+            Metres, shape (N, 3).
+
+        Raises
+        ------
+        MapError
+            If a point is not finite or the shape is wrong.
+        """
+        cells = self._cells(points)
+        field, gradient = np.empty((len(cells), 3)), np.empty((len(cells), 3, 3))
+        order = by_block(cells, self.coefficients.shape)
+        spline_derivatives(cells, order, self.spacing, self.coefficients, field, gradient)
+        return field, gradient
+
+    def _cells(self, points: FloatArray) -> FloatArray:
+        """Return places in cells from coefficient (0, 0, 0), those outside no further than one."""
+        upper = self.lower + self.spacing * np.array(self.coefficients.shape)
+        inside = np.clip(checked_points(points), self.lower - self.spacing, upper)
+        return (inside - self.lower) / self.spacing
+
+
+def potential_grid(
+    potential: Potential, points: FloatArray, reach: float, spacing: float, box: Box
+) -> PotentialGrid:
+    """Return the grid that covers every place of a box near a point.
+
+    Parameters
+    ----------
+    potential
+        Maps a lattice to the potential at its nodes in uT m, shape (nx, ny, nz). Places that need
+        a node where it is not finite are not covered. Nodes lie up to 10 cells beyond the places.
+    points
+        Positions of the survey in metres, shape (K, 3).
+    reach
+        How far from a point, along every axis, places are covered, in metres.
+    spacing
+        Edge of a cell in metres.
+    box
+        Places beyond it need not be covered.
+
+    Raises
+    ------
+    MapError
+        If there are no points near the box, one is not finite, or there would be too many nodes.
+    """
+    points = checked_points(points)
+    points = points[((points >= box.lower - reach) & (points <= box.upper + reach)).all(axis=1)]
+    if not len(points):
+        raise MapError("a potential grid without points: at least one is needed")
+    lower = np.maximum(points.min(axis=0) - reach, box.lower)
+    extent = np.minimum(points.max(axis=0) + reach, box.upper) - lower
+    shape = check_size(np.floor(extent / spacing) + 1 + AROUND, spacing)
+    first = np.floor((points - lower - reach) / spacing - EDGE).astype(np.int64)
+    last = np.floor((points - lower + reach) / spacing + EDGE).astype(np.int64)
+    needed = spread(np.maximum(first, 0), np.minimum(last + AROUND, np.array(shape) - 1), shape)
+    lattice = Lattice(lower - (HALF_TAPS + BELOW) * spacing, spacing, needed)
+    values = np.where(needed, potential(lattice), np.nan)
+    values[~np.isfinite(values)] = np.nan
+    coefficients = spline_coefficients(values)
+    return PotentialGrid(lattice.lower + HALF_TAPS * spacing, spacing, coefficients)
+
+
+def check_size(counts: FloatArray, spacing: float) -> tuple[int, int, int]:
+    """Return node counts per axis, shape (3,), as integers, or refuse a grid that is too large."""
+    nodes = float(np.prod(counts))
+    if nodes > MOST_NODES:
+        raise MapError(
+            f"a potential grid of spacing {spacing:.3g} m would have {nodes / 1e6:,.0f} million "
+            f"nodes, at most {MOST_NODES / 1e6:.0f} million are allowed: raise the spacing"
+        )
+    nx, ny, nz = (int(count) for count in counts)
+    return nx, ny, nz
+
+
+def spread(first: IntArray, last: IntArray, shape: tuple[int, int, int]) -> BoolArray:
+    """Return the nodes of the boxes whose first and last nodes, shape (K, 3), are given."""
+    steps = np.zeros(np.array(shape) + 1, dtype=np.int32)
+    for corner in np.ndindex(2, 2, 2):
+        at = np.where(np.array(corner, dtype=np.bool_), last + 1, first)
+        np.add.at(steps, tuple(at.T), (-1) ** sum(corner))
+    for axis in range(3):
+        np.cumsum(steps, axis=axis, out=steps)
+    return np.asarray(steps[:-1, :-1, :-1] > 0)
+
+
+def by_block(cells: FloatArray, shape: tuple[int, ...]) -> IntArray:
+    """Return an order of places that stays in one part of the grid at a time, shape (N,).
+
+    Scattered places wait for memory: in this order they are answered three times faster.
+    """
+    blocks = (cells[:, :2] / BLOCK).astype(np.int64)
+    rows = shape[1] // BLOCK + 1
+    # Numbers of 16 bits are sorted in linear time; where they run over, two blocks take turns.
+    numbers = (blocks[:, 0] * rows + blocks[:, 1]).astype(np.uint16)
+    return np.argsort(numbers, kind="stable")
+
+
+def spline_values() -> FloatArray:
+    """Return the B-spline at its inner nodes, shape (DEGREE,)."""
+    return np.asarray(spline_pieces()[0, :DEGREE])
+
+
+def spline_pieces() -> FloatArray:
+    """Return the polynomials of the spline, shape (WIDTH, WIDTH).
+
+    ``pieces[p, k]`` is the factor of ``f**p`` in the weight of coefficient k of the stencil, for a
+    point at the fraction f of its cell; from the truncated powers that sum to the B-spline.
+    """
+    pieces = np.zeros((WIDTH, WIDTH))
+    for k in range(WIDTH):
+        for j in range(WIDTH - k):
+            for p in range(WIDTH):
+                power = comb(DEGREE, p) * (DEGREE - k - j) ** (DEGREE - p)
+                pieces[p, k] += (-1) ** j * comb(WIDTH, j) * power / factorial(DEGREE)
+    return pieces
+
+
+def filter_taps() -> FloatArray:
+    """Return the filter that makes coefficients of values, shape (2 HALF_TAPS + 1,).
+
+    Symmetric, and such that filter and spline together leave even powers up to 2 HALF_TAPS, and
+    odd ones by symmetry, unchanged at the nodes.
+    """
+    spline, knots = spline_values(), np.arange(-BELOW, BELOW + 1)
+    moments = np.empty((HALF_TAPS + 1, HALF_TAPS + 1))
+    for tap in range(HALF_TAPS + 1):
+        places = np.concatenate([knots + tap, knots - tap])
+        weights = np.tile(spline, 2) / 2
+        moments[:, tap] = [weights @ places ** (2.0 * row) for row in range(HALF_TAPS + 1)]
+    one_side = np.linalg.solve(moments, np.eye(HALF_TAPS + 1)[0])
+    one_side[1:] /= 2
+    return np.concatenate([one_side[:0:-1], one_side])
+
+
+def spline_coefficients(values: FloatArray) -> FloatArray:
+    """Return the coefficients for node values, HALF_TAPS fewer on each side; consumes ``values``.
+
+    A coefficient is NaN where one of its values is.
+    """
+    for axis in range(3):
+        ndimage.correlate1d(values, filter_taps(), axis, values, mode="constant", cval=np.nan)
+    inner = slice(HALF_TAPS, -HALF_TAPS)
+    return np.ascontiguousarray(values[inner, inner, inner])
+
+
+PIECES = spline_pieces()
+
+# Sums in any order and fused products let the stencil run in vector registers; what breaks NaN
+# stays off.
+FAST = {"reassoc", "contract", "nsz"}
+
+
+@njit(cache=True, nogil=True)
+def stencil_start(cell: FloatArray, shape: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return the first coefficient of a place's stencil per axis, or -1, -1, -1 if not inside."""
+    i, j, k = np.floor(cell[0]) - BELOW, np.floor(cell[1]) - BELOW, np.floor(cell[2]) - BELOW
+    within = 0 <= i <= shape[0] - WIDTH and 0 <= j <= shape[1] - WIDTH
+    if within and 0 <= k <= shape[2] - WIDTH:
+        return int(i), int(j), int(k)
+    return -1, -1, -1
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def covered_cells(cells: FloatArray, coefficients: FloatArray, covered: BoolArray) -> None:
+    """Find which places, in cells from the first coefficient, have all they need."""
+    for n in range(len(cells)):
+        i, j, k = stencil_start(cells[n], coefficients.shape)
+        covered[n] = False
+        if i < 0:
+            continue
+        total = 0.0
+        for a in range(WIDTH):
+            for b in range(WIDTH):
+                for c in range(WIDTH):
+                    total += coefficients[i + a, j + b, k + c]
+        covered[n] = not np.isnan(total)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def spline_weights(place: float, weights: FloatArray) -> None:
+    """Write the weights of a stencil along one axis, their slopes and curvatures, shape (3, 8)."""
+    f = place - np.floor(place)
+    for k in range(WIDTH):
+        value, slope, half_curvature = PIECES[DEGREE, k], 0.0, 0.0
+        for p in range(DEGREE - 1, -1, -1):
+            half_curvature = half_curvature * f + slope
+            slope = slope * f + value
+            value = value * f + PIECES[p, k]
+        weights[0, k], weights[1, k], weights[2, k] = value, slope, 2 * half_curvature
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def spline_derivatives(
+    cells: FloatArray,
+    order: IntArray,
+    spacing: float,
+    coefficients: FloatArray,
+    field: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Write first derivatives (N, 3) and second ones (N, 3, 3) at places in cells, shape (N, 3).
+
+    NaN where a coefficient is missing.
+    The stencil is summed axis by axis, z first, where coefficients lie side by side.
+    """
+    x, y, z = np.empty((3, WIDTH)), np.empty((3, WIDTH)), np.empty((3, WIDTH))
+    for n in order:
+        i, j, k = stencil_start(cells[n], coefficients.shape)
+        if i < 0:
+            field[n], gradient[n] = np.nan, np.nan
+            continue
+        spline_weights(cells[n, 0], x)
+        spline_weights(cells[n, 1], y)
+        spline_weights(cells[n, 2], z)
+        bx = by = bz = xx = yy = zz = xy = xz = yz = 0.0
+        for a in range(WIDTH):
+            # Names count the derivatives along y and z that a sum holds.
+            s00 = s01 = s02 = s10 = s11 = s20 = 0.0
+            for b in range(WIDTH):
+                t0 = t1 = t2 = 0.0
+                for c in range(WIDTH):
+                    value = coefficients[i + a, j + b, k + c]
+                    t0 += z[0, c] * value
+                    t1 += z[1, c] * value
+                    t2 += z[2, c] * value
+                s00 += y[0, b] * t0
+                s01 += y[0, b] * t1
+                s02 += y[0, b] * t2
+                s10 += y[1, b] * t0
+                s11 += y[1, b] * t1
+                s20 += y[2, b] * t0
+            bx += x[1, a] * s00
+            by += x[0, a] * s10
+            bz += x[0, a] * s01
+            xx += x[2, a] * s00
+            yy += x[0, a] * s20
+            zz += x[0, a] * s02
+            xy += x[1, a] * s10
+            xz += x[1, a] * s01
+            yz += x[0, a] * s11
+        field[n, 0], field[n, 1], field[n, 2] = bx / spacing, by / spacing, bz / spacing
+        area = spacing * spacing
+        gradient[n, 0, 0], gradient[n, 1, 1], gradient[n, 2, 2] = xx / area, yy / area, zz / area
+        gradient[n, 0, 1] = gradient[n, 1, 0] = xy / area
+        gradient[n, 0, 2] = gradient[n, 2, 0] = xz / area
+        gradient[n, 1, 2] = gradient[n, 2, 1] = yz / area

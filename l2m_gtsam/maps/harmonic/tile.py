@@ -1,0 +1,76 @@
+"""One tile: its basis and the posterior of its weights."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.basis import Basis, batches
+from l2m_gtsam.maps.harmonic.evidence import Weights
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.modes import left_out
+from l2m_gtsam.maps.harmonic.tiling import Resolution
+
+
+@dataclass(frozen=True)
+class Tile:
+    """What a tile knows of the field.
+
+    Attributes
+    ----------
+    basis
+        Features.
+    weights
+        Their posterior.
+    hyperparameters
+        Of the prior.
+    resolution
+        Modes that were kept; those left out count as variance.
+    """
+
+    basis: Basis
+    weights: Weights
+    hyperparameters: Hyperparameters
+    resolution: Resolution
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the mean field (N, 3) in uT and its gradient (N, 3, 3) in uT/m."""
+        return self.basis.field_and_gradient(points, self.weights.mean)
+
+    def root(self, points: FloatArray) -> FloatArray:
+        """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""
+        m = len(self.basis)
+        F = self.basis.features(points).reshape(-1, m) * self.weights.prior_sigma
+        whitened = solve_triangular(self.weights.factor, F.T, lower=True, check_finite=False)
+        return np.asarray(whitened.T.reshape(-1, 3, m))
+
+    def variance(self, points: FloatArray) -> FloatArray:
+        """Return the posterior variance per axis in uT^2, shape (N, 3)."""
+        variance = np.empty((len(points), 3))
+        for at in batches(len(points)):
+            root = self.root(points[at])
+            variance[at] = np.einsum("nim,nim->ni", root, root)
+        return variance + self.unresolved(points)
+
+    def prior_variance(self, points: FloatArray) -> FloatArray:
+        """Return the prior variance per axis without the uniform field, uT^2, shape (N, 3)."""
+        variance = np.empty((len(points), 3))
+        varied = self.weights.prior_sigma.copy()
+        varied[: len(self.basis.families[0])] = 0.0  # the uniform field comes first
+        for at in batches(len(points)):
+            F = self.basis.features(points[at]) * varied
+            variance[at] = np.einsum("nim,nim->ni", F, F)
+        return variance + self.unresolved(points)
+
+    def unresolved(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis that the modes left out hold, uT^2, shape (N, 3)."""
+        z = self.basis.frame.localise(points)[:, 2]
+        h = self.hyperparameters
+        vertical = left_out(h.floor_scale, h.floor_depth, self.resolution.floor, z)
+        over = self.basis.frame.height - z
+        vertical = vertical + left_out(
+            h.ceiling_scale, h.ceiling_depth, self.resolution.ceiling, over
+        )
+        local = vertical[:, None] * np.array([0.5, 0.5, 1.0])
+        return np.asarray(local @ (self.basis.frame.R_map_tile.T**2))

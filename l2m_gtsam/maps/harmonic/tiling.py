@@ -1,0 +1,222 @@
+"""Tiles: how large they are, where they lie, and how they blend."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+from scipy.optimize import brentq
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.grid import Grid, grid_over
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR
+from l2m_gtsam.options import Options
+
+# Modes per square metre of box and squared wave number: a quarter of a disc of half waves.
+MODE_DENSITY = 1 / (4 * np.pi)
+WAVE_NUMBERS = (0.5, 60.0)  # 1/m: from a tile's longest wave to one of a decimetre
+LEAST_CORE = 1.0  # metres
+FILL = 0.15  # metres; cells of this edge with a reading make the surveyed area
+
+
+class TilingOptions(Options):
+    """The surroundings of a tile's core, in metres."""
+
+    overlap: float = Field(default=0.5, gt=0)
+    """Readings this far around the core take part in a tile."""
+    margin: float = Field(default=1.0, gt=0)
+    """The box reaches this far beyond its readings: the waves have no slope at its walls, where
+    the field knows nothing of them."""
+
+
+@dataclass(frozen=True)
+class Resolution:
+    """Largest wave numbers of floor and ceiling modes in 1/m."""
+
+    floor: float
+    ceiling: float
+
+    def modes(self, edge: float) -> float:
+        """Return about how many modes a square box of this edge in metres has."""
+        return MODE_DENSITY * edge**2 * (self.floor**2 + self.ceiling**2)
+
+
+def resolution_of(hyperparameters: Hyperparameters, density: float, share: float) -> Resolution:
+    """Return which modes readings of a density can tell something about.
+
+    A mode's prior variance over the variance with which the readings alone would determine it is
+    ``4 pi s^2 (2h)^3 k exp(-2 k h) density / sigma^2``, at the height of the lowest (highest)
+    reading. It falls with k; modes are kept as long as it exceeds ``share``.
+
+    Parameters
+    ----------
+    hyperparameters
+        Scales, depths and noise.
+    density
+        Readings per square metre.
+    share
+        Ratio below which a mode is left out.
+    """
+    limits = []
+    for side in (FLOOR, CEILING):
+        s = getattr(hyperparameters, f"{side}_scale")
+        h = getattr(hyperparameters, f"{side}_depth")
+        gain = 4 * np.pi * s**2 * (2 * h) ** 3 * density / (hyperparameters.noise**2 * share)
+        limits.append(_last_above_one(np.log(gain), h))
+    return Resolution(*limits)
+
+
+def _last_above_one(log_gain: float, h: float) -> float:
+    """Return the largest k with ``log_gain + log k - 2 k h >= 0``, within sensible limits."""
+    low, high = WAVE_NUMBERS
+
+    def excess(k: float) -> float:
+        return float(log_gain + np.log(k) - 2 * k * h)
+
+    top = float(np.clip(1 / (2 * h), low, high))  # where it is largest
+    if excess(top) <= 0:
+        return low
+    return high if excess(high) >= 0 else float(brentq(excess, top, high))
+
+
+def surveyed_area(points: FloatArray) -> float:
+    """Return the horizontal area in square metres in which there are readings."""
+    cells = np.unique(np.floor(points[:, :2] / FILL).astype(np.int64), axis=0)
+    return len(cells) * FILL**2
+
+
+@dataclass(frozen=True)
+class Visit:
+    """Points that one tile has a share in.
+
+    Attributes
+    ----------
+    tile
+        Index of the tile.
+    rows
+        Indices of the points, shape (K,).
+    share
+        How much the tile says at each; over all tiles they sum to one, shape (K,).
+    """
+
+    tile: int
+    rows: IntArray
+    share: FloatArray
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """The tiles of a map.
+
+    Attributes
+    ----------
+    grid
+        Cores of the tiles.
+    overlap
+        Readings this far around a tile's core take part in it, metres.
+    margin
+        How far its box reaches beyond those readings in metres.
+    blend
+        Half the width in metres of the band in which neighbours blend; at most half a core, so
+        that a point has no more than two neighbours along an axis.
+    """
+
+    grid: Grid
+    overlap: float
+    margin: float
+    blend: float
+
+    def __len__(self) -> int:
+        return len(self.grid)
+
+    @property
+    def edge(self) -> float:
+        """Edge of a tile's box in metres."""
+        return self.grid.size + 2 * (self.overlap + self.margin)
+
+    def shares(self, points: FloatArray, tile: int | IntArray) -> FloatArray:
+        """Return how much a tile would say at points, before it is set against the others.
+
+        Parameters
+        ----------
+        points
+            Metres, shape (N, 3).
+        tile
+            Index of the tile, or of one for each point, shape (N,).
+        """
+        away = np.abs(points[:, :2] - self.grid.centres[tile]) - 0.5 * self.grid.size
+        ramp = np.clip(0.5 - 0.5 * away / self.blend, 0.0, 1.0)
+        smooth = ramp**3 * (10 + ramp * (6 * ramp - 15))  # twice differentiable at both ends
+        return np.asarray(smooth.prod(axis=1))
+
+    def visits(self, points: FloatArray) -> list[Visit]:
+        """Return which tiles have a share in which points; far from all of them the nearest has.
+
+        Parameters
+        ----------
+        points
+            Metres, shape (N, 3).
+        """
+        rows, tiles = self._candidates(points)
+        share = self.shares(points[rows], tiles)
+        total = np.bincount(rows, share, minlength=len(points))
+        lonely = np.flatnonzero(total <= 0)
+        if len(lonely):
+            total[lonely] = 1.0
+            rows, share = np.append(rows, lonely), np.append(share, np.ones(len(lonely)))
+            tiles = np.append(tiles, self.grid.block_of(points[lonely]))
+        some = np.flatnonzero(share > 0)
+        # Of 16 bits: sorted in linear time; a grid has fewer blocks than that holds.
+        order = some[np.argsort(tiles[some].astype(np.uint16), kind="stable")]
+        rows, tiles, share = rows[order], tiles[order], share[order] / total[rows[order]]
+        edges = np.flatnonzero(np.diff(tiles)) + 1
+        return [
+            Visit(int(tiles[at[0]]), rows[at], share[at])
+            for at in np.split(np.arange(len(tiles)), edges)
+            if len(at)
+        ]
+
+    def _candidates(self, points: FloatArray) -> tuple[IntArray, IntArray]:
+        """Return rows of points and tiles that may have a share in them: own and neighbours."""
+        place = (points[:, :2] - self.grid.origin) / self.grid.size
+        # Far away there is no tile: what is so far need not be told apart.
+        place = np.clip(place, self.grid.cells.min(axis=0) - 2.0, self.grid.cells.max(axis=0) + 3.0)
+        own = np.floor(place).astype(np.int64)
+        side = np.where(place - own < 0.5, -1, 1)
+        band = np.abs(place - own - 0.5) > 0.5 - self.blend / self.grid.size - 1e-9
+        rows, cells = [np.arange(len(points))], [own]
+        for step in ((1, 0), (0, 1), (1, 1)):
+            near = np.flatnonzero((band | (np.array(step) == 0)).all(axis=1))
+            rows.append(near)
+            cells.append(own[near] + side[near] * np.array(step))
+        row, cell = np.concatenate(rows), np.concatenate(cells)
+        tile = self.grid.index_of(cell)
+        return row[tile >= 0], tile[tile >= 0]
+
+
+def tiling_of(
+    points: FloatArray, resolution: Resolution, options: TilingOptions, budget: int, reach: float
+) -> Tiling:
+    """Return tiles as large as the number of weights allows, over all readings.
+
+    Parameters
+    ----------
+    points
+        Positions of the readings in metres, shape (N, 3).
+    resolution
+        Modes to be kept.
+    options
+        Overlap and margin.
+    budget
+        The most modes of one tile.
+    reach
+        How far from the readings tiles are needed, metres.
+    """
+    largest = np.sqrt(budget / resolution.modes(1.0)) - 2 * (options.overlap + options.margin)
+    extent = float(np.ptp(points[:, :2], axis=0).max()) + 1e-6
+    core = max(min(largest, extent), LEAST_CORE)
+    if extent > core:  # equal tiles, the last as full as the first
+        core = extent / np.ceil(extent / core) * (1 + 1e-9)
+    blend = min(0.25 * core, 0.5, options.overlap)
+    grid = grid_over(points, core, min(reach, 0.49 * core))
+    return Tiling(grid, options.overlap, options.margin, blend)

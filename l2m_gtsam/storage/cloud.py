@@ -1,0 +1,192 @@
+"""Point clouds in files (PCD, PLY, NPZ): read, thinned, written."""
+
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import MapError, OutputError
+from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.pcd import pcd_pieces
+from l2m_gtsam.storage.ply import ply_pieces, write_ply
+from l2m_gtsam.storage.point_table import PIECE_POINTS, refuse_many, require_bytes
+from l2m_gtsam.storage.voxels import VoxelMeans
+
+NPZ_MEMBER = "points.npy"
+ACCEPTED = "a .pcd, .ply or .npz file (of the array `points`, shape (N, 3))"
+# Further from the map's origin than any site: geographic or broken coordinates.
+MAX_COORDINATE_M = 1e6
+
+
+def thinned_cloud(points: FloatArray, edge: float) -> FloatArray:
+    """Return the mean of the points in every cubic cell that has any.
+
+    Parameters
+    ----------
+    points
+        Finite points in metres, shape (N, 3).
+    edge
+        Side of the cells in metres, positive.
+
+    Returns
+    -------
+    Points in metres in order of the cells, shape (M, 3), M <= N.
+
+    Raises
+    ------
+    ValueError
+        Points are more than a million cells apart.
+    """
+    means = VoxelMeans(edge)
+    means.add(points)
+    return means.points()
+
+
+def read_cloud(path: Path, edge: float = 0.0) -> FloatArray:
+    """Return the points of a cloud in the map frame.
+
+    Coordinates are taken as they stand: the viewpoint that a PCD file may carry says where the
+    scanner stood, not where the points are.
+
+    Parameters
+    ----------
+    path
+        A ``.pcd`` (ascii, binary, binary_compressed), ``.ply`` (ascii, binary of either byte
+        order) or ``.npz`` (array ``points``, shape (N, 3)) in metres.
+    edge
+        Thin the cloud while reading, as `thinned_cloud` does, in metres; 0 keeps every point.
+
+    Returns
+    -------
+    Finite points in metres, shape (N, 3); those that are not finite are dropped.
+
+    Raises
+    ------
+    MapError
+        The file is missing, of another kind, damaged, has no finite point or too many, or its
+        coordinates are no metres in a map.
+    """
+    if path.suffix.lower() not in READERS:
+        raise MapError(f"{path}: not a kind of point cloud that is read; accepted: {ACCEPTED}")
+    with _translated(path):
+        pieces = (located(piece, str(path)) for piece in READERS[path.suffix.lower()](path))
+        points = _collected(pieces, edge)
+    if not len(points):
+        raise MapError(f"{path}: has no finite point; is it the right file?")
+    return points
+
+
+def write_cloud(path: Path, points: FloatArray) -> None:
+    """Write a cloud; `read_cloud` gives it back equal.
+
+    Parameters
+    ----------
+    path
+        File to write: ``.ply`` (binary, float64) or ``.npz``.
+    points
+        Finite points in metres, shape (N, 3).
+
+    Raises
+    ------
+    OutputError
+        The file is of another kind or cannot be written.
+    """
+    if path.suffix.lower() not in WRITERS:
+        raise OutputError(f"{path}: a point cloud is written as {' or '.join(WRITERS)}")
+    with atomic_path(path) as temporary:
+        WRITERS[path.suffix.lower()](temporary, points)
+
+
+def located(points: FloatArray, where: str) -> FloatArray:
+    """Return the finite ones of points in metres, shape (N, 3).
+
+    Raises
+    ------
+    MapError
+        A coordinate is too large for metres in a map; ``where`` names the offender.
+    """
+    points = points[np.isfinite(points).all(axis=1)]
+    furthest = float(np.abs(points).max(initial=0.0))
+    if furthest > MAX_COORDINATE_M:
+        raise MapError(
+            f"{where}: has a coordinate of {furthest:.3g} m, at most {MAX_COORDINATE_M:g} m are "
+            "accepted; give metres in the frame of the map, not geographic coordinates"
+        )
+    return points
+
+
+def _collected(pieces: Iterable[FloatArray], edge: float) -> FloatArray:
+    if not edge > 0:
+        return np.concatenate([np.zeros((0, 3)), *pieces])
+    means = VoxelMeans(edge)
+    for piece in pieces:
+        means.add(piece)
+    return means.points()
+
+
+def _npz_pieces(path: Path) -> Iterator[FloatArray]:
+    with zipfile.ZipFile(path) as archive:
+        if NPZ_MEMBER not in archive.namelist():
+            raise ValueError("it has no array `points`")
+        with archive.open(NPZ_MEMBER) as member:
+            size = archive.getinfo(NPZ_MEMBER).file_size
+            refuse_many(path, _npz_count(member, size))
+        with archive.open(NPZ_MEMBER) as member:
+            points = np.lib.format.read_array(member, allow_pickle=False)
+    for low in range(0, len(points), PIECE_POINTS):
+        yield points[low : low + PIECE_POINTS].astype(np.float64)
+
+
+def _npz_count(member: IO[bytes], size: int) -> int:
+    """Return the points that an array's header declares and its size in bytes confirms."""
+    version = np.lib.format.read_magic(member)
+    if version != (1, 0):
+        raise ValueError("its array `points` is of an unknown version")
+    shape, _, kind = np.lib.format.read_array_header_1_0(member)
+    if len(shape) != 2 or shape[1] != 3 or kind.kind not in "iuf":
+        raise ValueError(f"its array `points` is {kind} of shape {shape}, not numbers (N, 3)")
+    require_bytes(size - member.tell(), shape[0], 3 * kind.itemsize)
+    return shape[0]
+
+
+def _write_npz(path: Path, points: FloatArray) -> None:
+    # A bare ZipInfo has a fixed date: the same cloud gives the same bytes.
+    entry = zipfile.ZipInfo(NPZ_MEMBER)
+    with zipfile.ZipFile(path, "w") as archive, archive.open(entry, "w") as member:
+        np.lib.format.write_array(member, np.asarray(points, order="C"), allow_pickle=False)
+
+
+@contextmanager
+def _translated(path: Path) -> Iterator[None]:
+    """Turn what opening and understanding a bad file raises into one line."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise MapError(f"{path}: no such point cloud; accepted: {ACCEPTED}") from error
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except KeyError as error:
+        raise MapError(_damaged(path, f"{error} is missing or unknown")) from error
+    except (IndexError, EOFError, struct.error) as error:
+        raise MapError(_damaged(path, "it ends too early")) from error
+    except (*ZIP_ERRORS, ValueError, OverflowError) as error:
+        raise MapError(_damaged(path, str(error))) from error
+
+
+def _damaged(path: Path, reason: str) -> str:
+    return f"{path}: not a usable point cloud: {' '.join(reason.split())[:200]}"
+
+
+ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError)
+READERS: dict[str, Callable[[Path], Iterator[FloatArray]]] = {
+    ".pcd": pcd_pieces,
+    ".ply": ply_pieces,
+    ".npz": _npz_pieces,
+}
+WRITERS: dict[str, Callable[[Path, FloatArray], None]] = {".ply": write_ply, ".npz": _write_npz}

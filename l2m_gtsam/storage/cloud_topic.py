@@ -1,0 +1,255 @@
+"""A cloud of the surroundings out of a bag: its scans, placed by the poses of the lidar."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from rosbags.interfaces import Connection
+
+from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.errors import BagError
+from l2m_gtsam.options import Options
+from l2m_gtsam.storage.bag_options import Stamps
+from l2m_gtsam.storage.cloud import located
+from l2m_gtsam.storage.messages import header_ns
+from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
+from l2m_gtsam.storage.point_table import MAX_POINTS, stacked
+from l2m_gtsam.storage.selection import listed
+from l2m_gtsam.storage.tf import Link
+from l2m_gtsam.storage.voxels import VoxelMeans
+
+CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
+FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32 and FLOAT64
+
+
+class CloudTopicOptions(Options):
+    """How the scans of a topic become one cloud."""
+
+    edge: float = Field(default=0.1, ge=0.01)
+    """Scans are merged in cells of this size in metres, one point each."""
+    min_range: float = Field(default=0.5, ge=0)
+    """Nearer points are dropped, metres from the lidar: they are the vehicle itself."""
+    max_range: float = Field(default=20.0, gt=0, le=1000)
+    """Further points are dropped, metres from the lidar: they are out of reach of the sensors,
+    and the errors of the poses' rotations grow with the distance."""
+    max_pose_gap_s: float = Field(default=0.5, gt=0)
+    """Scans between two poses further apart than this are skipped."""
+
+    @model_validator(mode="after")
+    def _leave_room(self) -> Self:
+        if self.min_range >= self.max_range:
+            raise ValueError("`min_range` must be less than `max_range`")
+        return self
+
+
+@dataclass(frozen=True)
+class TopicCloud:
+    """The cloud of a topic, and what it is made of.
+
+    Attributes
+    ----------
+    points
+        One point per cell, in the map frame in metres, shape (N, 3).
+    scans
+        Scans received.
+    without_pose
+        Those of them that were skipped: before the first pose, after the last or in a gap.
+    """
+
+    points: FloatArray
+    scans: int
+    without_pose: int
+
+
+def read_cloud_topic(
+    path: Path,
+    topic: str,
+    trajectory: Trajectory,
+    options: CloudTopicOptions,
+    stamps: Stamps = Stamps.HEADER,
+    progress: Progress | None = None,
+) -> TopicCloud:
+    """Return what all scans of a topic saw, in the map frame.
+
+    Scans must be in the frame of the lidar, whose poses the trajectory holds; what their frame is
+    called does not matter, but it must be the same in all of them. A scan is taken as a snapshot
+    at its stamp: where the driver does not correct for motion within a scan, points are off by up
+    to speed times the duration of a scan. Poses are interpolated on SE(3) as in `sync`.
+
+    Parameters
+    ----------
+    path
+        Bag of any kind.
+    topic
+        Topic of type sensor_msgs/PointCloud2; the leading slash does not matter.
+    trajectory
+        Poses of the lidar in the map, by the same clock.
+    options
+        How scans are merged.
+    stamps
+        Which time of a scan counts, as for the poses.
+    progress
+        Called with the messages read and their number.
+
+    Raises
+    ------
+    BagError
+        The bag, the topic or a scan is not usable, or no scan has a pose or a point.
+    MapError
+        The poses are too far from the origin of the map.
+    """
+    merged = _MergedScans(f"{path}: topic {topic}", trajectory, options)
+    with open_bag(path) as bag:
+        for message in bag.messages(_connections(bag, topic), progress):
+            is_record = stamps is Stamps.RECORD
+            merged.add(message, message.record_ns if is_record else header_ns(message.content))
+    return merged.cloud()
+
+
+class _MergedScans:
+    """The cells of all scans so far."""
+
+    def __init__(self, where: str, trajectory: Trajectory, options: CloudTopicOptions) -> None:
+        self._where = where
+        self._trajectory = trajectory
+        self._options = options
+        self._frame: str | None = None
+        self._cells = VoxelMeans(options.edge)
+        self._scans = self._placed = 0
+
+    def add(self, message: Message, stamp_ns: int) -> None:
+        """Place and merge one scan."""
+        scan = message.content
+        self._check_frame(scan.header.frame_id)
+        self._scans += 1
+        pose = _pose_at(self._trajectory, stamp_ns, self._options.max_pose_gap_s)
+        if pose is None:
+            return
+        self._placed += 1
+        try:
+            points = _in_range(_points(scan), self._options)
+            self._cells.add(located(points @ pose.R.T + pose.t, self._where))
+        except ValueError as error:
+            raise BagError(f"{self._where}: {error}") from error
+        if len(self._cells) > MAX_POINTS:
+            raise BagError(
+                f"{self._where}: fills more than {MAX_POINTS} cells of {self._options.edge:g} m; "
+                "take larger ones or a smaller `max_range`"
+            )
+
+    def cloud(self) -> TopicCloud:
+        """Return the cloud of the scans so far."""
+        if not self._placed:
+            raise BagError(self._nothing_placed())
+        try:
+            points = self._cells.points()
+        except ValueError as error:
+            raise BagError(f"{self._where}: {error}") from error
+        if not len(points):
+            raise BagError(
+                f"{self._where}: no scan has a finite point between {self._options.min_range:g} "
+                f"and {self._options.max_range:g} m from the lidar; are its points in metres?"
+            )
+        return TopicCloud(points, self._scans, self._scans - self._placed)
+
+    def _check_frame(self, frame: str) -> None:
+        self._frame = frame if self._frame is None else self._frame
+        if frame != self._frame:
+            raise BagError(
+                f"{self._where}: has scans in several frames ({self._frame}, {frame}); record "
+                "one topic per lidar"
+            )
+        if frame.lstrip("/") == self._trajectory.frame.lstrip("/") != "":
+            raise BagError(
+                f"{self._where}: its scans are in {frame!r}, the frame of the map, where poses "
+                "must not move them; give the lidar's own scans, or save the cloud to a file"
+            )
+
+    def _nothing_placed(self) -> str:
+        if not self._scans or not len(self._trajectory):
+            return f"{self._where}: there are no scans, or no poses to place them by"
+        first, last = self._trajectory.stamp_ns[[0, -1]] * 1e-9
+        return (
+            f"{self._where}: none of its {self._scans} scans has a pose: poses run from "
+            f"{first:.3f} to {last:.3f} s and may be {self._options.max_pose_gap_s:g} s apart at "
+            "most; if the clocks differ, try `bag.stamps: record`"
+        )
+
+
+def _connections(bag: Bag, topic: str) -> list[Connection]:
+    named = [c for c in bag.connections if c.topic.lstrip("/") == topic.lstrip("/")]
+    clouds = [c for c in bag.connections if c.msgtype == CLOUD_TYPE]
+    if not named:
+        raise BagError(f"{bag.path}: no topic {topic!r}; with clouds there are: {listed(clouds)}")
+    if wrong := [c for c in named if c.msgtype != CLOUD_TYPE]:
+        raise BagError(
+            f"{bag.path}: topic {topic} is of type {wrong[0].msgtype}, a cloud must be "
+            f"{CLOUD_TYPE}; of that type there are: {listed(clouds)}"
+        )
+    return named
+
+
+def _pose_at(trajectory: Trajectory, stamp_ns: int, max_gap_s: float) -> RigidTransform | None:
+    """Return the pose at a time, or nothing where there is none on either side near enough."""
+    known = trajectory.stamp_ns
+    after = int(np.searchsorted(known, stamp_ns))
+    if after < len(known) and known[after] == stamp_ns:
+        return RigidTransform(trajectory.R[after], trajectory.p[after])
+    if after in (0, len(known)) or known[after] - known[after - 1] > max_gap_s * 1e9:
+        return None
+    near = slice(after - 1, after + 1)
+    ends = Link(
+        trajectory.frame,
+        trajectory.child_frame,
+        known[near],
+        trajectory.R[near],
+        trajectory.p[near],
+    )
+    between = ends.at(np.array([stamp_ns]))
+    return RigidTransform(between.R[0], between.p[0])
+
+
+def _in_range(points: FloatArray, options: CloudTopicOptions) -> FloatArray:
+    """Return the points, shape (N, 3), at a useful distance; NaN is at none."""
+    points = points[np.all(np.abs(points) <= options.max_range, axis=1)]
+    distance = np.linalg.norm(points, axis=1)
+    return np.asarray(points[(distance >= options.min_range) & (distance <= options.max_range)])
+
+
+def _points(scan: Any) -> FloatArray:
+    """Return x, y and z of a PointCloud2 as they stand, shape (N, 3).
+
+    Raises
+    ------
+    ValueError
+        The scan declares what its data does not hold, or has no x, y and z.
+    """
+    height, width, step = int(scan.height), int(scan.width), int(scan.point_step)
+    if not height * width:
+        return np.zeros((0, 3))
+    row = int(scan.row_step) if height > 1 else width * step
+    if row < width * step or (height - 1) * row + width * step > len(scan.data):
+        raise ValueError(
+            f"a scan declares {height} x {width} points of {step} bytes in rows of {row} bytes, "
+            f"which its {len(scan.data)} bytes are not"
+        )
+    order = ">" if scan.is_bigendian else "<"
+    columns = []
+    for axis in "xyz":
+        offset, kind = _field(scan, axis)
+        columns.append(np.ndarray((height, width), order + kind, scan.data, offset, (row, step)))
+    return stacked([column.ravel() for column in columns])
+
+
+def _field(scan: Any, name: str) -> tuple[int, str]:
+    """Return where a coordinate begins in a point, in bytes, and its type."""
+    found = [each for each in scan.fields if each.name == name]
+    if not found or found[0].datatype not in FLOATS or found[0].count > 1:
+        names = ", ".join(each.name for each in scan.fields[:20]) or "(none)"
+        raise ValueError(f"a scan has no field {name!r} of one float; its fields are: {names}")
+    offset, kind = int(found[0].offset), FLOATS[found[0].datatype]
+    if offset + np.dtype(kind).itemsize > scan.point_step:
+        raise ValueError(f"a scan's field {name!r} reaches over the end of a point")
+    return offset, kind

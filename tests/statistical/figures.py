@@ -1,0 +1,137 @@
+"""Whether stated uncertainties are true: z-scores, coverage, NEES, and the bands they must be in.
+
+Errors of calibrations on one survey are not independent, because they share its map. Every band
+here therefore comes in a form that takes only surveys for independent.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2, norm, t
+
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Band:
+    """An interval that holds a figure with a stated probability."""
+
+    low: float
+    high: float
+
+    def __contains__(self, value: float) -> bool:
+        return self.low <= value <= self.high
+
+    def __str__(self) -> str:
+        return f"{self.low:.3g}-{self.high:.3g}"
+
+
+@dataclass(frozen=True)
+class ClusteredMean:
+    """A mean over groups of values that are alike within each group.
+
+    Attributes
+    ----------
+    mean
+        Over all values.
+    standard_error
+        Of the mean, from the spread of the groups alone.
+    effective
+        How many independent values would leave the mean as unsure as it is: between the number
+        of groups and the number of values.
+    groups
+        How many there are.
+    """
+
+    mean: float
+    standard_error: float
+    effective: float
+    groups: int
+
+    def band(self, level: float = LEVEL) -> Band:
+        """Return Student's interval of the true mean."""
+        reach = float(t.ppf(0.5 + level / 2, self.groups - 1)) * self.standard_error
+        return Band(self.mean - reach, self.mean + reach)
+
+
+def z_scores(sample: FieldSample, truth: FloatArray) -> FloatArray:
+    """Return (map - truth) / sigma per axis at the points inside the map, shape (M, 3).
+
+    ``truth``, shape (N, 3), is the field without noise: a sample's variance has none.
+    """
+    z = (sample.field - truth) / np.sqrt(sample.variance)
+    return np.asarray(z[sample.inside])
+
+
+def interval_coverage(z: FloatArray, level: float = LEVEL) -> float:
+    """Return the share of z-scores of any shape within the central interval of a level."""
+    return float(np.mean(np.abs(z) <= norm.ppf(0.5 + level / 2)))
+
+
+def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Return e' inv(P) e of errors (N, K) with their covariances (N, K, K), shape (N,).
+
+    Its expectation is K where the covariances are true.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a covariance is not positive definite.
+    """
+    # Metres, ratios and microtesla in one matrix: scaled to correlations before factorising.
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    correlation = covariances / (sigma[:, :, None] * sigma[:, None, :])
+    white = np.linalg.solve(np.linalg.cholesky(correlation), (errors / sigma)[..., None])
+    return np.asarray(np.sum(white[..., 0] ** 2, axis=1))
+
+
+def chi_square_band(dof: int, count: float, level: float = LEVEL) -> Band:
+    """Return where the mean of ``count`` independent NEES of ``dof`` dimensions must lie.
+
+    ``count`` need not be whole: see ``ClusteredMean.effective``.
+    """
+    low, high = (float(chi2.ppf(p, dof * count)) for p in (0.5 - level / 2, 0.5 + level / 2))
+    return Band(low / count, high / count)
+
+
+def ellipsoid_coverage(values: FloatArray, dof: int, level: float = LEVEL) -> FloatArray:
+    """Return which NEES of ``dof`` dimensions lie within the ellipsoid of a level, 0 or 1."""
+    return (values <= chi2.ppf(level, dof)).astype(np.float64)
+
+
+def wilson_interval(share: float, count: float, level: float = LEVEL) -> Band:
+    """Return Wilson's score interval of a probability of which ``share`` of ``count`` came true.
+
+    E. B. Wilson, J. Am. Stat. Assoc. 22:209, 1927.
+    """
+    z2 = float(norm.ppf(0.5 + level / 2)) ** 2 / count
+    middle = (share + z2 / 2) / (1 + z2)
+    reach = np.sqrt(share * (1 - share) * z2 + z2**2 / 4) / (1 + z2)
+    return Band(float(middle - reach), float(middle + reach))
+
+
+def clustered_mean(values: FloatArray, groups: IntArray) -> ClusteredMean:
+    """Return the mean of values (N,) of which only different groups (N,) are independent.
+
+    The standard error is that of a ratio of sums over groups (cluster-robust), with the usual
+    correction G / (G - 1); groups may differ in size.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two groups.
+    """
+    _, group = np.unique(groups, return_inverse=True)
+    count, number = len(values), int(group.max()) + 1
+    if number < 2:
+        raise ValueError("one group tells nothing of how groups differ; two or more are needed")
+    mean = float(np.mean(values))
+    sums = np.bincount(group, values - mean)
+    variance = float(sums @ sums) / count**2 * number / (number - 1)
+    alone = float(np.var(values, ddof=1))
+    effective = alone / variance if variance > 0 else float(count)
+    # The estimate is rough with few groups; it cannot lie beyond what sharing makes possible.
+    effective = float(np.clip(effective, number, count))
+    return ClusteredMean(mean, float(np.sqrt(variance)), effective, number)

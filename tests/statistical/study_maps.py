@@ -1,0 +1,241 @@
+"""How well maps predict the field of extended bodies, and whether they know how well."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.field_map import FieldMap
+from tests.statistical.figures import interval_coverage, z_scores
+from tests.steel import MILD, STRONG, CloudVariant, SteelHall, steel_hall, structure_cloud
+from tests.steel_drives import Survey, held_out, survey
+
+NOISE_FACT = "noise of a reading (uT)"  # of a map's summary
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a map is made of, and the truth for maps that are exact on purpose.
+
+    Attributes
+    ----------
+    survey
+        Readings.
+    cloud
+        What the LiDAR saw of the structures in metres, shape (P, 3); empty where nothing.
+    hall
+        The truth.
+    """
+
+    survey: Survey
+    cloud: FloatArray
+    hall: SteelHall
+
+
+Build = Callable[[Scene], FieldMap]
+
+
+@dataclass(frozen=True)
+class MapCase:
+    """A kind of map under study.
+
+    Attributes
+    ----------
+    build
+        How it comes about.
+    clouds
+        Structure clouds it is tried with; a kind that knows no structure needs NONE alone.
+    """
+
+    build: Build
+    clouds: tuple[CloudVariant, ...] = (CloudVariant.NONE,)
+
+
+@dataclass(frozen=True)
+class MapConditions:
+    """Worlds and surveys of a study of maps.
+
+    Attributes
+    ----------
+    worlds
+        Seeds of hall and survey.
+    strengths
+        Factors on the polarisation of posts and racks.
+    heights
+        Passes of the surveys in metres, one tuple each.
+    noise
+        Of the surveys in uT.
+    readings
+        Of a survey.
+    off_plane
+        Places are held out this far above and below the passes too, in metres.
+    """
+
+    worlds: tuple[int, ...] = (0, 1, 2, 3)
+    strengths: tuple[float, ...] = (MILD, STRONG)
+    heights: tuple[tuple[float, ...], ...] = ((0.6,), (0.4, 0.9), (0.4, 0.7, 1.0))
+    noise: float = 0.2
+    readings: int = 1500
+    off_plane: float = 0.0
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Errors of one map at its held-out places.
+
+    Attributes
+    ----------
+    error
+        Map minus truth in uT where the map has data, shape (M, 3).
+    sigma
+        What the map said of it, shape (M, 3).
+    z
+        Their quotient, shape (M, 3).
+    inside
+        Share of the places where the map has data.
+    noise
+        Of a reading as the map estimates it in uT; NaN for a kind that does not.
+    """
+
+    error: FloatArray
+    sigma: FloatArray
+    z: FloatArray
+    inside: float
+    noise: float
+
+
+@dataclass(frozen=True)
+class MapRow:
+    """A line of the table: one kind under one condition, over all worlds.
+
+    Attributes
+    ----------
+    kind, cloud, strength, heights
+        What was studied.
+    rmse, sigma
+        Of the error and as predicted, root mean square over axes and places, in uT.
+    z_std, z_worst
+        Standard deviation of all z-scores about zero, and of the world where it is farthest from
+        one.
+    coverage
+        Of the 95 % interval per axis.
+    inside
+        Share of places inside the map.
+    noise
+        Of a reading as the maps estimate it, median over the worlds, in uT: much more than the
+        survey's noise says that a map does not explain the field.
+    """
+
+    kind: str
+    cloud: CloudVariant
+    strength: float
+    heights: tuple[float, ...]
+    rmse: float
+    sigma: float
+    z_std: float
+    z_worst: float
+    coverage: float
+    inside: float
+    noise: float
+
+    def __str__(self) -> str:
+        heights = "/".join(f"{height:g}" for height in self.heights)
+        return (
+            f"{self.kind:<16} {self.cloud:<21} {self.strength:>4g}  {heights:<12}"
+            f" {self.rmse:7.3f} {self.sigma:7.3f} {self.z_std:6.2f} {self.z_worst:6.2f}"
+            f" {self.coverage:6.3f} {self.inside:6.3f} {self.noise:6.3f}"
+        )
+
+
+HEADER = (
+    f"{'kind':<16} {'structure cloud':<21} {'steel':>4} {'heights (m)':<12}"
+    f" {'rmse uT':>7} {'sigma':>7} {'z std':>6} {'worst':>6} {'cov95':>6} {'inside':>6}"
+    f" {'noise':>6}"
+)
+
+
+def map_study(
+    cases: Mapping[str, MapCase],
+    conditions: MapConditions,
+    tell: Callable[[str], None] = print,
+) -> tuple[MapRow, ...]:
+    """Return a line for every kind, cloud, strength and set of heights, telling each at once.
+
+    All kinds get the same surveys and are asked at the same places.
+    """
+    tell(HEADER)
+    rows = []
+    for (kind, cloud), strength, heights in product(
+        _kinds(cases), conditions.strengths, conditions.heights
+    ):
+        build = cases[kind].build
+        predictions = [
+            predict(build, cloud, strength, heights, conditions, world)
+            for world in conditions.worlds
+        ]
+        rows.append(_row(kind, cloud, strength, heights, predictions))
+        tell(str(rows[-1]))
+    return tuple(rows)
+
+
+def predict(
+    build: Build,
+    cloud: CloudVariant,
+    strength: float,
+    heights: tuple[float, ...],
+    conditions: MapConditions,
+    world: int,
+) -> Prediction:
+    """Return the errors of the map of one survey."""
+    hall = steel_hall(world, strength)
+    surveyed = survey(hall, world, heights, conditions.noise, conditions.readings)
+    field_map = build(Scene(surveyed, structure_cloud(hall, cloud, world), hall))
+    low, high = surveyed.span
+    truth = held_out(hall, world, (low - conditions.off_plane, high + conditions.off_plane))
+    sample = field_map.query(truth.points)
+    error = (sample.field - truth.field)[sample.inside]
+    sigma = np.sqrt(sample.variance[sample.inside])
+    return Prediction(
+        error,
+        sigma,
+        z_scores(sample, truth.field),
+        inside=float(sample.inside.mean()),
+        noise=float(field_map.summary.facts.get(NOISE_FACT, np.nan)),
+    )
+
+
+def _kinds(cases: Mapping[str, MapCase]) -> Iterator[tuple[str, CloudVariant]]:
+    for kind, case in cases.items():
+        for cloud in case.clouds:
+            yield kind, cloud
+
+
+def _row(
+    kind: str,
+    cloud: CloudVariant,
+    strength: float,
+    heights: tuple[float, ...],
+    predictions: Sequence[Prediction],
+) -> MapRow:
+    """Return the figures over all worlds."""
+    z = np.concatenate([p.z for p in predictions])
+    stds = np.array([_rms(p.z) for p in predictions])
+    return MapRow(
+        kind,
+        cloud,
+        strength,
+        heights,
+        rmse=_rms(np.concatenate([p.error for p in predictions])),
+        sigma=_rms(np.concatenate([p.sigma for p in predictions])),
+        z_std=_rms(z),
+        z_worst=float(stds[np.argmax(np.abs(np.log(stds)))]),
+        coverage=interval_coverage(z),
+        inside=float(np.mean([p.inside for p in predictions])),
+        noise=float(np.median([p.noise for p in predictions])),
+    )
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
