@@ -320,13 +320,30 @@ def eliminate(
     linear: gtsam.GaussianFactorGraph, sensors: list[int], tiles: list[int]
 ) -> Eliminated:
     """Solve a linear graph by QR, which does not mind directions of very different strength."""
+    keys = [key for s in sensors for key in (T(s), D(s))] + [M(tile) for tile in tiles]
     ordering = gtsam.Ordering()
-    for key in [key for s in sensors for key in (T(s), D(s))] + [M(tile) for tile in tiles]:
+    for key in keys:
         ordering.push_back(key)
     net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
-    root, _ = net.matrix()
     columns = {s: 15 * i + np.arange(15) for i, s in enumerate(sensors)}
-    return Eliminated(net.optimize(), np.asarray(root), columns)
+    return Eliminated(net.optimize(), stacked(net, keys), columns)
+
+
+def stacked(net: gtsam.GaussianBayesNet, keys: list[int]) -> FloatArray:
+    """Return the conditionals of variables as one upper triangular matrix, in the keys' order."""
+    conditionals = {net.at(index).firstFrontalKey(): net.at(index) for index in range(net.size())}
+    ends = np.cumsum([len(conditionals[key].R()) for key in keys])
+    at = {
+        key: slice(int(end) - len(conditionals[key].R()), int(end))
+        for key, end in zip(keys, ends, strict=True)
+    }
+    root = np.zeros((int(ends[-1]), int(ends[-1])))
+    for key, conditional in conditionals.items():
+        root[at[key], at[key]] = conditional.R()
+        columns = [np.arange(root.shape[1])[at[parent]] for parent in list(conditional.keys())[1:]]
+        if columns:
+            root[at[key], np.concatenate(columns)] = conditional.S()
+    return root
 
 
 def _same(noise: FloatArray, before: FloatArray) -> bool:

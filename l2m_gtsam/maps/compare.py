@@ -32,7 +32,7 @@ from l2m_gtsam.maps.training import TrainingSet, training_set
 from l2m_gtsam.options import Options
 
 COMPARED = tuple(kind for kind in KINDS if kind != "dense_gp")  # that one only checks another
-LARGEST_FOLD, LEAST_FOLD = 1.5, 0.1  # metres
+LARGEST_FOLD, LEAST_FOLD, SMALLER = 1.5, 0.1, 0.8  # metres, and the step between
 PATCHES_IN_FOLD = 4  # fewer, and the luck of the deal decides
 ASIDE = 0.1  # of the training readings, which tell the noise
 LEAST_NOISE = 1e-3  # uT, finer than magnetometers resolve: no map may claim to be exact
@@ -50,7 +50,7 @@ class CompareOptions(Options):
 
     fold: float | None = Field(default=None, ge=LEAST_FOLD)
     """Edge of a patch in metres: the size of the gaps that the maps have to bridge. If not given,
-    1.5, halved until the readings fill four patches for each fold, but not below 0.1."""
+    1.5, made smaller by fifths until the readings fill four patches per fold, not below 0.1."""
 
     folds: int = Field(default=4, ge=2, le=20)
     """Groups that the patches are dealt out to; as many maps of each kind are built."""
@@ -260,12 +260,12 @@ def fitting_fold(points: FloatArray, options: CompareOptions) -> float:
     """Return the edge of a patch in metres that is given, or that suits the points, (N, 3)."""
     if options.fold is not None:
         return options.fold
-    fold = LARGEST_FOLD
-    while fold >= 2 * LEAST_FOLD:
-        if patches_of(points, fold).max() + 1 >= PATCHES_IN_FOLD * options.folds:
-            break
-        fold /= 2
-    return fold
+    edges = [LARGEST_FOLD]
+    while edges[-1] > LEAST_FOLD / SMALLER:
+        edges.append(SMALLER * edges[-1])
+    wanted = PATCHES_IN_FOLD * options.folds
+    fills = (edge for edge in edges if int(patches_of(points, edge).max()) + 1 >= wanted)
+    return next(fills, edges[-1])
 
 
 def patches_of(points: FloatArray, edge: float) -> IntArray:

@@ -10,7 +10,6 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.one_key import solve_one_key
-from l2m_gtsam.maps.field_map import FieldMap
 from tests.statistical.figures import (
     Band,
     chi_square_band,
@@ -19,7 +18,7 @@ from tests.statistical.figures import (
     nees,
     wilson_interval,
 )
-from tests.statistical.study_maps import Build, Scene
+from tests.statistical.study_maps import Build, Scene, StudiedMap
 from tests.steel import MILD, CloudVariant, SteelHall, steel_hall, structure_cloud
 from tests.steel_drives import CalibrationDrive, calibration_drive, survey
 
@@ -46,11 +45,11 @@ class Solved:
     covariance: FloatArray
 
 
-Calibrate = Callable[[Readings, FieldMap, FloatArray], Sequence[Solved]]
+Calibrate = Callable[[Readings, StudiedMap, FloatArray], Sequence[Solved]]
 """From readings of S sensors, a map and starts (S, 3); sensors not solved are left out."""
 
 
-def independent(readings: Readings, field_map: FieldMap, t_start: FloatArray) -> Sequence[Solved]:
+def independent(readings: Readings, field_map: StudiedMap, t_start: FloatArray) -> Sequence[Solved]:
     """Calibrate as if the map's errors were independent between readings."""
     solution = solve_one_key(readings, field_map, t_start, OneKeyOptions())
     return [
@@ -279,8 +278,8 @@ def _outcomes(
         surveyed = survey(hall, seed, heights, noise, conditions.survey_readings)
         field_map = case.build(Scene(surveyed, structure_cloud(hall, case.cloud, seed), hall))
         span = conditions.sensor_span or surveyed.span
-        for drive in _drives(hall, conditions, seed, span, noise):
-            start = _start(drive, seed)
+        for number, drive in enumerate(_drives(hall, conditions, seed, span, noise)):
+            start = _start(drive, seed, number)
             for method, calibrate in case.methods.items():
                 solved = calibrate(drive.readings, field_map, start)
                 parts[method].append(_compared(solved, drive, seed))
@@ -306,9 +305,10 @@ def _drives(
         )
 
 
-def _start(drive: CalibrationDrive, seed: int) -> FloatArray:
+def _start(drive: CalibrationDrive, seed: int, number: int) -> FloatArray:
     """Return starts near the truth: the basin of attraction is not what is studied here."""
-    away = np.random.default_rng([seed, 6]).uniform(-START_M, START_M, (len(drive.sensors), 3))
+    rng = np.random.default_rng([seed, number, 6])
+    away = rng.uniform(-START_M, START_M, (len(drive.sensors), 3))
     return np.asarray(drive.truth()[:, :3] + away)
 
 

@@ -3,11 +3,13 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Protocol
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.maps.field_map import MapSummary
 from tests.statistical.figures import interval_coverage, z_scores
 from tests.steel import MILD, STRONG, CloudVariant, SteelHall, steel_hall, structure_cloud
 from tests.steel_drives import Survey, held_out, survey
@@ -34,7 +36,16 @@ class Scene:
     hall: SteelHall
 
 
-Build = Callable[[Scene], FieldMap]
+class StudiedMap(QueryableMap, Protocol):
+    """What the studies ask of a map."""
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map; its facts may hold NOISE_FACT."""
+        ...
+
+
+Build = Callable[[Scene], StudiedMap]
 
 
 @dataclass(frozen=True)

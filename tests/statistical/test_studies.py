@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FieldSample, FloatArray, MapState, Readings
-from l2m_gtsam.maps.field_map import FieldMap, MapSummary
+from l2m_gtsam.data import FieldSample, FloatArray, Readings
+from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.simulate.world import SteelWorld
 from tests.statistical import study_calibration
 from tests.statistical.study_calibration import (
@@ -17,7 +17,14 @@ from tests.statistical.study_calibration import (
     calibration_study,
     independent,
 )
-from tests.statistical.study_maps import NOISE_FACT, MapCase, MapConditions, Scene, map_study
+from tests.statistical.study_maps import (
+    NOISE_FACT,
+    MapCase,
+    MapConditions,
+    Scene,
+    StudiedMap,
+    map_study,
+)
 from tests.steel import MILD, CloudVariant, SteelHall, steel_hall
 from tests.worlds import DipoleWorld, dipole_world
 
@@ -31,7 +38,6 @@ class TrueMap:
     exact: Exact
     sigma: float = 0.0
     told: float = 1.0
-    kind: str = "true"
 
     @property
     def summary(self) -> MapSummary:
@@ -48,9 +54,6 @@ class TrueMap:
 
     def variance(self, points: FloatArray) -> FloatArray:
         return np.full(points.shape, (self.told * self.sigma) ** 2)
-
-    def to_state(self) -> MapState:
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ def steel_of(scene: Scene, sigma: float, told: float) -> TrueMap:
     return TrueMap(lambda p: (scene.hall.world.field(p), np.zeros((len(p), 3, 3))), sigma, told)
 
 
-def doubtless(readings: Readings, field_map: FieldMap, t_start: FloatArray) -> Sequence[Solved]:
+def doubtless(readings: Readings, field_map: StudiedMap, t_start: FloatArray) -> Sequence[Solved]:
     """Calibrate, and halve every sigma."""
     return [
         replace(found, covariance=found.covariance / 4)

@@ -204,13 +204,13 @@ def test_a_drive_along_one_line_is_interpolated() -> None:
     ],
 )
 def test_layers_gather_readings_of_one_height(heights: list[float], expected: list[int]) -> None:
-    assert layers_of(np.array(heights), 0.25).tolist() == expected
+    assert layers_of(np.array(heights), np.ones(len(heights)), 0.25).tolist() == expected
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=40))
 def test_layers_count_upward_and_keep_their_distance(heights: list[float]) -> None:
-    layer = layers_of(np.array(heights), 0.25)
+    layer = layers_of(np.array(heights), np.ones(len(heights)), 0.25)
     assert set(layer) == set(range(max(layer) + 1))
     means = [np.mean(np.array(heights)[layer == k]) for k in range(max(layer) + 1)]
     assert np.diff(means).min(initial=np.inf) >= bilinear.LEAST_STEP * 0.25

@@ -17,6 +17,7 @@ from l2m_gtsam.maps.compare import (
     compare_maps,
     evenly,
     figures_of,
+    fitting_fold,
     folds_of,
     noise_of,
     patches_of,
@@ -55,6 +56,9 @@ class Flat:
 
     def variance(self, points: FloatArray) -> FloatArray:
         return np.full((len(points), 3), self.sigma**2)
+
+    def updated(self, points: FloatArray, field: FloatArray, /) -> "Flat":
+        return self
 
     def to_state(self) -> MapState:
         return MapState(self.kind, {}, {}, {})
@@ -279,8 +283,23 @@ def test_at_most_so_many_readings_are_used() -> None:
     assert set(np.diff(rows)) == {10, 11} or set(np.diff(rows)) == {10}
 
 
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [
+        ((8, 8), 1.5),  # 36 patches, more than four for each of four folds
+        ((2.4, 2.3), 1.5 * 0.8**4),  # 0.61 m, the first edge that gives 4 x 4
+        ((30, 0.2), 1.5),  # a corridor counts by its length
+        ((0.3, 0.2), 1.5 * 0.8**12),  # the last edge above a decimetre
+    ],
+)
+def test_patches_suit_the_area(size: tuple[float, float], expected: float) -> None:
+    points = np.random.default_rng(1).uniform([0, 0, 0], [*size, 0.5], (4000, 3))
+    assert fitting_fold(points, CompareOptions()) == pytest.approx(expected)
+    assert fitting_fold(points, CompareOptions(fold=0.7)) == 0.7
+
+
 def test_too_few_patches_are_refused_in_one_line() -> None:
-    with pytest.raises(MapError, match=r"fill 1 patches of 20 m, .* a smaller fold is needed"):
+    with pytest.raises(MapError, match=r"fill 1 patches, .* a smaller fold is needed"):
         compare_maps(places(), noisy(), CompareOptions(fold=20))
 
 
@@ -306,7 +325,7 @@ def rendered(comparison: MapComparison) -> str:
 
 def test_the_table_shows_figures_and_reasons(dipoles: MapComparison) -> None:
     text = rendered(dipoles)
-    assert "4,000 readings" in text
+    assert "4,000 readings in 36 patches of 1.5 m" in text
     assert "recommended: sliding_gp" in text
     assert "failed" not in text
     assert f"{figures(dipoles, 'bilinear').rmse:.3f}" in text

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.potential_grid import (
-    BATCH,
     DEGREE,
     HALF_TAPS,
+    Box,
+    Lattice,
     PotentialGrid,
     potential_grid,
 )
@@ -21,6 +22,29 @@ GRADIENT_TOLERANCE = 0.02  # uT/m, what the solvers are promised
 FELT = HALF_TAPS + DEGREE // 2 + 1  # cells: a value reaches no further
 
 BOX = np.array([0.6, 0.6, 0.4])
+EVERYWHERE = Box(np.full(3, -np.inf), np.full(3, np.inf))
+
+Potential = Callable[[FloatArray], FloatArray]
+
+
+def nodes_of(lattice: Lattice) -> FloatArray:
+    """Return all nodes, shape (nx, ny, nz, 3)."""
+    return np.stack(np.meshgrid(*lattice.axes, indexing="ij"), axis=-1)
+
+
+def grid_of(
+    potential: Potential,
+    points: FloatArray,
+    reach: float,
+    spacing: float,
+    box: Box = EVERYWHERE,
+) -> PotentialGrid:
+    """Return the grid of a potential that is given point by point."""
+
+    def on(lattice: Lattice) -> FloatArray:
+        return potential(nodes_of(lattice).reshape(-1, 3)).reshape(lattice.needed.shape)
+
+    return potential_grid(on, points, reach, spacing, box)
 
 
 @dataclass(frozen=True)
@@ -81,7 +105,7 @@ def places(count: int, seed: int = 0) -> FloatArray:
 def errors(source: Dipole | Wave, spacing: float) -> tuple[float, float]:
     """Return the largest errors of field and gradient in the box."""
     points = places(1500)
-    grid = potential_grid(source.potential, points, 0.1, spacing)
+    grid = grid_of(source.potential, points, 0.1, spacing)
     field, gradient = grid.field_and_gradient(points)
     true_field, true_gradient = source.field_and_gradient(points)
     return float(np.abs(field - true_field).max()), float(np.abs(gradient - true_gradient).max())
@@ -105,7 +129,7 @@ def test_polynomials_are_reproduced(seed: int, spacing: float) -> None:
         return np.asarray(value.sum(axis=1))
 
     points = places(40, seed % 1000)
-    grid = potential_grid(lambda nodes: monomials(nodes, (0, 0, 0)), points, 0.05, spacing)
+    grid = grid_of(lambda nodes: monomials(nodes, (0, 0, 0)), points, 0.05, spacing)
     field, gradient = grid.field_and_gradient(points)
     # Rounding of the values, which grow with the grid's extent, over the spacing (squared).
     rounding = 1e-12 * 12 * max(1.0, float(np.abs(grid.coefficients).max()))
@@ -150,7 +174,7 @@ def test_half_the_spacing_divides_the_error_by_the_order(
 
 def test_the_gradient_is_the_derivative_of_the_field() -> None:
     points = places(200)
-    grid = potential_grid(MIDDLE.potential, points, 0.1, 0.08)
+    grid = grid_of(MIDDLE.potential, points, 0.1, 0.08)
     _, gradient = grid.field_and_gradient(points)
     step = 1e-4
     for j, axis in enumerate(np.eye(3)):
@@ -165,13 +189,13 @@ def test_the_gradient_is_the_derivative_of_the_field() -> None:
 
 def test_the_gradient_is_symmetric() -> None:
     points = places(500)
-    _, gradient = potential_grid(NEAR.potential, points, 0.1, 0.1).field_and_gradient(points)
+    _, gradient = grid_of(NEAR.potential, points, 0.1, 0.1).field_and_gradient(points)
     np.testing.assert_array_equal(gradient, gradient.transpose(0, 2, 1))
 
 
 def test_nothing_steps_from_cell_to_cell() -> None:
     points = places(300)
-    grid = potential_grid(NEAR.potential, points, 0.3, 0.1)
+    grid = grid_of(NEAR.potential, points, 0.3, 0.1)
     for axis in range(3):
         at = points.copy()
         at[:, axis] = grid.lower[axis] + 0.1 * np.round((at[:, axis] - grid.lower[axis]) / 0.1)
@@ -185,14 +209,14 @@ def test_nothing_steps_from_cell_to_cell() -> None:
 
 def test_a_value_is_felt_no_further_than_the_stencil() -> None:
     spacing, points = 0.1, places(300) * 10
-    grid = potential_grid(MIDDLE.potential, points, 0.1, spacing)
+    grid = grid_of(MIDDLE.potential, points, 0.1, spacing)
 
     def disturbed(nodes: FloatArray) -> FloatArray:
         return MIDDLE.potential(nodes) + 1e9 * (nodes[:, 0] > 4)
 
     far = points[points[:, 0] < 4 - FELT * spacing]
     near = points[points[:, 0] > 4 - (FELT - 2) * spacing]
-    other = potential_grid(disturbed, points, 0.1, spacing)
+    other = grid_of(disturbed, points, 0.1, spacing)
     for calm, shaken in zip(
         grid.field_and_gradient(far), other.field_and_gradient(far), strict=True
     ):
@@ -204,7 +228,7 @@ def test_a_value_is_felt_no_further_than_the_stencil() -> None:
 @pytest.mark.parametrize("corner", [[0.0, 0.0, 0.0], [-1e4, 3e4, 7.7]])
 def test_the_grid_ends_beyond_the_reach(reach: float, corner: list[float]) -> None:
     spacing, points = 0.1, places(50) + corner
-    grid = potential_grid(lambda nodes: nodes[:, 0], points, reach, spacing)
+    grid = grid_of(lambda nodes: nodes[:, 0], points, reach, spacing)
     for side in np.array(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1])).reshape(3, -1).T:
         assert grid.covers(points + reach * side).all()
     lowest, highest = points.min(axis=0), points.max(axis=0)
@@ -220,7 +244,7 @@ def test_covered_is_where_field_and_gradient_are_known(
 ) -> None:
     rng = np.random.default_rng(seed)
     survey = rng.uniform(-1, 1, (4, 3)) * [6, 6, 1]
-    grid = potential_grid(lambda nodes: np.sin(nodes).sum(axis=1), survey, reach, spacing)
+    grid = grid_of(lambda nodes: np.sin(nodes).sum(axis=1), survey, reach, spacing)
     points = rng.uniform(-1, 1, (400, 3)) * [7, 7, 2]
     points[:100] = survey[rng.integers(0, 4, 100)] + rng.uniform(-reach, reach, (100, 3))
     covered = grid.covers(points)
@@ -234,7 +258,7 @@ def test_covered_is_where_field_and_gradient_are_known(
 def test_scattered_places_are_answered_in_their_own_order() -> None:
     points = places(3000) * [80, 80, 1]  # some forty blocks of cells
     wave = Wave(0.11, 0.07, 10.0)
-    grid = potential_grid(wave.potential, points, 0.1, 0.8)
+    grid = grid_of(wave.potential, points, 0.1, 0.8)
     field, gradient = grid.field_and_gradient(points)
     for n in range(0, len(points), 100):
         alone = grid.field_and_gradient(points[n : n + 1])
@@ -242,23 +266,44 @@ def test_scattered_places_are_answered_in_their_own_order() -> None:
         np.testing.assert_array_equal(gradient[n], alone[1][0])
 
 
-def test_the_potential_is_asked_only_near_the_survey() -> None:
+def test_the_potential_is_needed_only_near_the_survey() -> None:
     spacing, reach = 0.1, 0.2
-    survey = np.array([[0.0, 0.0, 0.0], [30.0, 20.0, 1.0]])
-    asked: list[FloatArray] = []
+    survey = np.array([[0.0, 0.0, 0.0], [3.0, 2.0, 1.0]])
+    asked: list[Lattice] = []
 
-    def potential(nodes: FloatArray) -> FloatArray:
-        asked.append(nodes)
-        return np.asarray(nodes[:, 0])
+    def potential(lattice: Lattice) -> FloatArray:
+        asked.append(lattice)
+        x = nodes_of(lattice)[..., 0]
+        return np.where(lattice.needed, x, 1e9)  # what is not needed must not be used
 
-    grid = potential_grid(potential, survey, reach, spacing)
-    nodes = np.concatenate(asked)
-    assert max(len(batch) for batch in asked) <= BATCH
-    assert len(np.unique(nodes, axis=0)) == len(nodes)
+    grid = potential_grid(potential, survey, reach, spacing, EVERYWHERE)
+    (lattice,) = asked
+    nodes = nodes_of(lattice)[lattice.needed]
     away = np.abs(nodes[:, None] - survey).max(axis=2).min(axis=1)
     assert away.max() <= reach + (FELT + 2) * spacing
     assert not grid.covers(survey.mean(axis=0)[None]).any()
     assert np.isnan(grid.field_and_gradient(survey.mean(axis=0)[None])[0]).all()
+    field, _ = grid.field_and_gradient(survey)
+    np.testing.assert_allclose(field, [[1, 0, 0]] * 2, atol=1e-9)  # rounding over the spacing
+
+
+def test_a_box_ends_the_grid() -> None:
+    spacing, points = 0.1, places(300) * 10
+    box = Box(np.array([1.0, -np.inf, 0.7]), np.array([2.5, 4.0, np.inf]))
+    whole = grid_of(MIDDLE.potential, points, 0.2, spacing)
+    part = grid_of(MIDDLE.potential, points, 0.2, spacing, box)
+    inside = ((points >= box.lower) & (points <= box.upper)).all(axis=1)
+    assert part.covers(points[inside]).all()
+    beyond = ((points < box.lower - 2 * spacing) | (points > box.upper + 2 * spacing)).any(axis=1)
+    assert beyond.any()
+    assert not part.covers(points[beyond]).any()
+    for one, other in zip(
+        part.field_and_gradient(points[inside]),
+        whole.field_and_gradient(points[inside]),
+        strict=True,
+    ):
+        # Nodes lie elsewhere: both err by what the spacing allows, far from the source.
+        np.testing.assert_allclose(one, other, rtol=0, atol=GRADIENT_TOLERANCE)
 
 
 @pytest.mark.parametrize("hole", [np.inf, -np.inf, np.nan])
@@ -270,7 +315,7 @@ def test_places_beside_a_node_without_a_value_are_not_covered(hole: float) -> No
         away = np.linalg.norm(nodes - source, axis=1)
         return np.where(away < 0.1, hole, MIDDLE.potential(nodes))
 
-    grid = potential_grid(potential, points, 0.0, 0.1)
+    grid = grid_of(potential, points, 0.0, 0.1)
     away = np.abs(points - source).max(axis=1)
     covered = grid.covers(points)
     assert covered[away > 0.1 * (FELT + 1)].all()
@@ -280,14 +325,14 @@ def test_places_beside_a_node_without_a_value_are_not_covered(hole: float) -> No
 
 @pytest.mark.parametrize("far", [1e6, 1e100, 1e308])
 def test_places_far_away_are_not_covered(far: float) -> None:
-    grid = potential_grid(lambda nodes: nodes[:, 0], places(5), 0.1, 0.1)
+    grid = grid_of(lambda nodes: nodes[:, 0], places(5), 0.1, 0.1)
     points = far * np.vstack([np.eye(3), -np.eye(3)])
     assert not grid.covers(points).any()
     assert np.isnan(grid.field_and_gradient(points)[0]).all()
 
 
 def test_no_places_give_no_answers() -> None:
-    grid = potential_grid(lambda nodes: nodes[:, 0], places(5), 0.1, 0.1)
+    grid = grid_of(lambda nodes: nodes[:, 0], places(5), 0.1, 0.1)
     field, gradient = grid.field_and_gradient(np.empty((0, 3)))
     assert field.shape == (0, 3)
     assert gradient.shape == (0, 3, 3)
@@ -297,18 +342,17 @@ def test_no_places_give_no_answers() -> None:
 def test_a_grid_that_would_be_too_large_is_refused(far: float) -> None:
     points = far * np.eye(3)
     with pytest.raises(MapError, match=r"spacing 0.05 m would have .* raise the spacing"):
-        potential_grid(lambda nodes: nodes[:, 0], points, 0.1, 0.05)
+        grid_of(lambda nodes: nodes[:, 0], points, 0.1, 0.05)
 
 
-@pytest.mark.parametrize("method", [PotentialGrid.covers, PotentialGrid.field_and_gradient])
-def test_bad_places_are_refused(method: Callable[[PotentialGrid, FloatArray], object]) -> None:
-    grid = potential_grid(lambda nodes: nodes[:, 0], places(5), 0.1, 0.1)
-    with pytest.raises(MapError, match="point 1 of 2 is not finite"):
-        method(grid, np.array([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]]))
-    with pytest.raises(MapError, match="shape"):
-        method(grid, np.zeros(3))
+def test_places_that_are_not_finite_are_not_covered() -> None:
+    grid = grid_of(lambda nodes: nodes[:, 0], places(5), 0.1, 0.1)
+    bad = np.full((3, 3), 0.3)
+    bad[np.diag_indices(3)] = [np.nan, np.inf, -np.inf]
+    assert not grid.covers(bad).any()
+    assert np.isnan(grid.field_and_gradient(bad)[1]).all()
 
 
 def test_a_grid_needs_a_point() -> None:
     with pytest.raises(MapError, match="at least one is needed"):
-        potential_grid(lambda nodes: nodes[:, 0], np.empty((0, 3)), 0.1, 0.1)
+        grid_of(lambda nodes: nodes[:, 0], np.empty((0, 3)), 0.1, 0.1)

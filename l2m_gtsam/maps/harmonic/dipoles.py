@@ -52,7 +52,7 @@ class Dipoles:
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient; see ``Family``."""
-        m = self._moments(weights)
+        m = self.moments(weights)
         r, d = separations(points, self.positions)
         mr = np.einsum("nki,ki->nk", r, m)
         d3, d5, d7 = d**-3, d**-5, d**-7
@@ -66,9 +66,10 @@ class Dipoles:
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential; see ``Family``."""
         r, d = separations(points, self.positions)
-        return np.asarray(-np.einsum("nki,ki,nk->n", r, self._moments(weights), d**-3))
+        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), d**-3))
 
-    def _moments(self, weights: FloatArray) -> FloatArray:
+    def moments(self, weights: FloatArray) -> FloatArray:
+        """Return the moments of the sources in uT m^3, shape (K, 3)."""
         return np.asarray((self.combinations @ weights).reshape(-1, 3))
 
 

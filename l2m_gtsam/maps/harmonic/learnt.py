@@ -16,6 +16,12 @@ from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.furnish import COARSE, FINE, basis_of, within
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions, learn
+from l2m_gtsam.maps.harmonic.search import (
+    MOST_READINGS,
+    SearchOptions,
+    look_for_sources,
+    residuals_of,
+)
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import Sources, StructureOptions
 from l2m_gtsam.maps.harmonic.threads import in_threads
@@ -41,6 +47,8 @@ class HarmonicOptions(Options):
     """The windows they are learnt from; one set serves the whole map."""
     structure: StructureOptions = StructureOptions()
     """How a LiDAR's point cloud becomes sources."""
+    search: SearchOptions = SearchOptions()
+    """The search for sources where there is no point cloud."""
     tiling: TilingOptions = TilingOptions()
     """The surroundings of a tile."""
     errors: ErrorOptions = ErrorOptions()
@@ -69,11 +77,14 @@ class Origin:
     readings
         Readings before they were merged.
     learning
-        How learning ended; absent where the hyperparameters were given.
+        How learning ended.
+    searched
+        Whether the sources were searched for in the residuals, for want of a point cloud.
     """
 
     readings: int
     learning: LearningEnd | None
+    searched: bool = False
 
 
 ORIGIN = TypeAdapter(Origin)
@@ -132,7 +143,7 @@ class Learnt:
     def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
         readings = merged(joined(self.readings, new), options.merge, options.independent)
-        grid, reach = self.tiling.grid, min(options.reach, 0.49 * self.tiling.grid.size)
+        grid, reach = self.tiling.grid, min(options.reach, self.tiling.overlap, 0.49 * self.tiling.grid.size)
         wider = grid_from(grid.origin, readings.points, grid.size, reach)
         return replace(
             self,
@@ -165,14 +176,69 @@ def learn_map(
     """
     raw = training_set(points, field)
     readings = merged(raw, options.merge, options.independent)
-    learning = None
-    hyperparameters = options.hyperparameters
-    if hyperparameters is None:
-        learning = learn(readings, sources, options.tiling, options.mode_share, options.learning)
-        hyperparameters = learning.hyperparameters
+    learning = learn_prior(readings, sources, options)
+    searched = not len(sources) and options.search.rounds > 0
+    if searched:
+        learning, sources = with_search(readings, learning, options)
+    origin = Origin(len(raw), learning, searched)
     even = np.ones(len(sources.split()))
-    plain = laid_out(readings, hyperparameters, sources, even, options, Origin(len(raw), learning))
+    plain = laid_out(readings, learning.hyperparameters, sources, even, options, origin)
     return with_strengths(plain)
+
+
+def learn_prior(
+    readings: TrainingSet, sources: Sources, options: HarmonicOptions
+) -> LearningEnd:
+    """Return the hyperparameters that are given, or else those that the readings teach."""
+    if options.hyperparameters is not None:
+        return LearningEnd(options.hyperparameters, float("nan"), 0, converged=True, at_bound=())
+    return learn(readings, sources, options.tiling, options.mode_share, options.learning)
+
+
+def with_search(
+    readings: TrainingSet, learning: LearningEnd, options: HarmonicOptions
+) -> tuple[LearningEnd, Sources]:
+    """Return sources found round by round, and the hyperparameters learnt with them.
+
+    What is not explained yet counts as noise and hides weaker sources, so that noise and sources
+    are learnt by turns.
+    """
+    positions = np.empty((0, 3))
+    for _ in range(options.search.rounds):
+        sources = Sources(positions, np.arange(len(positions)))
+        even = np.ones(len(positions))
+        plain = laid_out(
+            readings, learning.hyperparameters, sources, even, options, Origin(0, None)
+        )
+        found = found_in_tiles(plain, options)
+        if not len(found):
+            break
+        positions = np.concatenate([positions, found])
+        sources = Sources(positions, np.arange(len(positions)))
+        learning = learn_prior(readings, sources, options)
+    return learning, Sources(positions, np.arange(len(positions)))
+
+
+def found_in_tiles(plain: Learnt, options: HarmonicOptions) -> FloatArray:
+    """Return the places of one round of the search over all tiles, shape (K, 3)."""
+    members = plain.members
+
+    def look(tile: int) -> FloatArray:
+        rows = members[tile]
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_READINGS)).astype(int)]
+        basis, readings = plain.basis(tile, rows, COARSE), plain.readings[rows]
+        residuals = residuals_of(basis, readings, plain.hyperparameters)
+        found = look_for_sources(residuals, options.search)
+        return np.array([each.position for each in found]).reshape(-1, 3)
+
+    tiles = list(range(len(plain.tiling)))
+    places = in_threads(look, tiles)
+    own = [
+        place[plain.tiling.grid.block_of(place) == tile]
+        for tile, place in zip(tiles, places, strict=True)
+        if len(place)
+    ]
+    return np.concatenate([np.empty((0, 3)), *own])
 
 
 def laid_out(

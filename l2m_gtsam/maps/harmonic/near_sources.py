@@ -51,50 +51,45 @@ class PointSources:
         """
         phi = np.zeros(lattice.needed.shape)
         if len(self):
-            columns = lattice.needed.any(axis=2)
+            columns = np.asarray(lattice.needed.any(axis=2))
             add_smooth(*lattice.axes, columns, self.positions, self.moments, radius, phi)
         return phi
 
 
 @dataclass(frozen=True)
 class NearSources:
-    """The parts of sources that end at a radius, and where to look for them.
+    """The parts of sources that end at a radius, sorted by the cells in which they are felt.
 
     Attributes
     ----------
-    sources
-        All of them.
     radius
-        Where the second part ends, in metres.
+        Where these parts end, in metres.
     corner
         Lower corner of the cells in metres, shape (2,).
-    starts
-        Where the list of each cell starts in ``members``, shape (nx ny + 1,).
-    members
-        Sources within the radius of a cell, cell by cell.
     shape
         Number of cells along x and y.
+    starts
+        Where each cell starts in ``table``, shape (nx ny + 1,).
+    table
+        Positions and moments (x, y, z, mx, my, mz) of the sources within the radius of a cell,
+        cell by cell, shape (6, E).
     """
 
-    sources: PointSources
     radius: float
     corner: FloatArray
-    starts: IntArray
-    members: IntArray
     shape: tuple[int, int]
+    starts: IntArray
+    table: FloatArray
 
     def add_to(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> None:
         """Add field in uT and gradient in uT/m at points (N, 3) to those of the smooth part."""
-        if len(self.members):
-            cells = (points[:, :2] - self.corner) / CELL
+        if self.table.size:
             add_near(
                 points,
-                cells,
+                self.corner,
                 self.shape,
                 self.starts,
-                self.members,
-                self.sources.positions,
-                self.sources.moments,
+                self.table,
                 self.radius,
                 field,
                 gradient,
@@ -113,7 +108,9 @@ def near_sources(
         gaps.append(np.maximum(np.maximum(left - place, place - left - CELL), 0.0))
     near = np.hypot(gaps[0][:, None], gaps[1]) < radius
     starts = np.append(0, np.cumsum(near.sum(axis=2)))
-    return NearSources(sources, radius, lower, starts, np.nonzero(near)[2], (nx, ny))
+    members = np.nonzero(near)[2]
+    table = np.vstack([sources.positions[members].T, sources.moments[members].T])
+    return NearSources(radius, lower, (nx, ny), starts, np.ascontiguousarray(table))
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -158,32 +155,28 @@ def add_smooth(
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def add_near(
     points: FloatArray,
-    cells: FloatArray,
+    corner: FloatArray,
     shape: tuple[int, int],
     starts: IntArray,
-    members: IntArray,
-    positions: FloatArray,
-    moments: FloatArray,
+    table: FloatArray,
     radius: float,
     field: FloatArray,
     gradient: FloatArray,
 ) -> None:
-    """Add the near part of the sources at points whose cells are given."""
+    """Add the near part of the sources at points (N, 3)."""
     edge = radius * radius
     scale = 1 / (radius * edge)
+    px, py, pz, ux, uy, uz = table
     for n in range(len(points)):
-        if not (0 <= cells[n, 0] < shape[0] and 0 <= cells[n, 1] < shape[1]):
+        across, along = (points[n, 0] - corner[0]) / CELL, (points[n, 1] - corner[1]) / CELL
+        if not (0 <= across < shape[0] and 0 <= along < shape[1]):
             continue
-        cell = int(cells[n, 0]) * shape[1] + int(cells[n, 1])
+        cell = int(across) * shape[1] + int(along)
         bx = by = bz = xx = yy = zz = xy = xz = yz = 0.0
-        for entry in range(starts[cell], starts[cell + 1]):
-            k = members[entry]
-            x = points[n, 0] - positions[k, 0]
-            y = points[n, 1] - positions[k, 1]
-            z = points[n, 2] - positions[k, 2]
-            s = x * x + y * y + z * z
-            if s >= edge:
-                continue
+        for e in range(starts[cell], starts[cell + 1]):
+            x, y, z = points[n, 0] - px[e], points[n, 1] - py[e], points[n, 2] - pz[e]
+            # At the edge all that follows vanishes to rounding, so that no branch is needed.
+            s = min(x * x + y * y + z * z, edge)
             # S and its derivatives by s over the powers of the edge, by Horner's rule.
             t = s / edge - 1
             value, slope, half_curvature = TAYLOR[ORDER], 0.0, 0.0
@@ -196,7 +189,7 @@ def add_near(
             q0 = cube - scale * value
             q1 = -1.5 * cube * inverse - scale / edge * slope
             q2 = 3.75 * cube * inverse * inverse - scale / (edge * edge) * 2 * half_curvature
-            mx, my, mz = moments[k, 0], moments[k, 1], moments[k, 2]
+            mx, my, mz = ux[e], uy[e], uz[e]
             mr = mx * x + my * y + mz * z
             a, b, c = 2 * q1, 2 * mr * q1, 4 * mr * q2
             bx -= mx * q0 + b * x

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from math import comb, factorial
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 from scipy import ndimage
 
@@ -32,10 +33,10 @@ DEGREE = 7
 WIDTH = DEGREE + 1  # coefficients per axis that a point needs
 BELOW = DEGREE // 2  # of them, those below the node at the lower side of the point's cell
 HALF_TAPS = 4  # values to each side that a coefficient needs
-MOST_NODES = 20_000_000  # 160 MB of coefficients, and as much again while they are computed
+MOST_NODES = 8_000_000  # 64 MB of coefficients, and four times as much while they are computed
 BLOCK = 16  # cells of a block in x and y: its coefficients fit the processor's cache
 AROUND = WIDTH - 1 + 2 * HALF_TAPS  # nodes per axis that a cell needs beside its own
-EDGE = 1e-9  # cells: rounding of a place that is just within reach
+EDGE = 1e-6  # cells: more than the rounding of a place that is just within reach
 
 
 @dataclass(frozen=True)
@@ -102,15 +103,9 @@ class PotentialGrid:
         ----------
         points
             Metres, shape (N, 3).
-
-        Raises
-        ------
-        MapError
-            If a point is not finite or the shape is wrong.
         """
-        cells = self._cells(points)
-        covered = np.empty(len(cells), dtype=np.bool_)
-        covered_cells(cells, self.coefficients, covered)
+        covered = np.empty(len(points), dtype=np.bool_)
+        covered_places(points, self.lower, self.spacing, self.coefficients, covered)
         return covered
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -122,23 +117,18 @@ class PotentialGrid:
         ----------
         points
             Metres, shape (N, 3).
-
-        Raises
-        ------
-        MapError
-            If a point is not finite or the shape is wrong.
         """
-        cells = self._cells(points)
-        field, gradient = np.empty((len(cells), 3)), np.empty((len(cells), 3, 3))
-        order = by_block(cells, self.coefficients.shape)
-        spline_derivatives(cells, order, self.spacing, self.coefficients, field, gradient)
+        # Scattered places wait for memory: in an order that stays in one part of the grid at a
+        # time they are answered three times faster. Numbers of 16 bits are sorted in linear time;
+        # where they run over, two blocks take turns.
+        numbers = np.empty(len(points), dtype=np.uint16)
+        block_numbers(points, self.lower, self.spacing, self.coefficients, numbers)
+        order = np.argsort(numbers, kind="stable")
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        spline_derivatives(
+            points, order, self.lower, self.spacing, self.coefficients, field, gradient
+        )
         return field, gradient
-
-    def _cells(self, points: FloatArray) -> FloatArray:
-        """Return places in cells from coefficient (0, 0, 0), those outside no further than one."""
-        upper = self.lower + self.spacing * np.array(self.coefficients.shape)
-        inside = np.clip(checked_points(points), self.lower - self.spacing, upper)
-        return (inside - self.lower) / self.spacing
 
 
 def potential_grid(
@@ -169,11 +159,12 @@ def potential_grid(
     points = points[((points >= box.lower - reach) & (points <= box.upper + reach)).all(axis=1)]
     if not len(points):
         raise MapError("a potential grid without points: at least one is needed")
-    lower = np.maximum(points.min(axis=0) - reach, box.lower)
-    extent = np.minimum(points.max(axis=0) + reach, box.upper) - lower
+    slack = EDGE * spacing
+    lower = np.maximum(points.min(axis=0) - reach, box.lower) - slack
+    extent = np.minimum(points.max(axis=0) + reach, box.upper) + slack - lower
     shape = check_size(np.floor(extent / spacing) + 1 + AROUND, spacing)
-    first = np.floor((points - lower - reach) / spacing - EDGE).astype(np.int64)
-    last = np.floor((points - lower + reach) / spacing + EDGE).astype(np.int64)
+    first = np.floor((points - lower - reach - slack) / spacing).astype(np.int64)
+    last = np.floor((points - lower + reach + slack) / spacing).astype(np.int64)
     needed = spread(np.maximum(first, 0), np.minimum(last + AROUND, np.array(shape) - 1), shape)
     lattice = Lattice(lower - (HALF_TAPS + BELOW) * spacing, spacing, needed)
     values = np.where(needed, potential(lattice), np.nan)
@@ -203,18 +194,6 @@ def spread(first: IntArray, last: IntArray, shape: tuple[int, int, int]) -> Bool
     for axis in range(3):
         np.cumsum(steps, axis=axis, out=steps)
     return np.asarray(steps[:-1, :-1, :-1] > 0)
-
-
-def by_block(cells: FloatArray, shape: tuple[int, ...]) -> IntArray:
-    """Return an order of places that stays in one part of the grid at a time, shape (N,).
-
-    Scattered places wait for memory: in this order they are answered three times faster.
-    """
-    blocks = (cells[:, :2] / BLOCK).astype(np.int64)
-    rows = shape[1] // BLOCK + 1
-    # Numbers of 16 bits are sorted in linear time; where they run over, two blocks take turns.
-    numbers = (blocks[:, 0] * rows + blocks[:, 1]).astype(np.uint16)
-    return np.argsort(numbers, kind="stable")
 
 
 def spline_values() -> FloatArray:
@@ -273,20 +252,46 @@ FAST = {"reassoc", "contract", "nsz"}
 
 
 @njit(cache=True, nogil=True)
-def stencil_start(cell: FloatArray, shape: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Return the first coefficient of a place's stencil per axis, or -1, -1, -1 if not inside."""
-    i, j, k = np.floor(cell[0]) - BELOW, np.floor(cell[1]) - BELOW, np.floor(cell[2]) - BELOW
+def stencil_start(
+    point: FloatArray, lower: FloatArray, spacing: float, shape: tuple[int, int, int]
+) -> tuple[int, int, int]:
+    """Return the first coefficient of a point's stencil per axis, or -1, -1, -1 if not inside."""
+    per_metre = 1 / spacing
+    i = np.floor((point[0] - lower[0]) * per_metre) - BELOW
+    j = np.floor((point[1] - lower[1]) * per_metre) - BELOW
+    k = np.floor((point[2] - lower[2]) * per_metre) - BELOW
     within = 0 <= i <= shape[0] - WIDTH and 0 <= j <= shape[1] - WIDTH
     if within and 0 <= k <= shape[2] - WIDTH:
         return int(i), int(j), int(k)
     return -1, -1, -1
 
 
+@njit(cache=True, nogil=True)
+def block_numbers(
+    points: FloatArray,
+    lower: FloatArray,
+    spacing: float,
+    coefficients: FloatArray,
+    numbers: npt.NDArray[np.uint16],
+) -> None:
+    """Write the number of the block of cells that each point is in; 0 for those not inside."""
+    rows = coefficients.shape[1] // BLOCK + 1
+    for n in range(len(points)):
+        i, j, _ = stencil_start(points[n], lower, spacing, coefficients.shape)
+        numbers[n] = max(i, 0) // BLOCK * rows + max(j, 0) // BLOCK
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
-def covered_cells(cells: FloatArray, coefficients: FloatArray, covered: BoolArray) -> None:
-    """Find which places, in cells from the first coefficient, have all they need."""
-    for n in range(len(cells)):
-        i, j, k = stencil_start(cells[n], coefficients.shape)
+def covered_places(
+    points: FloatArray,
+    lower: FloatArray,
+    spacing: float,
+    coefficients: FloatArray,
+    covered: BoolArray,
+) -> None:
+    """Find which points have all they need."""
+    for n in range(len(points)):
+        i, j, k = stencil_start(points[n], lower, spacing, coefficients.shape)
         covered[n] = False
         if i < 0:
             continue
@@ -299,9 +304,11 @@ def covered_cells(cells: FloatArray, coefficients: FloatArray, covered: BoolArra
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def spline_weights(place: float, weights: FloatArray) -> None:
-    """Write the weights of a stencil along one axis, their slopes and curvatures, shape (3, 8)."""
-    f = place - np.floor(place)
+def spline_weights(f: float, weights: FloatArray) -> None:
+    """Write the weights of a stencil along one axis, their slopes and curvatures, shape (3, 8).
+
+    ``f`` is the fraction of its cell that a point has passed.
+    """
     for k in range(WIDTH):
         value, slope, half_curvature = PIECES[DEGREE, k], 0.0, 0.0
         for p in range(DEGREE - 1, -1, -1):
@@ -313,27 +320,29 @@ def spline_weights(place: float, weights: FloatArray) -> None:
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def spline_derivatives(
-    cells: FloatArray,
+    points: FloatArray,
     order: IntArray,
+    lower: FloatArray,
     spacing: float,
     coefficients: FloatArray,
     field: FloatArray,
     gradient: FloatArray,
 ) -> None:
-    """Write first derivatives (N, 3) and second ones (N, 3, 3) at places in cells, shape (N, 3).
+    """Write first derivatives (N, 3) and second ones (N, 3, 3) at points (N, 3), one by one.
 
     NaN where a coefficient is missing.
     The stencil is summed axis by axis, z first, where coefficients lie side by side.
     """
+    per_metre, per_area = 1 / spacing, 1 / (spacing * spacing)
     x, y, z = np.empty((3, WIDTH)), np.empty((3, WIDTH)), np.empty((3, WIDTH))
     for n in order:
-        i, j, k = stencil_start(cells[n], coefficients.shape)
+        i, j, k = stencil_start(points[n], lower, spacing, coefficients.shape)
         if i < 0:
             field[n], gradient[n] = np.nan, np.nan
             continue
-        spline_weights(cells[n, 0], x)
-        spline_weights(cells[n, 1], y)
-        spline_weights(cells[n, 2], z)
+        spline_weights((points[n, 0] - lower[0]) * per_metre - i - BELOW, x)
+        spline_weights((points[n, 1] - lower[1]) * per_metre - j - BELOW, y)
+        spline_weights((points[n, 2] - lower[2]) * per_metre - k - BELOW, z)
         bx = by = bz = xx = yy = zz = xy = xz = yz = 0.0
         for a in range(WIDTH):
             # Names count the derivatives along y and z that a sum holds.
@@ -360,9 +369,10 @@ def spline_derivatives(
             xy += x[1, a] * s10
             xz += x[1, a] * s01
             yz += x[0, a] * s11
-        field[n, 0], field[n, 1], field[n, 2] = bx / spacing, by / spacing, bz / spacing
-        area = spacing * spacing
-        gradient[n, 0, 0], gradient[n, 1, 1], gradient[n, 2, 2] = xx / area, yy / area, zz / area
-        gradient[n, 0, 1] = gradient[n, 1, 0] = xy / area
-        gradient[n, 0, 2] = gradient[n, 2, 0] = xz / area
-        gradient[n, 1, 2] = gradient[n, 2, 1] = yz / area
+        field[n, 0], field[n, 1], field[n, 2] = bx * per_metre, by * per_metre, bz * per_metre
+        gradient[n, 0, 0] = xx * per_area
+        gradient[n, 1, 1] = yy * per_area
+        gradient[n, 2, 2] = zz * per_area
+        gradient[n, 0, 1] = gradient[n, 1, 0] = xy * per_area
+        gradient[n, 0, 2] = gradient[n, 2, 0] = xz * per_area
+        gradient[n, 1, 2] = gradient[n, 2, 1] = yz * per_area

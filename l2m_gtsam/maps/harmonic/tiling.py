@@ -1,6 +1,7 @@
 """Tiles: how large they are, where they lie, and how they blend."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from pydantic import Field
@@ -16,6 +17,7 @@ from l2m_gtsam.options import Options
 MODE_DENSITY = 1 / (4 * np.pi)
 WAVE_NUMBERS = (0.5, 60.0)  # 1/m: from a tile's longest wave to one of a decimetre
 LEAST_CORE = 1.0  # metres
+ROUNDING = 1e-9  # of a tile: a little wider than the band is harmless
 FILL = 0.15  # metres; cells of this edge with a reading make the surveyed area
 
 
@@ -147,7 +149,7 @@ class Tiling:
         away = np.abs(points[:, :2] - self.grid.centres[tile]) - 0.5 * self.grid.size
         ramp = np.clip(0.5 - 0.5 * away / self.blend, 0.0, 1.0)
         smooth = ramp**3 * (10 + ramp * (6 * ramp - 15))  # twice differentiable at both ends
-        return np.asarray(smooth.prod(axis=1))
+        return np.asarray(smooth[:, 0] * smooth[:, 1])
 
     def visits(self, points: FloatArray) -> list[Visit]:
         """Return which tiles have a share in which points; far from all of them the nearest has.
@@ -169,29 +171,49 @@ class Tiling:
         # Of 16 bits: sorted in linear time; a grid has fewer blocks than that holds.
         order = some[np.argsort(tiles[some].astype(np.uint16), kind="stable")]
         rows, tiles, share = rows[order], tiles[order], share[order] / total[rows[order]]
-        edges = np.flatnonzero(np.diff(tiles)) + 1
+        edges = np.flatnonzero(np.diff(tiles, prepend=-1, append=-1)).tolist()
         return [
-            Visit(int(tiles[at[0]]), rows[at], share[at])
-            for at in np.split(np.arange(len(tiles)), edges)
-            if len(at)
+            Visit(int(tiles[start]), rows[start:stop], share[start:stop])
+            for start, stop in pairwise(edges)
         ]
 
     def _candidates(self, points: FloatArray) -> tuple[IntArray, IntArray]:
         """Return rows of points and tiles that may have a share in them: own and neighbours."""
-        place = (points[:, :2] - self.grid.origin) / self.grid.size
-        # Far away there is no tile: what is so far need not be told apart.
-        place = np.clip(place, self.grid.cells.min(axis=0) - 2.0, self.grid.cells.max(axis=0) + 3.0)
-        own = np.floor(place).astype(np.int64)
-        side = np.where(place - own < 0.5, -1, 1)
-        band = np.abs(place - own - 0.5) > 0.5 - self.blend / self.grid.size - 1e-9
-        rows, cells = [np.arange(len(points))], [own]
-        for step in ((1, 0), (0, 1), (1, 1)):
-            near = np.flatnonzero((band | (np.array(step) == 0)).all(axis=1))
-            rows.append(near)
-            cells.append(own[near] + side[near] * np.array(step))
-        row, cell = np.concatenate(rows), np.concatenate(cells)
-        tile = self.grid.index_of(cell)
+        own, side, near = [], [], []
+        for axis in (0, 1):
+            low, high = self.grid.cells[:, axis].min(), self.grid.cells[:, axis].max()
+            place = (points[:, axis] - self.grid.origin[axis]) / self.grid.size
+            # Far away there is no tile: what is so far need not be told apart.
+            place = np.clip(place, low - 2.0, high + 3.0)
+            cell = np.floor(place)
+            from_middle = place - cell - 0.5
+            own.append(cell.astype(np.int64))
+            side.append(np.where(from_middle < 0, -1, 1))
+            near.append(np.abs(from_middle) > 0.5 - self.blend / self.grid.size - ROUNDING)
+        rows, cells = [np.arange(len(points))], [np.column_stack(own)]
+        for x, y, band in ((1, 0, near[0]), (0, 1, near[1]), (1, 1, near[0] & near[1])):
+            some = np.flatnonzero(band)
+            rows.append(some)
+            cells.append(np.column_stack([own[0] + x * side[0], own[1] + y * side[1]])[some])
+        row, tile = np.concatenate(rows), index_of(self.grid.cells, np.concatenate(cells))
         return row[tile >= 0], tile[tile >= 0]
+
+
+def index_of(known: IntArray, cells: IntArray) -> IntArray:
+    """Return which of the known cells each one is, or -1, shape (N,).
+
+    Parameters
+    ----------
+    known
+        Whole numbers in lexical order, shape (B, 2).
+    cells
+        Whole numbers, at most 4 beyond those of the known cells, shape (N, 2).
+    """
+    corner = known.min(axis=0) - 4
+    stride = np.array([known[:, 1].max() + 5 - corner[1], 1])
+    keys, wanted = (known - corner) @ stride, (cells - corner) @ stride
+    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return np.where(keys[found] == wanted, found, -1)
 
 
 def tiling_of(
@@ -218,5 +240,6 @@ def tiling_of(
     if extent > core:  # equal tiles, the last as full as the first
         core = extent / np.ceil(extent / core) * (1 + 1e-9)
     blend = min(0.25 * core, 0.5, options.overlap)
-    grid = grid_over(points, core, min(reach, 0.49 * core))
+    # A tile whose core is further from all readings than the overlap would have none.
+    grid = grid_over(points, core, min(reach, options.overlap, 0.49 * core))
     return Tiling(grid, options.overlap, options.margin, blend)

@@ -1,0 +1,166 @@
+"""The harmonic map for solvers: the same field, hundreds of times faster."""
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
+from l2m_gtsam.maps.field_map import MapSummary
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
+from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiling import Visit
+from l2m_gtsam.maps.training import checked_points
+
+if TYPE_CHECKING:
+    from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+
+MEMORY = 1_000_000_000  # bytes of grids that are kept
+PIECE = 8_192  # points that a thread answers at once
+SERIAL = 2_000  # fewer points than this are not worth threads
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """Compiled tiles, made when first needed; those used last are kept.
+
+    Attributes
+    ----------
+    exact
+        The map.
+    made
+        Compiled tiles by index, the one used last at the end.
+    locks
+        One for each tile, so that no tile is made twice, and one for ``made`` at the end.
+    """
+
+    exact: "HarmonicMap"
+    made: OrderedDict[int, CompiledTile | Tile] = field(default_factory=OrderedDict)
+    locks: tuple[Lock, ...] = ()
+
+    @classmethod
+    def of(cls, exact: "HarmonicMap") -> "Workshop":
+        """Return a workshop for the tiles of a map."""
+        return cls(exact, locks=tuple(Lock() for _ in range(len(exact.tiles) + 1)))
+
+    def tile(self, index: int) -> CompiledTile | Tile:
+        """Return a tile, compiled; the exact one where no grid is good enough."""
+        with self.locks[index]:
+            found = self.made.get(index)
+            if found is None:
+                found = compile_tile(self.exact.tiles[index], self._places(index))
+            with self.locks[-1]:
+                self.made[index] = found
+                self.made.move_to_end(index)
+                self._forget()
+        return found
+
+    def _places(self, index: int) -> Places:
+        tiling = self.exact.learnt.tiling
+        return Places.around(
+            self.exact.learnt.readings.points,
+            self.exact.options.reach,
+            tiling.grid.centres[index],
+            0.5 * tiling.grid.size + tiling.blend,
+        )
+
+    def _forget(self) -> None:
+        held = sum(tile.nbytes for tile in self.made.values() if isinstance(tile, CompiledTile))
+        while held > MEMORY and len(self.made) > 1:
+            _, oldest = self.made.popitem(last=False)
+            held -= oldest.nbytes if isinstance(oldest, CompiledTile) else 0
+
+
+@dataclass(frozen=True)
+class CompiledMap:
+    """A harmonic map whose field and gradient come from grids, within 5 nT and 20 nT/m.
+
+    That holds wherever the exact map is near readings; elsewhere the exact map answers.
+    Everything but field and gradient is that of the exact map.
+
+    Attributes
+    ----------
+    exact
+        The map itself.
+    workshop
+        Its compiled tiles.
+    """
+
+    exact: "HarmonicMap"
+    workshop: Workshop
+
+    @classmethod
+    def of(cls, exact: "HarmonicMap") -> "CompiledMap":
+        """Return the compiled form of a map; tiles are compiled when they are first needed."""
+        return cls(exact, Workshop.of(exact))
+
+    @property
+    def kind(self) -> str:
+        """Name of the map kind."""
+        return self.exact.kind
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map."""
+        return self.exact.summary
+
+    def query(self, points: FloatArray) -> FieldSample:
+        """Return field, gradient and variance; see ``FieldMap``."""
+        points = checked_points(points)
+        return self.exact.sample(points, *self.field_and_gradient(points))
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Return field and gradient, also outside; see ``FieldMap``."""
+        points = checked_points(points)
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+
+        def answer(visit: Visit) -> tuple[FloatArray, FloatArray]:
+            return self.workshop.tile(visit.tile).field_and_gradient(points[visit.rows])
+
+        pieces = [p for visit in self.exact.learnt.tiling.visits(points) for p in cut(visit)]
+        few = len(points) < SERIAL or len(pieces) == 1
+        parts = [answer(piece) for piece in pieces] if few else in_threads(answer, pieces)
+        for piece, (b, g) in zip(pieces, parts, strict=True):
+            add_shares(piece.rows, piece.share, b, g, field, gradient)
+        return field, gradient
+
+    def variance(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis, also outside; see ``FieldMap``."""
+        return self.exact.variance(points)
+
+    def updated(self, points: FloatArray, field: FloatArray, /) -> "CompiledMap":
+        """Return the map with more readings and the same prior; see ``FieldMap``."""
+        return CompiledMap.of(self.exact.updated(points, field))
+
+    def to_state(self) -> MapState:
+        """Return the exact map as plain arrays and facts."""
+        return self.exact.to_state()
+
+
+def cut(visit: Visit) -> list[Visit]:
+    """Return the visit in pieces that threads can share."""
+    return [
+        Visit(visit.tile, visit.rows[start : start + PIECE], visit.share[start : start + PIECE])
+        for start in range(0, len(visit.rows), PIECE)
+    ]
+
+
+@njit(cache=True, nogil=True)
+def add_shares(
+    rows: IntArray,
+    share: FloatArray,
+    part_field: FloatArray,
+    part_gradient: FloatArray,
+    field: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add what one tile says, times its share, to the rows of field and gradient."""
+    for n in range(len(rows)):
+        for i in range(3):
+            field[rows[n], i] += share[n] * part_field[n, i]
+            for j in range(3):
+                gradient[rows[n], i, j] += share[n] * part_gradient[n, i, j]

@@ -1,0 +1,231 @@
+"""A tile made fast: its smooth part on a grid, its near sources one by one."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.harmonic.dipoles import Dipoles
+from l2m_gtsam.maps.harmonic.frame import TileFrame
+from l2m_gtsam.maps.harmonic.modes import Modes
+from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
+from l2m_gtsam.maps.harmonic.potential_grid import Box, Lattice, PotentialGrid, potential_grid
+from l2m_gtsam.maps.harmonic.tile import Tile
+
+FIELD_TOLERANCE = 0.005  # uT
+GRADIENT_TOLERANCE = 0.02  # uT/m
+SAFETY = 0.6  # of the tolerance: places that were not checked may be somewhat worse
+WAVE = 1.0  # spacing times the largest wave number: waves that short are never strong
+# The gradient of sources' smooth parts errs by this times moment, spacing^6 and radius^-10.
+SOURCE = 3e4
+WIDEST = 0.85  # metres: within a larger radius too many sources are summed one by one
+CHECKS = 300  # places, and as many beside sources
+ATTEMPTS = 4
+
+
+@runtime_checkable
+class Smooth(Protocol):
+    """A family whose potential a grid can hold."""
+
+    def potential_on(
+        self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
+    ) -> FloatArray:
+        """Return the potential in uT m at the nodes of these axes, shape (nx, ny, nz)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a tile is asked.
+
+    Attributes
+    ----------
+    readings
+        Positions of the readings near the square below in the map frame in metres, shape (K, 3).
+    reach
+        How far from them, in metres.
+    centre
+        Middle of the tile's core in x and y, metres, shape (2,).
+    half
+        Half the edge of the square around it in which the tile has a share, metres.
+    """
+
+    readings: FloatArray
+    reach: float
+    centre: FloatArray
+    half: float
+
+    @classmethod
+    def around(
+        cls, readings: FloatArray, reach: float, centre: FloatArray, half: float
+    ) -> "Places":
+        """Return the places of a square near readings, which may lie anywhere."""
+        near = np.abs(readings[:, :2] - centre).max(axis=1) <= half + reach
+        return cls(readings[near], reach, centre, half)
+
+    def box(self, frame: TileFrame) -> Box:
+        """Return the box in the tile's frame that holds all places."""
+        square = self.centre + self.half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        z = self.readings[:, 2]
+        corners = [
+            np.column_stack([square, np.full(4, height)])
+            for height in (z.min() - self.reach, z.max() + self.reach)
+        ]
+        local = frame.localise(np.concatenate(corners))
+        return Box(local.min(axis=0), local.max(axis=0))
+
+    def random(self, count: int) -> FloatArray:
+        """Return places in the map frame, shape (N, 3): about as many as asked for, or none."""
+        rng = np.random.default_rng(0)
+        offset = rng.uniform(-1, 1, (count, 3)) * self.reach
+        places = self.readings[rng.integers(0, len(self.readings), count)] + offset
+        return np.asarray(places[np.abs(places[:, :2] - self.centre).max(axis=1) <= self.half])
+
+
+@dataclass(frozen=True)
+class CompiledTile:
+    """A tile's field from a grid and near sources.
+
+    Attributes
+    ----------
+    tile
+        The exact one; it answers where the grid does not reach.
+    grid
+        The smooth part of the potential in the tile's frame.
+    near
+        What the grid leaves out.
+    """
+
+    tile: Tile
+    grid: PotentialGrid
+    near: NearSources
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the grid in bytes."""
+        return self.grid.coefficients.nbytes
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
+        frame = self.tile.basis.frame
+        local = frame.localise(points)
+        field, gradient = self.grid.field_and_gradient(local)
+        self.near.add_to(local, field, gradient)
+        R = frame.R_map_tile
+        if not np.array_equal(R, np.eye(3)):
+            field, gradient = field @ R.T, turned(gradient, R)
+        missing = np.flatnonzero(np.isnan(field[:, 0]))
+        if len(missing):
+            field[missing], gradient[missing] = self.tile.field_and_gradient(points[missing])
+        return field, gradient
+
+
+def turned(gradient: FloatArray, R: FloatArray) -> FloatArray:
+    """Return ``R G R^T`` for symmetric matrices, shape (N, 3, 3)."""
+    half = (gradient.reshape(-1, 3) @ R.T).reshape(-1, 3, 3)
+    return np.asarray((half.transpose(0, 2, 1).reshape(-1, 3) @ R.T).reshape(-1, 3, 3))
+
+
+@dataclass(frozen=True)
+class Fineness:
+    """How fine a tile is compiled.
+
+    Attributes
+    ----------
+    spacing
+        Of the grid in metres.
+    radius
+        Within which sources are summed one by one, in metres.
+    """
+
+    spacing: float
+    radius: float
+
+    def refined(self, excess: float) -> "Fineness":
+        """Return what divides the error of sources by a factor and that of waves by its root."""
+        return Fineness(self.spacing * excess ** (-1 / 12), self.radius * excess ** (1 / 20))
+
+
+def compile_tile(tile: Tile, places: Places) -> CompiledTile | Tile:
+    """Return a tile with a grid that is as fine as the tolerance asks, or the tile itself.
+
+    How fine follows from waves and sources, then from the error at places drawn at random and
+    beside sources. If no grid of a sensible size is good enough the exact tile remains.
+    """
+    if not len(places.readings):
+        return tile
+    sources = sources_of(tile)
+    fineness = fineness_for(tile, sources)
+    checks = check_places(tile, sources, places)
+    truth = tile.field_and_gradient(checks)
+    for _ in range(ATTEMPTS):
+        try:
+            compiled = with_grid(tile, sources, places, fineness)
+        except MapError:  # the grid would be too large
+            return tile
+        excess = worst(compiled.field_and_gradient(checks), truth)
+        if excess <= 1:
+            return compiled
+        fineness = fineness.refined(1.5 * excess)
+    return tile
+
+
+def fineness_for(tile: Tile, sources: PointSources) -> Fineness:
+    """Return the fineness that the physics suggests."""
+    waves = [np.abs(f.kz).max() for f in tile.basis.families if isinstance(f, Modes)]
+    spacing = WAVE / max(waves)
+    if not len(sources):
+        return Fineness(spacing, 0.0)
+    strongest = np.linalg.norm(sources.moments, axis=1).max()
+    strength = SOURCE * strongest / (SAFETY * GRADIENT_TOLERANCE)
+    spacing = min(spacing, (WIDEST**10 / strength) ** (1 / 6))
+    return Fineness(spacing, (strength * spacing**6) ** (1 / 10))
+
+
+def worst(found: tuple[FloatArray, FloatArray], truth: tuple[FloatArray, FloatArray]) -> float:
+    """Return the largest error over what is allowed of it."""
+    field = float(np.abs(found[0] - truth[0]).max()) / FIELD_TOLERANCE
+    gradient = float(np.abs(found[1] - truth[1]).max()) / GRADIENT_TOLERANCE
+    return max(field, gradient) / SAFETY
+
+
+def sources_of(tile: Tile) -> PointSources:
+    """Return all dipoles of a tile in its own frame."""
+    positions, moments = [np.empty((0, 3))], [np.empty((0, 3))]
+    for family, columns in zip(tile.basis.families, tile.basis.columns(), strict=True):
+        if isinstance(family, Dipoles):
+            positions.append(family.positions)
+            moments.append(family.moments(tile.weights.mean[columns]))
+    return PointSources(np.concatenate(positions), np.concatenate(moments))
+
+
+def check_places(tile: Tile, sources: PointSources, places: Places) -> FloatArray:
+    """Return places to compare at in the map frame: random ones and those next to sources."""
+    random = places.random(20 * CHECKS)
+    if not len(sources):
+        return random[:CHECKS]
+    away, _ = cKDTree(sources.positions).query(tile.basis.frame.localise(random))
+    nearest = np.argsort(away)[:CHECKS]
+    return np.concatenate([random[:CHECKS], random[nearest]])
+
+
+def with_grid(
+    tile: Tile, sources: PointSources, places: Places, fineness: Fineness
+) -> CompiledTile:
+    """Return the tile with a grid of this fineness."""
+    frame, spacing, radius = tile.basis.frame, fineness.spacing, fineness.radius
+
+    def potential(lattice: Lattice) -> FloatArray:
+        phi = sources.smooth_potential(lattice, radius)
+        for family, columns in zip(tile.basis.families, tile.basis.columns(), strict=True):
+            if isinstance(family, Smooth):
+                phi += family.potential_on(*lattice.axes, tile.weights.mean[columns])
+        return phi
+
+    readings = frame.localise(places.readings)
+    grid = potential_grid(potential, readings, places.reach, spacing, places.box(frame))
+    upper = grid.lower + spacing * np.array(grid.coefficients.shape)
+    return CompiledTile(tile, grid, near_sources(sources, grid.lower[:2], upper[:2], radius))

@@ -1,0 +1,194 @@
+"""Building, updating and comparing maps from the command line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.map_file import load_map
+from tests.end_to_end.conftest import complaint, l2m
+from tests.end_to_end.yard import POST, Yard, make_yard, world
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
+    return make_yard(tmp_path_factory.mktemp("yard"))
+
+
+@pytest.fixture(scope="module")
+def bare(yard: Yard) -> Path:
+    """The map of the west without a structure."""
+    path = yard.west.parent / "bare.npz"
+    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def sliding(yard: Yard) -> Path:
+    """The paper's map of the west."""
+    path = yard.west.parent / "sliding.npz"
+    l2m("map", "build", yard.west, "--config", yard.sliding, "--out", path)
+    return path
+
+
+def places() -> FloatArray:
+    """Between the lines of the drive in the west, at least 25 cm from the post."""
+    points = np.random.default_rng(3).uniform([-2.5, -1.5, 0.35], [0.3, 1.5, 0.5], (500, 3))
+    return points[np.linalg.norm(points[:, :2] - POST, axis=1) > 0.25]
+
+
+def error_of(path: Path) -> float:
+    """Return the rms error of a map near the post in microtesla."""
+    truth, _ = world().field_and_gradient(places())
+    sample = map_from_state(load_map(path)).query(places())
+    return float(np.sqrt(np.mean((sample.field - truth)[sample.inside] ** 2)))
+
+
+def test_a_structure_file_makes_a_better_map(yard: Yard, bare: Path, tmp_path: Path) -> None:
+    path = tmp_path / "new" / "map.npz"
+    arguments = ("--config", yard.config, "--structure", yard.cloud, "--out", path)
+    out = l2m("map", "build", yard.west, *arguments).out
+    source = source_file(yard.cloud)
+    assert load_map(path).provenance["structure"] == vars(source)
+    assert f"path {yard.cloud}, sha256 {source.sha256}" in out
+    assert f"written: {path}" in out
+    assert l2m("map", "info", path).out.count(source.sha256) == 1
+    # Sources in the right place explain what modes of 200 weights cannot.
+    assert error_of(path) < 0.5 * error_of(bare)
+
+
+def test_a_structure_topic_is_as_good_as_the_file(yard: Yard, bare: Path, tmp_path: Path) -> None:
+    """Its scans are placed by the poses of the bag; one of them is older than all poses."""
+    path = tmp_path / "map.npz"
+    bags = (yard.west, yard.east)
+    arguments = ("--config", yard.config, "--structure", "points", "--out", path)
+    out = l2m("map", "build", *bags, *arguments).out
+    structure = load_map(path).provenance["structure"]
+    assert structure["topic"] == "points"
+    assert structure["scans_without_pose"] == 2
+    assert f"topic points, scans {structure['scans']}, scans without pose 2" in out
+    assert error_of(path) < 0.5 * error_of(bare)
+
+
+def test_an_updated_map_is_that_of_all_readings(yard: Yard, sliding: Path, tmp_path: Path) -> None:
+    """Given hyperparameters, and few enough readings in a cube that all of them count."""
+    path, all_path = tmp_path / "map.npz", tmp_path / "all.npz"
+    path.write_bytes(sliding.read_bytes())
+    out = l2m("map", "update", path, yard.east, "--config", yard.sliding, "--out", path).out
+    bags = (yard.west, yard.east)
+    l2m("map", "build", *bags, "--config", yard.sliding, "--out", all_path)
+    updated, at_once = (map_from_state(load_map(each)) for each in (path, all_path))
+    rng = np.random.default_rng(6)
+    points = rng.uniform([-3, -2, 0.3], [3, 2, 0.5], (400, 3))
+    one, other = updated.query(points), at_once.query(points)
+    np.testing.assert_array_equal(one.inside, other.inside)
+    # Means of means, by a factor of condition 1e5; the cubes are cut alike.
+    np.testing.assert_allclose(one.field, other.field, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(one.variance, other.variance, rtol=0, atol=1e-7)
+    assert [bag["path"] for bag in load_map(path).provenance["bags"]] == [str(b) for b in bags]
+    assert all(str(bag) in out for bag in bags)
+    assert load_map(path).provenance["config"] == load_map(sliding).provenance["config"]
+
+
+def test_an_updated_harmonic_map_knows_the_new_place(
+    yard: Yard, bare: Path, tmp_path: Path
+) -> None:
+    path, before = tmp_path / "map.npz", bare.read_bytes()
+    l2m("map", "update", bare, yard.east, "--config", yard.config, "--out", path)
+    assert bare.read_bytes() == before
+    old, new = (map_from_state(load_map(each)) for each in (bare, path))
+    east = np.random.default_rng(7).uniform([1.5, -1.5, 0.4], [2.5, 1.5, 0.4], (50, 3))
+    assert not old.query(east).inside.any()
+    found, (truth, _) = new.query(east), world().field_and_gradient(east)
+    assert found.inside.all()
+    # 0.1 uT of noise, and a field that is smooth there.
+    assert np.sqrt(np.mean((found.field - truth) ** 2)) < 0.1
+    assert new.summary.readings > 1.8 * old.summary.readings
+
+
+@pytest.mark.parametrize("structure", [(), ("--structure", "/points")])
+def test_kinds_are_compared(yard: Yard, structure: tuple[str, ...]) -> None:
+    out = l2m("map", "compare", yard.west, "--config", yard.config, *structure).out
+    rows = {kind: out.count(f"│ {kind} ") for kind in ("harmonic", "sliding_gp", "bilinear")}
+    assert rows == {"harmonic": 1, "sliding_gp": 1, "bilinear": 1}
+    assert "recommended: harmonic; the log-likelihood of harmonic is" in out
+    assert "failed" not in out
+
+
+def test_kinds_are_compared_on_a_real_run(
+    shared_data: Path, repository: Path, tmp_path: Path
+) -> None:
+    """As a user would, but for the size of the harmonic map."""
+    run = shared_data / "bags" / "optitrack_run0_ros2_sqlite"
+    config = tmp_path / "c.yaml"
+    text = (repository / "configs" / "optitrack.yaml").read_text()
+    quick = "{harmonic: {search: {rounds: 0}, modes: 200}}"
+    config.write_text(text.replace("{kind: sliding_gp}", quick))
+    out = l2m("map", "compare", run, "--config", config).out
+    # An area of 2.3 by 2.1 m cannot be cut into patches of the usual 1.5 m.
+    assert "patches of 0.49152 m, held out in 4 folds" in out
+    assert "recommended: " in out
+    assert "failed" not in out
+
+
+def test_bad_structures_are_one_line(yard: Yard, tmp_path: Path) -> None:
+    out = tmp_path / "out" / "map.npz"
+    truncated = tmp_path / "cut.ply"
+    truncated.write_bytes(yard.cloud.read_bytes()[:-5])
+
+    def build(structure: str | Path, config: Path = yard.config) -> str:
+        given = ("--config", config, "--structure", structure)
+        line = complaint("map", "build", yard.west, *given, "--out", out)
+        assert line == complaint("map", "compare", yard.west, *given) or "kind" in line
+        return line
+
+    assert "nowhere.pcd: no such point cloud" in build(tmp_path / "nowhere.pcd")
+    assert "cloud.las: not a kind of point cloud that is read" in build("cloud.las")
+    assert "cut.ply: not a usable point cloud" in build(truncated)
+    assert "no topic '/lidar'; with clouds there are: /points" in build("/lidar")
+    assert "topic /mag is of type sensor_msgs/msg/MagneticField" in build("/mag")
+    assert not out.parent.exists()
+
+
+def test_a_structure_for_a_kind_that_cannot_use_it(yard: Yard, tmp_path: Path) -> None:
+    """Refused before the bags are read: this one is not there."""
+    given = ("nowhere.bag", "--structure", yard.cloud, "--config")
+    line = complaint("map", "build", *given, yard.sliding, "--out", tmp_path / "map.npz")
+    assert "maps of kind sliding_gp cannot use a structure cloud" in line
+    config = tmp_path / "c.yaml"
+    config.write_text("mapping: {compare: {kinds: [sliding_gp, bilinear]}}")
+    line = complaint("map", "compare", *given, config)
+    assert "maps of kind sliding_gp, bilinear cannot use a structure cloud" in line
+    assert list(tmp_path.iterdir()) == [config]
+
+
+def test_bad_updates_leave_everything_as_it_was(yard: Yard, sliding: Path, tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    config = tmp_path / "c.yaml"
+    settings = json.loads(yard.sliding.read_text())
+    settings["bag"]["frame"] = "elsewhere"
+    config.write_text(json.dumps(settings))
+
+    def update(bag: Path, config: Path = yard.sliding) -> str:
+        before = path.read_bytes()
+        line = complaint("map", "update", path, bag, "--config", config, "--out", path)
+        assert path.read_bytes() == before
+        return line
+
+    path.write_bytes(sliding.read_bytes())
+    assert "is in frame 'map', the poses of" in update(yard.east, config)
+    assert f"was made from {yard.west} already" in update(yard.west)
+    assert "nowhere.bag: no such file" in update(tmp_path / "nowhere.bag")
+    path.write_bytes(sliding.read_bytes()[:-1000])
+    assert "map.npz: not a map file of this program, or damaged" in update(yard.east)
+    line = complaint("map", "update", sliding, yard.east, "--out", tmp_path / "map.zip")
+    assert "the name must end in .npz" in line
+    assert sorted(tmp_path.iterdir()) == [config, path]
+
+
+def test_the_version_is_told() -> None:
+    assert l2m("--version").out.startswith("l2m 0.")
