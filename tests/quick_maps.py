@@ -7,6 +7,7 @@ from l2m_gtsam.maps.build import MapOptions
 QUICK_HARMONIC: dict[str, Any] = {
     "learning": {"windows": 1, "modes": 100, "readings": 500},
     "search": {"rounds": 0},
+    "tiling": {"overlap": 0.3, "margin": 0.5},
     "modes": 200,
 }
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
@@ -74,7 +73,7 @@ def route(low: float, high: float) -> FloatArray:
 def survey(folder: Path, name: str, p: FloatArray, seed: int) -> Path:
     """Write the bag of one drive."""
     make = ros("mcap")
-    R = Rotation.from_euler("z", np.linspace(0, 9, len(p)))
+    R = Rotation.from_rotvec(np.outer(np.linspace(0, 9, len(p)), [0, 0, 1]))
     field, _ = world().field_and_gradient(p)
     noise = np.random.default_rng(seed).normal(0, NOISE, field.shape)
     reading = (R.inv().apply(field) + noise) * 1e-6

@@ -11,6 +11,7 @@ from numba import njit
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
+from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import Visit
@@ -25,8 +26,8 @@ SERIAL = 2_000  # fewer points than this are not worth threads
 
 
 @dataclass(frozen=True)
-class Workshop:
-    """Compiled tiles, made when first needed; those used last are kept.
+class CompiledTiles:
+    """The tiles of a map, compiled when first needed; those used last are kept.
 
     Attributes
     ----------
@@ -43,8 +44,8 @@ class Workshop:
     locks: tuple[Lock, ...] = ()
 
     @classmethod
-    def of(cls, exact: "HarmonicMap") -> "Workshop":
-        """Return a workshop for the tiles of a map."""
+    def of(cls, exact: "HarmonicMap") -> "CompiledTiles":
+        """Return the tiles of a map, none of them made yet."""
         return cls(exact, locks=tuple(Lock() for _ in range(len(exact.tiles) + 1)))
 
     def tile(self, index: int) -> CompiledTile | Tile:
@@ -86,17 +87,17 @@ class CompiledMap:
     ----------
     exact
         The map itself.
-    workshop
-        Its compiled tiles.
+    tiles
+        Its tiles, compiled.
     """
 
     exact: "HarmonicMap"
-    workshop: Workshop
+    tiles: CompiledTiles
 
     @classmethod
     def of(cls, exact: "HarmonicMap") -> "CompiledMap":
         """Return the compiled form of a map; tiles are compiled when they are first needed."""
-        return cls(exact, Workshop.of(exact))
+        return cls(exact, CompiledTiles.of(exact))
 
     @property
     def kind(self) -> str:
@@ -119,7 +120,7 @@ class CompiledMap:
         field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
 
         def answer(visit: Visit) -> tuple[FloatArray, FloatArray]:
-            return self.workshop.tile(visit.tile).field_and_gradient(points[visit.rows])
+            return self.tiles.tile(visit.tile).field_and_gradient(points[visit.rows])
 
         pieces = [p for visit in self.exact.learnt.tiling.visits(points) for p in cut(visit)]
         few = len(points) < SERIAL or len(pieces) == 1
@@ -131,6 +132,10 @@ class CompiledMap:
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis, also outside; see ``FieldMap``."""
         return self.exact.variance(points)
+
+    def errors_over(self, points: FloatArray, /) -> ErrorModes:
+        """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
+        return self.exact.errors_over(points)
 
     def updated(self, points: FloatArray, field: FloatArray, /) -> "CompiledMap":
         """Return the map with more readings and the same prior; see ``FieldMap``."""

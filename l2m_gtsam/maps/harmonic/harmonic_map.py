@@ -11,6 +11,7 @@ from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
+from l2m_gtsam.maps.harmonic.explanation import Explanation
 from l2m_gtsam.maps.harmonic.learnt import (
     HarmonicOptions,
     Learnt,
@@ -127,7 +128,6 @@ class HarmonicMap:
         """Figures of the map."""
         learnt, points = self.learnt, self.learnt.readings.points
         h, weights = learnt.hyperparameters, [len(tile.basis) for tile in self.tiles]
-        shown = int(np.count_nonzero(learnt.strengths))
         return MapSummary(
             kind=KIND,
             readings=learnt.origin.readings,
@@ -139,7 +139,8 @@ class HarmonicMap:
                 "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
                 "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
                 "shortest wave (m)": 2 * np.pi / learnt.resolution.floor,
-                "structures": f"{shown} shown by the readings of {len(learnt.strengths)}",
+                "sources": described(learnt),
+                "held-out places": judged(learnt.origin.explanation),
                 "tiles": len(weights),
                 "tile (m)": learnt.tiling.grid.size,
                 "weights in a tile (median)": int(np.median(weights)),
@@ -198,6 +199,26 @@ class HarmonicMap:
             points, distance_upper_bound=self.options.reach
         )
         return np.isfinite(away)
+
+
+def described(learnt: Learnt) -> str:
+    """Return where the sources came from, in a few words."""
+    shown, given = int(np.count_nonzero(learnt.strengths)), len(learnt.strengths)
+    if learnt.origin.searched:
+        return (
+            f"{shown} found without a point cloud: sigmas are less sure; --structure tells where "
+            "steel stands"
+        )
+    if not given:
+        return "floor and ceiling only"
+    return f"{shown} of {given} structures, the readings show nothing of the others"
+
+
+def judged(explanation: Explanation) -> str:
+    """Return whether the map explains its readings, in a few words."""
+    if explanation.reasons:
+        return f"the map does not explain the field: {'; '.join(explanation.reasons)}"
+    return f"errors are {explanation.spread:.2f} times their sigmas: the field is explained"
 
 
 def solve_tiles(learnt: Learnt, kept: Mapping[int, Tile]) -> tuple[Tile, ...]:

@@ -13,9 +13,15 @@ from l2m_gtsam.maps.grid import grid_from
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.evidence import normal_of
+from l2m_gtsam.maps.harmonic.explanation import (
+    UNJUDGED,
+    Explanation,
+    explanation_of,
+    patchwork,
+)
 from l2m_gtsam.maps.harmonic.furnish import COARSE, FINE, basis_of, within
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions, learn
+from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions, learn, spread_tiles
 from l2m_gtsam.maps.harmonic.search import (
     MOST_READINGS,
     SearchOptions,
@@ -37,6 +43,9 @@ from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_ar
 from l2m_gtsam.maps.training import TrainingSet, joined, merged, training_set
 from l2m_gtsam.options import Options
 
+JUDGED = 4  # tiles whose held-out places say whether the field is explained
+GROWTH = 1.5  # of the sources, after which the prior is learnt anew
+
 
 class HarmonicOptions(Options):
     """Options of the harmonic map; lengths in metres."""
@@ -53,9 +62,12 @@ class HarmonicOptions(Options):
     """The surroundings of a tile."""
     errors: ErrorOptions = ErrorOptions()
     """How finely the map's error over a drive is told."""
+    sensor_noise: float | None = Field(default=None, gt=0)
+    """Standard deviation of the survey's sensors per axis in uT, from the data sheet, to judge
+    the learnt noise by; not used otherwise."""
     merge: float = Field(default=0.05, gt=0)
     """Readings within cubes of this edge are averaged."""
-    independent: int = Field(default=10, ge=1)
+    independent: int = Field(default=50, ge=1)
     """The most that the readings of one cube are worth: their errors share the pose and the
     disturbances of one passage."""
     modes: int = Field(default=1000, ge=50)
@@ -80,11 +92,14 @@ class Origin:
         How learning ended.
     searched
         Whether the sources were searched for in the residuals, for want of a point cloud.
+    explanation
+        How well the map predicts places that are held out.
     """
 
     readings: int
-    learning: LearningEnd | None
+    learning: LearningEnd
     searched: bool = False
+    explanation: Explanation = UNJUDGED
 
 
 ORIGIN = TypeAdapter(Origin)
@@ -143,7 +158,10 @@ class Learnt:
     def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
         readings = merged(joined(self.readings, new), options.merge, options.independent)
-        grid, reach = self.tiling.grid, min(options.reach, self.tiling.overlap, 0.49 * self.tiling.grid.size)
+        grid, reach = (
+            self.tiling.grid,
+            min(options.reach, self.tiling.overlap, 0.49 * self.tiling.grid.size),
+        )
         wider = grid_from(grid.origin, readings.points, grid.size, reach)
         return replace(
             self,
@@ -176,47 +194,62 @@ def learn_map(
     """
     raw = training_set(points, field)
     readings = merged(raw, options.merge, options.independent)
+    learnt = learn_once(readings, sources, options)
+    if not len(sources) and learnt.origin.explanation.reasons and options.search.rounds > 0:
+        learnt = with_search(learnt, options)
+    return replace(learnt, origin=replace(learnt.origin, readings=len(raw)))
+
+
+def learn_once(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> Learnt:
+    """Return what readings teach over given sources, and how well that explains them."""
     learning = learn_prior(readings, sources, options)
-    searched = not len(sources) and options.search.rounds > 0
-    if searched:
-        learning, sources = with_search(readings, learning, options)
-    origin = Origin(len(raw), learning, searched)
-    even = np.ones(len(sources.split()))
-    plain = laid_out(readings, learning.hyperparameters, sources, even, options, origin)
-    return with_strengths(plain)
+    plain = laid_out(readings, learning, sources, np.ones(len(sources.split())), options)
+    return explained(with_strengths(plain), options)
 
 
-def learn_prior(
-    readings: TrainingSet, sources: Sources, options: HarmonicOptions
-) -> LearningEnd:
+def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
+    """Return the same with a verdict from a few of its tiles."""
+    members = learnt.members
+    works = []
+    for tile in spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED):
+        rows = evenly(members[tile], options.learning.readings)
+        basis = learnt.basis(tile, rows, COARSE)
+        works.append(patchwork(basis, learnt.readings[rows], options.learning.seed))
+    explanation = explanation_of(works, learnt.hyperparameters, options.sensor_noise)
+    return replace(learnt, origin=replace(learnt.origin, explanation=explanation))
+
+
+def evenly(rows: IntArray, most: int) -> IntArray:
+    """Return at most so many of the rows, spread evenly."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+
+
+def learn_prior(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> LearningEnd:
     """Return the hyperparameters that are given, or else those that the readings teach."""
     if options.hyperparameters is not None:
         return LearningEnd(options.hyperparameters, float("nan"), 0, converged=True, at_bound=())
     return learn(readings, sources, options.tiling, options.mode_share, options.learning)
 
 
-def with_search(
-    readings: TrainingSet, learning: LearningEnd, options: HarmonicOptions
-) -> tuple[LearningEnd, Sources]:
-    """Return sources found round by round, and the hyperparameters learnt with them.
+def with_search(learnt: Learnt, options: HarmonicOptions) -> Learnt:
+    """Return the same with sources found round by round in the residuals.
 
-    What is not explained yet counts as noise and hides weaker sources, so that noise and sources
-    are learnt by turns.
+    What is not explained yet counts as noise and hides weaker sources: the prior is learnt anew
+    whenever the sources have become half as many again, and when no more are found.
     """
-    positions = np.empty((0, 3))
+    readings, current, learnt_with = learnt.readings, learnt, 0
     for _ in range(options.search.rounds):
-        sources = Sources(positions, np.arange(len(positions)))
-        even = np.ones(len(positions))
-        plain = laid_out(
-            readings, learning.hyperparameters, sources, even, options, Origin(0, None)
-        )
-        found = found_in_tiles(plain, options)
-        if not len(found):
+        found = found_in_tiles(current, options)
+        if not len(found) and len(current.sources) == learnt_with:
             break
-        positions = np.concatenate([positions, found])
+        positions = np.concatenate([current.sources.positions, found])
         sources = Sources(positions, np.arange(len(positions)))
-        learning = learn_prior(readings, sources, options)
-    return learning, Sources(positions, np.arange(len(positions)))
+        learning = current.origin.learning
+        if not len(found) or len(positions) >= GROWTH * learnt_with:
+            learning, learnt_with = learn_prior(readings, sources, options), len(positions)
+        current = laid_out(readings, learning, sources, np.ones(len(positions)), options)
+    searched = replace(current.origin, searched=True)
+    return explained(with_strengths(replace(current, origin=searched)), options)
 
 
 def found_in_tiles(plain: Learnt, options: HarmonicOptions) -> FloatArray:
@@ -224,8 +257,7 @@ def found_in_tiles(plain: Learnt, options: HarmonicOptions) -> FloatArray:
     members = plain.members
 
     def look(tile: int) -> FloatArray:
-        rows = members[tile]
-        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_READINGS)).astype(int)]
+        rows = evenly(members[tile], MOST_READINGS)
         basis, readings = plain.basis(tile, rows, COARSE), plain.readings[rows]
         residuals = residuals_of(basis, readings, plain.hyperparameters)
         found = look_for_sources(residuals, options.search)
@@ -243,17 +275,19 @@ def found_in_tiles(plain: Learnt, options: HarmonicOptions) -> FloatArray:
 
 def laid_out(
     readings: TrainingSet,
-    hyperparameters: Hyperparameters,
+    learning: LearningEnd,
     sources: Sources,
     strengths: FloatArray,
     options: HarmonicOptions,
-    origin: Origin,
 ) -> Learnt:
     """Return readings and prior with the tiles that suit them."""
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
-    resolution = resolution_of(hyperparameters, density, options.mode_share)
+    resolution = resolution_of(learning.hyperparameters, density, options.mode_share)
     tiling = tiling_of(readings.points, resolution, options.tiling, options.modes, options.reach)
-    return Learnt(readings, hyperparameters, sources, strengths, tiling, resolution, origin)
+    origin = Origin(len(readings), learning)
+    return Learnt(
+        readings, learning.hyperparameters, sources, strengths, tiling, resolution, origin
+    )
 
 
 def with_strengths(plain: Learnt) -> Learnt:
@@ -325,8 +359,9 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
         raise MapError("map array hyperparameters is not of the shape that is needed") from None
     readings = training_set(*(state_array(state, name) for name in ("points", "field", "weight")))
     sources, strengths = sources_from_state(state)
-    learnt = laid_out(readings, hyperparameters, sources, strengths, options, origin)
-    return learnt, options
+    learning = replace(origin.learning, hyperparameters=hyperparameters)
+    learnt = laid_out(readings, learning, sources, strengths, options)
+    return replace(learnt, origin=origin), options
 
 
 def sources_from_state(state: MapState) -> tuple[Sources, FloatArray]:

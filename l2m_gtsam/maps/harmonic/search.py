@@ -114,7 +114,9 @@ class Search:
 
     def _gains(self, places: FloatArray) -> FloatArray:
         K = len(places)
-        Phi = (moment_features(self._points, places) * self._scale[:, None, None]).reshape(-1, 3 * K)
+        Phi = (moment_features(self._points, places) * self._scale[:, None, None]).reshape(
+            -1, 3 * K
+        )
         q = (Phi.T @ self._left).reshape(K, 3)
         seen = (self._half.T @ Phi).reshape(-1, K, 3)
         blocks = Phi.reshape(-1, K, 3)

@@ -1,0 +1,139 @@
+"""Whether a map explains its readings: places held out, and the noise that was learnt."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.evidence import Normal, Weights, condition, normal_of
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.training import TrainingSet
+
+FOLDS = 4
+PATCH = 0.6  # metres; about as far as the space between two lanes of a survey
+# Of the errors at held-out readings over what was predicted for them. A normal distribution has a
+# spread of 1 and 0.27 % beyond three; in halls whose posts the map did not know of, 3 % and more
+# were beyond three, with the posts at most 0.7 %.
+MOST_SPREAD = 1.2
+MOST_SURPRISES = 0.015
+# Learnt noise over the sensor's own: what is not explained counts as noise.
+MOST_NOISE = 1.25
+
+
+class Verdict(StrEnum):
+    """Whether the map's model is one of this field."""
+
+    EXPLAINED = "explained"
+    NOT_EXPLAINED = "not explained"
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """How well a map predicts what it has not read.
+
+    Attributes
+    ----------
+    spread
+        Root mean square of held-out readings' errors over what the map predicts for them.
+    surprises
+        Share of them beyond three.
+    noise
+        Learnt standard deviation of a reading in uT.
+    sensor_noise
+        That of the sensor's data sheet in uT, if it is known.
+    """
+
+    spread: float
+    surprises: float
+    noise: float
+    sensor_noise: float | None
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return whether the field is explained."""
+        return Verdict.NOT_EXPLAINED if self.reasons else Verdict.EXPLAINED
+
+    @property
+    def reasons(self) -> list[str]:
+        """Return what speaks against the map."""
+        reasons = []
+        if self.spread > MOST_SPREAD:
+            reasons.append(f"errors at held-out places are {self.spread:.2g} times their sigmas")
+        if self.surprises > MOST_SURPRISES:
+            reasons.append(f"{self.surprises:.1%} of them exceed three sigmas")
+        if self.sensor_noise is not None and self.noise > MOST_NOISE * self.sensor_noise:
+            reasons.append(
+                f"the noise learnt, {self.noise:.2g} uT, is not the sensor's {self.sensor_noise:g}"
+            )
+        return reasons
+
+
+UNJUDGED = Explanation(float("nan"), float("nan"), float("nan"), None)
+
+
+@dataclass(frozen=True)
+class Patchwork:
+    """A basis, its readings, and the fold of each: squares that are held out together."""
+
+    basis: Basis
+    readings: TrainingSet
+    fold: IntArray
+
+
+def patchwork(basis: Basis, readings: TrainingSet, seed: int) -> Patchwork:
+    """Return readings dealt out to folds by squares of the floor."""
+    cells = np.floor(readings.points[:, :2] / PATCH).astype(np.int64)
+    known, cell = np.unique(cells, axis=0, return_inverse=True)
+    dealt = np.random.default_rng(seed).permutation(len(known)) % FOLDS
+    return Patchwork(basis, readings, np.asarray(dealt[cell], dtype=np.int64))
+
+
+def held_out_scores(work: Patchwork, hyperparameters: Hyperparameters) -> FloatArray:
+    """Return errors at held-out readings over their predicted standard deviations, (3 N,)."""
+    prior = work.basis.prior(hyperparameters).log_variance
+    parts = [work.readings[np.flatnonzero(work.fold == fold)] for fold in range(FOLDS)]
+    parts = [part for part in parts if len(part)]
+    normals = [normal_of(work.basis, part) for part in parts]
+    total = sum(normals[1:], start=normals[0])
+    scores = [
+        scores_of(work.basis, part, without(total, normal, prior, hyperparameters), hyperparameters)
+        for part, normal in zip(parts, normals, strict=True)
+    ]
+    return np.concatenate(scores)
+
+
+def without(
+    total: Normal, normal: Normal, prior: FloatArray, hyperparameters: Hyperparameters
+) -> Weights:
+    """Return the posterior of the weights without one fold."""
+    return condition(total - normal, prior, hyperparameters.noise)
+
+
+def scores_of(
+    basis: Basis, part: TrainingSet, weights: Weights, hyperparameters: Hyperparameters
+) -> FloatArray:
+    """Return the z-scores of readings that the weights do not know, shape (3 N,)."""
+    F = basis.features(part.points).reshape(-1, len(basis))
+    half = solve_triangular(weights.factor, (F * weights.prior_sigma).T, lower=True)
+    noise = np.repeat(hyperparameters.noise**2 / part.weight, 3)
+    spread = np.sqrt(np.einsum("mn,mn->n", half, half) + noise)
+    return np.asarray((part.field.ravel() - F @ weights.mean) / spread)
+
+
+def explanation_of(
+    works: Sequence[Patchwork], hyperparameters: Hyperparameters, sensor_noise: float | None
+) -> Explanation:
+    """Return how well the model predicts held-out patches of a few windows."""
+    scores = in_threads(lambda work: held_out_scores(work, hyperparameters), works)
+    z = np.concatenate(scores)
+    return Explanation(
+        spread=float(np.sqrt(np.mean(z**2))),
+        surprises=float(np.mean(np.abs(z) > 3)),
+        noise=hyperparameters.noise,
+        sensor_noise=sensor_noise,
+    )
