@@ -21,7 +21,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
 from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
 from l2m_gtsam.sync import stuck_sensors, synchronise
 
@@ -64,7 +64,8 @@ def calibrate(
     stuck = stuck_sensors(synchronised.readings)
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
     t_start = _starts(synchronised.readings.sensors, options)
-    solution = solve_one_key(alive, field_map, t_start, options.solve, progress)
+    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    solution = solve_one_key(alive, solver_map, t_start, options.solve, progress)
     sensors = _assess(synchronised, alive, solution, options)
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))

@@ -20,7 +20,7 @@ def linearised(
     smaller = gtsam.GaussianFactorGraph()
     for index in range(linear.size()):
         factor = linear.at(index)
-        widths = [len(zero.at(key)) for key in factor.keys()]
+        widths = [len(zero.at(key)) for key in list(factor.keys())]
         smaller.push_back(fewer_rows(factor, widths))
     return smaller
 

@@ -1,7 +1,7 @@
 """The readings that a map covers at the current estimate, and what the map says about them."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -18,6 +18,15 @@ class QueryableMap(Protocol):
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
+        ...
+
+
+@runtime_checkable
+class Compilable(Protocol):
+    """A map that has a faster form for solvers, equal within what no reading can tell."""
+
+    def compile(self) -> QueryableMap:
+        """Return that form."""
         ...
 
 

@@ -26,7 +26,7 @@ def comparison_table(comparison: MapComparison) -> Table:
     """
     table = Table(
         title=f"Maps compared on {comparison.readings:,} readings in {comparison.patches:,} "
-        f"patches of {comparison.fold:g} m, held out in {comparison.folds} folds",
+        f"patches of {comparison.fold:.3g} m, held out in {comparison.folds} folds",
         title_justify="left",
         caption=escape(recommendation(comparison)),
         caption_justify="left",

@@ -1,12 +1,16 @@
 """The demonstration on disk, made once for all tests of the command line."""
 
+import io
 import os
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+
+from l2m_gtsam.cli import main
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,22 @@ def l2m(*arguments: str | Path, fails: bool = False) -> Finished:
 
 def complaint(*arguments: str | Path) -> str:
     """Run ``l2m`` on bad input and return its one line; anything else fails the test."""
-    run = l2m(*arguments, fails=True)
+    return one_line(l2m(*arguments, fails=True))
+
+
+def complaint_here(*arguments: str | Path) -> str:
+    """As ``complaint``, but in this process: an answer in no time to many bad inputs."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", ["l2m", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            main()
+    assert isinstance(end.value.code, int)
+    return one_line(Finished(end.value.code, out.getvalue(), err.getvalue()))
+
+
+def one_line(run: Finished) -> str:
+    """Return the one line that a run on bad input ended with."""
     # progress bars of stages that went well may stand above the line
     lines = [line for line in run.err.splitlines() if line.startswith("l2m: ")]
     assert run.code == 2

@@ -18,8 +18,8 @@ START = 1_700_000_000_000_000_000
 STEP = 100_000_000  # ns, in which the vehicle drives 6 cm
 POST = np.array([0.2, 0.2])
 NOISE = 0.1  # uT
-SCANS_WITHOUT_POSE = 1  # in each bag
 PRIOR = {"length_scale": 0.8, "signal": 4.0, "noise": 0.2}
+HARMONIC_PRIOR = {"floor_scale": 2.0, "floor_depth": 0.6, "noise": 0.1}
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Yard:
     cloud
         The post as a point cloud.
     config
-        A harmonic map that is built fast.
+        A harmonic map with a given prior that is built fast.
     sliding
-        A sliding Gaussian process with given hyperparameters.
+        A sliding Gaussian process with a given prior.
     """
 
     west: Path
@@ -96,7 +96,10 @@ def make_yard(folder: Path) -> Yard:
     """Write everything into a folder."""
     # JSON is YAML.
     bag = {"poses": "/pose", "fields": ["/mag"]}
-    harmonic = {"kind": "harmonic", "harmonic": QUICK_HARMONIC}
+    harmonic = {
+        "kind": "harmonic",
+        "harmonic": QUICK_HARMONIC | {"hyperparameters": HARMONIC_PRIOR},
+    }
     sliding = {"kind": "sliding_gp", "sliding_gp": {"hyperparameters": PRIOR}}
     config, plain = folder / "harmonic.yaml", folder / "sliding.yaml"
     config.write_text(json.dumps({"bag": bag, "mapping": {"model": harmonic}}))

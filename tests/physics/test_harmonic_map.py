@@ -1,5 +1,7 @@
 """What Maxwell's equations demand of the harmonic map, and what they give it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,31 +20,44 @@ from l2m_gtsam.maps.sliding_gp import SlidingGP
 from tests.worlds import DIPOLE_CONSTANT, DipoleWorld, dipole_world
 
 GIVEN = Hyperparameters(
-    floor_scale=1.6, floor_depth=0.7, ceiling_scale=0.5, ceiling_depth=1.4, noise=0.1
+    floor_scale=1.6, floor_depth=0.7, ceiling_scale=0.5, ceiling_depth=1.4, noise=0.2
 )
-OPTIONS = HarmonicOptions(hyperparameters=GIVEN, search=SearchOptions(rounds=0), modes=200)
+# Coarse and fast: the laws hold for any number of modes.
+OPTIONS = HarmonicOptions(
+    hyperparameters=GIVEN, search=SearchOptions(rounds=0), modes=200, mode_share=0.5
+)
 KEEP_ALL = OPTIONS.model_copy(update={"merge": 1e-6})
+POST = np.column_stack([np.full(20, 0.3), np.full(20, 1.6), np.linspace(0, 1.5, 20)])
+STEEL = DipoleWorld(np.zeros(3), POST[::4], np.random.default_rng(6).normal(0, 6, (5, 3)))
 WORLD = dipole_world(1)
-POST = np.column_stack([np.full(20, 0.3), np.full(20, 1.9), np.linspace(0, 1.5, 20)])
 
 
-def readings(
-    count: int = 800, heights: tuple[float, float] = (0.2, 0.8)
-) -> tuple[FloatArray, FloatArray]:
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-2, -1.5, heights[0]], [2, 1.5, heights[1]], (count, 3))
-    field, _ = WORLD.field_and_gradient(points)
-    return points, field + rng.normal(0, GIVEN.noise, field.shape)
+def survey_points(count: int, low: float, high: float, seed: int) -> FloatArray:
+    return np.random.default_rng(seed).uniform([-1.5, -1.2, low], [1.5, 1.2, high], (count, 3))
+
+
+def noise(count: int) -> FloatArray:
+    return np.random.default_rng(7).normal(0, GIVEN.noise, (count, 3))
+
+
+def readings(count: int = 600) -> tuple[FloatArray, FloatArray]:
+    points = survey_points(count, 0.2, 0.8, seed=0)
+    return points, WORLD.field_and_gradient(points)[0] + noise(count)
+
+
+def readings_at_a_post() -> tuple[FloatArray, FloatArray]:
+    points, field = readings()
+    return points, field + STEEL.field_and_gradient(points)[0]
 
 
 def within_survey(count: int = 300, low: float = 0.2, high: float = 0.8) -> FloatArray:
-    return np.random.default_rng(1).uniform([-1.9, -1.4, low], [1.9, 1.4, high], (count, 3))
+    return survey_points(count, low, high, seed=1) * [0.95, 0.95, 1]
 
 
 @pytest.fixture(scope="module")
 def field_map() -> HarmonicMap:
     """Several tiles, with a post that carries sources."""
-    ours = HarmonicMap.fit(*readings(), OPTIONS, POST)
+    ours = HarmonicMap.fit(*readings_at_a_post(), OPTIONS, POST)
     assert len(ours.tiles) > 3
     assert ours.learnt.strengths.max() > 0
     return ours
@@ -88,7 +103,7 @@ def differences(field_map: HarmonicMap, points: FloatArray, step: float = 1e-4) 
 def alone(field_map: HarmonicMap, points: FloatArray) -> FloatArray:
     """Return the points at which one tile answers alone."""
     visits = field_map.learnt.tiling.visits(points)
-    return points[np.concatenate([visit.rows[visit.share == 1] for visit in visits])]
+    return np.asarray(points[np.concatenate([v.rows[v.share == 1] for v in visits])])
 
 
 def test_within_a_tile_the_gradient_is_the_derivative_of_the_field(field_map: HarmonicMap) -> None:
@@ -179,87 +194,78 @@ def test_the_prior_of_modes_at_the_lowest_reading_is_the_documented_scale() -> N
     np.testing.assert_allclose(sigma, [3.0, 3.0, 3.0 * np.sqrt(2)], rtol=0.005)
 
 
-@settings(max_examples=5, deadline=None)
-@given(uniform=st.tuples(*[st.floats(-60, 60)] * 3))
-def test_a_uniform_field_changes_only_the_mean(
-    field_map: HarmonicMap, uniform: tuple[float, float, float]
-) -> None:
+def test_a_uniform_field_changes_only_the_mean(field_map: HarmonicMap) -> None:
     """The prior of 100 uT holds back the variance of the uniform weight over 1e4 uT^2."""
-    points, field = readings()
-    added = HarmonicMap.condition(
-        HarmonicMap.fit(points, field + uniform, OPTIONS, POST).learnt, OPTIONS
-    )
+    points, field = readings_at_a_post()
+    uniform = np.array([60.0, -35.0, 20.0])
+    added = HarmonicMap.fit(points, field + uniform, OPTIONS, POST)
     at = within_survey(100)
     one, other = field_map.query(at), added.query(at)
-    # 60 uT times the posterior covariance of the field (0.03 uT) with the uniform weight (0.1
-    # uT), over 1e4 uT^2: 2e-5 at most.
-    np.testing.assert_allclose(other.field - uniform, one.field, rtol=0, atol=2e-5)
-    np.testing.assert_allclose(other.gradient, one.gradient, rtol=0, atol=2e-4)
-    # The same products.
-    np.testing.assert_allclose(other.variance, one.variance, rtol=1e-9)
+    # 60 uT times the posterior covariance of the field (0.03 uT) with the uniform weight (0.5 uT)
+    # over 1e4 uT^2: 1e-4 at most.
+    np.testing.assert_allclose(other.field - uniform, one.field, rtol=0, atol=1e-4)
+    np.testing.assert_allclose(other.gradient, one.gradient, rtol=0, atol=1e-3)
+    # The strength of the post is searched for anew, and the search ends where that is flat.
+    np.testing.assert_allclose(other.variance, one.variance, rtol=1e-4)
     np.testing.assert_array_equal(other.inside, one.inside)
 
 
 def test_one_height_tells_of_others() -> None:
     """The vertical gradient follows from the horizontal ones; independent axes know nothing."""
-    rng = np.random.default_rng(4)
-    points = rng.uniform([-2, -1.5, 0.5], [2, 1.5, 0.5], (1000, 3))
-    field = WORLD.field_and_gradient(points)[0] + rng.normal(0, GIVEN.noise, points.shape)
-    ours, sliding = HarmonicMap.fit(points, field, OPTIONS), SlidingGP.fit(points, field)
-    at = rng.uniform([-1.5, -1, 0.7], [1.5, 1, 0.7], (300, 3))
-    truth, slope = WORLD.field_and_gradient(at)
+    points, strong = (
+        survey_points(1000, 0.5, 0.5, seed=4),
+        replace(WORLD, moments=5 * WORLD.moments),
+    )
+    field = strong.field_and_gradient(points)[0] + noise(1000)
+    given = GIVEN.model_copy(update={"floor_scale": 8.0, "ceiling_scale": 2.5})
+    options = OPTIONS.model_copy(update={"hyperparameters": given})
+    ours, sliding = HarmonicMap.fit(points, field, options), SlidingGP.fit(points, field)
+    at = within_survey(300, 0.7, 0.7) * [0.7, 0.7, 1]
+    truth, _ = strong.field_and_gradient(at)
     error, theirs = ours.query(at).field - truth, sliding.field_and_gradient(at)[0] - truth
-    # 0.07 against 0.9 uT in this world; the sigma knows.
-    assert rms(error) < 0.25 * rms(theirs)
-    assert 0.6 < rms(error / np.sqrt(ours.variance(at))) < 1.4
-    here = at * [1, 1, 0] + [0, 0, 0.5]
-    truth, slope = WORLD.field_and_gradient(here)
-    vertical = ours.field_and_gradient(here)[1][:, :, 2] - slope[:, :, 2]
-    assert rms(sliding.field_and_gradient(here)[1][:, :, 2]) < 1e-9
-    assert rms(vertical) < 0.2 * rms(slope[:, :, 2])
+    assert rms(error) < 0.2 * rms(theirs)
+    assert 0.5 < rms(error / np.sqrt(ours.variance(at))) < 1.5
+    _, slope = strong.field_and_gradient(at - [0, 0, 0.2])
+    _, known = ours.field_and_gradient(at - [0, 0, 0.2])
+    _, nothing = sliding.field_and_gradient(at - [0, 0, 0.2])
+    assert rms(nothing[:, :, 2]) < 1e-9
+    assert rms((known - slope)[:, :, 2]) < 0.3 * rms(slope[:, :, 2])
 
 
-def turned(seed: int, count: int) -> tuple[Rotation, FloatArray, FloatArray]:
-    """A plane survey of the world turned by four degrees: rotation, points and field."""
-    rng = np.random.default_rng(seed)
-    R = Rotation.from_euler("xy", [4.0, -2.0], degrees=True)
-    flat = rng.uniform([-2, -1.5, 0.5], [2, 1.5, 0.5], (count, 3))
-    flat[:, 2] += rng.normal(0, 0.005, count)
-    field = WORLD.field_and_gradient(flat)[0] + rng.normal(0, GIVEN.noise, flat.shape)
-    return R, flat, field
+TILT = Rotation.from_euler("xy", [4.0, -2.0], degrees=True)
 
 
 def test_a_tilted_floor_turns_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tiles follow the plane of their readings: the tilted map is the level one, turned."""
-    R, flat, field = turned(5, 1000)
+    flat = survey_points(800, 0.5, 0.5, seed=5)
+    flat[:, 2] += np.random.default_rng(5).normal(0, 0.005, 800)
+    field = WORLD.field_and_gradient(flat)[0] + noise(800)
     level = HarmonicMap.fit(flat, field, OPTIONS)
-    tilted = HarmonicMap.fit(R.apply(flat), R.apply(field), OPTIONS)
-    np.testing.assert_allclose(
-        tilted.tiles[len(tilted.tiles) // 2].basis.frame.R_map_tile[:, 2],
-        R.apply([0, 0, 1]),
-        atol=0.005,  # a plane through 5 mm of unevenness
-    )
+    tilted = HarmonicMap.fit(TILT.apply(flat), TILT.apply(field), OPTIONS)
+    up = np.stack([tile.basis.frame.R_map_tile[:, 2] for tile in tilted.tiles])
+    # A plane through the 5 mm unevenness of a strip half a metre wide.
+    np.testing.assert_allclose(up, np.tile(TILT.apply([0, 0, 1]), (len(up), 1)), atol=0.01)
     at = within_survey(300, 0.4, 0.7)
-    here, there = level.query(at), tilted.query(R.apply(at))
+    here, there = level.query(at), tilted.query(TILT.apply(at))
     both = here.inside & there.inside
     assert both.mean() > 0.95
     sigma = np.sqrt(here.variance[both])
+    back = TILT.inv().apply(there.field[both])
     # Boxes and cubes of averaging lie elsewhere: a part of a sigma.
-    assert rms((R.inv().apply(there.field[both]) - here.field[both]) / sigma) < 0.3
-    back = R.as_matrix().T @ there.gradient[both] @ R.as_matrix()
-    assert rms(back - here.gradient[both]) < 0.1 * rms(here.gradient[both])
-    ratio = R.inv().apply(np.sqrt(there.variance[both])) / sigma
-    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)
+    assert rms((back - here.field[both]) / sigma) < 0.4
+    R = TILT.as_matrix()
+    slope = R.T @ there.gradient[both] @ R
+    assert rms(slope - here.gradient[both]) < 0.2 * rms(here.gradient[both])
+    # Turned by four degrees the axes' variances mix by less than a hundredth.
+    assert np.median(np.sqrt(there.variance[both]) / sigma) == pytest.approx(1.0, abs=0.1)
     monkeypatch.setattr(frame, "LEAST_SLOPE", np.inf)
-    ignored = HarmonicMap.fit(R.apply(flat), R.apply(field), OPTIONS)
+    ignored = HarmonicMap.fit(TILT.apply(flat), TILT.apply(field), OPTIONS)
     np.testing.assert_array_equal(ignored.tiles[0].basis.frame.R_map_tile, np.eye(3))
 
 
-@settings(max_examples=5, deadline=None)
-@given(steps=st.tuples(*[st.integers(-200, 200)] * 3))
-def test_a_moved_world_has_a_moved_map(steps: tuple[int, int, int]) -> None:
+def test_a_moved_world_has_a_moved_map() -> None:
     points, field = readings(300)
-    move = 0.15 * np.array(steps)  # the surveyed area is counted in cells of this size
+    move = 0.15 * np.array([200, -113, 17])  # the surveyed area is counted in cells of this size
     at = within_survey(50)
     here = HarmonicMap.fit(points, field, KEEP_ALL).query(at)
     there = HarmonicMap.fit(points + move, field, KEEP_ALL).query(at + move)

@@ -9,11 +9,17 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic import compiled, compiled_tile, potential_grid
+from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
-from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
+from l2m_gtsam.maps.harmonic.evidence import Weights
+from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
+from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiling import Resolution
+from l2m_gtsam.maps.harmonic.uniform import UniformField
 from tests.steel import STRONG, CloudVariant, steel_hall, structure_cloud
 from tests.steel_drives import survey
 from tests.worlds import dipole_world
@@ -237,3 +243,27 @@ def test_a_grid_that_errs_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     assert tiles
     coarse = compiled_tile.fineness_for(tiles[0].tile, compiled_tile.sources_of(tiles[0].tile))
     assert max(tile.grid.spacing for tile in tiles) < coarse.spacing
+
+
+def plain_tile() -> Tile:
+    """Return a tile that knows a uniform field and nothing else."""
+    frame = TileFrame(np.eye(3), np.zeros(3), np.array([4.0, 4.0]), 1.0)
+    weights = Weights(np.array([20.0, -3.0, 40.0]), np.ones(3), np.eye(3))
+    return Tile(Basis(frame, (UniformField(100.0),)), weights, PRIOR, Resolution(0.5, 0.5))
+
+
+def test_a_tile_without_waves_and_sources_is_compiled_too() -> None:
+    readings = np.random.default_rng(0).uniform(0, 4, (50, 3))
+    tile = compile_tile(plain_tile(), Places.around(readings, 0.5, np.full(2, 2.0), 2.0))
+    assert isinstance(tile, CompiledTile)
+    field, gradient = tile.field_and_gradient(readings)
+    # Rounding, 1e-16, of a potential of some 1000 uT m on a wide grid, some ten times over in the
+    # filter, over the spacing of 2 m or its square.
+    np.testing.assert_allclose(field, np.tile([20.0, -3.0, 40.0], (50, 1)), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(gradient, 0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("where", [[50.0, 50.0, 0.0], [4.4999999, 4.4999999, 0.5]])
+def test_a_tile_with_hardly_a_reading_nearby_stays_as_it_is(where: list[float]) -> None:
+    tile = plain_tile()
+    assert compile_tile(tile, Places.around(np.array([where]), 0.5, np.full(2, 2.0), 2.0)) is tile

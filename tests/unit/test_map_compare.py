@@ -102,9 +102,9 @@ def test_the_sliding_process_is_preferred_to_the_grid(dipoles: MapComparison) ->
 def test_folds_are_disjoint_in_space_and_hold_out_every_reading_once() -> None:
     options = CompareOptions(fold=1.0, folds=5)
     points = places()
-    folds = folds_of(patches_of(points, options.fold), options)
+    folds = folds_of(patches_of(points, 1.0), options)
     corner = points[:, :2].min(axis=0)
-    squares = [tuple(square) for square in ((points[:, :2] - corner) // options.fold).tolist()]
+    squares = [tuple(square) for square in ((points[:, :2] - corner) // 1.0).tolist()]
     for fold in folds:
         seen = {squares[row] for row in (*fold.training, *fold.aside)}
         unseen = {squares[row] for row in fold.held_out}
@@ -210,7 +210,7 @@ def test_readings_outside_of_a_map_count_as_without_a_map() -> None:
     np.testing.assert_allclose(
         found.rmse_axes, np.sqrt(np.mean((field - MEAN)[inside] ** 2, axis=0))
     )
-    patch = patches_of(points, options.fold)
+    patch = patches_of(points, 2.0)
     folds = folds_of(patch, options)
     scores = []
     for fold in folds:

@@ -14,10 +14,11 @@ from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
 from l2m_gtsam.maps.harmonic.potential_grid import Box, Lattice, PotentialGrid, potential_grid
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiling import WAVE_NUMBERS
 
 FIELD_TOLERANCE = 0.005  # uT
 GRADIENT_TOLERANCE = 0.02  # uT/m
-SAFETY = 0.6  # of the tolerance: places that were not checked may be somewhat worse
+SAFETY = 0.5  # of the tolerance: places that were not checked may be somewhat worse
 WAVE = 1.0  # spacing times the largest wave number: waves that short are never strong
 # The gradient of sources' smooth parts errs by this times moment, spacing^6 and radius^-10.
 SOURCE = 3e4
@@ -79,6 +80,8 @@ class Places:
 
     def random(self, count: int) -> FloatArray:
         """Return places in the map frame, shape (N, 3): about as many as asked for, or none."""
+        if not len(self.readings):
+            return np.empty((0, 3))
         rng = np.random.default_rng(0)
         offset = rng.uniform(-1, 1, (count, 3)) * self.reach
         places = self.readings[rng.integers(0, len(self.readings), count)] + offset
@@ -155,11 +158,11 @@ def compile_tile(tile: Tile, places: Places) -> CompiledTile | Tile:
     How fine follows from waves and sources, then from the error at places drawn at random and
     beside sources. If no grid of a sensible size is good enough the exact tile remains.
     """
-    if not len(places.readings):
-        return tile
     sources = sources_of(tile)
-    fineness = fineness_for(tile, sources)
     checks = check_places(tile, sources, places)
+    if not len(checks):
+        return tile
+    fineness = fineness_for(tile, sources)
     truth = tile.field_and_gradient(checks)
     for _ in range(ATTEMPTS):
         try:
@@ -176,10 +179,10 @@ def compile_tile(tile: Tile, places: Places) -> CompiledTile | Tile:
 def fineness_for(tile: Tile, sources: PointSources) -> Fineness:
     """Return the fineness that the physics suggests."""
     waves = [np.abs(f.kz).max() for f in tile.basis.families if isinstance(f, Modes)]
-    spacing = WAVE / max(waves)
-    if not len(sources):
+    spacing = WAVE / max(waves, default=WAVE_NUMBERS[0])
+    strongest = np.linalg.norm(sources.moments, axis=1).max(initial=0.0)
+    if strongest == 0:
         return Fineness(spacing, 0.0)
-    strongest = np.linalg.norm(sources.moments, axis=1).max()
     strength = SOURCE * strongest / (SAFETY * GRADIENT_TOLERANCE)
     spacing = min(spacing, (WIDEST**10 / strength) ** (1 / 6))
     return Fineness(spacing, (strength * spacing**6) ** (1 / 10))

@@ -14,6 +14,8 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.family import WeightPrior
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 
+SOFT = 1e-3  # metres
+
 
 @dataclass(frozen=True)
 class Dipoles:
@@ -76,7 +78,8 @@ class Dipoles:
 def separations(points: FloatArray, sources: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return vectors (N, K, 3) from sources to points and their lengths (N, K), in metres."""
     r = points[:, None, :] - sources
-    return r, np.sqrt(np.einsum("nki,nki->nk", r, r))
+    # At a source itself the field is not finite; a map must be.
+    return r, np.sqrt(np.einsum("nki,nki->nk", r, r) + SOFT**2)
 
 
 def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:

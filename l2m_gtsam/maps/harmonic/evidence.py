@@ -13,10 +13,10 @@ whatever the number of readings.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
+from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.training import TrainingSet
 
@@ -79,6 +79,36 @@ def normal_of(basis: Basis, readings: TrainingSet) -> Normal:
         yy += float(y @ y)
     log_weight = 3 * float(np.log(readings.weight).sum())
     return Normal(FF, Fy, yy, 3 * len(readings), log_weight)
+
+
+def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise: float) -> Normal:
+    """Return the sums for some weights alone, the others integrated out under their prior.
+
+    Evidence of the kept weights' prior is the same but for a constant.
+
+    Parameters
+    ----------
+    normal
+        Sums over the readings.
+    kept
+        Columns of the weights that stay, shape (k,).
+    log_variance, noise
+        Prior of all weights, shape (m,), and noise in uT.
+    """
+    gone = np.setdiff1d(np.arange(len(normal.Fy)), kept)
+    D = np.exp(0.5 * log_variance[gone])
+    part = Normal(normal.FF[np.ix_(gone, gone)], normal.Fy[gone], normal.yy, 0, 0.0)
+    K = whitened_factor(part, D, noise)
+    right = np.column_stack([normal.FF[np.ix_(gone, kept)], normal.Fy[gone]]) * D[:, None] / noise
+    half = solve_triangular(K, right, lower=True, check_finite=False)
+    known = half.T @ half
+    return Normal(
+        normal.FF[np.ix_(kept, kept)] - known[:-1, :-1],
+        normal.Fy[kept] - known[:-1, -1],
+        normal.yy - float(known[-1, -1]),
+        normal.rows,
+        normal.log_weight,
+    )
 
 
 @dataclass(frozen=True)

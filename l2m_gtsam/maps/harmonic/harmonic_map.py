@@ -166,13 +166,9 @@ class HarmonicMap:
 
     def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
         """Return what is known at points with this field and gradient; see ``query``."""
-        variance, prior = np.zeros_like(points), np.zeros_like(points)
-        for visit in self.learnt.tiling.visits(points):
-            tile, at, share = self.tiles[visit.tile], visit.rows, visit.share[:, None]
-            variance[at] += share * tile.variance(points[at])
-            prior[at] += share * tile.prior_variance(points[at])
-        explained = variance.sum(axis=1) <= 0.5 * prior.sum(axis=1)
-        return masked(FieldSample(field, gradient, variance, self._near(points) & explained))
+        variance = self.variance(points)
+        known = variance.sum(axis=1) <= self.learnt.most_variance
+        return masked(FieldSample(field, gradient, variance, self._near(points) & known))
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""

@@ -25,8 +25,8 @@ from l2m_gtsam.maps.harmonic.tiling import (
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 
-ROUNDS = 3  # learning is repeated while it asks for finer modes than it looked at
-FINER = 1.15
+ROUNDS = 2  # learning is repeated while it asks for finer modes than it looked at
+FINER = 1.3
 BOUND_TOLERANCE = 1e-6
 FURTHEST = np.log(300.0)  # from where a search starts
 
@@ -183,7 +183,7 @@ def maximise(windows: Sequence[Window], start: Hyperparameters) -> LearningEnd:
         jac=True,
         method="L-BFGS-B",
         bounds=Bounds(low, high),
-        options={"maxiter": 60, "ftol": 1e-8},
+        options={"maxiter": 60, "ftol": 1e-6},
     )
     on_bound = np.minimum(end.x - low, high - end.x) < BOUND_TOLERANCE
     at_bound = tuple(name for name, on in zip(names, on_bound, strict=True) if on)

@@ -43,6 +43,7 @@ from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_ar
 from l2m_gtsam.maps.training import TrainingSet, joined, merged, training_set
 from l2m_gtsam.options import Options
 
+KNOWN = 0.5  # of the readings' variance: a map that says less might as well say their mean
 JUDGED = 4  # tiles whose held-out places say whether the field is explained
 GROWTH = 1.5  # of the sources, after which the prior is learnt anew
 
@@ -76,8 +77,8 @@ class HarmonicOptions(Options):
     """A mode is kept if the readings could reduce its prior variance by this share; what is left
     out counts as variance."""
     reach: float = Field(default=0.5, gt=0)
-    """A point is inside the map when a reading is this near and the readings explain at least
-    half of the prior variance there."""
+    """A point is inside the map when a reading is this near and the field is known to better than
+    half of the variance with which the readings vary."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,12 @@ class Learnt:
     def members(self) -> list[IntArray]:
         """Rows of the readings that take part in each tile."""
         return self.tiling.grid.members(self.readings.points, self.tiling.overlap)
+
+    @property
+    def most_variance(self) -> float:
+        """Variance of the three axes together beyond which the field is not known, uT^2."""
+        varied = float(self.readings.field.var(axis=0).sum())
+        return max(KNOWN * varied, 3 * self.hyperparameters.noise**2)
 
     def basis(self, tile: int, rows: IntArray, visible: float = FINE) -> Basis:
         """Return the basis of a tile for its readings; ``visible`` is that of ``dipoles_of``."""

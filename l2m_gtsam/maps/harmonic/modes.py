@@ -165,8 +165,9 @@ def left_out(scale: float, depth: float, k_max: float, away: FloatArray) -> Floa
     k_max
         Largest wave number that is kept, 1/m.
     away
-        Distance of the points from the lowest (highest) reading, away from the sources, metres.
+        Distance of the points from the lowest (highest) reading, away from the sources, metres;
+        more than -depth.
     """
-    b = 2 * (depth + np.maximum(away, -0.9 * depth))
+    b = 2 * (depth + away)
     tail = k_max**2 / b + 2 * k_max / b**2 + 2 / b**3
     return np.asarray(scale**2 * (2 * depth) ** 3 * np.exp(-k_max * b) * tail)

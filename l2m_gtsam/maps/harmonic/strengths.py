@@ -6,7 +6,13 @@ from scipy.optimize import Bounds, minimize
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
-from l2m_gtsam.maps.harmonic.evidence import Normal, evidence, inverse_of, whitened_factor
+from l2m_gtsam.maps.harmonic.evidence import (
+    Normal,
+    evidence,
+    inverse_of,
+    marginalised,
+    whitened_factor,
+)
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 
 RANGE = (1e-4, 1e3)  # of a strength, relative to the map's structure_scale
@@ -31,42 +37,39 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
     hyperparameters
         Shared by the map.
     """
-    pairs = [
-        (columns, family.strength)
+    structures = [
+        (np.arange(columns.start, columns.stop), family.strength)
         for columns, family in zip(basis.columns(), basis.families, strict=True)
         if isinstance(family, Dipoles)
     ]
-    if not pairs:
+    if not structures:
         return []
-    columns = [pair[0] for pair in pairs]
-    given = np.log([pair[1] for pair in pairs])
-    base = basis.prior(hyperparameters).log_variance
-
-    def log_variance(x: FloatArray) -> FloatArray:
-        trial = base.copy()
-        for at, log_strength, start in zip(columns, x, given, strict=True):
-            trial[at] += 2 * (log_strength - start)
-        return trial
+    kept = np.concatenate([columns for columns, _ in structures])
+    owner = np.repeat(np.arange(len(structures)), [len(columns) for columns, _ in structures])
+    noise, prior = hyperparameters.noise, basis.prior(hyperparameters).log_variance
+    # Floor, ceiling and uniform field stay as they are: integrated out once, not at each step.
+    alone, given = marginalised(normal, kept, prior, noise), prior[kept]
+    start = np.log([strength for _, strength in structures])
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
-        result = evidence(normal, log_variance(x), hyperparameters.noise)
-        slope = np.array([2 * result.by_log_variance[at].sum() for at in columns])
-        return -result.value, -slope
+        result = evidence(alone, given + 2 * (x - start)[owner], noise)
+        slope = np.bincount(owner, result.by_log_variance).astype(np.float64)
+        return -result.value, -2 * slope
 
     low, high = np.log(RANGE)
     end = minimize(
         cost,
-        given,
+        start,
         jac=True,
         method="L-BFGS-B",
         bounds=Bounds(low, high),
-        options={"maxiter": STEPS, "ftol": 1e-9},
+        options={"maxiter": STEPS, "ftol": 1e-7},
     )
-    # At the maximum the slope vanishes, and what remains of it counts the determined weights.
-    determined = determined_weights(normal, log_variance(end.x), hyperparameters.noise)
+    determined = determined_weights(alone, given + 2 * (end.x - start)[owner], noise)
+    count = np.bincount(owner, determined)
     return [
-        float(np.exp(x)) if determined[at].sum() >= LEAST_DETERMINED else 0.0
-        for x, at in zip(end.x, columns, strict=True)
+        float(np.exp(x)) if c >= LEAST_DETERMINED else 0.0
+        for x, c in zip(end.x, count, strict=True)
     ]
 
 

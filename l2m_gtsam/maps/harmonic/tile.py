@@ -12,6 +12,8 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import left_out
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 
+NEAREST = 0.9  # of the way from the lowest (highest) reading to the sheet of sources
+
 
 @dataclass(frozen=True)
 class Tile:
@@ -36,12 +38,23 @@ class Tile:
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean field (N, 3) in uT and its gradient (N, 3, 3) in uT/m."""
-        return self.basis.field_and_gradient(points, self.weights.mean)
+        return self.basis.field_and_gradient(self.within(points), self.weights.mean)
+
+    def within(self, points: FloatArray) -> FloatArray:
+        """Return points moved to where the waves are bounded: no nearer to the sheets of sources.
+
+        So far from the readings nothing is known of the field; the variance says so.
+        """
+        frame, h = self.basis.frame, self.hyperparameters
+        z = frame.localise(points)[:, 2]
+        low = -NEAREST * h.floor_depth
+        high = frame.height + NEAREST * h.ceiling_depth
+        return np.asarray(points + (np.clip(z, low, high) - z)[:, None] * frame.R_map_tile[:, 2])
 
     def root(self, points: FloatArray) -> FloatArray:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""
         m = len(self.basis)
-        F = self.basis.features(points).reshape(-1, m) * self.weights.prior_sigma
+        F = self.basis.features(self.within(points)).reshape(-1, m) * self.weights.prior_sigma
         whitened = solve_triangular(self.weights.factor, F.T, lower=True, check_finite=False)
         return np.asarray(whitened.T.reshape(-1, 3, m))
 
@@ -53,19 +66,9 @@ class Tile:
             variance[at] = np.einsum("nim,nim->ni", root, root)
         return variance + self.unresolved(points)
 
-    def prior_variance(self, points: FloatArray) -> FloatArray:
-        """Return the prior variance per axis without the uniform field, uT^2, shape (N, 3)."""
-        variance = np.empty((len(points), 3))
-        varied = self.weights.prior_sigma.copy()
-        varied[: len(self.basis.families[0])] = 0.0  # the uniform field comes first
-        for at in batches(len(points)):
-            F = self.basis.features(points[at]) * varied
-            variance[at] = np.einsum("nim,nim->ni", F, F)
-        return variance + self.unresolved(points)
-
     def unresolved(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis that the modes left out hold, uT^2, shape (N, 3)."""
-        z = self.basis.frame.localise(points)[:, 2]
+        z = self.basis.frame.localise(self.within(points))[:, 2]
         h = self.hyperparameters
         vertical = left_out(h.floor_scale, h.floor_depth, self.resolution.floor, z)
         over = self.basis.frame.height - z

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 from scipy.optimize import brentq
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid, grid_over
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR
@@ -26,7 +26,7 @@ class TilingOptions(Options):
 
     overlap: float = Field(default=0.5, gt=0)
     """Readings this far around the core take part in a tile."""
-    margin: float = Field(default=1.0, gt=0)
+    margin: float = Field(default=0.6, gt=0)
     """The box reaches this far beyond its readings: the waves have no slope at its walls, where
     the field knows nothing of them."""
 
@@ -148,7 +148,9 @@ class Tiling:
         """
         away = np.abs(points[:, :2] - self.grid.centres[tile]) - 0.5 * self.grid.size
         ramp = np.clip(0.5 - 0.5 * away / self.blend, 0.0, 1.0)
-        smooth = ramp**3 * (10 + ramp * (6 * ramp - 15))  # twice differentiable at both ends
+        smooth = (
+            ramp * ramp * ramp * (10 + ramp * (6 * ramp - 15))
+        )  # twice differentiable at both ends
         return np.asarray(smooth[:, 0] * smooth[:, 1])
 
     def visits(self, points: FloatArray) -> list[Visit]:
@@ -159,8 +161,9 @@ class Tiling:
         points
             Metres, shape (N, 3).
         """
-        rows, tiles = self._candidates(points)
-        share = self.shares(points[rows], tiles)
+        rows, tiles, blended = self._candidates(points)
+        share = np.ones(len(rows))
+        share[blended] = self.shares(points[rows[blended]], tiles[blended])
         total = np.bincount(rows, share, minlength=len(points))
         lonely = np.flatnonzero(total <= 0)
         if len(lonely):
@@ -177,8 +180,11 @@ class Tiling:
             for start, stop in pairwise(edges)
         ]
 
-    def _candidates(self, points: FloatArray) -> tuple[IntArray, IntArray]:
-        """Return rows of points and tiles that may have a share in them: own and neighbours."""
+    def _candidates(self, points: FloatArray) -> tuple[IntArray, IntArray, BoolArray]:
+        """Return rows of points, tiles that may have a share in them, and where others have too.
+
+        These are the tile that a point lies in and, near its border, its neighbours.
+        """
         own, side, near = [], [], []
         for axis in (0, 1):
             low, high = self.grid.cells[:, axis].min(), self.grid.cells[:, axis].max()
@@ -191,12 +197,15 @@ class Tiling:
             side.append(np.where(from_middle < 0, -1, 1))
             near.append(np.abs(from_middle) > 0.5 - self.blend / self.grid.size - ROUNDING)
         rows, cells = [np.arange(len(points))], [np.column_stack(own)]
+        blended = [near[0] | near[1]]
         for x, y, band in ((1, 0, near[0]), (0, 1, near[1]), (1, 1, near[0] & near[1])):
             some = np.flatnonzero(band)
             rows.append(some)
+            blended.append(band[some])
             cells.append(np.column_stack([own[0] + x * side[0], own[1] + y * side[1]])[some])
         row, tile = np.concatenate(rows), index_of(self.grid.cells, np.concatenate(cells))
-        return row[tile >= 0], tile[tile >= 0]
+        known = np.flatnonzero(tile >= 0)
+        return row[known], tile[known], np.concatenate(blended)[known]
 
 
 def index_of(known: IntArray, cells: IntArray) -> IntArray:
