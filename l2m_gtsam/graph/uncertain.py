@@ -11,9 +11,8 @@ from typing import Protocol, runtime_checkable
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
 
-from l2m_factors import D, M, T, map_weights_prior, uncertain_block_factor
+from l2m_factors import D, M, map_weights_prior, uncertain_block_factor
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import (
@@ -22,6 +21,7 @@ from l2m_gtsam.graph.calibration import (
     prior_graph,
 )
 from l2m_gtsam.graph.compress import linearised
+from l2m_gtsam.graph.elimination import Eliminated, eliminate
 from l2m_gtsam.graph.joint import SensorSolution, with_infinities
 from l2m_gtsam.graph.view import QueryableMap, View
 from l2m_gtsam.solve.figures import residual_figures
@@ -34,7 +34,7 @@ SETTLED_SIGMAS = 0.01
 
 
 class MapErrors(Protocol):
-    """The error of a map over the places of a drive: ``A beta`` in each tile, and a rest."""
+    """The error of a map over the places of a drive: ``A beta`` in each tile."""
 
     @property
     def covariance(self) -> FloatArray:
@@ -51,10 +51,6 @@ class MapErrors(Protocol):
 
     def features(self, points: FloatArray, tile: int, /) -> FloatArray:
         """Return A of a tile at points in uT, shape (N, 3, r)."""
-        ...
-
-    def rest(self, points: FloatArray, tile: int, /) -> FloatArray:
-        """Return the variance per axis that is left in uT^2, shape (N, 3)."""
         ...
 
 
@@ -179,7 +175,8 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate) -> Coverage:
     for tile in told.sizes():
         rows = np.flatnonzero(owner == tile)
         features = told.features(x[rows], tile)
-        rest[rows] = told.rest(x[rows], tile)
+        shared = np.einsum("nir,nir->ni", features, features)
+        rest[rows] = np.maximum(view.map_variance[rows] - shared, 0.0)
         for sensor in np.unique(readings.sensor[rows]).tolist():
             own = readings.sensor[rows] == sensor
             groups.append(Group(sensor, tile, rows[own], features[own]))
@@ -240,7 +237,7 @@ class UncertainProblem:
         """Take Gauss-Newton steps."""
         for _ in range(STEPS):
             system = self._eliminated(values)
-            values = values.retract(system.step)
+            values = system.stepped(values, self._coverage.sizes)
         return Descent(values, max(system.sigmas(s) for s in self._view.sensors))
 
     def noise(self, values: gtsam.Values, estimate: Estimate) -> FloatArray:
@@ -268,9 +265,9 @@ class UncertainProblem:
             )
         return tuple(solutions)
 
-    def _eliminated(self, values: gtsam.Values) -> "Eliminated":
+    def _eliminated(self, values: gtsam.Values) -> Eliminated:
         linear = linearised(self._graph, values)
-        return eliminate(linear, self._view.sensors, list(self._coverage.sizes))
+        return eliminate(linear, self._view.sensors, self._coverage.sizes)
 
     def _residuals(self, values: gtsam.Values) -> FloatArray:
         """Return ``e`` with the map's error in it, uT, shape (N, 3)."""
@@ -281,69 +278,6 @@ class UncertainProblem:
             in_lidar = self._batch.R_lidar_map(group.rows) @ group.features
             residual[group.rows] = base + in_lidar @ values.atVector(M(group.tile)) @ C.T
         return residual
-
-
-@dataclass(frozen=True)
-class Eliminated:
-    """A linear graph solved: sensors first, the map's weights last.
-
-    Attributes
-    ----------
-    step
-        Its minimum.
-    root
-        Square root of the information of all variables, upper triangular, shape (n, n).
-    columns
-        Columns of each sensor's (t, C row by row, H), shape (15,).
-    """
-
-    step: gtsam.VectorValues
-    root: FloatArray
-    columns: dict[int, IntArray]
-
-    def covariance(self, sensor: int) -> FloatArray:
-        """Return the marginal covariance of a sensor, shape (15, 15)."""
-        at = self.columns[sensor]
-        unit = np.zeros((len(self.root), len(at)))
-        unit[at, np.arange(len(at))] = 1.0
-        # Columns of R^-T: what R^-1 R^-T is made of.
-        half = solve_triangular(self.root, unit, trans="T")
-        return np.asarray(half.T @ half)
-
-    def sigmas(self, sensor: int) -> float:
-        """Return the length of a sensor's step in standard deviations."""
-        step = np.concatenate([self.step.at(T(sensor)), self.step.at(D(sensor))])
-        return float(np.sqrt(step @ np.linalg.solve(self.covariance(sensor), step)))
-
-
-def eliminate(
-    linear: gtsam.GaussianFactorGraph, sensors: list[int], tiles: list[int]
-) -> Eliminated:
-    """Solve a linear graph by QR, which does not mind directions of very different strength."""
-    keys = [key for s in sensors for key in (T(s), D(s))] + [M(tile) for tile in tiles]
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
-    columns = {s: 15 * i + np.arange(15) for i, s in enumerate(sensors)}
-    return Eliminated(net.optimize(), stacked(net, keys), columns)
-
-
-def stacked(net: gtsam.GaussianBayesNet, keys: list[int]) -> FloatArray:
-    """Return the conditionals of variables as one upper triangular matrix, in the keys' order."""
-    conditionals = {net.at(index).firstFrontalKey(): net.at(index) for index in range(net.size())}
-    ends = np.cumsum([len(conditionals[key].R()) for key in keys])
-    at = {
-        key: slice(int(end) - len(conditionals[key].R()), int(end))
-        for key, end in zip(keys, ends, strict=True)
-    }
-    root = np.zeros((int(ends[-1]), int(ends[-1])))
-    for key, conditional in conditionals.items():
-        root[at[key], at[key]] = conditional.R()
-        columns = [np.arange(root.shape[1])[at[parent]] for parent in list(conditional.keys())[1:]]
-        if columns:
-            root[at[key], np.concatenate(columns)] = conditional.S()
-    return root
 
 
 def _same(noise: FloatArray, before: FloatArray) -> bool:

@@ -15,7 +15,14 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic import structure
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, moment_features
-from l2m_gtsam.maps.harmonic.evidence import Evidence, Normal, condition, evidence, normal_of
+from l2m_gtsam.maps.harmonic.evidence import (
+    Evidence,
+    Normal,
+    condition,
+    evidence,
+    marginalised,
+    normal_of,
+)
 from l2m_gtsam.maps.harmonic.family import Family
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of, dipoles_of, within
@@ -235,6 +242,26 @@ def test_the_posterior_is_that_of_the_dense_process() -> None:
     np.testing.assert_allclose(F_at @ L @ L.T @ F_at.T, covariance, rtol=0, atol=1e-7)
 
 
+def test_weights_that_are_integrated_out_leave_the_same_slopes() -> None:
+    readings, model = survey(), basis()
+    normal, log_variance = normal_of(model, readings), model.prior(GIVEN).log_variance
+    kept = np.arange(len(model) - 4, len(model))
+    alone = marginalised(normal, kept, log_variance, GIVEN.noise)
+    steps = np.array([-2.0, 0.0, 1.0])
+    values = []
+    for step in steps:
+        moved = log_variance.copy()
+        moved[kept] += step
+        whole = evidence(normal, moved, GIVEN.noise)
+        part = evidence(alone, moved[kept], GIVEN.noise)
+        # Condition 1e6 of slopes of order one.
+        np.testing.assert_allclose(
+            part.by_log_variance, whole.by_log_variance[kept], rtol=0, atol=1e-6
+        )
+        values.append(whole.value - part.value)
+    np.testing.assert_allclose(values, values[0], rtol=0, atol=1e-5)
+
+
 def assert_same_sums(one: Normal, other: Normal) -> None:
     # Sums of the same numbers in another order, differences of them at worst.
     np.testing.assert_allclose(one.FF, other.FF, rtol=0, atol=1e-12 * np.abs(other.FF).max())
@@ -299,10 +326,10 @@ def test_what_is_left_out_is_the_sum_over_the_modes_beyond(side: str) -> None:
 def test_nothing_left_out_is_the_whole_prior() -> None:
     """Documented scale: the horizontal field's deviation per axis at the lowest reading."""
     assert left_out(3.0, 0.7, 0.0, np.zeros(1))[0] / 2 == pytest.approx(9.0)
-    # Nearer to the sources than they are deep there is more, but no infinity.
-    nearer = left_out(3.0, 0.7, 2.0, np.array([1.0, 0.0, -0.5, -0.63, -5.0, -1e9]))
+    # Nearer to the sources there is more, but no infinity short of them.
+    nearer = left_out(3.0, 0.7, 2.0, np.array([1.0, 0.0, -0.5, -0.63]))
     assert np.isfinite(nearer).all()
-    assert (np.diff(nearer) >= 0).all()
+    assert (np.diff(nearer) > 0).all()
 
 
 POSITIVE = st.floats(0.05, 20.0)
@@ -589,6 +616,21 @@ def test_heights_that_follow_no_plane_leave_a_tile_level() -> None:
     rng = np.random.default_rng(13)
     points = np.column_stack([rng.uniform(-2, 2, (500, 2)), rng.choice([0.3, 0.6, 0.9], 500)])
     np.testing.assert_array_equal(tile_frame(points, np.zeros(2), 6.0).R_map_tile, np.eye(3))
+
+
+def two_lanes() -> FloatArray:
+    """Side by side at two heights."""
+    x = np.linspace(-2, 2, 80)
+    return np.column_stack([x, np.repeat([0.0, 0.4], 40), np.repeat([0.4, 0.7], 40)])
+
+
+FEW = np.array([[0.0, 0.0, 0.2], [0.1, 0.0, 0.5], [0.0, 0.1, 0.8]])
+
+
+@pytest.mark.parametrize("points", [FEW, two_lanes()], ids=["few", "lanes"])
+def test_a_plane_as_steep_as_no_floor_leaves_a_tile_level(points: FloatArray) -> None:
+    """37 and 80 degrees; vehicles drive on ramps of up to fifteen."""
+    np.testing.assert_array_equal(tile_frame(points, np.zeros(2), 4.0).R_map_tile, np.eye(3))
 
 
 def test_a_damped_weight_keeps_its_prior() -> None:

@@ -36,21 +36,21 @@ class TileModes:
     ----------
     tile
         What the tile knows.
-    combinations
-        U: orthonormal columns, shape (m, r).
+    weights
+        L U: the tile's weights for one unit of each beta, shape (m, r).
     """
 
     tile: Tile
-    combinations: FloatArray
+    weights: FloatArray
 
     def __len__(self) -> int:
-        return int(self.combinations.shape[1])
+        return int(self.weights.shape[1])
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return A at points, uT per unit of beta, shape (N, 3, r)."""
         A = np.empty((len(points), 3, len(self)))
         for at in batches(len(points)):
-            A[at] = self.tile.root(points[at]) @ self.combinations
+            A[at] = self.tile.basis.features(self.tile.within(points[at])) @ self.weights
         return A
 
 
@@ -86,12 +86,6 @@ class ErrorModes:
         """Return A of a tile at points, shape (N, 3, r)."""
         return self.tiles[tile].features(points)
 
-    def rest(self, points: FloatArray, tile: int) -> FloatArray:
-        """Return the variance per axis that a tile's modes leave at points, uT^2, shape (N, 3)."""
-        modes = self.tiles[tile]
-        told = np.einsum("nir,nir->ni", *(modes.features(points),) * 2)
-        return np.asarray(np.maximum(modes.tile.variance(points) - told, 0.0))
-
 
 def error_modes(
     learnt: Learnt, tiles: tuple[Tile, ...], points: FloatArray, options: ErrorOptions
@@ -113,7 +107,8 @@ def error_modes(
     def modes(index: int) -> TileModes:
         rows = np.flatnonzero(owner == index)
         some = rows[np.linspace(0, len(rows) - 1, min(options.places, len(rows))).astype(int)]
-        return TileModes(tiles[index], leading(tiles[index].root(points[some]), options.rest))
+        directions = leading(tiles[index].root(points[some]), options.rest)
+        return TileModes(tiles[index], tiles[index].unwhitened(directions))
 
     found = dict(zip(crossed, in_threads(modes, crossed), strict=True))
     return ErrorModes(learnt.tiling.grid, found, joint_covariance(learnt, found))
@@ -130,9 +125,12 @@ def leading(root: FloatArray, rest: float) -> FloatArray:
         Share that may be left out.
     """
     rows = root.reshape(-1, root.shape[2])
-    _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
-    held = np.cumsum(sizes**2) / np.sum(sizes**2)
-    return np.asarray(directions[: int(np.searchsorted(held, 1 - rest)) + 1].T)
+    # By the smaller of the two Gram matrices: few places, many weights.
+    squares, left = np.linalg.eigh(rows @ rows.T)
+    squares, left = np.maximum(squares[::-1], 0.0), left[:, ::-1]
+    held = np.cumsum(squares) / np.sum(squares)
+    count = int(np.searchsorted(held, 1 - rest)) + 1
+    return np.asarray(rows.T @ left[:, :count] / np.sqrt(squares[:count]))
 
 
 def joint_covariance(learnt: Learnt, tiles: dict[int, TileModes]) -> FloatArray:

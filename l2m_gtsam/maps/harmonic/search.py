@@ -18,8 +18,8 @@ from l2m_gtsam.options import Options
 # Standard deviations of a source's moment that are tried, over the one its readings suggest.
 STRENGTHS = (0.3, 1.0, 3.0)
 REFINEMENTS = 2  # each halves the lattice around a source that was found
-MOST_CANDIDATES = 4000  # of one tile
-MOST_READINGS = 2500  # of one tile
+MOST_CANDIDATES = 1000  # of one tile
+MOST_READINGS = 1000  # of one tile
 
 
 class SearchOptions(Options):

@@ -58,6 +58,13 @@ class Tile:
         whitened = solve_triangular(self.weights.factor, F.T, lower=True, check_finite=False)
         return np.asarray(whitened.T.reshape(-1, 3, m))
 
+    def unwhitened(self, directions: FloatArray) -> FloatArray:
+        """Return the weights that directions of the posterior's root stand for, both (m, r)."""
+        back = solve_triangular(
+            self.weights.factor, directions, lower=True, trans="T", check_finite=False
+        )
+        return np.asarray(self.weights.prior_sigma[:, None] * back)
+
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the posterior variance per axis in uT^2, shape (N, 3)."""
         variance = np.empty((len(points), 3))
