@@ -103,7 +103,8 @@ def solve_one_key(
     tell("joint graph", 1.0)
     if not settled:  # the weights of the last round are not those of its result
         problem = joint_problem(view, field_map, estimate, options)
-    if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
+    full_asked = options.uncertainty is Uncertainty.FULL and bool(view.sensors)
+    if full_asked and isinstance(field_map, UncertainMap):
         tell("map uncertainty", 0.0)
         full = solve_uncertain(view, field_map, field_map, estimate, problem.determinacies, options)
         tell("map uncertainty", 1.0)

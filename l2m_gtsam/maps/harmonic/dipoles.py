@@ -79,7 +79,7 @@ def separations(points: FloatArray, sources: FloatArray) -> tuple[FloatArray, Fl
     """Return vectors (N, K, 3) from sources to points and their lengths (N, K), in metres."""
     r = points[:, None, :] - sources
     # At a source itself the field is not finite; a map must be.
-    return r, np.sqrt(np.einsum("nki,nki->nk", r, r) + SOFT**2)
+    return r, np.maximum(np.sqrt(np.einsum("nki,nki->nk", r, r)), SOFT)
 
 
 def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:

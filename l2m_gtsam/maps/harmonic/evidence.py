@@ -13,14 +13,14 @@ whatever the number of readings.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.training import TrainingSet
 
-ROUNDING = 1e-14
+ROUNDING, LOST = 1e-14, 1e-11
 
 
 @dataclass(frozen=True)
@@ -142,9 +142,12 @@ def whitened_factor(normal: Normal, D: FloatArray, noise: float) -> FloatArray:
     """Return the Cholesky factor of ``I + D F^T W F D / sigma^2``, shape (m, m)."""
     A = normal.FF * (D[:, None] * D / noise**2)
     # One is lost to rounding where the readings know a weight 1e16 times better than the prior.
-    A[np.diag_indices_from(A)] += 1.0 + ROUNDING * A.diagonal().max()
-    # Symmetric: the transpose is in the order that LAPACK overwrites.
-    return np.asarray(cholesky(A.T, lower=True, overwrite_a=True, check_finite=False))
+    A[np.diag_indices_from(A)] += 1.0 + ROUNDING * A.diagonal()
+    try:
+        return np.asarray(cholesky(A, lower=True, check_finite=False))
+    except LinAlgError:  # what was integrated out before left rounding of the largest entries
+        A[np.diag_indices_from(A)] += LOST * A.diagonal().max()
+        return np.asarray(cholesky(A, lower=True, check_finite=False))
 
 
 def inverse_of(factor: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ from l2m_gtsam.data import FloatArray
 # A plane is worth following where it explains most of the heights and is steeper than a degree.
 LEAST_SHARE = 0.5
 LEAST_SLOPE = 0.02
+MOST_SLOPE = 0.3  # two lanes at different heights are no ramp
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def floor_axes(points: FloatArray) -> FloatArray:
     centred = points - points.mean(axis=0)
     slope, *_ = np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=None)
     left = centred[:, 2] - centred[:, :2] @ slope
-    level = np.linalg.norm(slope) < LEAST_SLOPE
+    level = not LEAST_SLOPE <= np.linalg.norm(slope) <= MOST_SLOPE
     if level or left @ left > (1 - LEAST_SHARE) * (centred[:, 2] @ centred[:, 2]):
         return np.eye(3)
     z = np.array([-slope[0], -slope[1], 1.0]) / np.hypot(1.0, np.linalg.norm(slope))

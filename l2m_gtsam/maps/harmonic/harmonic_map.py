@@ -75,10 +75,10 @@ class HarmonicMap:
             If no map can be made of the readings.
         """
         options = HarmonicOptions() if options is None else options
-        sources = NO_SOURCES
+        readings, sources = training_set(points, field), NO_SOURCES
         if cloud is not None:
-            sources = candidate_sources(checked_points(cloud), points, options.structure)
-        return cls.condition(learn_map(points, field, sources, options), options)
+            sources = candidate_sources(checked_points(cloud), readings.points, options.structure)
+        return cls.condition(learn_map(readings, sources, options), options)
 
     @classmethod
     def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
@@ -138,11 +138,11 @@ class HarmonicMap:
                 "noise of a reading (uT)": h.noise,
                 "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
                 "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
-                "shortest wave (m)": 2 * np.pi / learnt.resolution.floor,
+                "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
                 "sources": described(learnt),
                 "held-out places": judged(learnt.origin.explanation),
                 "tiles": len(weights),
-                "tile (m)": learnt.tiling.grid.size,
+                "tile (m)": float(learnt.tiling.grid.size),
                 "weights in a tile (median)": int(np.median(weights)),
             },
         )

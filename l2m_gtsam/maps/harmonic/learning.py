@@ -18,6 +18,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
     Resolution,
     Tiling,
     TilingOptions,
+    affordable,
     resolution_of,
     surveyed_area,
     tiling_of,
@@ -53,7 +54,7 @@ class LearningEnd:
     hyperparameters
         Where the likelihood is largest.
     log_likelihood
-        Sum over the windows, nats.
+        Sum over the windows, nats; absent where the hyperparameters were given.
     readings
         Readings in all windows.
     converged
@@ -63,7 +64,7 @@ class LearningEnd:
     """
 
     hyperparameters: Hyperparameters
-    log_likelihood: float
+    log_likelihood: float | None
     readings: int
     converged: bool
     at_bound: tuple[str, ...]
@@ -102,10 +103,11 @@ def learn(
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     guess = starting_point(readings)
     for _ in range(ROUNDS):
-        looked_at = resolution_of(guess, density, share)
+        looked_at = affordable(resolution_of(guess, density, share), tiling, options.modes)
         windows = draw_windows(readings, sources, looked_at, tiling, options)
         end = maximise(windows, guess)
-        needed = resolution_of(end.hyperparameters, density, share)
+        finest = resolution_of(end.hyperparameters, density, share)
+        needed = affordable(finest, tiling, options.modes)
         guess = end.hyperparameters
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
             break

@@ -29,20 +29,23 @@ from l2m_gtsam.maps.harmonic.search import (
     residuals_of,
 )
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
-from l2m_gtsam.maps.harmonic.structure import Sources, StructureOptions
+from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources, StructureOptions
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiling import (
     Resolution,
     Tiling,
     TilingOptions,
+    affordable,
+    blend_of,
     resolution_of,
     surveyed_area,
     tiling_of,
 )
 from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
-from l2m_gtsam.maps.training import TrainingSet, joined, merged, training_set
+from l2m_gtsam.maps.training import FEWEST, TrainingSet, joined, merged, training_set
 from l2m_gtsam.options import Options
 
+SAFE = 1.5  # times the modes that a tile of a file may have
 KNOWN = 0.5  # of the readings' variance: a map that says less might as well say their mean
 JUDGED = 4  # tiles whose held-out places say whether the field is explained
 GROWTH = 1.5  # of the sources, after which the prior is learnt anew
@@ -165,10 +168,8 @@ class Learnt:
     def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
         readings = merged(joined(self.readings, new), options.merge, options.independent)
-        grid, reach = (
-            self.tiling.grid,
-            min(options.reach, self.tiling.overlap, 0.49 * self.tiling.grid.size),
-        )
+        grid = self.tiling.grid
+        reach = reach_of(grid.size, options)
         wider = grid_from(grid.origin, readings.points, grid.size, reach)
         return replace(
             self,
@@ -178,17 +179,13 @@ class Learnt:
         )
 
 
-def learn_map(
-    points: FloatArray, field: FloatArray, sources: Sources, options: HarmonicOptions
-) -> Learnt:
+def learn_map(raw: TrainingSet, sources: Sources, options: HarmonicOptions) -> Learnt:
     """Return what readings and sources teach.
 
     Parameters
     ----------
-    points
-        Positions of the readings in the map frame in metres, shape (N, 3).
-    field
-        Readings in the map frame in microtesla, shape (N, 3).
+    raw
+        Readings in the map frame as they were taken.
     sources
         Where steel can be.
     options
@@ -199,8 +196,12 @@ def learn_map(
     MapError
         If no map can be made of the readings.
     """
-    raw = training_set(points, field)
     readings = merged(raw, options.merge, options.independent)
+    if len(readings) < FEWEST:
+        raise MapError(
+            f"the {len(raw)} map training readings lie at {len(readings)} places "
+            f"{options.merge:g} m apart; at least {FEWEST} are needed"
+        )
     learnt = learn_once(readings, sources, options)
     if not len(sources) and learnt.origin.explanation.reasons and options.search.rounds > 0:
         learnt = with_search(learnt, options)
@@ -234,7 +235,7 @@ def evenly(rows: IntArray, most: int) -> IntArray:
 def learn_prior(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> LearningEnd:
     """Return the hyperparameters that are given, or else those that the readings teach."""
     if options.hyperparameters is not None:
-        return LearningEnd(options.hyperparameters, float("nan"), 0, converged=True, at_bound=())
+        return LearningEnd(options.hyperparameters, None, 0, converged=True, at_bound=())
     return learn(readings, sources, options.tiling, options.mode_share, options.learning)
 
 
@@ -289,7 +290,8 @@ def laid_out(
 ) -> Learnt:
     """Return readings and prior with the tiles that suit them."""
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
-    resolution = resolution_of(learning.hyperparameters, density, options.mode_share)
+    finest = resolution_of(learning.hyperparameters, density, options.mode_share)
+    resolution = affordable(finest, options.tiling, options.modes)
     tiling = tiling_of(readings.points, resolution, options.tiling, options.modes, options.reach)
     origin = Origin(len(readings), learning)
     return Learnt(
@@ -336,6 +338,8 @@ def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapS
         "sources": learnt.sources.positions,
         "structure": learnt.sources.structure,
         "strengths": learnt.strengths,
+        "tiling": np.array([*learnt.tiling.grid.origin, learnt.tiling.grid.size]),
+        "resolution": np.array([learnt.resolution.floor, learnt.resolution.ceiling]),
     }
     origin = ORIGIN.dump_python(learnt.origin, mode="json")
     return MapState(kind, arrays, options.model_dump(mode="json"), origin)
@@ -366,9 +370,31 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
         raise MapError("map array hyperparameters is not of the shape that is needed") from None
     readings = training_set(*(state_array(state, name) for name in ("points", "field", "weight")))
     sources, strengths = sources_from_state(state)
-    learning = replace(origin.learning, hyperparameters=hyperparameters)
-    learnt = laid_out(readings, learning, sources, strengths, options)
-    return replace(learnt, origin=origin), options
+    tiling, resolution = tiles_from_state(state, readings, options)
+    learnt = Learnt(readings, hyperparameters, sources, strengths, tiling, resolution, origin)
+    return learnt, options
+
+
+def tiles_from_state(
+    state: MapState, readings: TrainingSet, options: HarmonicOptions
+) -> tuple[Tiling, Resolution]:
+    """Return how the tiles of a state lie and what they resolve, after checks."""
+    place, waves = state_array(state, "tiling"), state_array(state, "resolution")
+    if place.shape != (3,) or waves.shape != (2,) or not np.isfinite([*place, *waves]).all():
+        raise MapError("map tiling is damaged: three finite numbers and two are needed")
+    size, surroundings = float(place[2]), options.tiling
+    resolution = Resolution(float(waves[0]), float(waves[1]))
+    edge = size + 2 * (surroundings.overlap + surroundings.margin)
+    if min(size, *waves) <= 0 or resolution.modes(edge) > SAFE * options.modes:
+        raise MapError("map tiling is damaged: tiles and waves do not fit the number of modes")
+    grid = grid_from(place[:2], readings.points, size, reach_of(size, options))
+    blend = blend_of(size, surroundings)
+    return Tiling(grid, surroundings.overlap, surroundings.margin, blend), resolution
+
+
+def reach_of(core: float, options: HarmonicOptions) -> float:
+    """Return how far from the readings tiles lie, metres: each has readings in its overlap."""
+    return min(options.reach, options.tiling.overlap, 0.49 * core)
 
 
 def sources_from_state(state: MapState) -> tuple[Sources, FloatArray]:
@@ -376,8 +402,11 @@ def sources_from_state(state: MapState) -> tuple[Sources, FloatArray]:
     positions, number, strengths = (
         state_array(state, name) for name in ("sources", "structure", "strengths")
     )
+    flat = number.ndim == strengths.ndim == 1 and np.isfinite(number).all()
+    if not flat or positions.shape != (number.size, 3) or number.size > MOST_SOURCES:
+        raise MapError("map sources are damaged: their arrays do not have the shapes needed")
     structure = number.astype(np.int64)
-    fits = positions.shape == (len(structure), 3) and np.isfinite(positions).all()
+    fits = np.isfinite(positions).all() and bool((structure >= 0).all())
     numbered = np.array_equal(np.unique(structure), np.arange(len(strengths)))
     if not (fits and numbered and np.isfinite(strengths).all() and (strengths >= 0).all()):
         raise MapError("map sources are damaged: positions, structures and strengths disagree")

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.training import FURTHEST
 from l2m_gtsam.options import Options
 
 MOST_SOURCES = 200_000
@@ -86,6 +87,7 @@ def candidate_sources(
     MapError
         If there would be too many sources.
     """
+    cloud = cloud[(np.abs(cloud) < FURTHEST).all(axis=1)]
     voxels = np.unique(np.floor(cloud / options.edge).astype(np.int64), axis=0)
     centres = np.asarray((voxels + 0.5) * options.edge, dtype=np.float64)
     away, nearest = cKDTree(readings).query(centres, distance_upper_bound=options.reach)

@@ -41,15 +41,18 @@ class Tile:
         return self.basis.field_and_gradient(self.within(points), self.weights.mean)
 
     def within(self, points: FloatArray) -> FloatArray:
-        """Return points moved to where the waves are bounded: no nearer to the sheets of sources.
+        """Return points moved into the box, and no nearer to the sheets of sources than it.
 
-        So far from the readings nothing is known of the field; the variance says so.
+        Beyond, waves repeat themselves or grow without bound. So far from the readings nothing is
+        known of the field; the variance at the box's walls says so.
         """
         frame, h = self.basis.frame, self.hyperparameters
-        z = frame.localise(points)[:, 2]
-        low = -NEAREST * h.floor_depth
-        high = frame.height + NEAREST * h.ceiling_depth
-        return np.asarray(points + (np.clip(z, low, high) - z)[:, None] * frame.R_map_tile[:, 2])
+        local = frame.localise(points)
+        low = np.array([0.0, 0.0, -NEAREST * h.floor_depth])
+        high = np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
+        inside = np.clip(local, low, high)
+        moved = frame.corner + inside @ frame.R_map_tile.T
+        return np.where((inside == local).all(axis=1)[:, None], points, moved)
 
     def root(self, points: FloatArray) -> FloatArray:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""

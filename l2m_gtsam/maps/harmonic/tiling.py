@@ -81,6 +81,16 @@ def _last_above_one(log_gain: float, h: float) -> float:
     return high if excess(high) >= 0 else float(brentq(excess, top, high))
 
 
+def affordable(resolution: Resolution, options: TilingOptions, budget: int) -> Resolution:
+    """Return the resolution, coarser where the smallest tile would have more modes than allowed.
+
+    What is left out counts as variance.
+    """
+    smallest = LEAST_CORE + 2 * (options.overlap + options.margin)
+    over = np.sqrt(max(resolution.modes(smallest) / budget, 1.0))
+    return Resolution(float(resolution.floor / over), float(resolution.ceiling / over))
+
+
 def surveyed_area(points: FloatArray) -> float:
     """Return the horizontal area in square metres in which there are readings."""
     cells = np.unique(np.floor(points[:, :2] / FILL).astype(np.int64), axis=0)
@@ -208,6 +218,11 @@ class Tiling:
         return row[known], tile[known], np.concatenate(blended)[known]
 
 
+def blend_of(core: float, options: TilingOptions) -> float:
+    """Return half the width of the band in which tiles of this core blend, metres."""
+    return min(0.25 * core, 0.5, options.overlap)
+
+
 def index_of(known: IntArray, cells: IntArray) -> IntArray:
     """Return which of the known cells each one is, or -1, shape (N,).
 
@@ -248,7 +263,7 @@ def tiling_of(
     core = max(min(largest, extent), LEAST_CORE)
     if extent > core:  # equal tiles, the last as full as the first
         core = extent / np.ceil(extent / core) * (1 + 1e-9)
-    blend = min(0.25 * core, 0.5, options.overlap)
+    blend = blend_of(core, options)
     # A tile whose core is further from all readings than the overlap would have none.
     grid = grid_over(points, core, min(reach, options.overlap, 0.49 * core))
     return Tiling(grid, options.overlap, options.margin, blend)
