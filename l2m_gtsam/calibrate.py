@@ -72,6 +72,7 @@ def calibrate(
     return CalibrationResult(
         sensors=sensors,
         iterations=solution.steps,
+        uncertainty=solution.uncertainty,
         bag=recording.source,
         map=map_source,
         options=options.model_dump(mode="json"),

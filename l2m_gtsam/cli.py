@@ -135,18 +135,28 @@ def simulate(
 
 @app.command()
 def calibrate(
-    bag: BagArgument, map_path: MapOption, out: OutOption, config: ConfigOption = None
+    bag: BagArgument,
+    map_path: MapOption,
+    out: OutOption,
+    config: ConfigOption = None,
+    uncertainty: Annotated[
+        str | None,
+        typer.Option(
+            help="full: the map's errors are shared by readings near each other; independent: not."
+        ),
+    ] = None,
 ) -> None:
     """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
     from l2m_gtsam.batch import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
-    from l2m_gtsam.config import load_config
+    from l2m_gtsam.config import load_config, with_uncertainty
     from l2m_gtsam.qa.tables import calibration_table
     from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
+    chosen = with_uncertainty(load_config(config), uncertainty)
     with _progress() as progress:
-        result = calibrate_bag(bag, map_path, load_config(config), out, progress)
+        result = calibrate_bag(bag, map_path, chosen, out, progress)
     _print(calibration_table(result))
-    typer.echo(UNCERTAINTY)
+    typer.echo(UNCERTAINTY[result.uncertainty])
     typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
 
 

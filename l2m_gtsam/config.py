@@ -5,6 +5,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError
 
+from l2m_gtsam.data import Uncertainty
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.maps.build import MapOptions
@@ -68,6 +69,24 @@ def load_config(path: Path | None) -> Config:
         return Config.model_validate({} if content is None else content)
     except ValidationError as error:
         raise ConfigError(_explain(path, error)) from error
+
+
+def with_uncertainty(config: Config, name: str | None) -> Config:
+    """Return the configuration with the map's errors counted as named; as it is for None.
+
+    Raises
+    ------
+    ConfigError
+        The name is not known.
+    """
+    if name is None:
+        return config
+    if name not in list(Uncertainty):
+        accepted = ", ".join(Uncertainty)
+        raise ConfigError(f"--uncertainty: unknown {name!r}; accepted: {accepted}")
+    solve = config.calibration.solve.model_copy(update={"uncertainty": Uncertainty(name)})
+    calibration = config.calibration.model_copy(update={"solve": solve})
+    return config.model_copy(update={"calibration": calibration})
 
 
 def _explain(path: Path, error: ValidationError) -> str:

@@ -296,6 +296,13 @@ class SensorStatus(StrEnum):
     FLIPPED_AXIS = "flipped_axis"
 
 
+class Uncertainty(StrEnum):
+    """How a calibration counts the map's errors."""
+
+    FULL = "full"
+    INDEPENDENT = "independent"
+
+
 @dataclass(frozen=True)
 class ResidualFigures:
     """Residuals ``C b + H - z`` of one sensor over the readings used, in microtesla.
@@ -386,6 +393,8 @@ class CalibrationResult:
         One entry per magnetometer, in the order of the recording.
     iterations
         Outer steps of the one-key loop that were taken.
+    uncertainty
+        How the sigmas count the map's errors.
     bag, map
         Sources with hashes; absent when the data did not come from files.
     options
@@ -396,6 +405,7 @@ class CalibrationResult:
 
     sensors: tuple[SensorCalibration, ...]
     iterations: int
+    uncertainty: Uncertainty
     bag: SourceFile | None
     map: SourceFile | None
     options: dict[str, Any]

@@ -2,14 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import StrEnum
 
 import gtsam
 import numpy as np
 from pydantic import Field
 
 from l2m_factors import T
-from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.data import FloatArray, Readings, Uncertainty
 from l2m_gtsam.graph.calibration import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.graph.optimise import Optimizer, optimise
 from l2m_gtsam.graph.view import QueryableMap, View, observe
@@ -29,13 +28,6 @@ Progress = Callable[[str, float], None]
 FEWEST = 5
 # Weak tie of each T(i) to where it is, for directions without any gradient: metres.
 TIE_M = 10.0
-
-
-class Uncertainty(StrEnum):
-    """What is said of the map's errors."""
-
-    FULL = "full"
-    INDEPENDENT = "independent"
 
 
 class OneKeyOptions(Options):

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray, Readings
+from l2m_gtsam.data import BoolArray, FloatArray, Readings, Uncertainty
 from l2m_gtsam.graph.alternation import (
     OneKeyOptions,
     Progress,
-    Uncertainty,
     alternate,
     start_estimate,
 )
@@ -51,6 +50,8 @@ class OneKeySolution:
         How the last joint optimisation ended.
     settled
         Whether estimate and weights agree: another round would repeat the last.
+    uncertainty
+        How the map's errors were counted: full needs a map that knows them.
     """
 
     estimate: Estimate
@@ -59,6 +60,7 @@ class OneKeySolution:
     steps: int
     ending: Ending
     settled: bool
+    uncertainty: Uncertainty = Uncertainty.INDEPENDENT
 
 
 def solve_one_key(
@@ -109,7 +111,13 @@ def solve_one_key(
         full = solve_uncertain(view, field_map, field_map, estimate, problem.determinacies, options)
         tell("map uncertainty", 1.0)
         return OneKeySolution(
-            full.estimate, full.solved, view.inside, near.steps, ending, settled and full.settled
+            estimate=full.estimate,
+            solved=full.solved,
+            inside=view.inside,
+            steps=near.steps,
+            ending=ending,
+            settled=settled and full.settled,
+            uncertainty=Uncertainty.FULL,
         )
     solved = sensor_solutions(problem, estimate)
     return OneKeySolution(estimate, solved, view.inside, near.steps, ending, settled)

@@ -62,10 +62,7 @@ def honesty_note(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> s
     if not ratios:
         return "no sensor was solved"
     rms = float(np.sqrt(np.mean(np.square(ratios))))
-    return (
-        f"errors of t are {rms:.1f} times their sigmas (rms, 1 is honest): the map's own errors "
-        "are correlated along the drive, and the sigmas count them as independent"
-    )
+    return f"errors of t are {rms:.1f} times their sigmas (rms, 1 is honest)"
 
 
 def bag_table(report: BagReport) -> Table:

@@ -18,6 +18,7 @@ from l2m_gtsam.data import (
     SensorStatus,
     SourceFile,
     SyncCounts,
+    Uncertainty,
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
@@ -27,13 +28,18 @@ VERSION = 1
 HEADER = """Calibration of magnetometers against a LiDAR, written by l2m_gtsam.
 Formulas, frames and units stand under `model`; each sensor has its own entry under `sensors`."""
 
-UNCERTAINTY = (
-    "sigmas count the map's errors as independent from reading to reading; where the map is less "
-    "sure than the sensor they are too small"
-)
+UNCERTAINTY = {
+    Uncertainty.FULL: (
+        "sigmas carry the map's errors as they are: shared by readings near each other and by all "
+        "sensors; they hold as far as the map explains its own field (`l2m map info`)"
+    ),
+    Uncertainty.INDEPENDENT: (
+        "sigmas count the map's errors as independent from reading to reading; where the map is "
+        "less sure than the sensor they are too small"
+    ),
+}
 
 MODEL = {
-    "uncertainty": UNCERTAINTY,
     "measurement": "B_meas = C @ B_lidar + H",
     "correction": "B_lidar = inv(C) @ (B_meas - H)",
     "units": {"B": "uT", "H": "uT", "C": "1", "t": "m", "rotation": "rad", "noise": "uT"},
@@ -136,6 +142,8 @@ class _CalibrationFile(_Lenient):
     format: Literal["l2m-calibration"]
     version: Literal[1]
     iterations: int
+    # Files of the first version do not say; their sigmas are of this kind.
+    uncertainty: Uncertainty = Uncertainty.INDEPENDENT
     bag: _Source | None
     map: _Source | None
     options: dict[str, Any]
@@ -148,7 +156,8 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
     content = {
         "format": FORMAT,
         "version": VERSION,
-        "model": MODEL,
+        "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
+        "uncertainty": str(result.uncertainty),
         "bag": _source(result.bag),
         "map": _source(result.map),
         "versions": result.versions,
@@ -171,6 +180,7 @@ def read_calibration(path: Path) -> CalibrationResult:
     return CalibrationResult(
         sensors=tuple(_sensor(name, entry) for name, entry in parsed.sensors.items()),
         iterations=parsed.iterations,
+        uncertainty=parsed.uncertainty,
         bag=SourceFile(parsed.bag.path, parsed.bag.sha256) if parsed.bag else None,
         map=SourceFile(parsed.map.path, parsed.map.sha256) if parsed.map else None,
         options=parsed.options,

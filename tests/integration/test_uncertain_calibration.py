@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import block_diag, eigh
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions, Uncertainty
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Uncertainty
+from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.uncertain import UncertainMap
@@ -250,8 +250,8 @@ def test_a_sensor_without_readings_does_not_disturb_the_others(
     assert np.isfinite(found.solved[0].covariance).all()
 
 
-def test_a_sensor_that_leaves_the_map_on_the_way_is_not_solved() -> None:
-    """A faint field, a poor map: the readings lie inside at the start and outside in the end."""
+def test_a_sensor_that_leaves_the_map_on_the_way_is_not_settled() -> None:
+    """A faint field, a poor map: readings leave it and return, and nothing is claimed."""
     rng, count = np.random.default_rng(5), 1500
     faint = DipoleWorld(CALM.uniform, CALM.positions, 0.03 * CALM.moments)
     points = rng.uniform([-1.5, -1.5, 0.2], [1.5, 1.5, 0.8], (150, 3))
@@ -267,5 +267,4 @@ def test_a_sensor_that_leaves_the_map_on_the_way_is_not_solved() -> None:
     b = b + rng.normal(0, NOISE, b.shape)
     stamps, sensor = np.arange(count) * 50_000_000, np.zeros(count, dtype=np.int64)
     lost = solve_one_key(Readings(("mag",), sensor, stamps, R, p, b), poor, t[None], FULL)
-    assert np.count_nonzero(lost.inside) < FULL.min_readings
-    assert lost.solved == ()
+    assert not (lost.solved and lost.settled)

@@ -85,9 +85,10 @@ def candidate_sources(
     Raises
     ------
     MapError
-        If there would be too many sources.
+        If there would be too many sources, or points lie nowhere on Earth.
     """
-    cloud = cloud[(np.abs(cloud) < FURTHEST).all(axis=1)]
+    if len(cloud) and np.abs(cloud).max() > FURTHEST:
+        raise MapError(f"the structure cloud exceeds {FURTHEST:g} m: is it in metres?")
     voxels = np.unique(np.floor(cloud / options.edge).astype(np.int64), axis=0)
     centres = np.asarray((voxels + 0.5) * options.edge, dtype=np.float64)
     away, nearest = cKDTree(readings).query(centres, distance_upper_bound=options.reach)

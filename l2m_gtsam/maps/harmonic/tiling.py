@@ -26,7 +26,7 @@ class TilingOptions(Options):
 
     overlap: float = Field(default=0.5, gt=0)
     """Readings this far around the core take part in a tile."""
-    margin: float = Field(default=0.6, gt=0)
+    margin: float = Field(default=0.75, gt=0)
     """The box reaches this far beyond its readings: the waves have no slope at its walls, where
     the field knows nothing of them."""
 
