@@ -11,10 +11,11 @@ whatever the number of readings.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.lapack import dpotri, dtrtri
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
@@ -128,6 +129,16 @@ class Weights:
     mean: FloatArray
     prior_sigma: FloatArray
     factor: FloatArray
+
+    @cached_property
+    def root(self) -> FloatArray:
+        """L with covariance ``L L^T``, shape (m, m): made once, then each point costs a product.
+
+        The factor's condition is at most that of the square root of signal over noise, so that
+        its inverse loses no digit that counts.
+        """
+        inverse, _ = dtrtri(self.factor, lower=1)
+        return np.asarray(self.prior_sigma[:, None] * inverse.T)
 
 
 def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights:

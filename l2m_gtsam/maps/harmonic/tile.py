@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
@@ -57,16 +56,12 @@ class Tile:
     def root(self, points: FloatArray) -> FloatArray:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""
         m = len(self.basis)
-        F = self.basis.features(self.within(points)).reshape(-1, m) * self.weights.prior_sigma
-        whitened = solve_triangular(self.weights.factor, F.T, lower=True, check_finite=False)
-        return np.asarray(whitened.T.reshape(-1, 3, m))
+        F = self.basis.features(self.within(points)).reshape(-1, m)
+        return np.asarray((F @ self.weights.root).reshape(-1, 3, m))
 
     def unwhitened(self, directions: FloatArray) -> FloatArray:
         """Return the weights that directions of the posterior's root stand for, both (m, r)."""
-        back = solve_triangular(
-            self.weights.factor, directions, lower=True, trans="T", check_finite=False
-        )
-        return np.asarray(self.weights.prior_sigma[:, None] * back)
+        return np.asarray(self.weights.root @ directions)
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the posterior variance per axis in uT^2, shape (N, 3)."""
