@@ -26,6 +26,7 @@ from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiles import Tiles
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class ErrorModes:
 
 
 def error_modes(
-    learnt: Learnt, tiles: tuple[Tile, ...], points: FloatArray, options: ErrorOptions
+    learnt: Learnt, tiles: Tiles, points: FloatArray, options: ErrorOptions
 ) -> ErrorModes:
     """Return the error of a map over places.
 

@@ -1,6 +1,5 @@
 """A map of harmonic potentials: tiles of floor and ceiling modes, uniform field and sources."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,6 @@ from scipy.spatial import cKDTree
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
-from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.explanation import Explanation
 from l2m_gtsam.maps.harmonic.learnt import (
     HarmonicOptions,
@@ -21,7 +19,7 @@ from l2m_gtsam.maps.harmonic.learnt import (
 )
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.threads import in_threads
-from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.training import checked_points, training_set
 
 if TYPE_CHECKING:
@@ -41,12 +39,12 @@ class HarmonicMap:
     options
         Effective options.
     tiles
-        One for each cell of the tiling.
+        One for each cell of the tiling, solved when first needed.
     """
 
     learnt: Learnt
     options: HarmonicOptions
-    tiles: tuple[Tile, ...]
+    tiles: Tiles
 
     @classmethod
     def fit(
@@ -82,8 +80,8 @@ class HarmonicMap:
 
     @classmethod
     def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
-        """Return the map whose prior is known: every tile solved."""
-        return cls(learnt, options, solve_tiles(learnt, {}))
+        """Return the map whose prior is known."""
+        return cls(learnt, options, Tiles(learnt))
 
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
@@ -99,13 +97,14 @@ class HarmonicMap:
         box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap
         away, _ = cKDTree(new.points[:, :2]).query(learnt.tiling.grid.centres, p=np.inf)
         touched = np.asarray(away) <= box
+        solved = self.tiles.solved
         old = {tuple(cell): i for i, cell in enumerate(self.learnt.tiling.grid.cells.tolist())}
         kept = {
-            index: self.tiles[old[tuple(cell)]]
+            index: solved[old[tuple(cell)]]
             for index, cell in enumerate(learnt.tiling.grid.cells.tolist())
-            if not touched[index] and tuple(cell) in old
+            if not touched[index] and old.get(tuple(cell)) in solved
         }
-        return HarmonicMap(learnt, self.options, solve_tiles(learnt, kept))
+        return HarmonicMap(learnt, self.options, Tiles(learnt, kept))
 
     @classmethod
     def from_state(cls, state: MapState) -> "HarmonicMap":
@@ -127,7 +126,7 @@ class HarmonicMap:
     def summary(self) -> MapSummary:
         """Figures of the map."""
         learnt, points = self.learnt, self.learnt.readings.points
-        h, weights = learnt.hyperparameters, [len(tile.basis) for tile in self.tiles]
+        h = learnt.hyperparameters
         return MapSummary(
             kind=KIND,
             readings=learnt.origin.readings,
@@ -141,9 +140,8 @@ class HarmonicMap:
                 "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
                 "sources": described(learnt),
                 "held-out places": judged(learnt.origin.explanation),
-                "tiles": len(weights),
+                "tiles": len(self.tiles),
                 "tile (m)": float(learnt.tiling.grid.size),
-                "weights in a tile (median)": int(np.median(weights)),
             },
         )
 
@@ -222,19 +220,3 @@ def judged(explanation: Explanation) -> str:
     if explanation.reasons:
         return f"the map does not explain the field: {'; '.join(explanation.reasons)}"
     return f"errors are {explanation.spread:.2f} times their sigmas: the field is explained"
-
-
-def solve_tiles(learnt: Learnt, kept: Mapping[int, Tile]) -> tuple[Tile, ...]:
-    """Return all tiles, those that are kept as they are."""
-    members = learnt.members
-
-    def tile(index: int) -> Tile:
-        if index in kept:
-            return kept[index]
-        basis = learnt.basis(index, members[index])
-        normal = normal_of(basis, learnt.readings[members[index]])
-        prior = basis.prior(learnt.hyperparameters)
-        weights = condition(normal, prior.log_variance, learnt.hyperparameters.noise)
-        return Tile(basis, weights, learnt.hyperparameters, learnt.resolution)
-
-    return tuple(in_threads(tile, range(len(learnt.tiling))))

@@ -1,6 +1,7 @@
 """What a harmonic map knows before any tile is solved: readings, prior, sources, tiling."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -139,7 +140,7 @@ class Learnt:
     resolution: Resolution
     origin: Origin
 
-    @property
+    @cached_property
     def members(self) -> list[IntArray]:
         """Rows of the readings that take part in each tile."""
         return self.tiling.grid.members(self.readings.points, self.tiling.overlap)

@@ -1,0 +1,79 @@
+"""The tiles of a map, solved when they are first needed."""
+
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping
+from threading import Lock
+
+from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
+from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.harmonic.tile import Tile
+
+MEMORY = 2_000_000_000  # bytes of factors and roots that are kept
+MATRICES = 2  # of a tile: its factor and the root of its covariance
+
+
+class Tiles:
+    """Tiles by index; those used last are kept as long as memory lasts.
+
+    A drive crosses few tiles of a large map: solving them all would cost more than the
+    calibration.
+
+    Parameters
+    ----------
+    learnt
+        What the tiles follow from.
+    kept
+        Tiles that are solved already.
+    """
+
+    def __init__(self, learnt: Learnt, kept: Mapping[int, Tile] | None = None) -> None:
+        self._learnt = learnt
+        self._solved: OrderedDict[int, Tile] = OrderedDict(kept or {})
+        self._lock = Lock()
+
+    def __len__(self) -> int:
+        return len(self._learnt.tiling)
+
+    def __getitem__(self, index: int) -> Tile:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        with self._lock:
+            found = self._solved.get(index)
+        if found is None:
+            # Outside of the lock: two threads solve different tiles at the same time.
+            found = solved_tile(self._learnt, index)
+        with self._lock:
+            self._solved[index] = found
+            self._solved.move_to_end(index)
+            self._forget()
+        return found
+
+    def __iter__(self) -> Iterator[Tile]:
+        return (self[index] for index in range(len(self)))
+
+    def solve_all(self) -> None:
+        """Solve every tile now."""
+        in_threads(self.__getitem__, range(len(self)))
+
+    @property
+    def solved(self) -> dict[int, Tile]:
+        """Return the tiles that are in memory."""
+        with self._lock:
+            return dict(self._solved)
+
+    def _forget(self) -> None:
+        held = sum(8 * MATRICES * len(tile.basis) ** 2 for tile in self._solved.values())
+        while held > MEMORY and len(self._solved) > 1:
+            _, oldest = self._solved.popitem(last=False)
+            held -= 8 * MATRICES * len(oldest.basis) ** 2
+
+
+def solved_tile(learnt: Learnt, index: int) -> Tile:
+    """Return a tile with the posterior of its weights."""
+    rows = learnt.members[index]
+    basis = learnt.basis(index, rows)
+    normal = normal_of(basis, learnt.readings[rows])
+    prior = basis.prior(learnt.hyperparameters)
+    weights = condition(normal, prior.log_variance, learnt.hyperparameters.noise)
+    return Tile(basis, weights, learnt.hyperparameters, learnt.resolution)
