@@ -330,7 +330,12 @@ def inspect_file(bag: Path, config: Config, progress: Progress) -> BagReport:
 
 
 def calibrate_bag(
-    bag: Path, map_path: Path, config: Config, out: Path, progress: Progress
+    bag: Path,
+    map_path: Path,
+    config: Config,
+    out: Path,
+    progress: Progress,
+    truth: tuple[KnownSensor, ...] = (),
 ) -> CalibrationResult:
     """Calibrate all magnetometers of a bag and write `calibration.yaml` and a picture.
 
@@ -346,6 +351,8 @@ def calibrate_bag(
         Folder for the results, made if it is missing.
     progress
         Called with a stage and the fraction of it that is done.
+    truth
+        Sensors as they are, if that is known, to be drawn beside the estimate.
 
     Raises
     ------
@@ -360,7 +367,7 @@ def calibrate_bag(
     _check_frame(map_path, map_frame, recording)
     result = calibrate(recording, field_map, config.calibration, source, progress)
     result = replace(result, options=config.model_dump(mode="json"))
-    figure = calibration_figure(field_map, recording.trajectory, result, truth=())
+    figure = calibration_figure(field_map, recording.trajectory, result, truth)
     _ensure_folder(out)
     write_calibration(out / CALIBRATION_FILE, result)
     save_figure(figure, out / OVERVIEW_FILE)

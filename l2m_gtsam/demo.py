@@ -15,7 +15,6 @@ from l2m_gtsam.batch import (
 )
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import CalibrationResult, KnownSensor
-from l2m_gtsam.qa.figures import calibration_figure, save_figure
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 
@@ -45,9 +44,6 @@ def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonst
     mapping, drive = (out / bag_name(name, BagKind.MCAP) for name in ("mapping", "calibration"))
     scenario = simulate_bags(out, options, [BagKind.MCAP], progress)
     cloud = str(out / STRUCTURE_FILE)
-    built = build_map_file([mapping], map_path, config, out / SUITE_FILE, progress, cloud)
-    result = calibrate_bag(drive, map_path, config, out, progress)
-    picture = out / OVERVIEW_FILE
-    trajectory = scenario.calibration.recording.trajectory
-    save_figure(calibration_figure(built.field_map, trajectory, result, scenario.truth), picture)
-    return Demonstration(result, scenario.truth, picture)
+    build_map_file([mapping], map_path, config, out / SUITE_FILE, progress, cloud)
+    result = calibrate_bag(drive, map_path, config, out, progress, scenario.truth)
+    return Demonstration(result, scenario.truth, out / OVERVIEW_FILE)
