@@ -15,10 +15,9 @@ from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.mapping import (
     compare_recordings,
     map_recordings,
-    refuse_structure,
     update_map,
 )
-from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.maps.build import map_from_state, refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.qa.figures import calibration_figure, map_figure, save_figure

@@ -7,10 +7,9 @@ import numpy as np
 from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.build import build_map
+from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.harmonic.harmonic_map import KIND as HARMONIC
 from l2m_gtsam.maps.training import TrainingSet, training_set
 from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise
 
@@ -107,21 +106,12 @@ def compare_recordings(
         stage = f"building {kind} maps"
         progress(stage, built[kind] / options.compare.folds)
         model = options.model.model_copy(update={"kind": kind})
-        field_map = build_map(points, field, model, cloud if kind == HARMONIC else None)
+        field_map = build_map(points, field, model, cloud if KINDS[kind].uses_structure else None)
         built[kind] += 1
         progress(stage, built[kind] / options.compare.folds)
         return field_map
 
     return compare_maps(readings.points, readings.field, options.compare, build)
-
-
-def refuse_structure(*kinds: str) -> None:
-    """Raise a MapError if no map of these kinds has a use for a structure cloud."""
-    if HARMONIC not in kinds:
-        raise MapError(
-            f"maps of kind {', '.join(kinds)} cannot use a structure cloud; leave --structure out "
-            f"or choose the kind {HARMONIC}"
-        )
 
 
 def suite_readings(

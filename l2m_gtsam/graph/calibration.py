@@ -74,6 +74,10 @@ class Estimate:
             values.insert(D(sensor), self.distortion[sensor])
         return values
 
+    def same_noise(self, other: "Estimate") -> bool:
+        """Return whether no sensor's noise differs by more than 0.1 %."""
+        return bool(np.abs(np.log(self.noise / other.noise)).max() < 1e-3)
+
     def updated(self, values: gtsam.Values, sensors: list[int]) -> "Estimate":
         """Return the estimate with these sensors' T(i), and D(i) where present, taken over."""
         t, distortion = self.t.copy(), self.distortion.copy()

@@ -8,7 +8,8 @@ prior has unit variance, so that a Cholesky factor of their information is safe:
     R_s \delta_s + S_s \beta = d_s, \quad \Lambda = \Lambda_0 + \sum_s E_s^T E_s, \quad
     \mathrm{cov}(\delta_s) = R_s^{-1} (I + S_s \Lambda^{-1} S_s^T) R_s^{-T}
 
-GTSAM's own elimination gives the same, at a hundredth of the speed: it knows nothing of BLAS.
+GTSAM's own sequential QR gives the same at a tenth of the speed, 20 s against 2 s for twelve
+sensors and 1,500 weights: it knows nothing of BLAS.
 """
 
 from dataclasses import dataclass
@@ -58,11 +59,8 @@ class Eliminated:
 
     def covariance(self, sensor: int) -> FloatArray:
         """Return the marginal covariance of a sensor's (t, C row by row, H), shape (15, 15)."""
-        rows = self.sensors[sensor]
-        half = solve_triangular(self.factor, rows.S.T, lower=True, check_finite=False)
-        inner = np.eye(SENSOR) + half.T @ half
-        left = solve_triangular(rows.R, inner)
-        return np.asarray(solve_triangular(rows.R, left.T))
+        R = self.sensors[sensor].R
+        return np.asarray(solve_triangular(R, solve_triangular(R, self._spread(sensor)).T))
 
     def step(self, sensor: int) -> FloatArray:
         """Return the step of a sensor's parameters, shape (15,)."""
@@ -71,11 +69,14 @@ class Eliminated:
 
     def sigmas(self, sensor: int) -> float:
         """Return the length of a sensor's step in standard deviations."""
-        rows, step = self.sensors[sensor], self.step(sensor)
-        half = solve_triangular(self.factor, rows.S.T, lower=True, check_finite=False)
-        inner = np.eye(SENSOR) + half.T @ half
-        along = rows.R @ step
-        return float(np.sqrt(along @ np.linalg.solve(inner, along)))
+        along = self.sensors[sensor].R @ self.step(sensor)
+        return float(np.sqrt(along @ np.linalg.solve(self._spread(sensor), along)))
+
+    def _spread(self, sensor: int) -> FloatArray:
+        """Return ``I + S Lambda^-1 S^T``: the covariance of ``R x``, shape (15, 15)."""
+        S = self.sensors[sensor].S
+        half = solve_triangular(self.factor, S.T, lower=True, check_finite=False)
+        return np.asarray(np.eye(SENSOR) + half.T @ half)
 
     def stepped(self, values: gtsam.Values, sizes: dict[int, int]) -> gtsam.Values:
         """Return values moved by the step; ``sizes`` are those of the tiles' weights."""

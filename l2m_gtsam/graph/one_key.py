@@ -96,7 +96,7 @@ def solve_one_key(
         problem = joint_problem(view, field_map, estimate, options)
         step = joint_step(problem, estimate, options)
         moved = float(np.abs(step.estimate.t - estimate.t).max())
-        settled = moved < SETTLED_M and _noise_settled(estimate, step.estimate)
+        settled = moved < SETTLED_M and step.estimate.same_noise(estimate)
         estimate, ending = step.estimate, step.ending
         if settled:
             break
@@ -121,8 +121,3 @@ def solve_one_key(
         )
     solved = sensor_solutions(problem, estimate)
     return OneKeySolution(estimate, solved, view.inside, near.steps, ending, settled)
-
-
-def _noise_settled(before: Estimate, after: Estimate) -> bool:
-    """Return whether no sensor's noise changed by more than 0.1 %."""
-    return bool(np.abs(np.log(after.noise / before.noise)).max() < 1e-3)

@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from l2m_factors import D, M, map_weights_prior, uncertain_block_factor
 from l2m_gtsam.data import FloatArray, IntArray
@@ -158,7 +159,7 @@ def solve_uncertain(
         values, after = descent.values, estimate.updated(descent.values, view.sensors)
         if options.sensor_noise_ut is None:
             after = replace(after, noise=problem.noise(values, estimate))
-        settled = descent.last_step < SETTLED_SIGMAS and _same(after.noise, estimate.noise)
+        settled = descent.last_step < SETTLED_SIGMAS and after.same_noise(estimate)
         estimate = after
         if settled:
             break
@@ -181,7 +182,7 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate) -> Coverage:
             own = readings.sensor[rows] == sensor
             groups.append(Group(sensor, tile, rows[own], features[own]))
     lower = np.linalg.cholesky(told.covariance)
-    root = np.linalg.solve(lower, np.eye(len(lower)))
+    root = solve_triangular(lower, np.eye(len(lower)), lower=True)
     return Coverage(tuple(groups), rest, told.sizes(), root)
 
 
@@ -278,8 +279,3 @@ class UncertainProblem:
             in_lidar = self._batch.R_lidar_map(group.rows) @ group.features
             residual[group.rows] = base + in_lidar @ values.atVector(M(group.tile)) @ C.T
         return residual
-
-
-def _same(noise: FloatArray, before: FloatArray) -> bool:
-    """Return whether no sensor's noise changed by more than 0.1 %."""
-    return bool(np.abs(np.log(noise / before)).max() < 1e-3)

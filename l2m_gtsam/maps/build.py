@@ -51,49 +51,44 @@ class MapKind:
     ----------
     fit
         From positions and readings in the map frame, (N, 3) each, in metres and microtesla, and
-        the LiDAR's structure cloud if there is one, in metres, (M, 3).
+        the LiDAR's structure cloud, in metres, (M, 3), if there is one and the kind uses it.
     load
         From a stored state.
+    uses_structure
+        Whether the kind has a use for a structure cloud.
     """
 
     fit: Callable[[FloatArray, FloatArray, MapOptions, FloatArray | None], FieldMap]
     load: Callable[[MapState], FieldMap]
-
-
-def without_structure(
-    fit: Callable[[FloatArray, FloatArray, MapOptions], FieldMap],
-) -> Callable[[FloatArray, FloatArray, MapOptions, FloatArray | None], FieldMap]:
-    """Return the fit of a kind that has no use for a structure cloud and says so."""
-
-    def checked(
-        points: FloatArray, field: FloatArray, options: MapOptions, cloud: FloatArray | None
-    ) -> FieldMap:
-        if cloud is not None:
-            raise MapError(
-                f"a map of kind {options.kind} cannot use a structure cloud; leave it out or "
-                "choose `mapping.model.kind: harmonic`"
-            )
-        return fit(points, field, options)
-
-    return checked
+    uses_structure: bool = False
 
 
 KINDS = {
     "harmonic": MapKind(
-        lambda p, b, o, c: HarmonicMap.fit(p, b, o.harmonic, c), HarmonicMap.from_state
+        lambda p, b, o, cloud: HarmonicMap.fit(p, b, o.harmonic, cloud),
+        HarmonicMap.from_state,
+        uses_structure=True,
     ),
     "sliding_gp": MapKind(
-        without_structure(lambda p, b, o: SlidingGP.fit(p, b, o.sliding_gp)), SlidingGP.from_state
+        lambda p, b, o, _: SlidingGP.fit(p, b, o.sliding_gp), SlidingGP.from_state
     ),
     "bilinear": MapKind(
-        without_structure(lambda p, b, o: BilinearMap.fit(p, b, o.bilinear)),
-        BilinearMap.from_state,
+        lambda p, b, o, _: BilinearMap.fit(p, b, o.bilinear), BilinearMap.from_state
     ),
-    "dense_gp": MapKind(
-        without_structure(lambda p, b, o: DenseGP.fit(p, b, o.dense_gp)), DenseGP.from_state
-    ),
+    "dense_gp": MapKind(lambda p, b, o, _: DenseGP.fit(p, b, o.dense_gp), DenseGP.from_state),
 }
 """Every kind of map. A new kind is its own file, its line here and its options above."""
+
+
+def refuse_structure(*kinds: str) -> None:
+    """Raise a MapError if no map of these kinds has a use for a structure cloud."""
+    if any(KINDS[kind].uses_structure for kind in kinds):
+        return
+    useful = " or ".join(name for name, kind in KINDS.items() if kind.uses_structure)
+    raise MapError(
+        f"maps of kind {', '.join(kinds)} cannot use a structure cloud; leave it out or choose "
+        f"the kind {useful}"
+    )
 
 
 def build_map(
@@ -121,6 +116,8 @@ def build_map(
         If no map can be made of the readings, or the kind has no use for a structure cloud.
     """
     options = MapOptions() if options is None else options
+    if cloud is not None:
+        refuse_structure(options.kind)
     return KINDS[options.kind].fit(points, field, options, cloud)
 
 

@@ -130,7 +130,7 @@ def thinned(readings: TrainingSet, length_scale: float, options: ThinningOptions
     Parameters
     ----------
     readings
-        Readings as they were taken, each of weight one.
+        Readings; those of a map that is given more of them have been averaged before.
     length_scale
         Metres.
     options

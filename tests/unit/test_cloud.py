@@ -142,7 +142,8 @@ def test_ascii_ply_by_hand(tmp_path: Path) -> None:
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_npz_of_any_numbers(tmp_path: Path, kind: str, order: str) -> None:
     points = np.array([[1, 2, 3], [4, 5, -6]], dtype=kind)
-    np.savez_compressed(tmp_path / "a.npz", points=np.array(points, order=order), other=1)  # type: ignore[call-overload]
+    ordered = np.asfortranarray(points) if order == "F" else points
+    np.savez_compressed(tmp_path / "a.npz", points=ordered, other=np.array(1))
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.npz"), [[1, 2, 3], [4, 5, -6]])
 
 

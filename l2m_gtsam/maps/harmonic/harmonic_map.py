@@ -10,14 +10,10 @@ from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.explanation import Explanation
-from l2m_gtsam.maps.harmonic.learnt import (
-    HarmonicOptions,
-    Learnt,
-    learn_map,
-    learnt_from_state,
-    learnt_to_state,
-)
+from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
+from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
+from l2m_gtsam.maps.harmonic.teaching import learn_map
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.training import checked_points, training_set
@@ -137,6 +133,7 @@ class HarmonicMap:
                 "noise of a reading (uT)": h.noise,
                 "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
                 "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
+                "hyperparameters": learnt.origin.learning.described,
                 "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
                 "sources": described(learnt),
                 "held-out places": judged(learnt.origin.explanation),

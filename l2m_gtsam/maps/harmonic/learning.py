@@ -69,6 +69,15 @@ class LearningEnd:
     converged: bool
     at_bound: tuple[str, ...]
 
+    @property
+    def described(self) -> str:
+        """In a few words."""
+        if self.log_likelihood is None:
+            return "given"
+        if self.at_bound:
+            return f"learnt, not determined by the data: {', '.join(self.at_bound)}"
+        return "learnt" if self.converged else "learnt, search stopped early"
+
 
 @dataclass(frozen=True)
 class Window:

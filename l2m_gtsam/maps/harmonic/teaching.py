@@ -1,0 +1,158 @@
+"""What readings teach: prior, sources, their strengths, and whether that explains them."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.harmonic.evidence import normal_of
+from l2m_gtsam.maps.harmonic.explanation import (
+    explanation_of,
+    patchwork,
+)
+from l2m_gtsam.maps.harmonic.furnish import COARSE, within
+from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn, spread_tiles
+from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
+from l2m_gtsam.maps.harmonic.search import (
+    MOST_READINGS,
+    look_for_sources,
+    residuals_of,
+)
+from l2m_gtsam.maps.harmonic.strengths import learn_strengths
+from l2m_gtsam.maps.harmonic.structure import Sources
+from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
+
+JUDGED = 4  # tiles whose held-out places say whether the field is explained
+GROWTH = 1.5  # of the sources, after which the prior is learnt anew
+
+
+def learn_map(raw: TrainingSet, sources: Sources, options: HarmonicOptions) -> Learnt:
+    """Return what readings and sources teach.
+
+    Parameters
+    ----------
+    raw
+        Readings in the map frame as they were taken.
+    sources
+        Where steel can be.
+    options
+        Of the map.
+
+    Raises
+    ------
+    MapError
+        If no map can be made of the readings.
+    """
+    readings = merged(raw, options.merge, options.independent)
+    if len(readings) < FEWEST:
+        raise MapError(
+            f"the {len(raw)} map training readings lie at {len(readings)} places "
+            f"{options.merge:g} m apart; at least {FEWEST} are needed"
+        )
+    learnt = learn_once(readings, sources, options)
+    if not len(sources) and learnt.origin.explanation.reasons and options.search.rounds > 0:
+        learnt = with_search(learnt, options)
+    return replace(learnt, origin=replace(learnt.origin, readings=len(raw)))
+
+
+def learn_once(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> Learnt:
+    """Return what readings teach over given sources, and how well that explains them."""
+    learning = learn_prior(readings, sources, options)
+    plain = laid_out(readings, learning, sources, np.ones(len(sources.split())), options)
+    return explained(with_strengths(plain), options)
+
+
+def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
+    """Return the same with a verdict from a few of its tiles."""
+    members = learnt.members
+    works = []
+    for tile in spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED):
+        rows = evenly(members[tile], options.learning.readings)
+        basis = learnt.basis(tile, rows, COARSE)
+        works.append(patchwork(basis, learnt.readings[rows], options.learning.seed))
+    explanation = explanation_of(works, learnt.hyperparameters, options.sensor_noise)
+    return replace(learnt, origin=replace(learnt.origin, explanation=explanation))
+
+
+def evenly(rows: IntArray, most: int) -> IntArray:
+    """Return at most so many of the rows, spread evenly."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+
+
+def learn_prior(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> LearningEnd:
+    """Return the hyperparameters that are given, or else those that the readings teach."""
+    if options.hyperparameters is not None:
+        return LearningEnd(options.hyperparameters, None, 0, converged=True, at_bound=())
+    return learn(readings, sources, options.tiling, options.mode_share, options.learning)
+
+
+def with_search(learnt: Learnt, options: HarmonicOptions) -> Learnt:
+    """Return the same with sources found round by round in the residuals.
+
+    What is not explained yet counts as noise and hides weaker sources: the prior is learnt anew
+    whenever the sources have become half as many again, and when no more are found.
+    """
+    readings, current, learnt_with = learnt.readings, learnt, 0
+    for _ in range(options.search.rounds):
+        found = found_in_tiles(current, options)
+        if not len(found) and len(current.sources) == learnt_with:
+            break
+        positions = np.concatenate([current.sources.positions, found])
+        sources = Sources(positions, np.arange(len(positions)))
+        learning = current.origin.learning
+        if not len(found) or len(positions) >= GROWTH * learnt_with:
+            learning, learnt_with = learn_prior(readings, sources, options), len(positions)
+        current = laid_out(readings, learning, sources, np.ones(len(positions)), options)
+    searched = replace(current.origin, searched=True)
+    return explained(with_strengths(replace(current, origin=searched)), options)
+
+
+def found_in_tiles(plain: Learnt, options: HarmonicOptions) -> FloatArray:
+    """Return the places of one round of the search over all tiles, shape (K, 3)."""
+    members = plain.members
+
+    def look(tile: int) -> FloatArray:
+        rows = evenly(members[tile], MOST_READINGS)
+        basis, readings = plain.basis(tile, rows, COARSE), plain.readings[rows]
+        residuals = residuals_of(basis, readings, plain.hyperparameters)
+        found = look_for_sources(residuals, options.search)
+        return np.array([each.position for each in found]).reshape(-1, 3)
+
+    tiles = list(range(len(plain.tiling)))
+    places = in_threads(look, tiles)
+    own = [
+        place[plain.tiling.grid.block_of(place) == tile]
+        for tile, place in zip(tiles, places, strict=True)
+        if len(place)
+    ]
+    return np.concatenate([np.empty((0, 3)), *own])
+
+
+def with_strengths(plain: Learnt) -> Learnt:
+    """Return the same with the strength of every structure, learnt in the tile it stands in."""
+    middles = structure_middles(plain.sources)
+    if not len(middles):
+        return plain
+    home, members = plain.tiling.grid.block_of(middles), plain.members
+
+    def found(tile: int) -> dict[int, float]:
+        basis = plain.basis(tile, members[tile], COARSE)
+        normal = normal_of(basis, plain.readings[members[tile]])
+        near = within(plain.sources, plain.tiling.grid.centres[tile], plain.tiling.edge)
+        strengths = learn_strengths(basis, normal, plain.hyperparameters)
+        return dict(zip(near, strengths, strict=True))
+
+    strengths = plain.strengths.copy()
+    tiles = np.unique(home).tolist()
+    for tile, each in zip(tiles, in_threads(found, tiles), strict=True):
+        for structure, strength in each.items():
+            if home[structure] == tile:
+                strengths[structure] = strength
+    return replace(plain, strengths=strengths)
+
+
+def structure_middles(sources: Sources) -> FloatArray:
+    """Return the middle of each structure in metres, shape (S, 3)."""
+    return np.array([each.positions.mean(axis=0) for each in sources.split()]).reshape(-1, 3)
