@@ -24,6 +24,7 @@ from l2m_gtsam.solve.rank import RankOptions
 
 Progress = Callable[[str, float], None]
 
+DISTORTION = 12  # parameters of C and H
 # Readings of a sensor without which no step of the alternation is taken: five have 15 components.
 FEWEST = 5
 # Weak tie of each T(i) to where it is, for directions without any gradient: metres.
@@ -123,7 +124,7 @@ def fit_distortions(view: View, estimate: Estimate, options: OneKeyOptions) -> E
         fit = fit_distortion(b_lidar, b_meas, weights, options.closed_form)
         distortion[s] = fit.distortion.vector()
         if options.sensor_noise_ut is None:
-            noise[s] = estimate_noise(fit.distortion.apply(b_lidar) - b_meas, v)
+            noise[s] = estimate_noise(fit.distortion.apply(b_lidar) - b_meas, v, DISTORTION)
         ridge[s] = fit.ridge * ridge_unit(b_lidar, 1 / (v + noise[s] ** 2))
     return Estimate(estimate.t, distortion, noise, ridge)
 

@@ -32,11 +32,14 @@ class SensorRows:
     ----------
     R, S, d
         Shapes (15, 15), (15, K) and (15,).
+    E
+        What its readings say of the weights alone, shape (J, K).
     """
 
     R: FloatArray
     S: FloatArray
     d: FloatArray
+    E: FloatArray
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,16 @@ class Eliminated:
         """Return the length of a sensor's step in standard deviations."""
         along = self.sensors[sensor].R @ self.step(sensor)
         return float(np.sqrt(along @ np.linalg.solve(self._spread(sensor), along)))
+
+    def taken(self, sensor: int) -> float:
+        """Return the degrees of freedom of a sensor's readings that went into the weights.
+
+        ``tr(E cov(beta) E^T)``: as many as there are weights that no prior and no other sensor
+        tells.
+        """
+        E = self.sensors[sensor].E
+        half = solve_triangular(self.factor, E.T, lower=True, check_finite=False)
+        return float(np.sum(half**2))
 
     def _spread(self, sensor: int) -> FloatArray:
         """Return ``I + S Lambda^-1 S^T``: the covariance of ``R x``, shape (15, 15)."""
@@ -129,7 +142,8 @@ def without_sensor(rows: Rows) -> tuple[SensorRows, Rows]:
     """Return a sensor's conditional, and the rows that remain without it."""
     Q, R = np.linalg.qr(rows.X)
     S, d = Q.T @ rows.E, Q.T @ rows.b
-    return SensorRows(R, S, d), Rows(rows.X, rows.E - Q @ S, rows.b - Q @ d)
+    E = rows.E - Q @ S
+    return SensorRows(R, S, d, E), Rows(rows.X, E, rows.b - Q @ d)
 
 
 def rows_by_sensor(

@@ -121,9 +121,9 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
     noise, values = estimate.noise.copy(), estimate.values(problem.view.sensors)
     variance = np.trace(problem.map_share, axis1=1, axis2=2) / 3
     for s in problem.view.sensors:
-        rows = problem.batch.rows_of(s)
+        rows, taken = problem.batch.rows_of(s), problem.determinacies[s].free
         residual = problem.batch.residuals(values, s).residual[rows]
-        noise[s] = estimate_noise(residual, variance[rows])
+        noise[s] = estimate_noise(residual, variance[rows], taken)
     return noise
 
 
@@ -142,7 +142,7 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
             SensorSolution(
                 sensor=s,
                 covariance=with_infinities(covariances[s], test),
-                figures=residual_figures(residual, W[rows]),
+                figures=residual_figures(residual, W[rows], test.free),
                 determinacy=test,
                 remaining_sigmas=float(np.sqrt(gradient @ covariances[s] @ gradient)),
             )

@@ -244,9 +244,10 @@ class UncertainProblem:
     def noise(self, values: gtsam.Values, estimate: Estimate) -> FloatArray:
         """Return the most likely noise of each sensor in uT, shape (S,)."""
         noise, residual = estimate.noise.copy(), self._residuals(values)
+        system = self._eliminated(values)
         for s in self._view.sensors:
-            rows = self._batch.rows_of(s)
-            noise[s] = estimate_noise(residual[rows], self._rest[rows])
+            rows, taken = self._batch.rows_of(s), self._taken(system, s)
+            noise[s] = estimate_noise(residual[rows], self._rest[rows], taken)
         return noise
 
     def solutions(self, values: gtsam.Values) -> tuple[SensorSolution, ...]:
@@ -254,17 +255,21 @@ class UncertainProblem:
         system, residual = self._eliminated(values), self._residuals(values)
         solutions = []
         for s in self._view.sensors:
-            rows = self._batch.rows_of(s)
+            rows, taken = self._batch.rows_of(s), self._taken(system, s)
             solutions.append(
                 SensorSolution(
                     sensor=s,
                     covariance=with_infinities(system.covariance(s), self._tests[s]),
-                    figures=residual_figures(residual[rows], self._W[rows]),
+                    figures=residual_figures(residual[rows], self._W[rows], taken),
                     determinacy=self._tests[s],
                     remaining_sigmas=system.sigmas(s),
                 )
             )
         return tuple(solutions)
+
+    def _taken(self, system: Eliminated, sensor: int) -> float:
+        """Return the degrees of freedom that the fit took of a sensor's readings."""
+        return self._tests[sensor].free + system.taken(sensor)
 
     def _eliminated(self, values: gtsam.Values) -> Eliminated:
         linear = linearised(self._graph, values)

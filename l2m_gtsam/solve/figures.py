@@ -5,9 +5,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, ResidualFigures
 
 
-def residual_figures(
-    residual: FloatArray, whitening: FloatArray, parameters: int = 15
-) -> ResidualFigures:
+def residual_figures(residual: FloatArray, whitening: FloatArray, taken: float) -> ResidualFigures:
     """Summarise the residuals of one sensor.
 
     Parameters
@@ -16,12 +14,12 @@ def residual_figures(
         ``C b + H - z`` in uT, shape (N, 3).
     whitening
         Matrices that make them white, shape (N, 3, 3).
-    parameters
-        Number of parameters that were fitted to them.
+    taken
+        Degrees of freedom that the fit took; see ``estimate_noise``.
     """
     norm = np.linalg.norm(residual, axis=1)
     white = np.einsum("nij,nj->ni", whitening, residual)
-    freedom = max(residual.size - parameters, 1)
+    freedom = max(residual.size - taken, 1)
     return ResidualFigures(
         readings=len(residual),
         rms_axes=np.sqrt(np.mean(residual**2, axis=0)),

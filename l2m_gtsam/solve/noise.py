@@ -45,11 +45,13 @@ def whitening(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(lower, np.broadcast_to(np.eye(3), lower.shape)))
 
 
-def estimate_noise(residual: FloatArray, map_variance: FloatArray) -> float:
+def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float) -> float:
     """Return the most likely standard deviation of a sensor's noise in uT.
 
     The residuals are modelled as independent normal numbers of variance
     ``sigma^2 + map_variance``; what the map's variance already explains is not counted again.
+    A fit leaves less than that: its residuals are as small as if some of them were zero
+    (restricted maximum likelihood, Patterson and Thompson 1971, where all variances are equal).
 
     Parameters
     ----------
@@ -57,8 +59,12 @@ def estimate_noise(residual: FloatArray, map_variance: FloatArray) -> float:
         Residuals in uT, shape (N, 3).
     map_variance
         Mean variance of the map's prediction in uT^2, shape (N,).
+    taken
+        Degrees of freedom that the fit took: the number of its free parameters, less for those
+        with a prior. At least half of the values are counted.
     """
-    e2, v = residual**2, map_variance[:, None]
+    left = max(residual.size - taken, residual.size / 2)
+    e2, v = residual**2 * (residual.size / left), map_variance[:, None]
 
     def score(log_sigma: float) -> float:
         total = np.exp(2 * log_sigma) + v

@@ -51,6 +51,11 @@ class Determinacy:
     names: tuple[str, ...]
     touched: BoolArray
 
+    @property
+    def free(self) -> int:
+        """Number of directions that the readings determine."""
+        return len(self.touched) - len(self.held)
+
 
 def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
     """Test the rank of a whitened Jacobian.

@@ -1,0 +1,103 @@
+"""Block elimination of sensors and map weights against dense algebra."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from l2m_factors import D, M, T
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.graph.compress import JACOBIAN
+from l2m_gtsam.graph.elimination import Eliminated, eliminate
+
+SENSORS, SIZES = [0, 2], {4: 3, 7: 5}
+ROWS = 40
+ORDER = [T(0), D(0), T(2), D(2), M(4), M(7)]
+WIDTH = {T(0): 3, D(0): 12, T(2): 3, D(2): 12, M(4): 3, M(7): 5}
+START = dict(zip(ORDER, np.cumsum([0, *WIDTH.values()]), strict=False))
+
+
+def dense(terms: dict[int, FloatArray]) -> FloatArray:
+    """Return a factor's rows over all 38 numbers."""
+    rows = np.zeros((len(next(iter(terms.values()))), sum(WIDTH.values())))
+    for key, A in terms.items():
+        rows[:, START[key] : START[key] + WIDTH[key]] = A
+    return rows
+
+
+class Problem:
+    """Random readings of two sensors in two tiles, and a prior of unit variance on the weights."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        self.graph = gtsam.GaussianFactorGraph()
+        self.owner: list[IntArray] = []
+        blocks: list[FloatArray] = []
+        values: list[FloatArray] = []
+        for sensor in SENSORS:
+            for tile in SIZES:
+                terms = {
+                    key: rng.normal(size=(ROWS, WIDTH[key]))
+                    for key in (T(sensor), D(sensor), M(tile))
+                }
+                self._add(terms, rng.normal(size=ROWS), blocks, values, sensor)
+        for tile, size in SIZES.items():
+            self._add({M(tile): np.eye(size)}, np.zeros(size), blocks, values, -1)
+        self.A, self.b = np.concatenate(blocks), np.concatenate(values)
+        self.row_owner = np.concatenate(self.owner)
+
+    def _add(
+        self,
+        terms: dict[int, FloatArray],
+        b: FloatArray,
+        blocks: list[FloatArray],
+        values: list[FloatArray],
+        sensor: int,
+    ) -> None:
+        unit = gtsam.noiseModel.Unit.Create(len(b))
+        self.graph.push_back(JACOBIAN(*(x for term in terms.items() for x in term), b, unit))
+        blocks.append(dense(terms))
+        values.append(b)
+        self.owner.append(np.full(len(b), sensor))
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    return Problem()
+
+
+@pytest.fixture(scope="module")
+def solved(problem: Problem) -> Eliminated:
+    return eliminate(problem.graph, SENSORS, SIZES)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_steps_and_covariances_are_those_of_dense_algebra(
+    problem: Problem, solved: Eliminated, sensor: int
+) -> None:
+    """Random rows are well conditioned: to 1e-10."""
+    covariance = np.linalg.inv(problem.A.T @ problem.A)
+    step = covariance @ problem.A.T @ problem.b
+    own = slice(START[T(sensor)], START[T(sensor)] + 15)
+    np.testing.assert_allclose(solved.step(sensor), step[own], atol=1e-10)
+    np.testing.assert_allclose(solved.covariance(sensor), covariance[own, own], atol=1e-10)
+    length = np.sqrt(step[own] @ np.linalg.solve(covariance[own, own], step[own]))
+    assert solved.sigmas(sensor) == pytest.approx(length, rel=1e-9)
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_fit_takes_the_trace_of_the_hat_matrix(
+    problem: Problem, solved: Eliminated, sensor: int
+) -> None:
+    """Fifteen of a sensor's readings for itself, the rest for the weights."""
+    rows = problem.A[problem.row_owner == sensor]
+    hat = rows @ np.linalg.solve(problem.A.T @ problem.A, rows.T)
+    assert 15 + solved.taken(sensor) == pytest.approx(np.trace(hat), rel=1e-10)
+
+
+def test_all_readings_and_the_prior_take_as_much_as_there_are_numbers(
+    problem: Problem, solved: Eliminated
+) -> None:
+    prior = problem.A[problem.row_owner == -1]
+    hat = prior @ np.linalg.solve(problem.A.T @ problem.A, prior.T)
+    taken = sum(15 + solved.taken(sensor) for sensor in SENSORS)
+    assert taken + np.trace(hat) == pytest.approx(sum(WIDTH.values()))
