@@ -25,7 +25,7 @@ from l2m_gtsam.maps.harmonic.evidence import (
 )
 from l2m_gtsam.maps.harmonic.family import Family
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
-from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of, dipoles_of, within
+from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of, dipoles_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, Modes, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
@@ -236,7 +236,7 @@ def test_the_posterior_is_that_of_the_dense_process() -> None:
     solved = np.linalg.solve(dense_covariance(readings, log_variance, GIVEN.noise), cross.T)
     mean, covariance = solved.T @ readings.field.ravel(), -cross @ solved
     covariance += (F_at * np.exp(log_variance)) @ F_at.T
-    L = ours.prior_sigma[:, None] * np.linalg.inv(ours.factor).T
+    L = ours.root
     # Condition 1e6 (100 uT against 0.1) of numbers up to 100 (mean) and 1e4 (prior covariance).
     np.testing.assert_allclose(F_at @ ours.mean, mean, rtol=0, atol=1e-8)
     np.testing.assert_allclose(F_at @ L @ L.T @ F_at.T, covariance, rtol=0, atol=1e-7)
@@ -496,7 +496,7 @@ def test_pieces_are_touching_voxels_of_one_cell() -> None:
     wall = np.concatenate([column(x, 0.7, 0.2, 1.2) for x in np.arange(0.06, 3.9, 0.05)])
     lone = column(5.5, -0.7, 0.2, 1.2)
     found = candidate_sources(np.concatenate([wall, lone]), DRIVE, VOXELS)
-    parts = found.split()
+    parts = found.pieces
     assert sum(len(part) for part in parts) == len(found)
     assert len(parts) == 5  # four metres of wall and a post
     for part in parts:
@@ -507,7 +507,7 @@ def test_pieces_are_touching_voxels_of_one_cell() -> None:
 
 def test_two_posts_of_one_cell_are_two_structures() -> None:
     posts = np.concatenate([column(3.2, 0.7, 0.2, 1.2), column(3.7, 0.7, 0.2, 1.2)])
-    assert len(candidate_sources(posts, DRIVE, VOXELS).split()) == 2
+    assert len(candidate_sources(posts, DRIVE, VOXELS).pieces) == 2
 
 
 def test_too_many_sources_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -519,10 +519,10 @@ def test_too_many_sources_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_structures_stand_in_the_tile_that_holds_their_middle() -> None:
     positions = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [3.2, 0, 0]])
     sources = Sources(positions, np.array([0, 0, 1, 1]))
-    assert within(sources, np.zeros(2), 1.2) == [0]
-    assert within(sources, np.array([2.0, 0.0]), 4.0) == [0, 1]
-    assert within(sources, np.array([9.0, 0.0]), 1.0) == []
-    assert within(NO_SOURCES, np.zeros(2), 1.0) == []
+    assert sources.within(np.zeros(2), 1.2) == [0]
+    assert sources.within(np.array([2.0, 0.0]), 4.0) == [0, 1]
+    assert sources.within(np.array([9.0, 0.0]), 1.0) == []
+    assert NO_SOURCES.within(np.zeros(2), 1.0) == []
 
 
 def sparse_post(x: float) -> FloatArray:
@@ -566,7 +566,7 @@ def two_posts(moments: FloatArray) -> tuple[TrainingSet, Sources]:
 def learnt_strengths(readings: TrainingSet, sources: Sources) -> list[float]:
     resolution = Resolution(3.0, 2.0)
     quiet = GIVEN.model_copy(update={"floor_scale": 0.1, "ceiling_scale": 0.1})
-    model = basis_of(readings, np.zeros(2), 5.0, resolution, sources.split(), np.ones(2))
+    model = basis_of(readings, np.zeros(2), 5.0, resolution, sources.pieces, np.ones(2))
     return learn_strengths(model, normal_of(model, readings), quiet)
 
 
@@ -586,7 +586,7 @@ def test_no_field_no_strength() -> None:
 def test_strengths_do_not_depend_on_where_the_search_starts() -> None:
     readings, sources = two_posts(np.random.default_rng(11).normal(0, 0.5, (6, 3)))
     model = basis_of(
-        readings, np.zeros(2), 5.0, Resolution(3.0, 2.0), sources.split(), np.full(2, 0.2)
+        readings, np.zeros(2), 5.0, Resolution(3.0, 2.0), sources.pieces, np.full(2, 0.2)
     )
     quiet = GIVEN.model_copy(update={"floor_scale": 0.1, "ceiling_scale": 0.1})
     elsewhere = learn_strengths(model, normal_of(model, readings), quiet)
@@ -641,7 +641,7 @@ def test_a_damped_weight_keeps_its_prior() -> None:
     silent = Basis(model.frame, (model.families[0], model.families[1]))
     assume_prior = silent.prior(GIVEN).log_variance
     ours = condition(normal_of(silent, far), assume_prior, GIVEN.noise)
-    L = ours.prior_sigma[:, None] * np.linalg.inv(ours.factor).T
+    L = ours.root
     np.testing.assert_allclose(
         np.diag(L @ L.T)[floor], np.exp(assume_prior)[floor], rtol=1e-9
     )  # exp(-1000 k) of a mode is left there

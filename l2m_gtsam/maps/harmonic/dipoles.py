@@ -55,36 +55,43 @@ class Dipoles:
     ) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient; see ``Family``."""
         m = self.moments(weights)
-        r, d = separations(points, self.positions)
+        r, inverse, cube = separations(points, self.positions)
+        fifth = 3 * cube * inverse
         mr = np.einsum("nki,ki->nk", r, m)
-        d3, d5, d7 = d**-3, d**-5, d**-7
-        field = np.einsum("nki,nk->ni", r, 3 * mr * d5) - d3 @ m
-        mixed = np.einsum("nki,kj,nk->nij", r, m, 3 * d5)
-        outer = np.einsum("nki,nkj,nk->nij", r, r, -15 * mr * d7)
-        trace = np.einsum("nk,nk->n", 3 * mr, d5)
-        gradient = mixed + mixed.transpose(0, 2, 1) + outer + trace[:, None, None] * np.eye(3)
+        pull = mr * fifth
+        field = np.einsum("nki,nk->ni", r, pull) - cube @ m
+        mixed = np.einsum("nki,nk->nik", r, fifth) @ m
+        outer = r.transpose(0, 2, 1) @ (r * (-5 * pull * inverse)[..., None])
+        gradient = mixed + mixed.transpose(0, 2, 1) + outer
+        gradient[:, range(3), range(3)] += pull.sum(axis=1)[:, None]
         return field, gradient
 
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential; see ``Family``."""
-        r, d = separations(points, self.positions)
-        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), d**-3))
+        r, _, cube = separations(points, self.positions)
+        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), cube))
 
     def moments(self, weights: FloatArray) -> FloatArray:
         """Return the moments of the sources in uT m^3, shape (K, 3)."""
         return np.asarray((self.combinations @ weights).reshape(-1, 3))
 
 
-def separations(points: FloatArray, sources: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return vectors (N, K, 3) from sources to points and their lengths (N, K), in metres."""
+def separations(
+    points: FloatArray, sources: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return vectors r (N, K, 3) from sources to points in metres, and r^-2 and r^-3, (N, K)."""
     r = points[:, None, :] - sources
     # At a source itself the field is not finite; a map must be.
-    return r, np.maximum(np.sqrt(np.einsum("nki,nki->nk", r, r)), SOFT)
+    inverse = 1.0 / np.maximum(np.einsum("nki,nki->nk", r, r), SOFT**2)
+    return r, inverse, inverse * np.sqrt(inverse)
 
 
 def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:
     """Return the field of unit moments at sources, source by source, shape (N, 3, 3 K)."""
-    r, d = separations(points, sources)
-    T = r[..., :, None] * (3 * r / d[..., None] ** 5)[..., None, :]
-    T[..., range(3), range(3)] -= (d**-3)[..., None]
-    return np.asarray(T.transpose(0, 2, 1, 3).reshape(len(points), 3, -1))
+    r, inverse, cube = separations(points, sources)
+    T = np.empty((len(points), 3, len(sources), 3))
+    along = r * (3 * cube * inverse)[..., None]
+    for i in range(3):
+        np.multiply(along, r[..., i, None], out=T[:, i])
+        T[:, i, :, i] -= cube
+    return T.reshape(len(points), 3, -1)

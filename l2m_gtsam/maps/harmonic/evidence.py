@@ -11,7 +11,6 @@ whatever the number of readings.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
@@ -114,39 +113,31 @@ def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise
 
 @dataclass(frozen=True)
 class Weights:
-    """Posterior of a tile's weights: mean, and covariance ``L L^T`` with ``L = D K^-T``.
+    """Posterior of a tile's weights.
 
     Attributes
     ----------
     mean
         Shape (m,).
-    prior_sigma
-        Diagonal of D: prior standard deviations, shape (m,).
-    factor
-        K, lower triangular, shape (m, m).
+    root
+        L with covariance ``L L^T``, shape (m, m): each point's variance costs one product.
     """
 
     mean: FloatArray
-    prior_sigma: FloatArray
-    factor: FloatArray
-
-    @cached_property
-    def root(self) -> FloatArray:
-        """L with covariance ``L L^T``, shape (m, m): made once, then each point costs a product.
-
-        The factor's condition is at most that of the square root of signal over noise, so that
-        its inverse loses no digit that counts.
-        """
-        inverse, _ = dtrtri(self.factor, lower=1)
-        return np.asarray(self.prior_sigma[:, None] * inverse.T)
+    root: FloatArray
 
 
 def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights:
-    """Return the posterior of the weights for a prior and a noise in uT."""
+    """Return the posterior of the weights for a prior and a noise in uT.
+
+    With ``L = D K^-T`` the mean is ``L L^T F^T W y / sigma^2``. The condition of K is at most that
+    of the square root of signal over noise, so that its inverse loses no digit that counts.
+    """
     D = np.exp(0.5 * log_variance)
-    K = whitened_factor(normal, D, noise)
-    u = D * normal.Fy / noise**2
-    return Weights(D * cho_solve((K, True), u, check_finite=False), D, K)
+    inverse, _ = dtrtri(whitened_factor(normal, D, noise), lower=1, overwrite_c=1)
+    root = np.asarray(inverse.T)
+    root *= D[:, None]
+    return Weights(root @ (normal.Fy @ root) / noise**2, root)
 
 
 def whitened_factor(normal: Normal, D: FloatArray, noise: float) -> FloatArray:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
@@ -119,9 +118,9 @@ def scores_of(
 ) -> FloatArray:
     """Return the z-scores of readings that the weights do not know, shape (3 N,)."""
     F = basis.features(part.points).reshape(-1, len(basis))
-    half = solve_triangular(weights.factor, (F * weights.prior_sigma).T, lower=True)
+    root = F @ weights.root
     noise = np.repeat(hyperparameters.noise**2 / part.weight, 3)
-    spread = np.sqrt(np.einsum("mn,mn->n", half, half) + noise)
+    spread = np.sqrt(np.einsum("nm,nm->n", root, root) + noise)
     return np.asarray((part.field.ravel() - F @ weights.mean) / spread)
 
 

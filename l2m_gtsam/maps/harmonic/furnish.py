@@ -1,5 +1,7 @@
 """From a box to its basis: modes as fine as needed, and the sources that stand in it."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
@@ -25,7 +27,7 @@ def basis_of(
     centre: FloatArray,
     edge: float,
     resolution: Resolution,
-    structures: list[Sources],
+    structures: Sequence[Sources],
     strengths: FloatArray,
     visible: float = FINE,
 ) -> Basis:
@@ -73,15 +75,3 @@ def dipoles_of(
         information += F.T @ F
     values, vectors = np.linalg.eigh(information)
     return Dipoles(positions, vectors[:, values >= visible * values[-1]], strength)
-
-
-def within(sources: Sources, centre: FloatArray, edge: float) -> list[int]:
-    """Return which structures have their middle in a square around a centre (x, y), metres."""
-    if not len(sources):
-        return []
-    count = np.bincount(sources.structure)
-    middle = np.column_stack(
-        [np.bincount(sources.structure, sources.positions[:, axis]) / count for axis in (0, 1)]
-    )
-    inside = (np.abs(middle - centre) <= edge / 2).all(axis=1)
-    return [int(s) for s in np.flatnonzero(inside)]

@@ -16,12 +16,31 @@ from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.teaching import learn_map
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.harmonic.tiling import Visit
 from l2m_gtsam.maps.training import checked_points, training_set
 
 if TYPE_CHECKING:
     from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 
 KIND = "harmonic"
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one tile says of the points that it has a share in.
+
+    Attributes
+    ----------
+    field, gradient
+        Of all these points, shapes (N, 3) and (N, 3, 3).
+    own, variance
+        Which of the points lie in the tile's core, shape (N,), and the variance there, (K, 3).
+    """
+
+    field: FloatArray
+    gradient: FloatArray
+    own: BoolArray
+    variance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -150,7 +169,22 @@ class HarmonicMap:
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
         points = checked_points(points)
-        return self.sample(points, *self.field_and_gradient(points))
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        variance = np.empty_like(points)
+        visits, owner = self.learnt.tiling.visits(points), self.learnt.tiling.grid.block_of(points)
+
+        def answer(visit: Visit) -> Answer:
+            # All that a tile is asked at once: it may not stay in memory.
+            tile, at = self.tiles[visit.tile], points[visit.rows]
+            own = owner[visit.rows] == visit.tile
+            return Answer(*tile.field_and_gradient(at), own, tile.variance(at[own]))
+
+        for visit, found in zip(visits, in_threads(answer, visits), strict=True):
+            at, share = visit.rows, visit.share
+            field[at] += share[:, None] * found.field
+            gradient[at] += share[:, None, None] * found.gradient
+            variance[at[found.own]] = found.variance
+        return self._sample(points, field, gradient, variance)
 
     def compile(self) -> "CompiledMap":
         """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster."""
@@ -161,9 +195,7 @@ class HarmonicMap:
 
     def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
         """Return what is known at points with this field and gradient; see ``query``."""
-        variance = self.variance(points)
-        known = variance.sum(axis=1) <= self.learnt.most_variance
-        return masked(FieldSample(field, gradient, variance, self._near(points) & known))
+        return self._sample(points, field, gradient, self.variance(points))
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
@@ -192,11 +224,14 @@ class HarmonicMap:
             variance[at] = part
         return variance
 
-    def _near(self, points: FloatArray) -> BoolArray:
+    def _sample(
+        self, points: FloatArray, field: FloatArray, gradient: FloatArray, variance: FloatArray
+    ) -> FieldSample:
         away, _ = cKDTree(self.learnt.readings.points).query(
             points, distance_upper_bound=self.options.reach
         )
-        return np.isfinite(away)
+        inside = np.isfinite(away) & (variance.sum(axis=1) <= self.learnt.most_variance)
+        return masked(FieldSample(field, gradient, variance, inside))
 
 
 def described(learnt: Learnt) -> str:

@@ -10,7 +10,7 @@ from scipy.optimize import Bounds, minimize
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import Normal, evidence, normal_of
-from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of, within
+from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.threads import in_threads
@@ -154,8 +154,7 @@ def window_of(
 ) -> Window:
     """Return a tile's readings as a window, with every structure in it at the common strength."""
     centre = tiling.grid.centres[tile]
-    everything = sources.split()
-    structures = [everything[s] for s in within(sources, centre, tiling.edge)]
+    structures = [sources.pieces[s] for s in sources.within(centre, tiling.edge)]
     even = np.ones(len(structures))
     basis = basis_of(readings, centre, tiling.edge, resolution, structures, even, COARSE)
     return Window(basis, normal_of(basis, readings))

@@ -13,7 +13,7 @@ from l2m_gtsam.maps.harmonic.explanation import (
     UNJUDGED,
     Explanation,
 )
-from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of, within
+from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
 from l2m_gtsam.maps.harmonic.search import (
@@ -58,7 +58,7 @@ class HarmonicOptions(Options):
     independent: int = Field(default=50, ge=1)
     """The most that the readings of one cube are worth: their errors share the pose and the
     disturbances of one passage."""
-    modes: int = Field(default=1000, ge=50)
+    modes: int = Field(default=600, ge=50)
     """About how many modes a tile has; tiles are as large as that allows."""
     mode_share: float = Field(default=0.05, gt=0, lt=1)
     """A mode is kept if the readings could reduce its prior variance by this share; what is left
@@ -137,14 +137,13 @@ class Learnt:
     def basis(self, tile: int, rows: IntArray, visible: float = FINE) -> Basis:
         """Return the basis of a tile for its readings; ``visible`` is that of ``dipoles_of``."""
         centre, edge = self.tiling.grid.centres[tile], self.tiling.edge
-        near = within(self.sources, centre, edge)
-        split = self.sources.split()
+        near = self.sources.within(centre, edge)
         return basis_of(
             self.readings[rows],
             centre,
             edge,
             self.resolution,
-            [split[s] for s in near],
+            [self.sources.pieces[s] for s in near],
             self.strengths[near],
             visible,
         )

@@ -139,8 +139,10 @@ class Modes:
         )
         e = np.exp((points[:, 2] - self.z)[:, None] * self.kz)
         p, q = self.numbers.T
-        cx, sx = np.cos(phase_x)[:, p] * e, np.sin(phase_x)[:, p] * e
-        cy, sy = np.cos(phase_y)[:, q], np.sin(phase_y)[:, q]
+        cx, sx = np.cos(phase_x).take(p, axis=1), np.sin(phase_x).take(p, axis=1)
+        cy, sy = np.cos(phase_y).take(q, axis=1), np.sin(phase_y).take(q, axis=1)
+        cx *= e
+        sx *= e
         return Waves(cx * cy, sx * cy, cx * sy, sx * sy)
 
 

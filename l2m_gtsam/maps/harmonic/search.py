@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
-from scipy.linalg import solve_triangular
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray
@@ -67,8 +66,7 @@ class Residuals:
             F = self.basis.features(self.readings.points[at]).reshape(-1, m)
             rows = slice(3 * at.start, 3 * at.stop)
             left[rows] = self.readings.field[at].ravel() - F @ self.weights.mean
-            whitened = (F * self.weights.prior_sigma).T
-            half[rows] = solve_triangular(self.weights.factor, whitened, lower=True).T
+            half[rows] = F @ self.weights.root
         return left * scale, half * scale[:, None]
 
 

@@ -1,6 +1,7 @@
 """Where sources can be: voxels in which the LiDAR saw something beside or over the drive."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
@@ -55,11 +56,22 @@ class Sources:
     def __getitem__(self, rows: IntArray) -> "Sources":
         return Sources(self.positions[rows], self.structure[rows])
 
-    def split(self) -> list["Sources"]:
-        """Return each structure by itself."""
+    @cached_property
+    def pieces(self) -> tuple["Sources", ...]:
+        """Each structure by itself."""
         order = np.argsort(self.structure, kind="stable")
         edges = np.flatnonzero(np.diff(self.structure[order])) + 1
-        return [self[rows] for rows in np.split(order, edges) if len(rows)]
+        return tuple(self[rows] for rows in np.split(order, edges) if len(rows))
+
+    @cached_property
+    def middles(self) -> FloatArray:
+        """Middle of each structure in metres, shape (S, 3)."""
+        return np.array([each.positions.mean(axis=0) for each in self.pieces]).reshape(-1, 3)
+
+    def within(self, centre: FloatArray, edge: float) -> list[int]:
+        """Return which structures have their middle in a square around (x, y), metres."""
+        inside = (np.abs(self.middles[:, :2] - centre) <= edge / 2).all(axis=1)
+        return [int(s) for s in np.flatnonzero(inside)]
 
 
 NO_SOURCES = Sources(np.empty((0, 3)), np.empty(0, dtype=np.int64))
@@ -103,7 +115,7 @@ def candidate_sources(
             f"{options.reach:g} m of the survey, at most {MOST_SOURCES} are allowed; a larger "
             "structure.edge or a smaller structure.reach is needed"
         )
-    return Sources(centres[keep], pieces(centres[keep], options))
+    return Sources(centres[keep], structures_of(centres[keep], options))
 
 
 def lowest_nearby(readings: FloatArray, radius: float) -> FloatArray:
@@ -122,7 +134,7 @@ def stands(voxels: IntArray, above: BoolArray) -> BoolArray:
     return np.asarray(np.bincount(column, above)[column] > 0)
 
 
-def pieces(centres: FloatArray, options: StructureOptions) -> IntArray:
+def structures_of(centres: FloatArray, options: StructureOptions) -> IntArray:
     """Return the structure of each voxel: touching voxels of one cell of ``piece``, (K,)."""
     if not len(centres):
         return np.empty(0, dtype=np.int64)

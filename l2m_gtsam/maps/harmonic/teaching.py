@@ -11,7 +11,7 @@ from l2m_gtsam.maps.harmonic.explanation import (
     explanation_of,
     patchwork,
 )
-from l2m_gtsam.maps.harmonic.furnish import COARSE, within
+from l2m_gtsam.maps.harmonic.furnish import COARSE
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn, spread_tiles
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
 from l2m_gtsam.maps.harmonic.search import (
@@ -60,7 +60,7 @@ def learn_map(raw: TrainingSet, sources: Sources, options: HarmonicOptions) -> L
 def learn_once(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> Learnt:
     """Return what readings teach over given sources, and how well that explains them."""
     learning = learn_prior(readings, sources, options)
-    plain = laid_out(readings, learning, sources, np.ones(len(sources.split())), options)
+    plain = laid_out(readings, learning, sources, np.ones(len(sources.pieces)), options)
     return explained(with_strengths(plain), options)
 
 
@@ -132,7 +132,7 @@ def found_in_tiles(plain: Learnt, options: HarmonicOptions) -> FloatArray:
 
 def with_strengths(plain: Learnt) -> Learnt:
     """Return the same with the strength of every structure, learnt in the tile it stands in."""
-    middles = structure_middles(plain.sources)
+    middles = plain.sources.middles
     if not len(middles):
         return plain
     home, members = plain.tiling.grid.block_of(middles), plain.members
@@ -140,7 +140,7 @@ def with_strengths(plain: Learnt) -> Learnt:
     def found(tile: int) -> dict[int, float]:
         basis = plain.basis(tile, members[tile], COARSE)
         normal = normal_of(basis, plain.readings[members[tile]])
-        near = within(plain.sources, plain.tiling.grid.centres[tile], plain.tiling.edge)
+        near = plain.sources.within(plain.tiling.grid.centres[tile], plain.tiling.edge)
         strengths = learn_strengths(basis, normal, plain.hyperparameters)
         return dict(zip(near, strengths, strict=True))
 
@@ -151,8 +151,3 @@ def with_strengths(plain: Learnt) -> Learnt:
             if home[structure] == tile:
                 strengths[structure] = strength
     return replace(plain, strengths=strengths)
-
-
-def structure_middles(sources: Sources) -> FloatArray:
-    """Return the middle of each structure in metres, shape (S, 3)."""
-    return np.array([each.positions.mean(axis=0) for each in sources.split()]).reshape(-1, 3)

@@ -9,8 +9,7 @@ from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 
-MEMORY = 2_000_000_000  # bytes of factors and roots that are kept
-MATRICES = 2  # of a tile: its factor and the root of its covariance
+MEMORY = 2_000_000_000  # bytes of the tiles' covariances that are kept
 
 
 class Tiles:
@@ -63,10 +62,10 @@ class Tiles:
             return dict(self._solved)
 
     def _forget(self) -> None:
-        held = sum(8 * MATRICES * len(tile.basis) ** 2 for tile in self._solved.values())
+        held = sum(8 * len(tile.basis) ** 2 for tile in self._solved.values())
         while held > MEMORY and len(self._solved) > 1:
             _, oldest = self._solved.popitem(last=False)
-            held -= 8 * MATRICES * len(oldest.basis) ** 2
+            held -= 8 * len(oldest.basis) ** 2
 
 
 def solved_tile(learnt: Learnt, index: int) -> Tile:
