@@ -17,7 +17,6 @@ from l2m_gtsam.options import Options
 # Standard deviations of a source's moment that are tried, over the one its readings suggest.
 STRENGTHS = (0.3, 1.0, 3.0)
 REFINEMENTS = 2  # each halves the lattice around a source that was found
-MOST_CANDIDATES = 1000  # of one tile
 MOST_READINGS = 1000  # of one tile
 
 
@@ -111,15 +110,20 @@ class Search:
         return gains
 
     def _gains(self, places: FloatArray) -> FloatArray:
-        K = len(places)
-        Phi = (moment_features(self._points, places) * self._scale[:, None, None]).reshape(
-            -1, 3 * K
-        )
-        q = (Phi.T @ self._left).reshape(K, 3)
-        seen = (self._half.T @ Phi).reshape(-1, K, 3)
-        blocks = Phi.reshape(-1, K, 3)
-        s = np.einsum("nki,nkj->kij", blocks, blocks) - np.einsum("mki,mkj->kij", seen, seen)
-        return best_gain(s, q)
+        K, m = len(places), self._half.shape[1]
+        moments = moment_features(self._points, places) * self._scale[:, None, None]
+        # Axis by axis: sums over rows then run along the places.
+        Phi = np.ascontiguousarray(moments.reshape(-1, K, 3).transpose(0, 2, 1))
+        rows = Phi.reshape(-1, 3 * K)
+        seen = (self._half.T @ rows).reshape(m, 3, K)
+        q = (self._left @ rows).reshape(3, K)
+        s = np.empty((K, 3, 3))
+        for i in range(3):
+            for j in range(i + 1):
+                known = np.einsum("nk,nk->k", Phi[:, i], Phi[:, j])
+                s[:, i, j] = known - np.einsum("mk,mk->k", seen[:, i], seen[:, j])
+                s[:, j, i] = s[:, i, j]
+        return best_gain(s, np.ascontiguousarray(q.T))
 
 
 def best_gain(s: FloatArray, q: FloatArray) -> FloatArray:
@@ -158,21 +162,26 @@ def unvisited(points: FloatArray, options: SearchOptions) -> FloatArray:
     return np.asarray(lattice[np.isfinite(away) & (away >= options.clearance)])
 
 
-def look_for_sources(residuals: Residuals, options: SearchOptions) -> list[Found]:
-    """Return the sources of one round: the best places, apart from each other."""
+def look_for_sources(
+    residuals: Residuals, places: FloatArray, options: SearchOptions
+) -> list[Found]:
+    """Return the sources of one round: the best of some places (K, 3), apart from each other."""
     points = residuals.readings.points
-    places = unvisited(points, options)
-    places = places[np.linspace(0, len(places) - 1, min(len(places), MOST_CANDIDATES)).astype(int)]
     search, visited = Search(residuals), cKDTree(points)
     gains = search.gains(places)
-    found: list[Found] = []
-    for index in np.argsort(-gains):
-        if gains[index] < options.gain:
-            break
-        place = places[index]
-        if all(np.linalg.norm(place - other.position) >= options.apart for other in found):
-            found.append(refined(search, visited, Found(place, float(gains[index])), options))
-    return found
+    good = np.flatnonzero(gains >= options.gain)
+    wanted = apart([Found(places[k], float(gains[k])) for k in good], options.apart)
+    return [refined(search, visited, start, options) for start in wanted]
+
+
+def apart(found: list[Found], distance: float) -> list[Found]:
+    """Return the best sources that keep a distance from each other, best first."""
+    kept: list[Found] = []
+    for each in sorted(found, key=lambda one: -one.gain):
+        away = [np.linalg.norm(each.position - other.position) for other in kept]
+        if min(away, default=np.inf) >= distance:
+            kept.append(each)
+    return kept
 
 
 def refined(search: Search, visited: cKDTree, start: Found, options: SearchOptions) -> Found:

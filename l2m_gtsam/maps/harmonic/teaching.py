@@ -16,8 +16,11 @@ from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn, spread_tiles
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
 from l2m_gtsam.maps.harmonic.search import (
     MOST_READINGS,
+    Found,
+    apart,
     look_for_sources,
     residuals_of,
+    unvisited,
 )
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import Sources
@@ -92,42 +95,47 @@ def with_search(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     """Return the same with sources found round by round in the residuals.
 
     What is not explained yet counts as noise and hides weaker sources: the prior is learnt anew
-    whenever the sources have become half as many again, and when no more are found.
+    whenever the sources have become half as many again, and when no more are found. Until then a
+    tile is looked at again only if sources were found in it.
     """
     readings, current, learnt_with = learnt.readings, learnt, 0
+    tiles = list(range(len(learnt.tiling)))
     for _ in range(options.search.rounds):
-        found = found_in_tiles(current, options)
+        found = found_in_tiles(current, tiles, options)
         if not len(found) and len(current.sources) == learnt_with:
             break
         positions = np.concatenate([current.sources.positions, found])
         sources = Sources(positions, np.arange(len(positions)))
         learning = current.origin.learning
-        if not len(found) or len(positions) >= GROWTH * learnt_with:
+        anew = not len(found) or len(positions) >= GROWTH * learnt_with
+        if anew:
             learning, learnt_with = learn_prior(readings, sources, options), len(positions)
         current = laid_out(readings, learning, sources, np.ones(len(positions)), options)
+        tiles = [
+            tile
+            for tile, centre in enumerate(current.tiling.grid.centres)
+            if anew or Sources(found, np.arange(len(found))).within(centre, current.tiling.edge)
+        ]
     searched = replace(current.origin, searched=True)
     return explained(with_strengths(replace(current, origin=searched)), options)
 
 
-def found_in_tiles(plain: Learnt, options: HarmonicOptions) -> FloatArray:
-    """Return the places of one round of the search over all tiles, shape (K, 3)."""
-    members = plain.members
+def found_in_tiles(plain: Learnt, tiles: list[int], options: HarmonicOptions) -> FloatArray:
+    """Return the places of one round of the search in the cores of tiles, shape (K, 3)."""
+    members, grid = plain.members, plain.tiling.grid
 
-    def look(tile: int) -> FloatArray:
+    def look(tile: int) -> list[Found]:
         rows = evenly(members[tile], MOST_READINGS)
         basis, readings = plain.basis(tile, rows, COARSE), plain.readings[rows]
+        places = unvisited(readings.points, options.search)
+        places = places[grid.block_of(places) == tile]
         residuals = residuals_of(basis, readings, plain.hyperparameters)
-        found = look_for_sources(residuals, options.search)
-        return np.array([each.position for each in found]).reshape(-1, 3)
+        return look_for_sources(residuals, places, options.search)
 
-    tiles = list(range(len(plain.tiling)))
-    places = in_threads(look, tiles)
-    own = [
-        place[plain.tiling.grid.block_of(place) == tile]
-        for tile, place in zip(tiles, places, strict=True)
-        if len(place)
-    ]
-    return np.concatenate([np.empty((0, 3)), *own])
+    found = [each for part in in_threads(look, tiles) for each in part]
+    # Neighbouring tiles may have seen the same steel.
+    kept = apart(found, options.search.apart)
+    return np.array([each.position for each in kept]).reshape(-1, 3)
 
 
 def with_strengths(plain: Learnt) -> Learnt:
