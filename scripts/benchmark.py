@@ -6,5 +6,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-for name in ("benchmarks.map_queries", "benchmarks.one_key"):
-    runpy.run_module(name, run_name="__main__")
+MODULES = ("map_queries", "harmonic_build", "compiled_map", "one_key", "map_uncertainty")
+
+for name in MODULES:
+    runpy.run_module(f"benchmarks.{name}", run_name="__main__")

@@ -14,7 +14,9 @@ from tests.statistical.figures import interval_coverage, z_scores
 from tests.steel import MILD, STRONG, CloudVariant, SteelHall, steel_hall, structure_cloud
 from tests.steel_drives import Survey, held_out, survey
 
-NOISE_FACT = "noise of a reading (uT)"  # of a map's summary
+# Of a map's summary.
+NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "held-out places"
+DOUBT = "does not explain the field"
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class StudiedMap(QueryableMap, Protocol):
 
     @property
     def summary(self) -> MapSummary:
-        """Figures of the map; its facts may hold NOISE_FACT."""
+        """Figures of the map; its facts may hold NOISE_FACT and VERDICT_FACT."""
         ...
 
 
@@ -108,6 +110,8 @@ class Prediction:
         Share of the places where the map has data.
     noise
         Of a reading as the map estimates it in uT; NaN for a kind that does not.
+    doubted
+        Whether the map says that it does not explain the field.
     """
 
     error: FloatArray
@@ -115,6 +119,7 @@ class Prediction:
     z: FloatArray
     inside: float
     noise: float
+    doubted: bool
 
 
 @dataclass(frozen=True)
@@ -135,8 +140,9 @@ class MapRow:
     inside
         Share of places inside the map.
     noise
-        Of a reading as the maps estimate it, median over the worlds, in uT: much more than the
-        survey's noise says that a map does not explain the field.
+        Of a reading as the maps estimate it, median over the worlds, in uT.
+    doubted
+        Share of the maps that say that they do not explain the field.
     """
 
     kind: str
@@ -150,6 +156,7 @@ class MapRow:
     coverage: float
     inside: float
     noise: float
+    doubted: float
 
     def __str__(self) -> str:
         heights = "/".join(f"{height:g}" for height in self.heights)
@@ -157,13 +164,14 @@ class MapRow:
             f"{self.kind:<16} {self.cloud:<21} {self.strength:>4g}  {heights:<12}"
             f" {self.rmse:7.3f} {self.sigma:7.3f} {self.z_std:6.2f} {self.z_worst:6.2f}"
             f" {self.coverage:6.3f} {self.inside:6.3f} {self.noise:6.3f}"
+            f" {self.doubted:7.2f}"
         )
 
 
 HEADER = (
     f"{'kind':<16} {'structure cloud':<21} {'steel':>4} {'heights (m)':<12}"
     f" {'rmse uT':>7} {'sigma':>7} {'z std':>6} {'worst':>6} {'cov95':>6} {'inside':>6}"
-    f" {'noise':>6}"
+    f" {'noise':>6} {'doubted':>7}"
 )
 
 
@@ -208,12 +216,14 @@ def predict(
     sample = field_map.query(truth.points)
     error = (sample.field - truth.field)[sample.inside]
     sigma = np.sqrt(sample.variance[sample.inside])
+    facts = field_map.summary.facts
     return Prediction(
         error,
         sigma,
         z_scores(sample, truth.field),
         inside=float(sample.inside.mean()),
-        noise=float(field_map.summary.facts.get(NOISE_FACT, np.nan)),
+        noise=float(facts.get(NOISE_FACT, np.nan)),
+        doubted=DOUBT in str(facts.get(VERDICT_FACT, "")),
     )
 
 
@@ -245,6 +255,7 @@ def _row(
         coverage=interval_coverage(z),
         inside=float(np.mean([p.inside for p in predictions])),
         noise=float(np.median([p.noise for p in predictions])),
+        doubted=float(np.mean([p.doubted for p in predictions])),
     )
 
 
