@@ -248,7 +248,7 @@ def test_a_grid_that_errs_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
 def plain_tile() -> Tile:
     """Return a tile that knows a uniform field and nothing else."""
     frame = TileFrame(np.eye(3), np.zeros(3), np.array([4.0, 4.0]), 1.0)
-    weights = Weights(np.array([20.0, -3.0, 40.0]), np.eye(3))
+    weights = Weights(np.array([20.0, -3.0, 40.0]), np.ones(3), np.eye(3))
     return Tile(Basis(frame, (UniformField(100.0),)), weights, PRIOR, Resolution(0.5, 0.5))
 
 

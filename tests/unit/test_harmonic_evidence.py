@@ -78,7 +78,7 @@ def test_the_posterior_is_that_of_the_dense_process() -> None:
     solved = np.linalg.solve(dense_covariance(readings, log_variance, GIVEN.noise), cross.T)
     mean, covariance = solved.T @ readings.field.ravel(), -cross @ solved
     covariance += (F_at * np.exp(log_variance)) @ F_at.T
-    L = ours.root
+    L = ours.unwhitened(np.eye(len(ours.mean)))
     # Condition 1e6 (100 uT against 0.1) of numbers up to 100 (mean) and 1e4 (prior covariance).
     np.testing.assert_allclose(F_at @ ours.mean, mean, rtol=0, atol=1e-8)
     np.testing.assert_allclose(F_at @ L @ L.T @ F_at.T, covariance, rtol=0, atol=1e-7)
@@ -153,7 +153,7 @@ def test_a_damped_weight_keeps_its_prior() -> None:
     silent = Basis(model.frame, (model.families[0], model.families[1]))
     assume_prior = silent.prior(GIVEN).log_variance
     ours = condition(normal_of(silent, far), assume_prior, GIVEN.noise)
-    L = ours.root
+    L = ours.unwhitened(np.eye(len(ours.mean)))
     np.testing.assert_allclose(
         np.diag(L @ L.T)[floor], np.exp(assume_prior)[floor], rtol=1e-9
     )  # exp(-1000 k) of a mode is left there

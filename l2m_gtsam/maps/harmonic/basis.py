@@ -44,7 +44,9 @@ class Basis:
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each weight in the map frame, uT per unit, shape (N, 3, m)."""
         local = self.frame.localise(points)
-        F = np.concatenate([family.features(local) for family in self.families], axis=2)
+        F = np.empty((len(points), 3, len(self)))
+        for columns, family in zip(self.columns(), self.families, strict=True):
+            F[:, :, columns] = family.features(local)
         if np.array_equal(self.frame.R_map_tile, np.eye(3)):
             return F
         return np.asarray(np.einsum("ij,njm->nim", self.frame.R_map_tile, F, optimize=True))

@@ -9,6 +9,7 @@ with moments m in uT m^3.
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.family import WeightPrior
@@ -47,8 +48,8 @@ class Dipoles:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each combination; see ``Family``."""
-        moments = moment_features(points, self.positions)
-        return np.asarray(moments @ self.combinations)
+        moments = moment_features(points, self.positions).reshape(3 * len(points), -1)
+        return np.asarray(moments @ self.combinations).reshape(len(points), 3, -1)
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
@@ -88,10 +89,24 @@ def separations(
 
 def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:
     """Return the field of unit moments at sources, source by source, shape (N, 3, 3 K)."""
-    r, inverse, cube = separations(points, sources)
-    T = np.empty((len(points), 3, len(sources), 3))
-    along = r * (3 * cube * inverse)[..., None]
-    for i in range(3):
-        np.multiply(along, r[..., i, None], out=T[:, i])
-        T[:, i, :, i] -= cube
-    return T.reshape(len(points), 3, -1)
+    T = np.empty((len(points), 3, 3 * len(sources)))
+    fill_moment_features(np.ascontiguousarray(points), np.ascontiguousarray(sources), T)
+    return T
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fill_moment_features(points: FloatArray, sources: FloatArray, out: FloatArray) -> None:
+    """Write the field of unit moments, shape (N, 3, 3 K)."""
+    r = np.empty(3)
+    for n in range(len(points)):
+        for k in range(len(sources)):
+            square = 0.0
+            for i in range(3):
+                r[i] = points[n, i] - sources[k, i]
+                square += r[i] * r[i]
+            inverse = 1.0 / max(square, SOFT * SOFT)
+            cube = inverse * np.sqrt(inverse)
+            for i in range(3):
+                along = 3.0 * cube * inverse * r[i]
+                for j in range(3):
+                    out[n, i, 3 * k + j] = along * r[j] - (cube if i == j else 0.0)

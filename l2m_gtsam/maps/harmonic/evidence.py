@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
-from scipy.linalg.lapack import dpotri, dtrtri
+from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
@@ -72,7 +72,9 @@ def normal_of(basis: Basis, readings: TrainingSet) -> Normal:
     FF, Fy, yy = np.zeros((m, m)), np.zeros(m), 0.0
     for at in batches(len(readings)):
         root = np.sqrt(readings.weight[at])
-        F = (basis.features(readings.points[at]) * root[:, None, None]).reshape(-1, m)
+        F = basis.features(readings.points[at])
+        F *= root[:, None, None]
+        F = F.reshape(-1, m)
         y = (readings.field[at] * root[:, None]).ravel()
         FF += F.T @ F
         Fy += F.T @ y
@@ -113,31 +115,41 @@ def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise
 
 @dataclass(frozen=True)
 class Weights:
-    """Posterior of a tile's weights.
+    """Posterior of a tile's weights: mean, and covariance ``L L^T`` with ``L = D K^-T``.
 
     Attributes
     ----------
     mean
         Shape (m,).
-    root
-        L with covariance ``L L^T``, shape (m, m): each point's variance costs one product.
+    prior_sigma
+        Diagonal of D: prior standard deviations, shape (m,).
+    factor
+        K, lower triangular, shape (m, m).
     """
 
     mean: FloatArray
-    root: FloatArray
+    prior_sigma: FloatArray
+    factor: FloatArray
+
+    def root(self, features: FloatArray) -> FloatArray:
+        """Return ``F L`` for features F, both of shape (J, m)."""
+        white = (features * self.prior_sigma).T
+        return np.asarray(
+            solve_triangular(self.factor, white, lower=True, overwrite_b=True, check_finite=False).T
+        )
+
+    def unwhitened(self, directions: FloatArray) -> FloatArray:
+        """Return ``L U`` for directions U, both of shape (m, r)."""
+        turned = solve_triangular(self.factor, directions, trans=1, lower=True, check_finite=False)
+        return np.asarray(self.prior_sigma[:, None] * turned)
 
 
 def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights:
-    """Return the posterior of the weights for a prior and a noise in uT.
-
-    With ``L = D K^-T`` the mean is ``L L^T F^T W y / sigma^2``. The condition of K is at most that
-    of the square root of signal over noise, so that its inverse loses no digit that counts.
-    """
+    """Return the posterior of the weights for a prior and a noise in uT."""
     D = np.exp(0.5 * log_variance)
-    inverse, _ = dtrtri(whitened_factor(normal, D, noise), lower=1, overwrite_c=1)
-    root = np.asarray(inverse.T)
-    root *= D[:, None]
-    return Weights(root @ (normal.Fy @ root) / noise**2, root)
+    K = whitened_factor(normal, D, noise)
+    u = D * normal.Fy / noise**2
+    return Weights(D * cho_solve((K, True), u, check_finite=False), D, K)
 
 
 def whitened_factor(normal: Normal, D: FloatArray, noise: float) -> FloatArray:

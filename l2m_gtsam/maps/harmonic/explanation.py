@@ -17,7 +17,7 @@ FOLDS = 4
 PATCH = 0.6  # metres; about as far as the space between two lanes of a survey
 # Of the errors at held-out readings over what was predicted for them. A normal distribution has a
 # spread of 1 and 0.27 % beyond three; in halls whose posts the map did not know of, 3 % and more
-# were beyond three, with the posts at most 0.7 %.
+# were beyond three, with the posts at most 0.9 %.
 MOST_SPREAD = 1.2
 MOST_SURPRISES = 0.015
 # Learnt noise over the sensor's own: what is not explained counts as noise.
@@ -118,7 +118,7 @@ def scores_of(
 ) -> FloatArray:
     """Return the z-scores of readings that the weights do not know, shape (3 N,)."""
     F = basis.features(part.points).reshape(-1, len(basis))
-    root = F @ weights.root
+    root = weights.root(F)
     noise = np.repeat(hyperparameters.noise**2 / part.weight, 3)
     spread = np.sqrt(np.einsum("nm,nm->n", root, root) + noise)
     return np.asarray((part.field.ravel() - F @ weights.mean) / spread)

@@ -65,7 +65,7 @@ class Residuals:
             F = self.basis.features(self.readings.points[at]).reshape(-1, m)
             rows = slice(3 * at.start, 3 * at.stop)
             left[rows] = self.readings.field[at].ravel() - F @ self.weights.mean
-            half[rows] = F @ self.weights.root
+            half[rows] = self.weights.root(F)
         return left * scale, half * scale[:, None]
 
 

@@ -27,7 +27,7 @@ from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
 
-JUDGED = 4  # tiles whose held-out places say whether the field is explained
+JUDGED = 16  # tiles whose held-out places say whether the field is explained
 GROWTH = 1.5  # of the sources, after which the prior is learnt anew
 
 

@@ -57,11 +57,11 @@ class Tile:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""
         m = len(self.basis)
         F = self.basis.features(self.within(points)).reshape(-1, m)
-        return np.asarray((F @ self.weights.root).reshape(-1, 3, m))
+        return np.asarray(self.weights.root(F).reshape(-1, 3, m))
 
     def unwhitened(self, directions: FloatArray) -> FloatArray:
         """Return the weights that directions of the posterior's root stand for, both (m, r)."""
-        return np.asarray(self.weights.root @ directions)
+        return self.weights.unwhitened(directions)
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the posterior variance per axis in uT^2, shape (N, 3)."""
