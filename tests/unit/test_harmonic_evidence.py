@@ -62,9 +62,9 @@ def test_slopes_of_the_evidence_are_its_derivatives() -> None:
     for column, unit in enumerate(np.eye(len(log_variance))):
         up, down = (evidence_at(log_variance + s * unit, log_noise).value for s in (step, -step))
         slope = (up - down) / (2 * step)
-        assert ours.by_log_variance[column] == pytest.approx(slope, abs=tolerance)
+        assert ours.slopes().by_log_variance[column] == pytest.approx(slope, abs=tolerance)
     up, down = (evidence_at(log_variance, log_noise + s).value for s in (step, -step))
-    assert ours.by_log_noise == pytest.approx((up - down) / (2 * step), rel=tolerance)
+    assert ours.slopes().by_log_noise == pytest.approx((up - down) / (2 * step), rel=tolerance)
 
 
 def test_the_posterior_is_that_of_the_dense_process() -> None:
@@ -98,7 +98,10 @@ def test_weights_that_are_integrated_out_leave_the_same_slopes() -> None:
         part = evidence(alone, moved[kept], GIVEN.noise)
         # Condition 1e6 of slopes of order one.
         np.testing.assert_allclose(
-            part.by_log_variance, whole.by_log_variance[kept], rtol=0, atol=1e-6
+            part.slopes().by_log_variance,
+            whole.slopes().by_log_variance[kept],
+            rtol=0,
+            atol=1e-6,
         )
         values.append(whole.value - part.value)
     np.testing.assert_allclose(values, values[0], rtol=0, atol=1e-5)

@@ -29,16 +29,17 @@ class Basis:
     families: tuple[Family, ...]
 
     def __len__(self) -> int:
-        return sum(len(family) for family in self.families)
+        return self.columns()[-1].stop if self.families else 0
 
     def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
         """Return the prior of all weights."""
         priors = [family.prior(hyperparameters) for family in self.families]
         log_variance = np.concatenate([prior.log_variance for prior in priors])
         slopes: dict[str, FloatArray] = {}
+        m = len(self)
         for columns, prior in zip(self.columns(), priors, strict=True):
             for name, slope in prior.slopes.items():
-                slopes.setdefault(name, np.zeros(len(self)))[columns] = slope
+                slopes.setdefault(name, np.zeros(m))[columns] = slope
         return WeightPrior(log_variance, slopes)
 
     def features(self, points: FloatArray) -> FloatArray:
@@ -78,12 +79,10 @@ class Basis:
             )
         return phi
 
-    def columns(self) -> Iterator[slice]:
-        """Yield the columns of each family."""
-        start = 0
-        for family in self.families:
-            yield slice(start, start + len(family))
-            start += len(family)
+    def columns(self) -> tuple[slice, ...]:
+        """Return the columns of each family."""
+        ends = np.cumsum([len(family) for family in self.families]).tolist()
+        return tuple(slice(end - len(f), end) for end, f in zip(ends, self.families, strict=True))
 
 
 def batches(count: int) -> Iterator[slice]:

@@ -172,21 +172,70 @@ def inverse_of(factor: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Logarithm of the marginal likelihood and its derivatives.
+    """Logarithm of the marginal likelihood.
 
     Attributes
     ----------
     value
         Nats.
-    by_log_variance
-        Derivative by the logarithm of each weight's prior variance, shape (m,).
-    by_log_noise
-        Derivative by the logarithm of the noise.
+    factor
+        K, lower triangular, shape (m, m).
+    mean
+        Posterior mean of the whitened weights, shape (m,).
+    misfit
+        ``|y - F w|^2 / sigma^2`` at the posterior mean.
+    rows
+        Number of values.
     """
 
     value: float
+    factor: FloatArray
+    mean: FloatArray
+    misfit: float
+    rows: int
+
+    def slopes(self) -> "EvidenceSlopes":
+        """Return the derivatives, which cost twice as much as the value."""
+        unknown = inverse_of(self.factor)
+        known = 1 - np.diag(unknown)  # share of each weight's prior variance that is gone
+        return EvidenceSlopes(
+            by_log_variance=0.5 * (self.mean**2 - known),
+            by_log_noise=self.misfit + float(known.sum()) - self.rows,
+            unknown=unknown,
+        )
+
+
+@dataclass(frozen=True)
+class EvidenceSlopes:
+    """Derivatives of the logarithm of the marginal likelihood.
+
+    Attributes
+    ----------
+    by_log_variance
+        By the logarithm of each weight's prior variance, shape (m,).
+    by_log_noise
+        By the logarithm of the noise.
+    unknown
+        Lower triangle of ``A^-1``: what is left of the prior's covariance, whitened, (m, m).
+    """
+
     by_log_variance: FloatArray
     by_log_noise: float
+    unknown: FloatArray
+
+    def information(self, slopes: FloatArray) -> FloatArray:
+        """Return the expected information on numbers that the prior depends on, shape (p, p).
+
+        Parameters
+        ----------
+        slopes
+            Derivatives of the logarithms of the prior variances by these numbers, shape (p, m).
+        """
+        known = -np.tril(self.unknown)
+        known[np.diag_indices_from(known)] += 1.0
+        known *= known
+        half = slopes @ known @ slopes.T
+        return np.asarray(0.5 * (half + half.T - slopes * np.diag(known) @ slopes.T))
 
 
 def evidence(normal: Normal, log_variance: FloatArray, noise: float) -> Evidence:
@@ -195,15 +244,9 @@ def evidence(normal: Normal, log_variance: FloatArray, noise: float) -> Evidence
     K = whitened_factor(normal, D, noise)
     u = D * normal.Fy / noise**2
     v = cho_solve((K, True), u, check_finite=False)
-    spread = np.diag(inverse_of(K))  # posterior over prior variance of each weight
     log_det = 2 * float(np.log(np.diag(K)).sum())
     chi2 = normal.yy / noise**2 - float(u @ v)
     log_noise = normal.rows * np.log(2 * np.pi * noise**2) - normal.log_weight
-    explained = len(D) - float(spread.sum())
-    # |y - F w|^2 / sigma^2 at the posterior mean, by w^T (A - I) w = w^T u - w^T w when whitened
+    # By w^T (A - I) w = w^T u - w^T w for whitened weights.
     misfit = chi2 - float(v @ v)
-    return Evidence(
-        value=-0.5 * (chi2 + log_det + log_noise),
-        by_log_variance=0.5 * (v * v - (1 - spread)),
-        by_log_noise=misfit + explained - normal.rows,
-    )
+    return Evidence(-0.5 * (chi2 + log_det + log_noise), K, v, misfit, normal.rows)

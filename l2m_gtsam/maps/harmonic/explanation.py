@@ -8,8 +8,9 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
-from l2m_gtsam.maps.harmonic.evidence import Normal, Weights, condition, normal_of
+from l2m_gtsam.maps.harmonic.evidence import Weights, condition, normal_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.training import TrainingSet
 
@@ -92,47 +93,42 @@ def patchwork(basis: Basis, readings: TrainingSet, seed: int) -> Patchwork:
     return Patchwork(basis, readings, np.asarray(dealt[cell], dtype=np.int64))
 
 
-def held_out_scores(work: Patchwork, hyperparameters: Hyperparameters) -> FloatArray:
+def held_out_scores(work: Patchwork, shared: Hyperparameters, local: LocalOptions) -> FloatArray:
     """Return errors at held-out readings over their predicted standard deviations, (3 N,)."""
-    prior = work.basis.prior(hyperparameters).log_variance
     parts = [work.readings[np.flatnonzero(work.fold == fold)] for fold in range(FOLDS)]
     parts = [part for part in parts if len(part)]
     normals = [normal_of(work.basis, part) for part in parts]
     total = sum(normals[1:], start=normals[0])
-    scores = [
-        scores_of(work.basis, part, without(total, normal, prior, hyperparameters), hyperparameters)
-        for part, normal in zip(parts, normals, strict=True)
-    ]
+    scores = []
+    for part, normal in zip(parts, normals, strict=True):
+        rest = total - normal
+        own = local_hyperparameters(work.basis, rest, shared, local)
+        weights = condition(rest, work.basis.prior(own).log_variance, own.noise)
+        scores.append(scores_of(work.basis, part, weights, own.noise))
     return np.concatenate(scores)
 
 
-def without(
-    total: Normal, normal: Normal, prior: FloatArray, hyperparameters: Hyperparameters
-) -> Weights:
-    """Return the posterior of the weights without one fold."""
-    return condition(total - normal, prior, hyperparameters.noise)
-
-
-def scores_of(
-    basis: Basis, part: TrainingSet, weights: Weights, hyperparameters: Hyperparameters
-) -> FloatArray:
+def scores_of(basis: Basis, part: TrainingSet, weights: Weights, noise: float) -> FloatArray:
     """Return the z-scores of readings that the weights do not know, shape (3 N,)."""
     F = basis.features(part.points).reshape(-1, len(basis))
     root = weights.root(F)
-    noise = np.repeat(hyperparameters.noise**2 / part.weight, 3)
-    spread = np.sqrt(np.einsum("nm,nm->n", root, root) + noise)
+    variance = np.repeat(noise**2 / part.weight, 3)
+    spread = np.sqrt(np.einsum("nm,nm->n", root, root) + variance)
     return np.asarray((part.field.ravel() - F @ weights.mean) / spread)
 
 
 def explanation_of(
-    works: Sequence[Patchwork], hyperparameters: Hyperparameters, sensor_noise: float | None
+    works: Sequence[Patchwork],
+    shared: Hyperparameters,
+    local: LocalOptions,
+    sensor_noise: float | None,
 ) -> Explanation:
     """Return how well the model predicts held-out patches of a few windows."""
-    scores = in_threads(lambda work: held_out_scores(work, hyperparameters), works)
+    scores = in_threads(lambda work: held_out_scores(work, shared, local), works)
     z = np.concatenate(scores)
     return Explanation(
         spread=float(np.sqrt(np.mean(z**2))),
         surprises=float(np.mean(np.abs(z) > 3)),
-        noise=hyperparameters.noise,
+        noise=shared.noise,
         sensor_noise=sensor_noise,
     )

@@ -226,5 +226,6 @@ def log_likelihood(window: Window, hyperparameters: Hyperparameters) -> Likeliho
     """Return how likely a window's readings are."""
     prior = window.basis.prior(hyperparameters)
     result = evidence(window.normal, prior.log_variance, hyperparameters.noise)
-    slopes = {name: float(result.by_log_variance @ slope) for name, slope in prior.slopes.items()}
-    return Likelihood(result.value, {**slopes, "noise": result.by_log_noise})
+    found = result.slopes()
+    slopes = {name: float(found.by_log_variance @ slope) for name, slope in prior.slopes.items()}
+    return Likelihood(result.value, {**slopes, "noise": found.by_log_noise})

@@ -16,6 +16,7 @@ from l2m_gtsam.maps.harmonic.explanation import (
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
+from l2m_gtsam.maps.harmonic.local import LocalOptions
 from l2m_gtsam.maps.harmonic.search import (
     SearchOptions,
 )
@@ -39,9 +40,11 @@ class HarmonicOptions(Options):
     """Options of the harmonic map; lengths in metres."""
 
     hyperparameters: Hyperparameters | None = None
-    """Fixed hyperparameters; learnt from the marginal likelihood where absent."""
+    """Fixed hyperparameters of all tiles; learnt from the marginal likelihood where absent."""
     learning: LearningOptions = LearningOptions()
-    """The windows they are learnt from; one set serves the whole map."""
+    """The windows that those of the whole map are learnt from."""
+    local: LocalOptions = LocalOptions()
+    """How far those of a tile may differ from them."""
     structure: StructureOptions = StructureOptions()
     """How a LiDAR's point cloud becomes sources."""
     search: SearchOptions = SearchOptions()
@@ -58,7 +61,7 @@ class HarmonicOptions(Options):
     independent: int = Field(default=50, ge=1)
     """The most that the readings of one cube are worth: their errors share the pose and the
     disturbances of one passage."""
-    modes: int = Field(default=600, ge=50)
+    modes: int = Field(default=400, ge=50)
     """About how many modes a tile has; tiles are as large as that allows."""
     mode_share: float = Field(default=0.05, gt=0, lt=1)
     """A mode is kept if the readings could reduce its prior variance by this share; what is left
@@ -66,6 +69,11 @@ class HarmonicOptions(Options):
     reach: float = Field(default=0.5, gt=0)
     """A point is inside the map when a reading is this near and the field is known to better than
     half of the variance with which the readings vary."""
+
+    @property
+    def effective_local(self) -> LocalOptions:
+        """Fixed hyperparameters are those of every tile."""
+        return self.local if self.hyperparameters is None else LocalOptions(spread=0)
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,7 @@ class Learnt:
     readings
         Training readings, merged.
     hyperparameters
-        Of the prior, shared by all tiles.
+        Of the prior of the whole map.
     sources
         Candidate sources.
     strengths
@@ -111,6 +119,8 @@ class Learnt:
         Where the tiles lie.
     resolution
         Largest wave numbers of the modes.
+    local
+        How far the prior of a tile may differ.
     origin
         For the record.
     """
@@ -121,6 +131,7 @@ class Learnt:
     strengths: FloatArray
     tiling: Tiling
     resolution: Resolution
+    local: LocalOptions
     origin: Origin
 
     @cached_property
@@ -175,9 +186,8 @@ def laid_out(
     resolution = affordable(finest, options.tiling, options.modes)
     tiling = tiling_of(readings.points, resolution, options.tiling, options.modes, options.reach)
     origin = Origin(len(readings), learning)
-    return Learnt(
-        readings, learning.hyperparameters, sources, strengths, tiling, resolution, origin
-    )
+    hyperparameters, local = learning.hyperparameters, options.effective_local
+    return Learnt(readings, hyperparameters, sources, strengths, tiling, resolution, local, origin)
 
 
 def reach_of(core: float, options: HarmonicOptions) -> float:

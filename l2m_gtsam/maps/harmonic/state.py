@@ -67,7 +67,10 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
     readings = training_set(*(state_array(state, name) for name in ("points", "field", "weight")))
     sources, strengths = sources_from_state(state)
     tiling, resolution = tiles_from_state(state, readings, options)
-    learnt = Learnt(readings, hyperparameters, sources, strengths, tiling, resolution, origin)
+    local = options.effective_local
+    learnt = Learnt(
+        readings, hyperparameters, sources, strengths, tiling, resolution, local, origin
+    )
     return learnt, options
 
 

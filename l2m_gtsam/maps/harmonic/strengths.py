@@ -53,7 +53,7 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
         result = evidence(alone, given + 2 * (x - start)[owner], noise)
-        slope = np.bincount(owner, result.by_log_variance).astype(np.float64)
+        slope = np.bincount(owner, result.slopes().by_log_variance).astype(np.float64)
         return -result.value, -2 * slope
 
     low, high = np.log(RANGE)

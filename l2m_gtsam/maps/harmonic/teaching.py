@@ -75,7 +75,7 @@ def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
         rows = evenly(members[tile], options.learning.readings)
         basis = learnt.basis(tile, rows, COARSE)
         works.append(patchwork(basis, learnt.readings[rows], options.learning.seed))
-    explanation = explanation_of(works, learnt.hyperparameters, options.sensor_noise)
+    explanation = explanation_of(works, learnt.hyperparameters, learnt.local, options.sensor_noise)
     return replace(learnt, origin=replace(learnt.origin, explanation=explanation))
 
 

@@ -6,6 +6,7 @@ from threading import Lock
 
 from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.local import local_hyperparameters
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 
@@ -73,6 +74,6 @@ def solved_tile(learnt: Learnt, index: int) -> Tile:
     rows = learnt.members[index]
     basis = learnt.basis(index, rows)
     normal = normal_of(basis, learnt.readings[rows])
-    prior = basis.prior(learnt.hyperparameters)
-    weights = condition(normal, prior.log_variance, learnt.hyperparameters.noise)
-    return Tile(basis, weights, learnt.hyperparameters, learnt.resolution)
+    own = local_hyperparameters(basis, normal, learnt.hyperparameters, learnt.local)
+    weights = condition(normal, basis.prior(own).log_variance, own.noise)
+    return Tile(basis, weights, own, learnt.resolution)
