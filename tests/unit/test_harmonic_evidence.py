@@ -84,6 +84,21 @@ def test_the_posterior_is_that_of_the_dense_process() -> None:
     np.testing.assert_allclose(F_at @ L @ L.T @ F_at.T, covariance, rtol=0, atol=1e-7)
 
 
+def test_information_is_that_of_the_dense_process() -> None:
+    """Half the trace of S^-1 dS_a S^-1 dS_b, the expected curvature of a normal density."""
+    readings, prior = survey(), basis().prior(GIVEN)
+    by = np.stack(list(prior.slopes.values()))
+    ours = evidence_at(prior.log_variance, float(np.log(GIVEN.noise))).slopes().information(by)
+    F = basis().features(readings.points).reshape(-1, len(basis()))
+    dense = dense_covariance(readings, prior.log_variance, GIVEN.noise)
+    change = [
+        np.linalg.solve(dense, (F * np.exp(prior.log_variance) * slope) @ F.T) for slope in by
+    ]
+    expected = [[0.5 * np.trace(a @ b) for b in change] for a in change]
+    # Condition 1e6 of numbers of order ten.
+    np.testing.assert_allclose(ours, expected, rtol=0, atol=1e-6)
+
+
 def test_weights_that_are_integrated_out_leave_the_same_slopes() -> None:
     readings, model = survey(), basis()
     normal, log_variance = normal_of(model, readings), model.prior(GIVEN).log_variance

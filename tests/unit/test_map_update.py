@@ -82,7 +82,7 @@ def test_a_grid_is_that_of_all_readings() -> None:
 def test_a_harmonic_map_is_nearly_that_of_all_readings() -> None:
     """With the same prior, but the tiles and modes of the first half: within the sigma."""
     points, field = readings()
-    usual_margin = QUICK_HARMONIC | {"tiling": {}}
+    usual_margin = QUICK_HARMONIC | {"tiling": {}, "local": {"spread": 0}}
     options = MapOptions.model_validate({"harmonic": usual_margin})
     updated = build_map(points[OLD], field[OLD], options).updated(points[NEW], field[NEW])
     prior = updated.to_state().arrays["hyperparameters"]
