@@ -11,7 +11,7 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.local import NAMES, LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.training import TrainingSet, training_set
-from tests.harmonic_models import GIVEN, NO_SEARCH, TILTED, basis, places, rms
+from tests.harmonic_models import GIVEN, NO_SEARCH, TILTED, basis, places
 from tests.worlds import DipoleWorld
 
 WANTED = LocalOptions(spread=0.7, steps=8)
