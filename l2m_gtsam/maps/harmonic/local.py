@@ -6,11 +6,12 @@ from pydantic import Field
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import EvidenceSlopes, Normal, evidence, marginalised
+from l2m_gtsam.maps.harmonic.family import WeightPrior
 from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
-from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.options import Options
 
 NAMES = ("floor_scale", "floor_depth", "ceiling_scale", "ceiling_depth")
+LEAST_GAIN = 1.0  # information of the readings over that of the prior
 LONGEST = 1.5  # of a step in the logarithm of a scale or depth
 
 
@@ -46,40 +47,42 @@ def local_hyperparameters(
     options
         Spread of the prior, and the number of steps.
     """
-    waves = waves_of(basis)
-    names = [name for name in NAMES if name in waves.prior(shared).slopes]
-    if options.spread == 0 or not names:
+    if options.spread == 0:
         return shared
+    given = basis.prior(shared)
     # All else stays as it is: integrated out once, not at each step.
-    alone = marginalised(normal, columns_of(basis), basis.prior(shared).log_variance, shared.noise)
+    telling = telling_waves(given, normal, shared.noise)
+    alone = marginalised(normal, telling, given.log_variance, shared.noise)
+    names = [name for name in NAMES if name in given.slopes and given.slopes[name][telling].any()]
+    if not names:
+        return shared
     centre = np.log([getattr(shared, name) for name in names])
     low, high = np.log([BOUNDS[name] for name in names]).T
     best, x, highest, step = centre, centre, -np.inf, np.zeros_like(centre)
     for left in range(options.steps, -1, -1):
-        prior = waves.prior(moved(shared, names, x))
-        found = evidence(alone, prior.log_variance, shared.noise)
+        prior = basis.prior(moved(shared, names, x))
+        found = evidence(alone, prior.log_variance[telling], shared.noise)
         value = found.value - 0.5 * float(np.sum(((x - centre) / options.spread) ** 2))
         if value <= highest:
             step = 0.5 * step
         else:
             best, highest = x, value
             if left:
-                by = np.stack([prior.slopes[name] for name in names])
+                by = np.stack([prior.slopes[name][telling] for name in names])
                 step = scoring_step(found.slopes(), by, x - centre, options.spread)
         x = np.clip(best + step, low, high)
     return moved(shared, names, best)
 
 
-def waves_of(basis: Basis) -> Basis:
-    """Return floor and ceiling alone."""
-    return Basis(basis.frame, tuple(f for f in basis.families if isinstance(f, Modes)))
+def telling_waves(prior: WeightPrior, normal: Normal, noise: float) -> IntArray:
+    """Return which weights depend on scales or depths and could be known better than their prior.
 
-
-def columns_of(basis: Basis) -> IntArray:
-    """Return which weights of a basis are those of its waves."""
-    pairs = zip(basis.columns(), basis.families, strict=True)
-    ranges = [np.arange(at.start, at.stop) for at, f in pairs if isinstance(f, Modes)]
-    return np.concatenate([np.empty(0, dtype=np.int64), *ranges])
+    Short waves hardly reach the readings. They say next to nothing of scale and depth, and are
+    half of all.
+    """
+    of_waves = np.any([prior.slopes[name] for name in NAMES if name in prior.slopes], axis=0)
+    gain = np.exp(prior.log_variance) * normal.FF.diagonal() / noise**2
+    return np.flatnonzero(of_waves & (gain > LEAST_GAIN))
 
 
 def scoring_step(
