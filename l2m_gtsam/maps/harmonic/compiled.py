@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from threading import Lock
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -12,17 +12,65 @@ from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
+from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.tiling import Visit
 from l2m_gtsam.maps.training import checked_points
-
-if TYPE_CHECKING:
-    from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 
 MEMORY = 1_000_000_000  # bytes of grids that are kept
 PIECE = 8_192  # points that a thread answers at once
 SERIAL = 2_000  # fewer points than this are not worth threads
+
+
+class ExactMap(Protocol):
+    """What the compiled form needs of the map itself; see ``HarmonicMap``."""
+
+    @property
+    def learnt(self) -> Learnt:
+        """Readings, prior, sources and tiling."""
+        ...
+
+    @property
+    def options(self) -> HarmonicOptions:
+        """Effective options."""
+        ...
+
+    @property
+    def tiles(self) -> Tiles:
+        """One for each cell of the tiling."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """Name of the map kind."""
+        ...
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map."""
+        ...
+
+    def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
+        """Return what is known at points with this field and gradient."""
+        ...
+
+    def variance(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis, also outside."""
+        ...
+
+    def errors_over(self, points: FloatArray, /) -> ErrorModes:
+        """Return the map's error over places as correlated numbers."""
+        ...
+
+    def updated(self, points: FloatArray, field: FloatArray) -> "ExactMap":
+        """Return the map with more readings and the same prior."""
+        ...
+
+    def to_state(self) -> MapState:
+        """Return the map as plain arrays and facts."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -39,12 +87,12 @@ class CompiledTiles:
         One for each tile, so that no tile is made twice, and one for ``made`` at the end.
     """
 
-    exact: "HarmonicMap"
+    exact: ExactMap
     made: OrderedDict[int, CompiledTile | Tile] = field(default_factory=OrderedDict)
     locks: tuple[Lock, ...] = ()
 
     @classmethod
-    def of(cls, exact: "HarmonicMap") -> "CompiledTiles":
+    def of(cls, exact: ExactMap) -> "CompiledTiles":
         """Return the tiles of a map, none of them made yet."""
         return cls(exact, locks=tuple(Lock() for _ in range(len(exact.tiles) + 1)))
 
@@ -91,11 +139,11 @@ class CompiledMap:
         Its tiles, compiled.
     """
 
-    exact: "HarmonicMap"
+    exact: ExactMap
     tiles: CompiledTiles
 
     @classmethod
-    def of(cls, exact: "HarmonicMap") -> "CompiledMap":
+    def of(cls, exact: ExactMap) -> "CompiledMap":
         """Return the compiled form of a map; tiles are compiled when they are first needed."""
         return cls(exact, CompiledTiles.of(exact))
 

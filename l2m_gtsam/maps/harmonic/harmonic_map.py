@@ -1,13 +1,13 @@
 """A map of harmonic potentials: tiles of floor and ceiling modes, uniform field and sources."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.explanation import Explanation
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
@@ -18,9 +18,6 @@ from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.tiling import Visit
 from l2m_gtsam.maps.training import checked_points, training_set
-
-if TYPE_CHECKING:
-    from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 
 KIND = "harmonic"
 
@@ -186,11 +183,8 @@ class HarmonicMap:
             variance[at[found.own]] = found.variance
         return self._sample(points, field, gradient, variance)
 
-    def compile(self) -> "CompiledMap":
+    def compile(self) -> CompiledMap:
         """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster."""
-        # What it compiles itself with takes most of a second to load.
-        from l2m_gtsam.maps.harmonic.compiled import CompiledMap
-
         return CompiledMap.of(self)
 
     def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
