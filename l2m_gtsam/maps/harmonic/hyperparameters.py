@@ -6,7 +6,7 @@ from l2m_gtsam.options import Options
 
 
 class Hyperparameters(Options):
-    """Scales of the prior; learnt by the marginal likelihood.
+    """Scales of the prior; learnt by the marginal likelihood, for the map and again for each tile.
 
     The depth of a side is the distance of its sources below the lowest, or above the highest,
     reading; its scale is the standard deviation of their horizontal field there per axis (the

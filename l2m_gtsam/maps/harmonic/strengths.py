@@ -35,7 +35,7 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
     normal
         Sums over the readings.
     hyperparameters
-        Shared by the map.
+        Of the map.
     """
     structures = [
         (np.arange(columns.start, columns.stop), family.strength)
