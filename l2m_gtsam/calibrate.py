@@ -22,6 +22,7 @@ from l2m_gtsam.graph.alternation import Progress
 from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.view import Compilable, QueryableMap
+from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
 from l2m_gtsam.sync import stuck_sensors, synchronise
 
@@ -73,6 +74,7 @@ def calibrate(
         sensors=sensors,
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
+        doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
         bag=recording.source,
         map=map_source,
         options=options.model_dump(mode="json"),

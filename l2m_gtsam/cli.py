@@ -5,7 +5,7 @@ Heavy modules are imported inside the commands, so that ``--help`` answers at on
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -142,7 +142,10 @@ def calibrate(
     uncertainty: Annotated[
         str | None,
         typer.Option(
-            help="full: the map's errors are shared by readings near each other; independent: not."
+            help="full (default, unless the configuration says otherwise): readings near each "
+            "other share the map's errors; independent: each has its own, which gives sigmas that "
+            "are too small. Kinds of map that do not know how their errors are correlated always "
+            "use independent."
         ),
     ] = None,
 ) -> None:
@@ -157,6 +160,7 @@ def calibrate(
         result = calibrate_bag(bag, map_path, chosen, out, progress)
     _print(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
+    _warn(result.doubts)
     typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
 
 
@@ -193,6 +197,7 @@ def map_build(
     with _progress() as progress:
         built = build_map_file(bags, out, load_config(config), suite, progress, structure)
     _print(map_table(built.description))
+    _warn(built.description.summary.doubts)
     typer.echo(f"written: {out}")
 
 
@@ -204,7 +209,10 @@ def map_update(
     config: ConfigOption = None,
     suite: SuiteOption = None,
 ) -> None:
-    """Add bags to a map, which keeps its kind, its options and what it learnt as its prior."""
+    """Add bags to a map, which keeps its kind, its options and the prior of the whole map.
+
+    Where there are new readings, the scales of a harmonic map's tiles follow them.
+    """
     from l2m_gtsam.batch import update_map_file
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import map_table
@@ -212,6 +220,7 @@ def map_update(
     with _progress() as progress:
         updated = update_map_file(map_path, bags, out, load_config(config), suite, progress)
     _print(map_table(updated.description))
+    _warn(updated.description.summary.doubts)
     typer.echo(f"written: {out}")
 
 
@@ -241,6 +250,7 @@ def map_info(map_path: MapArgument) -> None:
     with _progress() as progress:
         description = describe_map_file(map_path, progress)
     _print(map_table(description))
+    _warn(description.summary.doubts)
 
 
 @map_app.command("plot")
@@ -257,6 +267,12 @@ def map_plot(
     with _progress() as progress:
         plot_map_file(map_path, out, height, progress)
     typer.echo(f"written: {out}")
+
+
+def _warn(doubts: Sequence[str]) -> None:
+    """Say on the error stream what speaks against a result that was written all the same."""
+    for doubt in doubts:
+        typer.echo(f"l2m: warning: {doubt}", err=True)
 
 
 def _print(table: "Table") -> None:

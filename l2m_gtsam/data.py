@@ -395,6 +395,8 @@ class CalibrationResult:
         Outer steps of the one-key loop that were taken.
     uncertainty
         How the sigmas count the map's errors.
+    doubts
+        What speaks against the map, and therefore against the sigmas, a sentence each.
     bag, map
         Sources with hashes; absent when the data did not come from files.
     options
@@ -406,6 +408,7 @@ class CalibrationResult:
     sensors: tuple[SensorCalibration, ...]
     iterations: int
     uncertainty: Uncertainty
+    doubts: tuple[str, ...]
     bag: SourceFile | None
     map: SourceFile | None
     options: dict[str, Any]

@@ -10,7 +10,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.training import TrainingSet, training_set
+from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise
 
 Progress = Callable[[str, float], None]
@@ -132,7 +132,7 @@ def suite_readings(
         known = [_known(name, suite, recording) for name in readings.sensors]
         points.append(sensor_positions(readings, known))
         fields.append(map_fields(readings, known))
-    return training_set(np.concatenate(points), np.concatenate(fields))
+    return checked_readings(np.concatenate(points), np.concatenate(fields))
 
 
 def _refuse_stuck(readings: Readings, recording: Recording) -> None:

@@ -23,7 +23,14 @@ from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.trained import options_from_state, state_array
-from l2m_gtsam.maps.training import FURTHEST, TrainingSet, checked_points, joined, training_set
+from l2m_gtsam.maps.training import (
+    FURTHEST,
+    TrainingSet,
+    additional_set,
+    checked_points,
+    joined,
+    training_set,
+)
 from l2m_gtsam.options import Options
 
 KIND = "bilinear"
@@ -235,7 +242,7 @@ class BilinearMap:
         by these. Their squares about the new interpolant are those about the old one, corrected
         by what the averages say: exact where the two differ by a constant over a cell.
         """
-        new = training_set(points, field)
+        new = additional_set(points, field)
         old = TrainingSet(self.cells.points, self.cells.field, self.cells.count)
         cells = averaged(joined(old, new), self.options)
         lattice = lattice_over(cells, self.options)

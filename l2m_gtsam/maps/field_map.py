@@ -1,7 +1,7 @@
 """What the application asks of a map, whatever its kind."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -24,6 +24,8 @@ class MapSummary:
         Corners of the box around them in the map frame in metres, shape (3,).
     facts
         What else is worth knowing of this kind, by name with unit: plain values.
+    doubts
+        What speaks against trusting the map, a sentence each.
     """
 
     kind: str
@@ -32,6 +34,17 @@ class MapSummary:
     lower: FloatArray
     upper: FloatArray
     facts: dict[str, Any]
+    doubts: tuple[str, ...] = ()
+
+
+@runtime_checkable
+class Summarised(Protocol):
+    """A map that can say what it is worth."""
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map."""
+        ...
 
 
 class FieldMap(Protocol):

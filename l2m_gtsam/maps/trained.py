@@ -20,6 +20,7 @@ from l2m_gtsam.maps.hyperparameters import (
 from l2m_gtsam.maps.training import (
     ThinningOptions,
     TrainingSet,
+    additional_set,
     joined,
     thinned,
     training_set,
@@ -131,7 +132,7 @@ def extended(
     MapError
         If the readings are not fit for a map.
     """
-    new = training_set(points, field)
+    new = additional_set(points, field)
     together = joined(trained.readings, new)
     kept = thinned(together, trained.hyperparameters.length_scale, options.thinning)
     origin = replace(trained.origin, readings=trained.origin.readings + len(new))

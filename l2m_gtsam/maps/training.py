@@ -77,6 +77,31 @@ def checked_points(points: FloatArray) -> FloatArray:
     return points
 
 
+def checked_readings(
+    points: FloatArray, field: FloatArray, weight: FloatArray | None = None
+) -> TrainingSet:
+    """Return readings after checking each of them; there may be none. See ``training_set``."""
+    points = checked_points(points)
+    field = np.asarray(field, dtype=np.float64)
+    weight = np.ones(len(points)) if weight is None else np.asarray(weight, dtype=np.float64)
+    if field.shape != points.shape or weight.shape != points.shape[:1]:
+        raise MapError(
+            f"map training readings have shape {field.shape} and weights {weight.shape}; "
+            f"{len(points)} points need {points.shape} and {points.shape[:1]}"
+        )
+    bad = ~(np.isfinite(field).all(axis=1) & np.isfinite(weight) & (weight > 0))
+    if bad.any():
+        raise MapError(
+            f"map training reading {int(bad.argmax())} of {len(points)} is not finite and of "
+            "positive weight"
+        )
+    if np.abs(points).max(initial=0.0) > FURTHEST:
+        raise MapError(f"map training positions exceed {FURTHEST:g} m: are they in metres?")
+    if np.abs(field).max(initial=0.0) > STRONGEST:
+        raise MapError(f"map training readings exceed {STRONGEST:g} uT: are they in microtesla?")
+    return TrainingSet(points, field, weight)
+
+
 def training_set(
     points: FloatArray, field: FloatArray, weight: FloatArray | None = None
 ) -> TrainingSet:
@@ -96,29 +121,33 @@ def training_set(
     MapError
         If shapes disagree, a value is not finite, or there is too little to make a map from.
     """
-    points = checked_points(points)
-    field = np.asarray(field, dtype=np.float64)
-    weight = np.ones(len(points)) if weight is None else np.asarray(weight, dtype=np.float64)
-    if field.shape != points.shape or weight.shape != points.shape[:1]:
-        raise MapError(
-            f"map training readings have shape {field.shape} and weights {weight.shape}; "
-            f"{len(points)} points need {points.shape} and {points.shape[:1]}"
-        )
-    bad = ~(np.isfinite(field).all(axis=1) & np.isfinite(weight) & (weight > 0))
-    if bad.any():
-        raise MapError(
-            f"map training reading {int(bad.argmax())} of {len(points)} is not finite and of "
-            "positive weight"
-        )
-    if len(points) < FEWEST:
-        raise MapError(f"a map needs at least {FEWEST} training readings, got {len(points)}")
-    if np.abs(points).max() > FURTHEST:
-        raise MapError(f"map training positions exceed {FURTHEST:g} m: are they in metres?")
-    if np.abs(field).max() > STRONGEST:
-        raise MapError(f"map training readings exceed {STRONGEST:g} uT: are they in microtesla?")
-    if np.ptp(points, axis=0).max() < LEAST_EXTENT:
+    readings = checked_readings(points, field, weight)
+    if len(readings) < FEWEST:
+        raise MapError(f"a map needs at least {FEWEST} training readings, got {len(readings)}")
+    if np.ptp(readings.points, axis=0).max() < LEAST_EXTENT:
         raise MapError("all map training readings were taken at one point; a drive is needed")
-    return TrainingSet(points, field, weight)
+    return readings
+
+
+def additional_set(points: FloatArray, field: FloatArray) -> TrainingSet:
+    """Return readings that a map is given more of; few will do, and a vehicle at rest.
+
+    Parameters
+    ----------
+    points
+        Positions in the map frame in metres, shape (N, 3).
+    field
+        Readings in the map frame in microtesla, shape (N, 3).
+
+    Raises
+    ------
+    MapError
+        If shapes disagree, a value is not finite, or there is no reading.
+    """
+    readings = checked_readings(points, field)
+    if not len(readings):
+        raise MapError("there are no readings to add to the map; at least one is needed")
+    return readings
 
 
 def thinned(readings: TrainingSet, length_scale: float, options: ThinningOptions) -> TrainingSet:

@@ -144,6 +144,7 @@ class _CalibrationFile(_Lenient):
     iterations: int
     # Files of the first version do not say; their sigmas are of this kind.
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
+    doubts: tuple[str, ...] = ()
     bag: _Source | None
     map: _Source | None
     options: dict[str, Any]
@@ -158,6 +159,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "version": VERSION,
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
         "uncertainty": str(result.uncertainty),
+        "doubts": list(result.doubts),
         "bag": _source(result.bag),
         "map": _source(result.map),
         "versions": result.versions,
@@ -181,6 +183,7 @@ def read_calibration(path: Path) -> CalibrationResult:
         sensors=tuple(_sensor(name, entry) for name, entry in parsed.sensors.items()),
         iterations=parsed.iterations,
         uncertainty=parsed.uncertainty,
+        doubts=parsed.doubts,
         bag=SourceFile(parsed.bag.path, parsed.bag.sha256) if parsed.bag else None,
         map=SourceFile(parsed.map.path, parsed.map.sha256) if parsed.map else None,
         options=parsed.options,

@@ -12,24 +12,13 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic import frame
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
-from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.maps.sliding_gp import SlidingGP
-from tests.worlds import DIPOLE_CONSTANT, DipoleWorld, dipole_world
+from tests.harmonic_models import OPTIONS, POST, PRIOR, WORLD, fitted_map, rms
+from tests.harmonic_models import readings as readings_at_a_post
+from tests.worlds import DIPOLE_CONSTANT, DipoleWorld
 
-GIVEN = Hyperparameters(
-    floor_scale=1.6, floor_depth=0.7, ceiling_scale=0.5, ceiling_depth=1.4, noise=0.2
-)
-# Coarse and fast: the laws hold for any number of modes.
-OPTIONS = HarmonicOptions(
-    hyperparameters=GIVEN, search=SearchOptions(rounds=0), modes=200, mode_share=0.5
-)
 KEEP_ALL = OPTIONS.model_copy(update={"merge": 1e-6})
-POST = np.column_stack([np.full(20, 0.3), np.full(20, 1.6), np.linspace(0, 1.5, 20)])
-STEEL = DipoleWorld(np.zeros(3), POST[::4], np.random.default_rng(6).normal(0, 6, (5, 3)))
-WORLD = dipole_world(1)
 
 
 def survey_points(count: int, low: float, high: float, seed: int) -> FloatArray:
@@ -37,17 +26,12 @@ def survey_points(count: int, low: float, high: float, seed: int) -> FloatArray:
 
 
 def noise(count: int) -> FloatArray:
-    return np.random.default_rng(7).normal(0, GIVEN.noise, (count, 3))
+    return np.random.default_rng(7).normal(0, PRIOR.noise, (count, 3))
 
 
 def readings(count: int = 600) -> tuple[FloatArray, FloatArray]:
     points = survey_points(count, 0.2, 0.8, seed=0)
     return points, WORLD.field_and_gradient(points)[0] + noise(count)
-
-
-def readings_at_a_post() -> tuple[FloatArray, FloatArray]:
-    points, field = readings()
-    return points, field + STEEL.field_and_gradient(points)[0]
 
 
 def within_survey(count: int = 300, low: float = 0.2, high: float = 0.8) -> FloatArray:
@@ -57,14 +41,9 @@ def within_survey(count: int = 300, low: float = 0.2, high: float = 0.8) -> Floa
 @pytest.fixture(scope="module")
 def field_map() -> HarmonicMap:
     """Several tiles, with a post that carries sources."""
-    ours = HarmonicMap.fit(*readings_at_a_post(), OPTIONS, POST)
+    ours = fitted_map()
     assert len(ours.tiles) > 3
-    assert ours.learnt.strengths.max() > 0
     return ours
-
-
-def rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def divergence_and_curl(gradient: FloatArray) -> float:
@@ -160,7 +139,7 @@ def test_modes_of_a_large_box_have_the_covariance_of_the_closed_form(side: str, 
     Hessian's largest entry, is 0.003 s^2. What the waves up to 18 / m leave out at h = 0.4 is
     exp(-14) of everything.
     """
-    h = GIVEN.model_copy(update={f"{side}_scale": 2.0, f"{side}_depth": 0.4})
+    h = PRIOR.model_copy(update={f"{side}_scale": 2.0, f"{side}_depth": 0.4})
     modes = modes_up_to(side, np.full(2, BOX), 0.0, K_MAX)
     rng = np.random.default_rng(3)
     offsets = np.column_stack([rng.uniform(-0.7, 0.7, (8, 2)), up * rng.uniform(0, 0.5, 8)])
@@ -187,7 +166,7 @@ def test_modes_of_a_large_box_have_the_covariance_of_the_closed_form(side: str, 
 def test_the_prior_of_modes_at_the_lowest_reading_is_the_documented_scale() -> None:
     modes = modes_up_to(FLOOR, np.full(2, BOX), 0.0, K_MAX)
     middle = np.array([[BOX / 2 + 0.3, BOX / 2 - 0.2, 0.0]])
-    h = GIVEN.model_copy(update={"floor_scale": 3.0, "floor_depth": 0.4})
+    h = PRIOR.model_copy(update={"floor_scale": 3.0, "floor_depth": 0.4})
     F = modes.features(middle)[0]
     sigma = np.sqrt(F**2 @ np.exp(modes.prior(h).log_variance))
     # Mirror images as above.
@@ -217,7 +196,7 @@ def test_one_height_tells_of_others() -> None:
         replace(WORLD, moments=5 * WORLD.moments),
     )
     field = strong.field_and_gradient(points)[0] + noise(1000)
-    given = GIVEN.model_copy(update={"floor_scale": 8.0, "ceiling_scale": 2.5})
+    given = PRIOR.model_copy(update={"floor_scale": 8.0, "ceiling_scale": 2.5})
     options = OPTIONS.model_copy(update={"hyperparameters": given})
     ours, sliding = HarmonicMap.fit(points, field, options), SlidingGP.fit(points, field)
     at = within_survey(300, 0.7, 0.7) * [0.7, 0.7, 1]
@@ -276,6 +255,10 @@ def test_a_moved_world_has_a_moved_map() -> None:
 
 
 def test_more_readings_never_make_a_map_less_certain() -> None:
+    """With given hyperparameters, which all tiles share.
+
+    Where those of a tile follow its readings, new ones may show a stronger field than the old.
+    """
     points, field = readings()
     few = HarmonicMap.fit(points, field, KEEP_ALL)
     at = within_survey()

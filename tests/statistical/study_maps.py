@@ -15,7 +15,7 @@ from tests.steel import MILD, STRONG, CloudVariant, SteelHall, steel_hall, struc
 from tests.steel_drives import Survey, held_out, survey
 
 # Of a map's summary.
-NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "held-out places"
+NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "field"
 DOUBT = "does not explain the field"
 
 

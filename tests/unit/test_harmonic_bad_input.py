@@ -1,7 +1,6 @@
 """A harmonic map's state, and what it makes of damage and of bad or meagre data."""
 
 import json
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +12,7 @@ from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
+from l2m_gtsam.maps.training import additional_set, training_set
 from tests.harmonic_models import (
     NO_SEARCH,
     OPTIONS,
@@ -90,6 +90,9 @@ DAMAGE: list[tuple[str, npt.NDArray[Any], str]] = [
     ("hyperparameters", np.array(1.0), "hyperparameters"),
     ("hyperparameters", np.array([1.0, np.nan, 1, 1, 1, 1]), "damaged"),
     ("hyperparameters", np.array([1.0, 1, 1, 1, 0, 1]), "damaged: noise"),
+    ("hyperparameters", np.array([1e-300, 1, 1, 1, 1, 1]), "damaged: ceiling_depth is 1e-300"),
+    ("hyperparameters", np.array([1.0, 1, 1, 1e300, 1, 1]), "damaged: floor_scale is 1e"),
+    ("hyperparameters", np.full(6, 1e-300), "damaged: ceiling_depth.*; build the map again"),
     ("sources", np.zeros((3, 2)), "sources are damaged"),
     ("sources", np.zeros(3), "sources are damaged"),
     ("sources", np.full((7, 3), np.inf), "sources are damaged"),
@@ -97,12 +100,30 @@ DAMAGE: list[tuple[str, npt.NDArray[Any], str]] = [
     ("structure", np.array(0), "sources are damaged"),
     ("structure", np.array([0, 5]), "sources are damaged"),
     ("structure", np.full(7, np.nan), "sources are damaged"),
+    ("structure", np.full(7, 1e300), "sources are damaged"),
     ("structure", np.zeros((7, 1), dtype=np.int64), "sources are damaged"),
     ("strengths", np.array(1.0), "sources are damaged"),
     ("strengths", np.array([-1.0]), "sources are damaged"),
     ("strengths", np.array([np.nan]), "sources are damaged"),
+    ("strengths", np.array([1e300]), "sources are damaged"),
     ("strengths", np.ones(2), "sources are damaged"),
-    ("strengths", np.ones((1, 1)), "sources are damaged"),
+    ("strengths", np.ones((1, 1)), "sources are damaged.*; build the map again"),
+    ("tiling", np.zeros(2), "tiling is damaged"),
+    ("tiling", np.array(1.0), "tiling is damaged"),
+    ("tiling", np.array([0.0, np.nan, 1.5]), "tiling is damaged"),
+    ("tiling", np.array([1e300, 0, 1.5]), "tiling is damaged: its origin.*; build the map again"),
+    ("tiling", np.array([0.0, -1e20, 1.5]), "tiling is damaged: its origin"),
+    ("tiling", np.array([0.0, 0, -1.5]), "tiling is damaged: a tile is -1.5 m"),
+    ("tiling", np.array([0.0, 0, 1e-300]), "tiling is damaged: a tile is 1e-300 m"),
+    ("tiling", np.array([0.0, 0, 1e300]), "tiling is damaged: a tile is 1e"),
+    ("tiling", np.array([0.0, 0, 100]), "tiling is damaged: tiles and waves"),
+    ("resolution", np.ones(3), "resolution is damaged"),
+    ("resolution", np.array(1.0), "resolution is damaged"),
+    ("resolution", np.array([5.0, np.nan]), "resolution is damaged"),
+    ("resolution", np.array([-5.0, 5.0]), "resolution is damaged"),
+    ("resolution", np.array([5.0, 1e-300]), "resolution is damaged"),
+    ("resolution", np.array([5.0, 1e300]), "resolution is damaged.*; build the map again"),
+    ("resolution", np.array([5.0, 500.0]), "tiling is damaged: tiles and waves"),
 ]
 
 
@@ -120,16 +141,40 @@ def test_a_damaged_array_is_refused(
     assert "\n" not in str(caught.value)
 
 
-ARRAYS = ["points", "field", "weight", "hyperparameters", "sources", "structure", "strengths"]
+ARRAYS = [
+    "points",
+    "field",
+    "weight",
+    "hyperparameters",
+    "sources",
+    "structure",
+    "strengths",
+    "tiling",
+    "resolution",
+]
 
 
 @pytest.mark.parametrize("name", ARRAYS)
 def test_a_missing_array_is_named(harmonic: HarmonicMap, name: str) -> None:
     state = harmonic.to_state()
-    assert sorted(set(ARRAYS) - set(state.arrays)) == []
+    assert sorted(ARRAYS) == sorted(state.arrays)
     arrays = {key: array for key, array in state.arrays.items() if key != name}
     with pytest.raises(MapError, match=f"needs a numeric array {name}"):
         HarmonicMap.from_state(replace(state, arrays=arrays))
+
+
+@pytest.mark.parametrize("extreme", [1e-9, 1e9])
+def test_hyperparameters_far_beyond_those_of_learning_are_accepted(
+    harmonic: HarmonicMap, extreme: float
+) -> None:
+    """They may have been given; at the ends of what is accepted nothing overflows."""
+    state = harmonic.to_state()
+    for number in range(6):
+        values = state.arrays["hyperparameters"].copy()
+        values[number] = extreme
+        arrays = {**state.arrays, "hyperparameters": values}
+        sample = HarmonicMap.from_state(replace(state, arrays=arrays)).query(queries(10))
+        assert not np.isnan(sample.variance).any()
 
 
 def test_damaged_options_and_provenance_are_refused(harmonic: HarmonicMap) -> None:
@@ -174,6 +219,40 @@ def test_bad_readings_are_refused_in_one_line(cloud: FloatArray | None) -> None:
     for p, b, complaint in bad:
         with pytest.raises(MapError, match=complaint) as caught:
             HarmonicMap.fit(p, b, OPTIONS, cloud)
+        assert "\n" not in str(caught.value)
+
+
+def test_few_readings_and_readings_at_rest_can_be_added(harmonic: HarmonicMap) -> None:
+    """They make no map, but a map that exists can learn from them."""
+    points, field = readings(5, seed=9)
+    at_rest = np.tile(points[:1], (50, 1)), np.tile(field[:1], (50, 1))
+    for p, b in ((points, field), (points[:1], field[:1]), at_rest):
+        with pytest.raises(MapError):
+            training_set(p, b)
+        new = additional_set(p, b)
+        np.testing.assert_array_equal(new.points, p)
+        np.testing.assert_array_equal(new.field, b)
+        np.testing.assert_array_equal(new.weight, 1.0)
+        learnt = harmonic.learnt.extended(new, harmonic.options)
+        assert learnt.origin.readings == harmonic.learnt.origin.readings + len(p)
+        sample = HarmonicMap.condition(learnt, harmonic.options).query(p)
+        assert sample.inside.all()
+
+
+def test_bad_additional_readings_are_refused_in_one_line() -> None:
+    points, field = readings(5)
+    bad: list[tuple[FloatArray, FloatArray, str]] = [
+        (points[:0], field[:0], "no readings to add to the map"),
+        (spoiled(points), field, "map point 3 of 5 is not finite"),
+        (points, spoiled(field), "training reading 3 of 5 is not finite"),
+        (points[:, :2], field, r"shape \(5, 2\)"),
+        (points, field[:4], "5 points need"),
+        (points * 1e9, field, "are they in metres"),
+        (points, field * 1e9, "are they in microtesla"),
+    ]
+    for p, b, complaint in bad:
+        with pytest.raises(MapError, match=complaint) as caught:
+            additional_set(p, b)
         assert "\n" not in str(caught.value)
 
 
@@ -230,15 +309,26 @@ def test_readings_at_one_point_that_disagree_are_averaged() -> None:
     assert_same(one.query(queries()), other.query(queries()), 1e-8)
 
 
-def test_two_places_that_disagree_make_no_sure_map() -> None:
+def test_places_that_disagree_make_no_sure_map() -> None:
+    """Ten pairs of readings two centimetres apart and 5 uT apart, none of them merged."""
+    along, across = np.repeat(0.1 * np.arange(10), 2), np.tile([0.0, 0.02], 10)
+    points = np.column_stack([along, across, np.full(20, 0.4)])
+    field = np.tile([20.0, 0.0, -40.0], (20, 1))
+    field[::2] += 5
+    ours = HarmonicMap.fit(points, field, HarmonicOptions(search=NO_SEARCH, merge=0.01))
+    assert len(ours.learnt.readings) == 20
+    # The mean of readings that are 2.5 uT off it is the best there is.
+    assert np.sqrt(ours.variance(points)).min() > 2.5 / np.sqrt(20)
+
+
+def test_two_places_that_disagree_make_no_map() -> None:
     """Twenty readings within two centimetres, 5 uT apart."""
     points = np.repeat([[0.0, 0.0, 0.4], [0.02, 0.0, 0.4]], 10, axis=0)
     field = np.tile([20.0, 0.0, -40.0], (20, 1))
-    field[::2] += 5
-    with suppress(MapError):  # a clear line is an answer too
-        ours = HarmonicMap.fit(points, field, HarmonicOptions(search=NO_SEARCH))
-        sigma = np.sqrt(ours.variance(points[:1]))
-        assert sigma.min() > 5 / np.sqrt(20) / 2
+    field[10:] += 5
+    with pytest.raises(MapError, match="readings fill 1 cubes of") as caught:
+        HarmonicMap.fit(points, field, HarmonicOptions(search=NO_SEARCH))
+    assert "\n" not in str(caught.value)
 
 
 def test_between_two_surveys_the_map_knows_nothing() -> None:

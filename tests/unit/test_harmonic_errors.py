@@ -129,3 +129,34 @@ def test_tiles_share_the_errors_that_shared_noise_makes(harmonic: HarmonicMap) -
         np.testing.assert_allclose(empirical / scale, expected / scale, rtol=0, atol=0.09)
         strongest = max(strongest, float(np.abs(expected / scale).max()))
     assert strongest > 0.5
+
+
+def test_covariance_between_points_is_that_of_the_map(harmonic: HarmonicMap) -> None:
+    """Its diagonal is the variance; in one tile it is the posterior's; it is a covariance."""
+    at = within_survey(60)
+    covariance = harmonic.covariance(at)
+    diagonal = np.einsum("nini->ni", covariance)
+    np.testing.assert_allclose(diagonal, harmonic.variance(at), rtol=1e-6)
+    flat = covariance.reshape(180, 180)
+    np.testing.assert_allclose(flat, flat.T, atol=1e-12)
+    assert np.linalg.eigvalsh(flat).min() > -1e-9 * diagonal.max()
+    owner = harmonic.learnt.tiling.grid.block_of(at)
+    same = np.flatnonzero(owner == owner[0])
+    root = harmonic.tiles[int(owner[0])].root(at[same]).reshape(3 * len(same), -1)
+    ours = covariance[np.ix_(same, range(3), same, range(3))].reshape(root.shape[0], -1)
+    between = ~np.eye(len(ours), dtype=np.bool_)
+    # The directions left out hold a billionth of the variance.
+    np.testing.assert_allclose(ours[between], (root @ root.T)[between], atol=1e-6 * diagonal.max())
+
+
+def test_errors_of_near_places_are_alike_and_of_far_ones_are_not(harmonic: HarmonicMap) -> None:
+    at = np.array([[0.0, 0.0, 0.5], [0.05, 0.0, 0.5], [1.4, 1.1, 0.5]])
+    covariance = harmonic.covariance(at)
+    sigma = np.sqrt(np.einsum("nini->ni", covariance))
+    near, far = (np.diag(covariance[0, :, n]) / (sigma[0] * sigma[n]) for n in (1, 2))
+    assert (near > 0.8).all()
+    assert (np.abs(far) < 0.4).all()
+
+
+def test_no_points_have_no_covariance(harmonic: HarmonicMap) -> None:
+    assert harmonic.covariance(np.empty((0, 3))).shape == (0, 3, 0, 3)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from l2m_factors.field_map import FieldMap as PluginFieldMap
 from l2m_gtsam.graph.uncertain import UncertainMap
@@ -90,13 +91,16 @@ def test_the_order_of_queries_does_not_matter(harmonic: HarmonicMap) -> None:
 def test_a_trial_step_to_anywhere_is_finite(
     harmonic: HarmonicMap, anywhere: list[tuple[float, float, float]]
 ) -> None:
-    """A kilometre up, down or away; and never surer there than inside."""
+    """A kilometre up, down or away; and a metre from all readings never surer than inside."""
     points = np.array(anywhere)
     field, gradient = harmonic.field_and_gradient(points)
     variance = harmonic.variance(points)
     assert np.isfinite(field).all()
     assert np.isfinite(gradient).all()
     assert np.isfinite(variance).all()
+    away, _ = cKDTree(harmonic.learnt.readings.points).query(points)
+    known = harmonic.variance(within_survey()).sum(axis=1)
+    assert (variance[away > 1].sum(axis=1) > known.max()).all()
 
 
 @pytest.mark.parametrize("towards", [[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [0, 0, -1.0]])

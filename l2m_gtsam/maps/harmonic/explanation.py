@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 
@@ -21,15 +20,12 @@ PATCH = 0.6  # metres; about as far as the space between two lanes of a survey
 # were beyond three, with the posts at most 0.9 %.
 MOST_SPREAD = 1.2
 MOST_SURPRISES = 0.015
+# Of one tile: steel that one place hides must not drown among many that hide none.
+MOST_SPREAD_OF_ONE = 2.0
+FEWEST_SCORES = 60
+FEWEST_PATCHES = 2 * FOLDS
 # Learnt noise over the sensor's own: what is not explained counts as noise.
 MOST_NOISE = 1.25
-
-
-class Verdict(StrEnum):
-    """Whether the map's model is one of this field."""
-
-    EXPLAINED = "explained"
-    NOT_EXPLAINED = "not explained"
 
 
 @dataclass(frozen=True)
@@ -40,6 +36,8 @@ class Explanation:
     ----------
     spread
         Root mean square of held-out readings' errors over what the map predicts for them.
+    worst
+        The same of the tile where it is largest.
     surprises
         Share of them beyond three.
     noise
@@ -49,14 +47,15 @@ class Explanation:
     """
 
     spread: float
+    worst: float
     surprises: float
     noise: float
     sensor_noise: float | None
 
     @property
-    def verdict(self) -> Verdict:
-        """Return whether the field is explained."""
-        return Verdict.NOT_EXPLAINED if self.reasons else Verdict.EXPLAINED
+    def judged(self) -> bool:
+        """Return whether there were places enough to hold some out."""
+        return not np.isnan(self.spread)
 
     @property
     def reasons(self) -> list[str]:
@@ -64,25 +63,33 @@ class Explanation:
         reasons = []
         if self.spread > MOST_SPREAD:
             reasons.append(f"errors at held-out places are {self.spread:.2g} times their sigmas")
+        elif self.worst > MOST_SPREAD_OF_ONE:
+            reasons.append(f"errors in one region are {self.worst:.2g} times their sigmas")
         if self.surprises > MOST_SURPRISES:
             reasons.append(f"{self.surprises:.1%} of them exceed three sigmas")
         if self.sensor_noise is not None and self.noise > MOST_NOISE * self.sensor_noise:
             reasons.append(
-                f"the noise learnt, {self.noise:.2g} uT, is not the sensor's {self.sensor_noise:g}"
+                f"the readings' noise is {self.noise:.2g} uT, the sensor's {self.sensor_noise:g}"
             )
         return reasons
 
 
-UNJUDGED = Explanation(float("nan"), float("nan"), float("nan"), None)
+UNJUDGED = Explanation(float("nan"), float("nan"), float("nan"), float("nan"), None)
 
 
 @dataclass(frozen=True)
 class Patchwork:
-    """A basis, its readings, and the fold of each: squares that are held out together."""
+    """A basis, its readings, the square of the floor of each, and the fold of each square."""
 
     basis: Basis
     readings: TrainingSet
-    fold: IntArray
+    cell: IntArray
+    folds: IntArray
+
+    @property
+    def fold(self) -> IntArray:
+        """Fold of each reading: those of a square are held out together, shape (N,)."""
+        return self.folds[self.cell]
 
 
 def patchwork(basis: Basis, readings: TrainingSet, seed: int) -> Patchwork:
@@ -90,7 +97,7 @@ def patchwork(basis: Basis, readings: TrainingSet, seed: int) -> Patchwork:
     cells = np.floor(readings.points[:, :2] / PATCH).astype(np.int64)
     known, cell = np.unique(cells, axis=0, return_inverse=True)
     dealt = np.random.default_rng(seed).permutation(len(known)) % FOLDS
-    return Patchwork(basis, readings, np.asarray(dealt[cell], dtype=np.int64))
+    return Patchwork(basis, readings, np.asarray(cell, dtype=np.int64), dealt)
 
 
 def held_out_scores(work: Patchwork, shared: Hyperparameters, local: LocalOptions) -> FloatArray:
@@ -124,11 +131,20 @@ def explanation_of(
     sensor_noise: float | None,
 ) -> Explanation:
     """Return how well the model predicts held-out patches of a few windows."""
+    patches = sum(len(np.unique(work.cell)) for work in works)
+    if patches < FEWEST_PATCHES:
+        return UNJUDGED
     scores = in_threads(lambda work: held_out_scores(work, shared, local), works)
     z = np.concatenate(scores)
     return Explanation(
-        spread=float(np.sqrt(np.mean(z**2))),
+        spread=rms(z),
+        worst=max((rms(each) for each in scores if len(each) >= FEWEST_SCORES), default=0.0),
         surprises=float(np.mean(np.abs(z) > 3)),
         noise=shared.noise,
         sensor_noise=sensor_noise,
     )
+
+
+def rms(values: FloatArray) -> float:
+    """Return the root mean square."""
+    return float(np.sqrt(np.mean(values**2)))

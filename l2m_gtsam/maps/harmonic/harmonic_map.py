@@ -9,17 +9,20 @@ from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
+from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.explanation import Explanation
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
-from l2m_gtsam.maps.harmonic.teaching import learn_map
+from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.tiling import Visit
-from l2m_gtsam.maps.training import checked_points, training_set
+from l2m_gtsam.maps.training import additional_set, checked_points, training_set
 
 KIND = "harmonic"
+EXACT = 1e-9  # share of the variance between points that may be left out
+LOCAL = "its own, about those of the map"
 
 
 @dataclass(frozen=True)
@@ -100,13 +103,15 @@ class HarmonicMap:
         return error_modes(self.learnt, self.tiles, checked_points(points), self.options.errors)
 
     def updated(self, points: FloatArray, field: FloatArray) -> "HarmonicMap":
-        """Return the map with more readings and the same prior; see ``FieldMap``.
+        """Return the map with more readings and the same prior of the whole; see ``FieldMap``.
 
-        Only tiles that the new readings take part in are solved again.
+        Only tiles that the new readings take part in are solved again, with scales of their own
+        anew; whether the field is explained is judged anew as well.
         """
-        new = training_set(points, field)
-        learnt = self.learnt.extended(new, self.options)
-        box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap
+        new = additional_set(points, field)
+        learnt = explained(self.learnt.extended(new, self.options), self.options)
+        # A new reading may have moved an old one that it was merged with.
+        box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap + self.options.merge
         away, _ = cKDTree(new.points[:, :2]).query(learnt.tiling.grid.centres, p=np.inf)
         touched = np.asarray(away) <= box
         solved = self.tiles.solved
@@ -149,13 +154,15 @@ class HarmonicMap:
                 "noise of a reading (uT)": h.noise,
                 "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
                 "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
+                "scales of a tile": LOCAL if learnt.local.spread else "those of the map",
                 "hyperparameters": learnt.origin.learning.described,
                 "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
                 "sources": described(learnt),
-                "held-out places": judged(learnt.origin.explanation),
+                "field": judged(learnt.origin.explanation),
                 "tiles": len(self.tiles),
                 "tile (m)": float(learnt.tiling.grid.size),
             },
+            doubts=doubts(learnt),
         )
 
     @property
@@ -218,6 +225,34 @@ class HarmonicMap:
             variance[at] = part
         return variance
 
+    def covariance(self, points: FloatArray) -> FloatArray:
+        """Return the covariance of the map's errors at all points, uT^2, shape (N, 3, N, 3).
+
+        Of points in one tile it is the posterior's; of points in two it comes from the readings
+        that both know, see ``error_modes``. Its diagonal is ``variance``.
+
+        Parameters
+        ----------
+        points
+            In the map frame in metres, shape (N, 3).
+        """
+        points = checked_points(points)
+        count = len(points)
+        every = ErrorOptions(places=max(count, 10), rest=EXACT)
+        errors = error_modes(self.learnt, self.tiles, points, every)
+        A = np.zeros((3 * count, len(errors.covariance)))
+        owner, start = errors.owner(points), 0
+        for tile, size in errors.sizes().items():
+            rows = np.flatnonzero(owner == tile)
+            features = errors.features(points[rows], tile).reshape(-1, size)
+            A[(3 * rows[:, None] + np.arange(3)).ravel(), start : start + size] = features
+            start += size
+        covariance = A @ errors.covariance @ A.T
+        # What was left out, and waves too short for the tile, belong to each point alone.
+        rest = self.variance(points).ravel() - covariance.diagonal()
+        covariance[np.diag_indices_from(covariance)] += np.maximum(rest, 0.0)
+        return np.asarray(covariance.reshape(count, 3, count, 3))
+
     def _sample(
         self, points: FloatArray, field: FloatArray, gradient: FloatArray, variance: FloatArray
     ) -> FieldSample:
@@ -238,11 +273,33 @@ def described(learnt: Learnt) -> str:
         )
     if not given:
         return "floor and ceiling only"
-    return f"{shown} of {given} structures, the readings show nothing of the others"
+    return f"the readings show {shown} of {given} structures"
+
+
+def doubts(learnt: Learnt) -> tuple[str, ...]:
+    """Return what speaks against the map, a sentence each."""
+    origin, parts = learnt.origin, learnt.tiling.parts
+    found = list(origin.survey)
+    if origin.explanation.reasons:
+        found.append(judged(origin.explanation))
+    if not origin.explanation.judged:
+        found.append("there are too few places to say whether the map explains the field")
+    if origin.searched:
+        found.append(
+            "sources were searched for, for want of a point cloud of the structure: sigmas are "
+            "less sure"
+        )
+    if parts > 1:
+        found.append(
+            f"the survey lies in {parts} separate parts; between them nothing is known of the field"
+        )
+    return tuple(found)
 
 
 def judged(explanation: Explanation) -> str:
     """Return whether the map explains its readings, in a few words."""
     if explanation.reasons:
         return f"the map does not explain the field: {'; '.join(explanation.reasons)}"
-    return f"errors are {explanation.spread:.2f} times their sigmas: the field is explained"
+    if not explanation.judged:
+        return "too few places to hold any out"
+    return f"explained: errors at held-out places are {explanation.spread:.2f} times their sigmas"

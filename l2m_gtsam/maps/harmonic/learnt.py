@@ -26,10 +26,12 @@ from l2m_gtsam.maps.harmonic.tiling import (
     Tiling,
     TilingOptions,
     affordable,
+    finest,
     resolution_of,
     surveyed_area,
     tiling_of,
 )
+from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import TrainingSet, joined, merged
 from l2m_gtsam.options import Options
 
@@ -90,12 +92,15 @@ class Origin:
         Whether the sources were searched for in the residuals, for want of a point cloud.
     explanation
         How well the map predicts places that are held out.
+    survey
+        What speaks against the readings themselves; of the first ones, where more were added.
     """
 
     readings: int
     learning: LearningEnd
     searched: bool = False
     explanation: Explanation = UNJUDGED
+    survey: tuple[str, ...] = ()
 
 
 ORIGIN = TypeAdapter(Origin)
@@ -161,6 +166,7 @@ class Learnt:
 
     def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
+        survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(new))))
         readings = merged(joined(self.readings, new), options.merge, options.independent)
         grid = self.tiling.grid
         reach = reach_of(grid.size, options)
@@ -169,7 +175,7 @@ class Learnt:
             self,
             readings=readings,
             tiling=replace(self.tiling, grid=wider),
-            origin=replace(self.origin, readings=self.origin.readings + len(new)),
+            origin=replace(self.origin, readings=self.origin.readings + len(new), survey=survey),
         )
 
 
@@ -182,8 +188,11 @@ def laid_out(
 ) -> Learnt:
     """Return readings and prior with the tiles that suit them."""
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
-    finest = resolution_of(learning.hyperparameters, density, options.mode_share)
-    resolution = affordable(finest, options.tiling, options.modes)
+    needed = [
+        resolution_of(each, density, options.mode_share)
+        for each in (learning.hyperparameters, *learning.roughest)
+    ]
+    resolution = affordable(finest(needed), options.tiling, options.modes)
     tiling = tiling_of(readings.points, resolution, options.tiling, options.modes, options.reach)
     origin = Origin(len(readings), learning)
     hyperparameters, local = learning.hyperparameters, options.effective_local

@@ -12,6 +12,9 @@ from l2m_gtsam.options import Options
 
 NAMES = ("floor_scale", "floor_depth", "ceiling_scale", "ceiling_depth")
 LEAST_GAIN = 1.0  # information of the readings over that of the prior
+# Where scales are far from those of the map, waves tell of them that told nothing before.
+PASSES, ANEW = 3, 0.5
+SMALL = 0.1  # in the logarithm of a scale or depth: a fraction of how well one tile tells it
 LONGEST = 1.5  # of a step in the logarithm of a scale or depth
 
 
@@ -23,8 +26,8 @@ class LocalOptions(Options):
     0 shares them. A floor with bundles of reinforcement here and there is quiet in most tiles and
     strong in some: with one scale for all the map of the simulated warehouse claimed 0.7 of its
     error, with a scale for each tile all of it."""
-    steps: int = Field(default=3, ge=1)
-    """Steps of Fisher scoring."""
+    steps: int = Field(default=6, ge=1)
+    """The most steps of Fisher scoring; three are usual."""
 
 
 def local_hyperparameters(
@@ -47,20 +50,35 @@ def local_hyperparameters(
     options
         Spread of the prior, and the number of steps.
     """
-    if options.spread == 0:
-        return shared
-    given = basis.prior(shared)
+    found = shared
+    for _ in range(PASSES if options.spread > 0 else 0):
+        before, found = found, scored(basis, normal, shared, found, options)
+        change = [np.log(getattr(found, name) / getattr(before, name)) for name in NAMES]
+        if np.abs(change).max() < ANEW:
+            break
+    return found
+
+
+def scored(
+    basis: Basis,
+    normal: Normal,
+    shared: Hyperparameters,
+    start: Hyperparameters,
+    options: LocalOptions,
+) -> Hyperparameters:
+    """Return where Fisher scoring leads from a start, over the waves that tell something there."""
+    given = basis.prior(start)
     # All else stays as it is: integrated out once, not at each step.
     telling = telling_waves(given, normal, shared.noise)
     alone = marginalised(normal, telling, given.log_variance, shared.noise)
     names = [name for name in NAMES if name in given.slopes and given.slopes[name][telling].any()]
     if not names:
-        return shared
-    centre = np.log([getattr(shared, name) for name in names])
+        return start
+    centre, x = (np.log([getattr(each, name) for name in names]) for each in (shared, start))
     low, high = np.log([BOUNDS[name] for name in names]).T
-    best, x, highest, step = centre, centre, -np.inf, np.zeros_like(centre)
+    best, highest, step = x, -np.inf, np.zeros_like(centre)
     for left in range(options.steps, -1, -1):
-        prior = basis.prior(moved(shared, names, x))
+        prior = basis.prior(moved(start, names, x))
         found = evidence(alone, prior.log_variance[telling], shared.noise)
         value = found.value - 0.5 * float(np.sum(((x - centre) / options.spread) ** 2))
         if value <= highest:
@@ -71,7 +89,9 @@ def local_hyperparameters(
                 by = np.stack([prior.slopes[name][telling] for name in names])
                 step = scoring_step(found.slopes(), by, x - centre, options.spread)
         x = np.clip(best + step, low, high)
-    return moved(shared, names, best)
+        if float(np.abs(step).max()) < SMALL:
+            return moved(start, names, x)  # so near a maximum it is nearer still
+    return moved(start, names, best)
 
 
 def telling_waves(prior: WeightPrior, normal: Normal, noise: float) -> IntArray:

@@ -13,14 +13,19 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import ORIGIN, HarmonicOptions, Learnt, reach_of
 from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources
 from l2m_gtsam.maps.harmonic.tiling import (
+    LEAST_CORE,
     Resolution,
     Tiling,
     blend_of,
 )
 from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
-from l2m_gtsam.maps.training import TrainingSet, training_set
+from l2m_gtsam.maps.training import FURTHEST, TrainingSet, training_set
 
 SAFE = 1.5  # times the modes that a tile of a file may have
+LEAST_SIZE = 0.4 * LEAST_CORE  # equal tiles over an extent may be half as large as the least core
+# Given hyperparameters may lie outside the bounds of learning; powers and squares of these are
+# still far from the ends of float64.
+LEAST, MOST = 1e-9, 1e9
 
 
 def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapState:
@@ -50,23 +55,15 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
         If an array or an entry is missing, of the wrong shape, or makes no sense.
     """
     options = options_from_state(state, HarmonicOptions)
+    hyperparameters = hyperparameters_from_state(state)
     try:
-        values = dict(
-            zip(
-                sorted(Hyperparameters.model_fields),
-                state_array(state, "hyperparameters").tolist(),
-                strict=True,
-            )
-        )
-        hyperparameters = Hyperparameters(**values)
         origin = ORIGIN.validate_python(state.provenance)
     except ValidationError as error:
-        raise MapError(f"map state is damaged: {first_complaint(error)}") from None
-    except (TypeError, ValueError):
-        raise MapError("map array hyperparameters is not of the shape that is needed") from None
+        raise damaged("state is", first_complaint(error)) from None
     readings = training_set(*(state_array(state, name) for name in ("points", "field", "weight")))
     sources, strengths = sources_from_state(state)
-    tiling, resolution = tiles_from_state(state, readings, options)
+    resolution = resolution_from_state(state)
+    tiling = tiling_from_state(state, readings, resolution, options)
     local = options.effective_local
     learnt = Learnt(
         readings, hyperparameters, sources, strengths, tiling, resolution, local, origin
@@ -74,21 +71,55 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
     return learnt, options
 
 
-def tiles_from_state(
-    state: MapState, readings: TrainingSet, options: HarmonicOptions
-) -> tuple[Tiling, Resolution]:
-    """Return how the tiles of a state lie and what they resolve, after checks."""
-    place, waves = state_array(state, "tiling"), state_array(state, "resolution")
-    if place.shape != (3,) or waves.shape != (2,) or not np.isfinite([*place, *waves]).all():
-        raise MapError("map tiling is damaged: three finite numbers and two are needed")
-    size, surroundings = float(place[2]), options.tiling
-    resolution = Resolution(float(waves[0]), float(waves[1]))
+def damaged(what: str, complaint: str) -> MapError:
+    """Return the error for a part of a state that makes no sense, such as ``tiling is``."""
+    return MapError(f"map {what} damaged: {complaint}; build the map again")
+
+
+def credible(values: FloatArray) -> bool:
+    """Return whether all values are positive numbers that can be computed with."""
+    return bool(((values >= LEAST) & (values <= MOST)).all())  # false for NaN
+
+
+def hyperparameters_from_state(state: MapState) -> Hyperparameters:
+    """Return the prior of a state after checks."""
+    names, values = sorted(Hyperparameters.model_fields), state_array(state, "hyperparameters")
+    if values.shape != (len(names),):
+        raise damaged("hyperparameters are", f"shape {values.shape}, ({len(names)},) is needed")
+    for name, value in zip(names, values, strict=True):
+        if not credible(value):
+            complaint = f"{name} is {value:g}, {LEAST:g} to {MOST:g} is accepted"
+            raise damaged("hyperparameters are", complaint)
+    return Hyperparameters(**dict(zip(names, values.tolist(), strict=True)))
+
+
+def resolution_from_state(state: MapState) -> Resolution:
+    """Return the largest wave numbers of a state after checks."""
+    waves = state_array(state, "resolution")
+    if waves.shape != (2,) or not credible(waves):
+        raise damaged("resolution is", f"two wave numbers of {LEAST:g} to {MOST:g} 1/m are needed")
+    return Resolution(*waves.tolist())
+
+
+def tiling_from_state(
+    state: MapState, readings: TrainingSet, resolution: Resolution, options: HarmonicOptions
+) -> Tiling:
+    """Return how the tiles of a state lie, after checks."""
+    place = state_array(state, "tiling")
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise damaged("tiling is", "three finite numbers are needed")
+    corner, size, surroundings = place[:2], float(place[2]), options.tiling
+    if np.abs(corner).max() > FURTHEST:  # the corner was that of readings
+        raise damaged("tiling is", f"its origin lies further than {FURTHEST:g} m")
+    if not LEAST_SIZE <= size <= FURTHEST:
+        complaint = f"a tile is {size:g} m, {LEAST_SIZE:g} to {FURTHEST:g} m is accepted"
+        raise damaged("tiling is", complaint)
     edge = size + 2 * (surroundings.overlap + surroundings.margin)
-    if min(size, *waves) <= 0 or resolution.modes(edge) > SAFE * options.modes:
-        raise MapError("map tiling is damaged: tiles and waves do not fit the number of modes")
-    grid = grid_from(place[:2], readings.points, size, reach_of(size, options))
+    if resolution.modes(edge) > SAFE * options.modes:
+        raise damaged("tiling is", "tiles and waves do not fit the number of modes")
+    grid = grid_from(corner, readings.points, size, reach_of(size, options))
     blend = blend_of(size, surroundings)
-    return Tiling(grid, surroundings.overlap, surroundings.margin, blend), resolution
+    return Tiling(grid, surroundings.overlap, surroundings.margin, blend)
 
 
 def sources_from_state(state: MapState) -> tuple[Sources, FloatArray]:
@@ -96,12 +127,12 @@ def sources_from_state(state: MapState) -> tuple[Sources, FloatArray]:
     positions, number, strengths = (
         state_array(state, name) for name in ("sources", "structure", "strengths")
     )
-    flat = number.ndim == strengths.ndim == 1 and np.isfinite(number).all()
+    flat = number.ndim == strengths.ndim == 1 and (np.abs(number) < MOST_SOURCES).all()
     if not flat or positions.shape != (number.size, 3) or number.size > MOST_SOURCES:
-        raise MapError("map sources are damaged: their arrays do not have the shapes needed")
+        raise damaged("sources are", "their arrays do not have the shapes needed")
     structure = number.astype(np.int64)
     fits = np.isfinite(positions).all() and bool((structure >= 0).all())
     numbered = np.array_equal(np.unique(structure), np.arange(len(strengths)))
-    if not (fits and numbered and np.isfinite(strengths).all() and (strengths >= 0).all()):
-        raise MapError("map sources are damaged: positions, structures and strengths disagree")
+    if not (fits and numbered and ((strengths >= 0) & (strengths <= MOST)).all()):
+        raise damaged("sources are", "positions, structures and strengths disagree")
     return Sources(positions, structure), strengths

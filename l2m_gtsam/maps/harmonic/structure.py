@@ -15,9 +15,11 @@ from l2m_gtsam.maps.training import FURTHEST
 from l2m_gtsam.options import Options
 
 MOST_SOURCES = 200_000
-# Metres beside a tile's box. Without the strong posts that stand there, 1.3 m from its outermost
-# readings, a tile takes their field for that of those it has: strengths of a hundred were learnt.
-SIGHT = 0.5
+MOST_REACH = 2.0  # metres
+# Metres beside a tile's box, which itself ends 0.75 m beyond the readings: all that is in reach.
+# Without the strong posts that stand 1.3 m from its outermost readings a tile takes their field
+# for that of those it has; strengths of a hundred were learnt.
+SIGHT = 1.25
 
 
 class StructureOptions(Options):
@@ -27,7 +29,7 @@ class StructureOptions(Options):
     """Edge of the voxels; each holds one source. Sources this close make any field half a metre
     away, also that of a post a few centimetres beside. At 0.2 m strong posts were told with
     twice the error that the map claimed."""
-    reach: float = Field(default=2.0, gt=0)
+    reach: float = Field(default=2.0, gt=0, le=MOST_REACH)
     """Structure further than this from every reading is left to floor and ceiling modes."""
     clearance: float = Field(default=0.12, ge=0)
     """No source is nearer than this to a reading: the sensor was there."""
@@ -86,7 +88,8 @@ def candidate_sources(
     """Return the sources that a point cloud suggests for a survey.
 
     A voxel is kept where it is within reach of a reading but not at one, and where something
-    stands: its column holds points above the lowest reading nearby. A bare floor makes none.
+    stands: its column holds points above the lowest reading nearby, and higher than a ramp could
+    rise from what lies around. A bare floor makes none, level or not.
 
     Parameters
     ----------
@@ -111,7 +114,9 @@ def candidate_sources(
     lowest = np.full(len(voxels), np.inf)
     lowest[near] = lowest_nearby(readings, options.reach)[np.asarray(nearest)[near]]
     keep = near & (centres[:, 2] >= lowest - options.below)
-    keep = keep & stands(voxels, near & (centres[:, 2] >= lowest))
+    above = np.flatnonzero(near & (centres[:, 2] >= lowest))
+    above = above[rises(centres[above], np.concatenate([centres, readings]), options.edge)]
+    keep = keep & stands(voxels, above)
     if np.count_nonzero(keep) > MOST_SOURCES:
         raise MapError(
             f"the structure cloud suggests {np.count_nonzero(keep)} sources within "
@@ -121,20 +126,67 @@ def candidate_sources(
     return Sources(centres[keep], structures_of(centres[keep], options))
 
 
-def lowest_nearby(readings: FloatArray, radius: float) -> FloatArray:
-    """Return the height of the lowest reading of the cell around each one, shape (N,)."""
-    _, cell = np.unique(
-        np.floor(readings[:, :2] / radius).astype(np.int64), axis=0, return_inverse=True
-    )
+# A floor that vehicles drive on rises by less than this, 17 degrees, in any direction.
+STEEPEST = 0.3
+# What a voxel is compared with: the lowest points of so many cells of so many voxels around it,
+# about a metre far. The floor under a rack's shelf may be hidden, that beside the rack is seen.
+GROUND_CELL, GROUND_CELLS = 3, 25
+
+
+def cells_of(points: FloatArray | IntArray, edge: float) -> IntArray:
+    """Return the number of the square cell, from above, that holds each point, shape (N,)."""
+    x, y = np.floor(points[:, :2] / edge).astype(np.int64).T
+    # One number per cell, as sorting pairs takes several times as long. It may wrap, but no two
+    # cells less than 2^31 apart share one.
+    _, cell = np.unique((x << 32) + y, return_inverse=True)
+    return np.asarray(cell, dtype=np.int64)
+
+
+def lowest_of_cells(points: FloatArray, edge: float) -> FloatArray:
+    """Return the lowest point of every square cell that holds any, shape (C, 3)."""
+    cell = cells_of(points, edge)
+    order = np.lexsort((points[:, 2], cell))
+    return points[order[np.diff(cell[order], prepend=-1) > 0]]
+
+
+def lowest_nearby(points: FloatArray, edge: float) -> FloatArray:
+    """Return the height of the lowest point of the cell around each one, shape (N,)."""
+    cell = cells_of(points, edge)
     lowest = np.full(cell.max() + 1, np.inf)
-    np.minimum.at(lowest, cell, readings[:, 2])
+    np.minimum.at(lowest, cell, points[:, 2])
     return np.asarray(lowest[cell])
 
 
-def stands(voxels: IntArray, above: BoolArray) -> BoolArray:
-    """Return which voxels share their column with one of those that are ``above``, shape (K,)."""
-    _, column = np.unique(voxels[:, :2], axis=0, return_inverse=True)
-    return np.asarray(np.bincount(column, above)[column] > 0)
+def rises(centres: FloatArray, seen: FloatArray, edge: float) -> BoolArray:
+    """Return which voxels are higher than a ramp could lead to from the points around, (K,).
+
+    Readings alone cannot tell: those of a drive along a ramp's foot, or across it, know nothing
+    of how the floor goes on beside them. In a cloud without floor a beam little higher than the
+    sensors is taken for one.
+
+    Parameters
+    ----------
+    centres
+        Of the voxels in metres, shape (K, 3).
+    seen
+        Centres of all voxels, and the readings, under which there is floor too, shape (N, 3).
+    edge
+        Of the voxels in metres.
+    """
+    ground = lowest_of_cells(seen, GROUND_CELL * edge)
+    away, which = cKDTree(ground[:, :2]).query(centres[:, :2], k=GROUND_CELLS)
+    heights = np.append(ground[:, 2], np.inf)  # where there are fewer cells
+    lowest = (heights[which] + STEEPEST * away).min(axis=1)
+    # An even floor's points are in one layer of voxels or, where it is left, in two.
+    return np.asarray(centres[:, 2] > lowest + 1.5 * edge)
+
+
+def stands(voxels: IntArray, above: IntArray) -> BoolArray:
+    """Return which voxels share their column with one of those numbered ``above``, shape (K,)."""
+    column = cells_of(voxels, 1.0)
+    standing = np.zeros(len(voxels), dtype=bool)  # by column; there are no more than voxels
+    standing[column[above]] = True
+    return np.asarray(standing[column])
 
 
 def structures_of(centres: FloatArray, options: StructureOptions) -> IntArray:

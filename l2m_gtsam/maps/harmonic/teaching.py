@@ -12,8 +12,9 @@ from l2m_gtsam.maps.harmonic.explanation import (
     patchwork,
 )
 from l2m_gtsam.maps.harmonic.furnish import COARSE
-from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn, spread_tiles
+from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
+from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
 from l2m_gtsam.maps.harmonic.search import (
     MOST_READINGS,
     Found,
@@ -25,9 +26,12 @@ from l2m_gtsam.maps.harmonic.search import (
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.threads import in_threads
+from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
 
-JUDGED = 16  # tiles whose held-out places say whether the field is explained
+# Tiles whose held-out places say whether the field is explained, and those of them where the
+# readings are roughest.
+JUDGED, JUDGED_ROUGH = 12, 4
 GROWTH = 1.5  # of the sources, after which the prior is learnt anew
 
 
@@ -51,13 +55,14 @@ def learn_map(raw: TrainingSet, sources: Sources, options: HarmonicOptions) -> L
     readings = merged(raw, options.merge, options.independent)
     if len(readings) < FEWEST:
         raise MapError(
-            f"the {len(raw)} map training readings lie at {len(readings)} places "
-            f"{options.merge:g} m apart; at least {FEWEST} are needed"
+            f"the {len(raw)} map training readings fill {len(readings)} cubes of "
+            f"{options.merge:g} m; at least {FEWEST} are needed"
         )
     learnt = learn_once(readings, sources, options)
     if not len(sources) and learnt.origin.explanation.reasons and options.search.rounds > 0:
         learnt = with_search(learnt, options)
-    return replace(learnt, origin=replace(learnt.origin, readings=len(raw)))
+    origin = replace(learnt.origin, readings=len(raw), survey=survey_doubts(raw))
+    return replace(learnt, origin=origin)
 
 
 def learn_once(readings: TrainingSet, sources: Sources, options: HarmonicOptions) -> Learnt:
@@ -71,7 +76,8 @@ def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     """Return the same with a verdict from a few of its tiles."""
     members = learnt.members
     works = []
-    for tile in spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED):
+    spread = spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED)
+    for tile in spread + rough_tiles(learnt.readings, learnt.tiling, JUDGED_ROUGH, spread):
         rows = evenly(members[tile], options.learning.readings)
         basis = learnt.basis(tile, rows, COARSE)
         works.append(patchwork(basis, learnt.readings[rows], options.learning.seed))
@@ -152,7 +158,7 @@ def with_strengths(plain: Learnt) -> Learnt:
         strengths = learn_strengths(basis, normal, plain.hyperparameters)
         return dict(zip(near, strengths, strict=True))
 
-    strengths = plain.strengths.copy()
+    strengths = np.zeros(len(plain.strengths))  # of those too far from all tiles
     tiles = np.unique(home).tolist()
     for tile, each in zip(tiles, in_threads(found, tiles), strict=True):
         for structure, strength in each.items():

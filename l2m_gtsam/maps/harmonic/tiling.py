@@ -1,10 +1,12 @@
 """Tiles: how large they are, where they lie, and how they blend."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from pydantic import Field
+from scipy.ndimage import label
 from scipy.optimize import brentq
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
@@ -16,6 +18,7 @@ from l2m_gtsam.options import Options
 # Modes per square metre of box and squared wave number: a quarter of a disc of half waves.
 MODE_DENSITY = 1 / (4 * np.pi)
 WAVE_NUMBERS = (0.5, 60.0)  # 1/m: from a tile's longest wave to one of a decimetre
+FINER = 1.3  # finer waves by less than this are not worth learning anew or smaller tiles
 LEAST_CORE = 1.0  # metres
 ROUNDING = 1e-9  # of a tile: a little wider than the band is harmless
 FILL = 0.15  # metres; cells of this edge with a reading make the surveyed area
@@ -79,6 +82,15 @@ def _last_above_one(log_gain: float, h: float) -> float:
     if excess(top) <= 0:
         return low
     return high if excess(high) >= 0 else float(brentq(excess, top, high))
+
+
+def finest(needed: Sequence[Resolution]) -> Resolution:
+    """Return the first resolution, or the finest where that is finer by more than a little."""
+    most = Resolution(max(each.floor for each in needed), max(each.ceiling for each in needed))
+    return Resolution(
+        most.floor if most.floor > FINER * needed[0].floor else needed[0].floor,
+        most.ceiling if most.ceiling > FINER * needed[0].ceiling else needed[0].ceiling,
+    )
 
 
 def affordable(resolution: Resolution, options: TilingOptions, budget: int) -> Resolution:
@@ -145,6 +157,14 @@ class Tiling:
     def edge(self) -> float:
         """Edge of a tile's box in metres."""
         return self.grid.size + 2 * (self.overlap + self.margin)
+
+    @property
+    def parts(self) -> int:
+        """Number of parts of the survey that are further apart than a tile."""
+        cells = self.grid.cells - self.grid.cells.min(axis=0)
+        taken = np.zeros(cells.max(axis=0) + 1, dtype=np.bool_)
+        taken[tuple(cells.T)] = True
+        return int(label(taken, structure=np.ones((3, 3)))[1])
 
     def shares(self, points: FloatArray, tile: int | IntArray) -> FloatArray:
         """Return how much a tile would say at points, before it is set against the others.
