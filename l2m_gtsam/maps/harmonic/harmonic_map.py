@@ -238,6 +238,8 @@ class HarmonicMap:
         """
         points = checked_points(points)
         count = len(points)
+        if not count:
+            return np.empty((0, 3, 0, 3))
         every = ErrorOptions(places=max(count, 10), rest=EXACT)
         errors = error_modes(self.learnt, self.tiles, points, every)
         A = np.zeros((3 * count, len(errors.covariance)))
