@@ -3,7 +3,6 @@
 Two places: the open floor of ``map_queries``, and the simulated warehouse of ``l2m simulate``,
 where racks and posts that a LiDAR saw add some 17,000 candidate sources. Ten of either side by
 side show how the cost grows. The sliding Gaussian process of the same readings stands beside them.
-Set OPENBLAS_NUM_THREADS=1: tiles are solved in two threads.
 """
 
 from collections.abc import Callable

@@ -98,6 +98,8 @@ class FieldMap(Protocol):
     def updated(self, points: FloatArray, field: FloatArray, /) -> "FieldMap":
         """Return the map with more readings, shapes (N, 3) in metres and uT, and the same prior.
 
+        The prior is that of the whole map: a kind may let its parts follow the new readings.
+
         Raises
         ------
         MapError

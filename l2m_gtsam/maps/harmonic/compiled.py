@@ -65,7 +65,7 @@ class ExactMap(Protocol):
         ...
 
     def updated(self, points: FloatArray, field: FloatArray) -> "ExactMap":
-        """Return the map with more readings and the same prior."""
+        """Return the map with more readings."""
         ...
 
     def to_state(self) -> MapState:
@@ -186,7 +186,7 @@ class CompiledMap:
         return self.exact.errors_over(points)
 
     def updated(self, points: FloatArray, field: FloatArray, /) -> "CompiledMap":
-        """Return the map with more readings and the same prior; see ``FieldMap``."""
+        """Return the map with more readings; see ``FieldMap``."""
         return CompiledMap.of(self.exact.updated(points, field))
 
     def to_state(self) -> MapState:

@@ -24,7 +24,7 @@ class LocalOptions(Options):
     spread: float = Field(default=0.7, ge=0)
     """Standard deviation of the logarithms of a tile's scales and depths about those of the map;
     0 shares them. A floor with bundles of reinforcement here and there is quiet in most tiles and
-    strong in some: with one scale for all the map of the simulated warehouse claimed 0.7 of its
+    strong in some: with one scale for all the map of the simulated warehouse claimed 0.8 of its
     error, with a scale for each tile all of it."""
     steps: int = Field(default=6, ge=1)
     """The most steps of Fisher scoring; three are usual."""
