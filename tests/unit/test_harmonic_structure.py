@@ -12,7 +12,6 @@ from l2m_gtsam.maps.harmonic.frame import tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of, dipoles_of
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import (
-    MOST_REACH,
     NO_SOURCES,
     SIGHT,
     Sources,
@@ -20,7 +19,7 @@ from l2m_gtsam.maps.harmonic.structure import (
     candidate_sources,
 )
 from l2m_gtsam.maps.harmonic.teaching import learn_map
-from l2m_gtsam.maps.harmonic.tiling import Resolution, TilingOptions
+from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.training import TrainingSet, training_set
 from tests.harmonic_models import GIVEN, OPTIONS
 
@@ -104,7 +103,7 @@ def test_too_many_sources_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
         candidate_sources(column(3.0, 0.7, 0.0, 1.5), DRIVE, VOXELS)
 
 
-def test_structures_are_those_of_every_tile_whose_readings_they_can_reach() -> None:
+def test_structures_are_those_of_every_tile_they_stand_in_or_close_to() -> None:
     """By their middle, in the box or up to ``SIGHT`` beside it."""
     positions = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [3.2, 0, 0]])
     sources = Sources(positions, np.array([0, 0, 1, 1]))
@@ -113,11 +112,6 @@ def test_structures_are_those_of_every_tile_whose_readings_they_can_reach() -> N
     assert sources.within(np.zeros(2), 2 * (3.1 - SIGHT) + 0.01) == [0, 1]
     assert sources.within(np.array([9.0, 0.0]), 1.0) == []
     assert NO_SOURCES.within(np.zeros(2), 1.0) == []
-
-
-def test_a_tile_sees_as_far_as_candidates_are_looked_for() -> None:
-    """A box ends ``margin`` beyond its readings; none in reach of these may be left out."""
-    assert TilingOptions().margin + SIGHT >= MOST_REACH
 
 
 def test_structure_that_no_tile_sees_has_no_strength() -> None:

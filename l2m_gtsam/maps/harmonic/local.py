@@ -12,9 +12,10 @@ from l2m_gtsam.options import Options
 
 NAMES = ("floor_scale", "floor_depth", "ceiling_scale", "ceiling_depth")
 LEAST_GAIN = 1.0  # information of the readings over that of the prior
-# Where scales are far from those of the map, waves tell of them that told nothing before.
-PASSES, ANEW = 3, 0.5
-SMALL = 0.1  # in the logarithm of a scale or depth: a fraction of how well one tile tells it
+SCALES = ("floor_scale", "ceiling_scale")
+# Where scales are far above those of the map, waves tell of them that told nothing before.
+PASSES, RISE = 3, 0.7
+SMALL = 0.2  # in the logarithm of a scale or depth: a fraction of how well one tile tells it
 LONGEST = 1.5  # of a step in the logarithm of a scale or depth
 
 
@@ -53,8 +54,8 @@ def local_hyperparameters(
     found = shared
     for _ in range(PASSES if options.spread > 0 else 0):
         before, found = found, scored(basis, normal, shared, found, options)
-        change = [np.log(getattr(found, name) / getattr(before, name)) for name in NAMES]
-        if np.abs(change).max() < ANEW:
+        rise = [np.log(getattr(found, name) / getattr(before, name)) for name in SCALES]
+        if max(rise) < RISE:
             break
     return found
 

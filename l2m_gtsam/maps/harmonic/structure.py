@@ -15,11 +15,10 @@ from l2m_gtsam.maps.training import FURTHEST
 from l2m_gtsam.options import Options
 
 MOST_SOURCES = 200_000
-MOST_REACH = 2.0  # metres
-# Metres beside a tile's box, which itself ends 0.75 m beyond the readings: all that is in reach.
-# Without the strong posts that stand 1.3 m from its outermost readings a tile takes their field
+MOST_REACH = 2.0  # metres; tiles see no structure further away
+# Metres beside a tile's box, which itself ends 0.75 m beyond the readings. Without the strong posts that stand 1.3 m from its outermost readings a tile takes their field
 # for that of those it has; strengths of a hundred were learnt.
-SIGHT = 1.25
+SIGHT = 0.5
 
 
 class StructureOptions(Options):
@@ -29,7 +28,7 @@ class StructureOptions(Options):
     """Edge of the voxels; each holds one source. Sources this close make any field half a metre
     away, also that of a post a few centimetres beside. At 0.2 m strong posts were told with
     twice the error that the map claimed."""
-    reach: float = Field(default=2.0, gt=0, le=MOST_REACH)
+    reach: float = Field(default=MOST_REACH, gt=0, le=MOST_REACH)
     """Structure further than this from every reading is left to floor and ceiling modes."""
     clearance: float = Field(default=0.12, ge=0)
     """No source is nearer than this to a reading: the sensor was there."""
