@@ -15,7 +15,7 @@ LEAST_GAIN = 1.0  # information of the readings over that of the prior
 SCALES = ("floor_scale", "ceiling_scale")
 # Where scales are far above those of the map, waves tell of them that told nothing before.
 PASSES, RISE = 3, 0.7
-SMALL = 0.2  # in the logarithm of a scale or depth: a fraction of how well one tile tells it
+SMALL = 0.1  # in the logarithm of a scale or depth: a fraction of how well one tile tells it
 LONGEST = 1.5  # of a step in the logarithm of a scale or depth
 
 

@@ -16,8 +16,9 @@ from l2m_gtsam.options import Options
 
 MOST_SOURCES = 200_000
 MOST_REACH = 2.0  # metres; tiles see no structure further away
-# Metres beside a tile's box, which itself ends 0.75 m beyond the readings. Without the strong posts that stand 1.3 m from its outermost readings a tile takes their field
-# for that of those it has; strengths of a hundred were learnt.
+# Metres beside a tile's box, which itself ends 0.75 m beyond the readings. Without the strong
+# posts that stand 1.3 m from its outermost readings a tile takes their field for that of those it
+# has; strengths of a hundred were learnt.
 SIGHT = 0.5
 
 
