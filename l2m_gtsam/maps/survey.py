@@ -15,19 +15,18 @@ FEW = 0.01  # of the readings; single spikes are no reason to doubt a survey
 
 
 def survey_doubts(readings: TrainingSet) -> tuple[str, ...]:
-    """Return what speaks against a survey, a sentence each.
+    """Return what speaks against readings, a sentence each.
 
     Parameters
     ----------
     readings
         As they were taken, in the map frame.
     """
-    found = (narrow(readings.points), disagreement(readings), strong(readings.field))
-    return tuple(each for each in found if each)
+    return tuple(each for each in (disagreement(readings), strong(readings.field)) if each)
 
 
 def narrow(points: FloatArray) -> str:
-    """Return a sentence if all readings lie on one line."""
+    """Return a sentence if all readings of a map lie on one line."""
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     if len(spread) > 1 and spread[1] > NARROW:
         return ""

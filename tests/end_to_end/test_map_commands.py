@@ -52,6 +52,15 @@ def error_of(path: Path) -> float:
     return float(np.sqrt(np.mean((sample.field - truth)[sample.inside] ** 2)))
 
 
+def test_what_speaks_against_a_map_is_a_warning(bare: Path) -> None:
+    """A post that the map does not know of; each doubt is a line of the error stream."""
+    doubts = map_from_state(load_map(bare)).summary.doubts
+    run = l2m("map", "info", bare)
+    warned = [line for line in run.err.splitlines() if line.startswith("l2m: warning: ")]
+    assert warned == [f"l2m: warning: {doubt}" for doubt in doubts]
+    assert any("does not explain the field" in line for line in warned)
+
+
 def test_a_structure_file_makes_a_better_map(yard: Yard, bare: Path, tmp_path: Path) -> None:
     path = tmp_path / "new" / "map.npz"
     arguments = ("--config", yard.config, "--structure", yard.cloud, "--out", path)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.explanation import UNJUDGED
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.representatives import rough_tiles, roughness
@@ -51,10 +50,10 @@ def test_rough_tiles_are_those_over_the_patch() -> None:
     few = slice(None, None, 10)
     ours = HarmonicMap.fit(points[few], field[few], OPTIONS)
     learnt = ours.learnt
-    tiles = rough_tiles(learnt.readings, learnt.tiling, 3, besides=())
+    tiles = rough_tiles(learnt.readings, learnt.members, 3, besides=())
     east = learnt.tiling.grid.centres[tiles, 0]
     assert ((east > 11) & (east < 16)).all()
-    assert not set(tiles) & set(rough_tiles(learnt.readings, learnt.tiling, 3, besides=tiles))
+    assert not set(tiles) & set(rough_tiles(learnt.readings, learnt.members, 3, besides=tiles))
 
 
 def test_a_linear_field_is_not_rough() -> None:
@@ -80,8 +79,7 @@ def test_one_small_place_is_not_judged() -> None:
     points = rng.uniform([0, 0, 0.2], [0.45, 0.45, 0.8], (200, 3))
     field = WORLD.field_and_gradient(points)[0] + rng.normal(0, 0.2, points.shape)
     ours = HarmonicMap.fit(points, field, OPTIONS)
-    assert ours.learnt.origin.explanation.worst != ours.learnt.origin.explanation.worst
-    assert not UNJUDGED.judged
+    assert not ours.learnt.origin.explanation.judged
     assert ours.summary.facts["field"] == "too few places to hold any out"
     assert any("too few places" in each for each in ours.summary.doubts)
 
@@ -91,6 +89,24 @@ def test_two_halls_are_two_parts() -> None:
     far = points + np.array([40.0, 0.0, 0.0])
     ours = HarmonicMap.fit(np.vstack([points, far]), np.vstack([field, field]), OPTIONS)
     assert any("2 separate parts" in each for each in ours.summary.doubts)
+
+
+def test_halls_a_hundred_kilometres_apart_take_no_more_memory() -> None:
+    points, field = readings()
+    far = points + np.array([1e5, -1e5, 0.0])
+    ours = HarmonicMap.fit(np.vstack([points, far]), np.vstack([field, field]), OPTIONS)
+    assert ours.learnt.tiling.parts == 2
+
+
+def test_a_straight_drive_that_is_added_is_no_survey_on_one_line() -> None:
+    points, field = readings()
+    ours = HarmonicMap.fit(points, field, OPTIONS)
+    assert not any(
+        "on one line" in each for each in ours.updated(points[:1], field[:1]).summary.doubts
+    )
+    line = points * np.array([10.0, 0.02, 0.0])
+    alone = HarmonicMap.fit(line, WORLD.field_and_gradient(line)[0], OPTIONS)
+    assert any("on one line" in each for each in alone.summary.doubts)
 
 
 def test_readings_that_are_added_are_judged() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.survey import survey_doubts
+from l2m_gtsam.maps.survey import narrow, survey_doubts
 from l2m_gtsam.maps.training import TrainingSet
 from tests.harmonic_models import readings
 
@@ -18,11 +18,11 @@ def test_nothing_speaks_against_a_good_survey() -> None:
 
 
 def test_a_straight_line_is_named_and_a_lane_beside_it_is_enough() -> None:
-    points, field = readings(300)
+    points, _ = readings(300)
     one_lane = points * np.array([10.0, 0.02, 0.0])
-    assert "on one line" in doubts(one_lane, field)
+    assert "on one line" in narrow(one_lane)
     two_lanes = np.concatenate([one_lane, one_lane + np.array([0.0, 0.5, 0.0])])
-    assert doubts(two_lanes, np.tile(field, (2, 1))) == ""
+    assert narrow(two_lanes) == ""
 
 
 @pytest.mark.parametrize("by", [12.0, 100.0])

@@ -18,6 +18,7 @@ from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.tiling import Visit
+from l2m_gtsam.maps.survey import narrow
 from l2m_gtsam.maps.training import additional_set, checked_points, training_set
 
 KIND = "harmonic"
@@ -281,7 +282,7 @@ def described(learnt: Learnt) -> str:
 def doubts(learnt: Learnt) -> tuple[str, ...]:
     """Return what speaks against the map, a sentence each."""
     origin, parts = learnt.origin, learnt.tiling.parts
-    found = list(origin.survey)
+    found = [each for each in (*origin.survey, narrow(learnt.readings.points)) if each]
     if origin.explanation.reasons:
         found.append(judged(origin.explanation))
     if not origin.explanation.judged:

@@ -93,7 +93,7 @@ class Origin:
     explanation
         How well the map predicts places that are held out.
     survey
-        What speaks against the readings themselves; of the first ones, where more were added.
+        What speaks against the readings as they were taken.
     """
 
     readings: int
@@ -166,8 +166,9 @@ class Learnt:
 
     def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
-        survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(new))))
-        readings = merged(joined(self.readings, new), options.merge, options.independent)
+        together = joined(self.readings, new)
+        survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(together))))
+        readings = merged(together, options.merge, options.independent)
         grid = self.tiling.grid
         reach = reach_of(grid.size, options)
         wider = grid_from(grid.origin, readings.points, grid.size, reach)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from l2m_gtsam.data import IntArray
 from l2m_gtsam.maps.harmonic.tiling import Tiling
 from l2m_gtsam.maps.training import TrainingSet
 
@@ -23,7 +24,7 @@ def spread_tiles(tiling: Tiling, counts: Sequence[int], number: int) -> list[int
 
 
 def rough_tiles(
-    readings: TrainingSet, tiling: Tiling, number: int, besides: Sequence[int]
+    readings: TrainingSet, members: Sequence[IntArray], number: int, besides: Sequence[int]
 ) -> list[int]:
     """Return tiles where the field is roughest, besides those that are looked at already.
 
@@ -34,14 +35,13 @@ def rough_tiles(
     ----------
     readings
         Of the whole survey.
-    tiling
-        Tiles over it.
+    members
+        Rows of the readings that take part in each tile.
     number
         How many are wanted; there may be fewer.
     besides
         Tiles that are not wanted.
     """
-    members = tiling.grid.members(readings.points, tiling.overlap)
     rough = np.array([roughness(readings[rows]) for rows in members])
     rough[list(besides)] = 0.0
     roughest = np.argsort(-rough, kind="stable")[:number]

@@ -77,7 +77,7 @@ def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     members = learnt.members
     works = []
     spread = spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED)
-    for tile in spread + rough_tiles(learnt.readings, learnt.tiling, JUDGED_ROUGH, spread):
+    for tile in spread + rough_tiles(learnt.readings, members, JUDGED_ROUGH, spread):
         rows = evenly(members[tile], options.learning.readings)
         basis = learnt.basis(tile, rows, COARSE)
         works.append(patchwork(basis, learnt.readings[rows], options.learning.seed))

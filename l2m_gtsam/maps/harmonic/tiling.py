@@ -6,8 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 from pydantic import Field
-from scipy.ndimage import label
 from scipy.optimize import brentq
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid, grid_over
@@ -161,10 +163,10 @@ class Tiling:
     @property
     def parts(self) -> int:
         """Number of parts of the survey that are further apart than a tile."""
-        cells = self.grid.cells - self.grid.cells.min(axis=0)
-        taken = np.zeros(cells.max(axis=0) + 1, dtype=np.bool_)
-        taken[tuple(cells.T)] = True
-        return int(label(taken, structure=np.ones((3, 3)))[1])
+        cells = self.grid.cells
+        touching = cKDTree(cells).query_pairs(1.5, output_type="ndarray")
+        graph = coo_array((np.ones(len(touching)), tuple(touching.T)), shape=(len(cells),) * 2)
+        return int(connected_components(graph, directed=False)[0])
 
     def shares(self, points: FloatArray, tile: int | IntArray) -> FloatArray:
         """Return how much a tile would say at points, before it is set against the others.
