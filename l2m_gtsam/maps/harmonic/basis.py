@@ -2,10 +2,12 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain, compress
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.family import Family, WeightPrior
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
@@ -29,7 +31,14 @@ class Basis:
     families: tuple[Family, ...]
 
     def __len__(self) -> int:
-        return self.columns()[-1].stop if self.families else 0
+        return self.columns[-1].stop if self.families else 0
+
+    def of_kind(self, kind: type[Family]) -> tuple["Basis", IntArray]:
+        """Return the part of one kind of families, and its columns in the whole."""
+        chosen = [isinstance(family, kind) for family in self.families]
+        columns = [range(c.start, c.stop) for c, on in zip(self.columns, chosen, strict=True) if on]
+        part = Basis(self.frame, tuple(compress(self.families, chosen)))
+        return part, np.array(list(chain(*columns)), dtype=np.int64)
 
     def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
         """Return the prior of all weights."""
@@ -37,7 +46,7 @@ class Basis:
         log_variance = np.concatenate([prior.log_variance for prior in priors])
         slopes: dict[str, FloatArray] = {}
         m = len(self)
-        for columns, prior in zip(self.columns(), priors, strict=True):
+        for columns, prior in zip(self.columns, priors, strict=True):
             for name, slope in prior.slopes.items():
                 slopes.setdefault(name, np.zeros(m))[columns] = slope
         return WeightPrior(log_variance, slopes)
@@ -46,7 +55,7 @@ class Basis:
         """Return the field of each weight in the map frame, uT per unit, shape (N, 3, m)."""
         local = self.frame.localise(points)
         F = np.empty((len(points), 3, len(self)))
-        for columns, family in zip(self.columns(), self.families, strict=True):
+        for columns, family in zip(self.columns, self.families, strict=True):
             F[:, :, columns] = family.features(local)
         if np.array_equal(self.frame.R_map_tile, np.eye(3)):
             return F
@@ -62,7 +71,7 @@ class Basis:
             local = self.frame.localise(points[at])
             parts = [
                 family.field_and_gradient(local, weights[columns])
-                for family, columns in zip(self.families, self.columns(), strict=True)
+                for family, columns in zip(self.families, self.columns, strict=True)
             ]
             field[at] = sum(part[0] for part in parts) @ R.T
             gradient[at] = R @ sum(part[1] for part in parts) @ R.T
@@ -75,12 +84,13 @@ class Basis:
             local = self.frame.localise(points[at])
             phi[at] = sum(
                 family.potential(local, weights[columns])
-                for family, columns in zip(self.families, self.columns(), strict=True)
+                for family, columns in zip(self.families, self.columns, strict=True)
             )
         return phi
 
+    @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Return the columns of each family."""
+        """Columns of each family."""
         ends = np.cumsum([len(family) for family in self.families]).tolist()
         return tuple(slice(end - len(f), end) for end, f in zip(ends, self.families, strict=True))
 

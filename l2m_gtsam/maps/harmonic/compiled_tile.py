@@ -198,7 +198,7 @@ def worst(found: tuple[FloatArray, FloatArray], truth: tuple[FloatArray, FloatAr
 def sources_of(tile: Tile) -> PointSources:
     """Return all dipoles of a tile in its own frame."""
     positions, moments = [np.empty((0, 3))], [np.empty((0, 3))]
-    for family, columns in zip(tile.basis.families, tile.basis.columns(), strict=True):
+    for family, columns in zip(tile.basis.families, tile.basis.columns, strict=True):
         if isinstance(family, Dipoles):
             positions.append(family.positions)
             moments.append(family.moments(tile.weights.mean[columns]))
@@ -223,7 +223,7 @@ def with_grid(
 
     def potential(lattice: Lattice) -> FloatArray:
         phi = sources.smooth_potential(lattice, radius)
-        for family, columns in zip(tile.basis.families, tile.basis.columns(), strict=True):
+        for family, columns in zip(tile.basis.families, tile.basis.columns, strict=True):
             if isinstance(family, Smooth):
                 phi += family.potential_on(*lattice.axes, tile.weights.mean[columns])
         return phi

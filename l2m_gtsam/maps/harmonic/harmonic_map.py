@@ -23,7 +23,7 @@ from l2m_gtsam.maps.training import additional_set, checked_points, training_set
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out
-LOCAL = "its own, about those of the map"
+LOCAL, SHARED = "its own, about those of the map", "those of the map"
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,11 @@ class HarmonicMap:
     ----------
     learnt
         Readings, prior, sources and tiling.
-    options
-        Effective options.
     tiles
         One for each cell of the tiling, solved when first needed.
     """
 
     learnt: Learnt
-    options: HarmonicOptions
     tiles: Tiles
 
     @classmethod
@@ -92,12 +89,17 @@ class HarmonicMap:
         readings, sources = training_set(points, field), NO_SOURCES
         if cloud is not None:
             sources = candidate_sources(checked_points(cloud), readings.points, options.structure)
-        return cls.condition(learn_map(readings, sources, options), options)
+        return cls.condition(learn_map(readings, sources, options))
 
     @classmethod
-    def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
+    def condition(cls, learnt: Learnt) -> "HarmonicMap":
         """Return the map whose prior is known."""
-        return cls(learnt, options, Tiles(learnt))
+        return cls(learnt, Tiles(learnt))
+
+    @property
+    def options(self) -> HarmonicOptions:
+        """Effective options."""
+        return self.learnt.options
 
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
@@ -110,7 +112,7 @@ class HarmonicMap:
         anew; whether the field is explained is judged anew as well.
         """
         new = additional_set(points, field)
-        learnt = explained(self.learnt.extended(new, self.options), self.options)
+        learnt = explained(self.learnt.extended(new))
         # A new reading may have moved an old one that it was merged with.
         box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap + self.options.merge
         away, _ = cKDTree(new.points[:, :2]).query(learnt.tiling.grid.centres, p=np.inf)
@@ -122,7 +124,7 @@ class HarmonicMap:
             for index, cell in enumerate(learnt.tiling.grid.cells.tolist())
             if not touched[index] and old.get(tuple(cell)) in solved
         }
-        return HarmonicMap(learnt, self.options, Tiles(learnt, kept))
+        return HarmonicMap(learnt, Tiles(learnt, kept))
 
     @classmethod
     def from_state(cls, state: MapState) -> "HarmonicMap":
@@ -133,12 +135,11 @@ class HarmonicMap:
         MapError
             If the state is damaged.
         """
-        learnt, options = learnt_from_state(state)
-        return cls.condition(learnt, options)
+        return cls.condition(learnt_from_state(state))
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""
-        return learnt_to_state(KIND, self.learnt, self.options)
+        return learnt_to_state(KIND, self.learnt)
 
     @property
     def summary(self) -> MapSummary:
@@ -155,7 +156,7 @@ class HarmonicMap:
                 "noise of a reading (uT)": h.noise,
                 "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
                 "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
-                "scales of a tile": LOCAL if learnt.local.spread else "those of the map",
+                "scales of a tile": LOCAL if self.options.effective_local.spread else SHARED,
                 "hyperparameters": learnt.origin.learning.described,
                 "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
                 "sources": described(learnt),

@@ -26,9 +26,8 @@ from l2m_gtsam.maps.harmonic.tiling import (
     Tiling,
     TilingOptions,
     affordable,
-    finest,
+    density_of,
     resolution_of,
-    surveyed_area,
     tiling_of,
 )
 from l2m_gtsam.maps.survey import survey_doubts
@@ -65,6 +64,8 @@ class HarmonicOptions(Options):
     disturbances of one passage."""
     modes: int = Field(default=400, ge=50)
     """About how many modes a tile has; tiles are as large as that allows."""
+    most_modes: int = Field(default=1600, ge=50)
+    """The most modes of a tile whose own scales and depths ask for finer ones than the map's."""
     mode_share: float = Field(default=0.05, gt=0, lt=1)
     """A mode is kept if the readings could reduce its prior variance by this share; what is left
     out counts as variance."""
@@ -124,8 +125,8 @@ class Learnt:
         Where the tiles lie.
     resolution
         Largest wave numbers of the modes.
-    local
-        How far the prior of a tile may differ.
+    options
+        Of the map.
     origin
         For the record.
     """
@@ -136,13 +137,18 @@ class Learnt:
     strengths: FloatArray
     tiling: Tiling
     resolution: Resolution
-    local: LocalOptions
+    options: HarmonicOptions
     origin: Origin
 
     @cached_property
     def members(self) -> list[IntArray]:
         """Rows of the readings that take part in each tile."""
         return self.tiling.grid.members(self.readings.points, self.tiling.overlap)
+
+    @cached_property
+    def density(self) -> float:
+        """Readings per square metre of the surveyed area."""
+        return density_of(self.readings)
 
     @property
     def most_variance(self) -> float:
@@ -164,9 +170,9 @@ class Learnt:
             visible,
         )
 
-    def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
+    def extended(self, new: TrainingSet) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
-        together = joined(self.readings, new)
+        options, together = self.options, joined(self.readings, new)
         survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(together))))
         readings = merged(together, options.merge, options.independent)
         grid = self.tiling.grid
@@ -188,16 +194,13 @@ def laid_out(
     options: HarmonicOptions,
 ) -> Learnt:
     """Return readings and prior with the tiles that suit them."""
-    density = float(readings.weight.sum()) / surveyed_area(readings.points)
-    needed = [
-        resolution_of(each, density, options.mode_share)
-        for each in (learning.hyperparameters, *learning.roughest)
-    ]
-    resolution = affordable(finest(needed), options.tiling, options.modes)
+    density = density_of(readings)
+    needed = resolution_of(learning.hyperparameters, density, options.mode_share)
+    resolution = affordable(needed, options.tiling.least_edge, options.modes)
     tiling = tiling_of(readings.points, resolution, options.tiling, options.modes, options.reach)
     origin = Origin(len(readings), learning)
-    hyperparameters, local = learning.hyperparameters, options.effective_local
-    return Learnt(readings, hyperparameters, sources, strengths, tiling, resolution, local, origin)
+    h = learning.hyperparameters
+    return Learnt(readings, h, sources, strengths, tiling, resolution, options, origin)
 
 
 def reach_of(core: float, options: HarmonicOptions) -> float:

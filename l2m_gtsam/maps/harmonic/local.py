@@ -1,5 +1,7 @@
 """Scales and depths of one tile: steel is not spread evenly under a floor."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from pydantic import Field
 
@@ -8,6 +10,7 @@ from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import EvidenceSlopes, Normal, evidence, marginalised
 from l2m_gtsam.maps.harmonic.family import WeightPrior
 from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
+from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.options import Options
 
 NAMES = ("floor_scale", "floor_depth", "ceiling_scale", "ceiling_depth")
@@ -68,26 +71,24 @@ def scored(
     options: LocalOptions,
 ) -> Hyperparameters:
     """Return where Fisher scoring leads from a start, over the waves that tell something there."""
-    given = basis.prior(start)
-    # All else stays as it is: integrated out once, not at each step.
-    telling = telling_waves(given, normal, shared.noise)
-    alone = marginalised(normal, telling, given.log_variance, shared.noise)
-    names = [name for name in NAMES if name in given.slopes and given.slopes[name][telling].any()]
+    telling = telling_waves(basis, normal, start)
+    slopes = telling.prior(start).slopes
+    names = [name for name in NAMES if name in slopes and slopes[name].any()]
     if not names:
         return start
     centre, x = (np.log([getattr(each, name) for name in names]) for each in (shared, start))
     low, high = np.log([BOUNDS[name] for name in names]).T
     best, highest, step = x, -np.inf, np.zeros_like(centre)
     for left in range(options.steps, -1, -1):
-        prior = basis.prior(moved(start, names, x))
-        found = evidence(alone, prior.log_variance[telling], shared.noise)
+        prior = telling.prior(moved(start, names, x))
+        found = evidence(telling.normal, prior.log_variance, shared.noise)
         value = found.value - 0.5 * float(np.sum(((x - centre) / options.spread) ** 2))
         if value <= highest:
             step = 0.5 * step
         else:
             best, highest = x, value
             if left:
-                by = np.stack([prior.slopes[name][telling] for name in names])
+                by = np.stack([prior.slopes[name] for name in names])
                 step = scoring_step(found.slopes(), by, x - centre, options.spread)
         x = np.clip(best + step, low, high)
         if float(np.abs(step).max()) < SMALL:
@@ -95,15 +96,43 @@ def scored(
     return moved(start, names, best)
 
 
-def telling_waves(prior: WeightPrior, normal: Normal, noise: float) -> IntArray:
-    """Return which weights depend on scales or depths and could be known better than their prior.
+@dataclass(frozen=True)
+class Telling:
+    """The waves of a tile that tell something of scales and depths.
+
+    Attributes
+    ----------
+    waves
+        All waves.
+    rows
+        Those that tell something.
+    normal
+        Sums over the readings for these, all other weights integrated out.
+    """
+
+    waves: Basis
+    rows: IntArray
+    normal: Normal
+
+    def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
+        """Return the prior of these waves."""
+        prior = self.waves.prior(hyperparameters)
+        slopes = {name: slope[self.rows] for name, slope in prior.slopes.items()}
+        return WeightPrior(prior.log_variance[self.rows], slopes)
+
+
+def telling_waves(basis: Basis, normal: Normal, given: Hyperparameters) -> Telling:
+    """Return the waves that could be known better than from their prior.
 
     Short waves hardly reach the readings. They say next to nothing of scale and depth, and are
     half of all.
     """
-    of_waves = np.any([prior.slopes[name] for name in NAMES if name in prior.slopes], axis=0)
-    gain = np.exp(prior.log_variance) * normal.FF.diagonal() / noise**2
-    return np.flatnonzero(of_waves & (gain > LEAST_GAIN))
+    waves, columns = basis.of_kind(Modes)
+    log_variance = basis.prior(given).log_variance
+    gain = np.exp(log_variance) * normal.FF.diagonal() / given.noise**2
+    rows = np.flatnonzero(gain[columns] > LEAST_GAIN)
+    # All else stays as it is: integrated out once, not at each step.
+    return Telling(waves, rows, marginalised(normal, columns[rows], log_variance, given.noise))
 
 
 def scoring_step(

@@ -39,7 +39,7 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
     """
     structures = [
         (np.arange(columns.start, columns.stop), family.strength)
-        for columns, family in zip(basis.columns(), basis.families, strict=True)
+        for columns, family in zip(basis.columns, basis.families, strict=True)
         if isinstance(family, Dipoles)
     ]
     if not structures:

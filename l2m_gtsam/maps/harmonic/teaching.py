@@ -7,10 +7,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.evidence import normal_of
-from l2m_gtsam.maps.harmonic.explanation import (
-    explanation_of,
-    patchwork,
-)
+from l2m_gtsam.maps.harmonic.explanation import Patchwork, explanation_of, patchwork
 from l2m_gtsam.maps.harmonic.furnish import COARSE
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
@@ -25,6 +22,7 @@ from l2m_gtsam.maps.harmonic.search import (
 )
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import Sources
+from l2m_gtsam.maps.harmonic.suited import suited
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
@@ -69,19 +67,22 @@ def learn_once(readings: TrainingSet, sources: Sources, options: HarmonicOptions
     """Return what readings teach over given sources, and how well that explains them."""
     learning = learn_prior(readings, sources, options)
     plain = laid_out(readings, learning, sources, np.ones(len(sources.pieces)), options)
-    return explained(with_strengths(plain), options)
+    return explained(with_strengths(plain))
 
 
-def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
+def explained(learnt: Learnt) -> Learnt:
     """Return the same with a verdict from a few of its tiles."""
-    members = learnt.members
-    works = []
-    spread = spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED)
-    for tile in spread + rough_tiles(learnt.readings, members, JUDGED_ROUGH, spread):
+    members, options = learnt.members, learnt.options
+
+    def work(tile: int) -> Patchwork:
         rows = evenly(members[tile], options.learning.readings)
-        basis = learnt.basis(tile, rows, COARSE)
-        works.append(patchwork(basis, learnt.readings[rows], options.learning.seed))
-    explanation = explanation_of(works, learnt.hyperparameters, learnt.local, options.sensor_noise)
+        basis = suited(learnt, tile, rows, COARSE).basis
+        return patchwork(basis, learnt.readings[rows], options.learning.seed)
+
+    spread = spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED)
+    rough = rough_tiles(learnt.readings, members, JUDGED_ROUGH, spread)
+    works, local = in_threads(work, spread + rough), options.effective_local
+    explanation = explanation_of(works, learnt.hyperparameters, local, options.sensor_noise)
     return replace(learnt, origin=replace(learnt.origin, explanation=explanation))
 
 
@@ -123,7 +124,7 @@ def with_search(learnt: Learnt, options: HarmonicOptions) -> Learnt:
             if anew or Sources(found, np.arange(len(found))).within(centre, current.tiling.edge)
         ]
     searched = replace(current.origin, searched=True)
-    return explained(with_strengths(replace(current, origin=searched)), options)
+    return explained(with_strengths(replace(current, origin=searched)))
 
 
 def found_in_tiles(plain: Learnt, tiles: list[int], options: HarmonicOptions) -> FloatArray:

@@ -35,6 +35,11 @@ class Tile:
     hyperparameters: Hyperparameters
     resolution: Resolution
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the covariance, by far the most of it, in bytes."""
+        return self.weights.factor.nbytes
+
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the mean field (N, 3) in uT and its gradient (N, 3, 3) in uT/m."""
         return self.basis.field_and_gradient(self.within(points), self.weights.mean)

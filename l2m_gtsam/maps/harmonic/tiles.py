@@ -4,9 +4,9 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from threading import Lock
 
-from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
+from l2m_gtsam.maps.harmonic.evidence import condition
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.harmonic.local import local_hyperparameters
+from l2m_gtsam.maps.harmonic.suited import suited
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 
@@ -30,6 +30,7 @@ class Tiles:
     def __init__(self, learnt: Learnt, kept: Mapping[int, Tile] | None = None) -> None:
         self._learnt = learnt
         self._solved: OrderedDict[int, Tile] = OrderedDict(kept or {})
+        self._held = sum(tile.nbytes for tile in self._solved.values())
         self._lock = Lock()
 
     def __len__(self) -> int:
@@ -40,13 +41,13 @@ class Tiles:
             raise IndexError(index)
         with self._lock:
             found = self._solved.get(index)
-        if found is None:
-            # Outside of the lock: two threads solve different tiles at the same time.
-            found = solved_tile(self._learnt, index)
+            if found is not None:
+                self._solved.move_to_end(index)
+                return found
+        # Outside of the lock: two threads solve different tiles at the same time.
+        found = solved_tile(self._learnt, index)
         with self._lock:
-            self._solved[index] = found
-            self._solved.move_to_end(index)
-            self._forget()
+            self._remember(index, found)
         return found
 
     def __iter__(self) -> Iterator[Tile]:
@@ -62,18 +63,19 @@ class Tiles:
         with self._lock:
             return dict(self._solved)
 
-    def _forget(self) -> None:
-        held = sum(8 * len(tile.basis) ** 2 for tile in self._solved.values())
-        while held > MEMORY and len(self._solved) > 1:
+    def _remember(self, index: int, tile: Tile) -> None:
+        if index not in self._solved:  # another thread may have been faster
+            self._held += tile.nbytes
+        self._solved[index] = tile
+        self._solved.move_to_end(index)
+        while self._held > MEMORY and len(self._solved) > 1:
             _, oldest = self._solved.popitem(last=False)
-            held -= 8 * len(oldest.basis) ** 2
+            self._held -= oldest.nbytes
 
 
 def solved_tile(learnt: Learnt, index: int) -> Tile:
     """Return a tile with the posterior of its weights."""
-    rows = learnt.members[index]
-    basis = learnt.basis(index, rows)
-    normal = normal_of(basis, learnt.readings[rows])
-    own = local_hyperparameters(basis, normal, learnt.hyperparameters, learnt.local)
-    weights = condition(normal, basis.prior(own).log_variance, own.noise)
-    return Tile(basis, weights, own, learnt.resolution)
+    fit = suited(learnt, index, learnt.members[index])
+    prior = fit.basis.prior(fit.hyperparameters)
+    weights = condition(fit.normal, prior.log_variance, fit.hyperparameters.noise)
+    return Tile(fit.basis, weights, fit.hyperparameters, fit.resolution)
