@@ -23,7 +23,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.storage.atomic import atomic_path
 
 FORMAT = "l2m-map"
-VERSION = 3
+VERSION = 2
 HEADER, CHECKSUM, ARRAYS = "header.npy", "checksum.npy", "arrays/"
 # Booleans, integers, unsigned, floating and complex numbers; anything else could hide objects.
 NUMERIC = "biufc"

@@ -233,9 +233,9 @@ def test_few_readings_and_readings_at_rest_can_be_added(harmonic: HarmonicMap) -
         np.testing.assert_array_equal(new.points, p)
         np.testing.assert_array_equal(new.field, b)
         np.testing.assert_array_equal(new.weight, 1.0)
-        learnt = harmonic.learnt.extended(new)
+        learnt = harmonic.learnt.extended(new, harmonic.options)
         assert learnt.origin.readings == harmonic.learnt.origin.readings + len(p)
-        sample = HarmonicMap.condition(learnt).query(p)
+        sample = HarmonicMap.condition(learnt, harmonic.options).query(p)
         assert sample.inside.all()
 
 

@@ -1,11 +1,13 @@
 """Error modes of a harmonic map over a drive: all of its variance, tile with tile."""
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
+from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -53,8 +55,8 @@ def test_all_modes_tell_all_of_the_variance(harmonic: HarmonicMap) -> None:
 
 def fine_errors(harmonic: HarmonicMap, at: FloatArray) -> ErrorModes:
     """Return the errors with nothing left out."""
-    every = ErrorOptions(rest=1e-9, places=1000)
-    return error_modes(harmonic.learnt, harmonic.tiles, at, every)
+    options = harmonic.options.model_copy(update={"errors": ErrorOptions(rest=1e-9, places=1000)})
+    return replace(harmonic, options=options).errors_over(at)
 
 
 def test_errors_have_a_proper_covariance(errors: ErrorModes) -> None:

@@ -149,7 +149,7 @@ def test_maps_satisfy_all_protocols(harmonic: HarmonicMap) -> None:
 
 def assert_conditioned_on_all(ours: HarmonicMap) -> None:
     """Every tile is the posterior for the readings that are its members now."""
-    whole = HarmonicMap.condition(ours.learnt)
+    whole = HarmonicMap.condition(ours.learnt, ours.options)
     # Equal numbers but for the order of sums, of which 1e6 remain in the condition.
     assert_same(ours.query(queries()), whole.query(queries()), 1e-8)
     for one, other in zip(ours.tiles, whole.tiles, strict=True):

@@ -43,7 +43,7 @@ class Basis:
     def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
         """Return the prior of all weights."""
         priors = [family.prior(hyperparameters) for family in self.families]
-        log_variance = np.concatenate([prior.log_variance for prior in priors])
+        log_variance = np.concatenate([np.empty(0), *(prior.log_variance for prior in priors)])
         slopes: dict[str, FloatArray] = {}
         m = len(self)
         for columns, prior in zip(self.columns, priors, strict=True):

@@ -9,7 +9,7 @@ from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, moment_features
 from l2m_gtsam.maps.harmonic.family import Family
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
-from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, Modes, modes_up_to
+from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.harmonic.uniform import UniformField
@@ -47,28 +47,15 @@ def basis_of(
         Of ``dipoles_of``.
     """
     frame = tile_frame(readings.points, centre, edge)
-    dipoles = [
+    families: list[Family] = [UniformField(UNIFORM_SIGMA)]
+    families.append(modes_up_to(FLOOR, frame.size, 0.0, resolution.floor))
+    families.append(modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling))
+    families += [
         dipoles_of(sources, readings, frame, strength, visible)
         for sources, strength in zip(structures, strengths, strict=True)
         if strength > 0
     ]
-    families: list[Family] = [UniformField(UNIFORM_SIGMA), *waves_of(frame, resolution), *dipoles]
     return Basis(frame, tuple(family for family in families if len(family)))
-
-
-def waves_of(frame: TileFrame, resolution: Resolution) -> list[Modes]:
-    """Return the modes of floor and ceiling of a box."""
-    return [
-        modes_up_to(FLOOR, frame.size, 0.0, resolution.floor),
-        modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling),
-    ]
-
-
-def with_waves(basis: Basis, resolution: Resolution) -> Basis:
-    """Return the same basis with waves of another resolution."""
-    others = [family for family in basis.families if not isinstance(family, Modes)]
-    families: list[Family] = [*waves_of(basis.frame, resolution), *others]
-    return Basis(basis.frame, tuple(family for family in families if len(family)))
 
 
 def dipoles_of(

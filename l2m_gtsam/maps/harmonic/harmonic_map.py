@@ -23,7 +23,7 @@ from l2m_gtsam.maps.training import additional_set, checked_points, training_set
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out
-LOCAL, SHARED = "its own, about those of the map", "those of the map"
+LOCAL = "its own, about those of the map"
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,14 @@ class HarmonicMap:
     ----------
     learnt
         Readings, prior, sources and tiling.
+    options
+        Effective options.
     tiles
         One for each cell of the tiling, solved when first needed.
     """
 
     learnt: Learnt
+    options: HarmonicOptions
     tiles: Tiles
 
     @classmethod
@@ -89,17 +92,12 @@ class HarmonicMap:
         readings, sources = training_set(points, field), NO_SOURCES
         if cloud is not None:
             sources = candidate_sources(checked_points(cloud), readings.points, options.structure)
-        return cls.condition(learn_map(readings, sources, options))
+        return cls.condition(learn_map(readings, sources, options), options)
 
     @classmethod
-    def condition(cls, learnt: Learnt) -> "HarmonicMap":
+    def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
         """Return the map whose prior is known."""
-        return cls(learnt, Tiles(learnt))
-
-    @property
-    def options(self) -> HarmonicOptions:
-        """Effective options."""
-        return self.learnt.options
+        return cls(learnt, options, Tiles(learnt))
 
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
@@ -112,7 +110,7 @@ class HarmonicMap:
         anew; whether the field is explained is judged anew as well.
         """
         new = additional_set(points, field)
-        learnt = explained(self.learnt.extended(new))
+        learnt = explained(self.learnt.extended(new, self.options), self.options)
         # A new reading may have moved an old one that it was merged with.
         box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap + self.options.merge
         away, _ = cKDTree(new.points[:, :2]).query(learnt.tiling.grid.centres, p=np.inf)
@@ -124,7 +122,7 @@ class HarmonicMap:
             for index, cell in enumerate(learnt.tiling.grid.cells.tolist())
             if not touched[index] and old.get(tuple(cell)) in solved
         }
-        return HarmonicMap(learnt, Tiles(learnt, kept))
+        return HarmonicMap(learnt, self.options, Tiles(learnt, kept))
 
     @classmethod
     def from_state(cls, state: MapState) -> "HarmonicMap":
@@ -135,11 +133,12 @@ class HarmonicMap:
         MapError
             If the state is damaged.
         """
-        return cls.condition(learnt_from_state(state))
+        learnt, options = learnt_from_state(state)
+        return cls.condition(learnt, options)
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""
-        return learnt_to_state(KIND, self.learnt)
+        return learnt_to_state(KIND, self.learnt, self.options)
 
     @property
     def summary(self) -> MapSummary:
@@ -156,7 +155,7 @@ class HarmonicMap:
                 "noise of a reading (uT)": h.noise,
                 "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
                 "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
-                "scales of a tile": LOCAL if self.options.effective_local.spread else SHARED,
+                "scales of a tile": LOCAL if learnt.local.spread else "those of the map",
                 "hyperparameters": learnt.origin.learning.described,
                 "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
                 "sources": described(learnt),

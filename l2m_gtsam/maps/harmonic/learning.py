@@ -1,7 +1,7 @@
 """Learning the hyperparameters: the marginal likelihood of a few windows of the survey."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -12,7 +12,8 @@ from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import Normal, evidence, normal_of
 from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
-from l2m_gtsam.maps.harmonic.representatives import spread_tiles
+from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
+from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiling import (
@@ -21,8 +22,8 @@ from l2m_gtsam.maps.harmonic.tiling import (
     Tiling,
     TilingOptions,
     affordable,
-    density_of,
     resolution_of,
+    surveyed_area,
     tiling_of,
 )
 from l2m_gtsam.maps.training import TrainingSet
@@ -38,6 +39,8 @@ class LearningOptions(Options):
 
     windows: int = Field(default=4, ge=1)
     """Number of windows, spread over the survey."""
+    rough: int = Field(default=2, ge=0)
+    """Windows where the readings are roughest: the map's waves are as fine as these need."""
     modes: int = Field(default=450, ge=50)
     """About how many modes a window has; smaller windows learn faster."""
     readings: int = Field(default=3000, ge=100)
@@ -62,6 +65,8 @@ class LearningEnd:
         Whether the search ended at a maximum inside the bounds.
     at_bound
         Names of hyperparameters that ended on a bound: the data do not determine them.
+    roughest
+        Hyperparameters that windows would have by themselves where the readings are roughest.
     """
 
     hyperparameters: Hyperparameters
@@ -69,6 +74,7 @@ class LearningEnd:
     readings: int
     converged: bool
     at_bound: tuple[str, ...]
+    roughest: tuple[Hyperparameters, ...] = ()
 
     @property
     def described(self) -> str:
@@ -86,6 +92,14 @@ class Window:
 
     basis: Basis
     normal: Normal
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows spread over the survey, and some where the readings are roughest."""
+
+    spread: list[Window]
+    rough: list[Window]
 
 
 def learn(
@@ -110,19 +124,18 @@ def learn(
     options
         Of the windows.
     """
-    density = density_of(readings)
+    density = float(readings.weight.sum()) / surveyed_area(readings.points)
     guess = starting_point(readings)
     for _ in range(ROUNDS):
-        wanted = resolution_of(guess, density, share)
-        looked_at = affordable(wanted, tiling.least_edge, options.modes)
+        looked_at = affordable(resolution_of(guess, density, share), tiling, options.modes)
         windows = draw_windows(readings, sources, looked_at, tiling, options)
-        end = maximise(windows, guess)
+        end = maximise(windows.spread, guess)
         finest = resolution_of(end.hyperparameters, density, share)
-        needed = affordable(finest, tiling.least_edge, options.modes)
+        needed = affordable(finest, tiling, options.modes)
         guess = end.hyperparameters
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
             break
-    return end
+    return replace(end, roughest=tuple(own(each, end.hyperparameters) for each in windows.rough))
 
 
 def starting_point(readings: TrainingSet) -> Hyperparameters:
@@ -139,8 +152,8 @@ def draw_windows(
     resolution: Resolution,
     options: TilingOptions,
     learning: LearningOptions,
-) -> list[Window]:
-    """Return windows spread over the survey."""
+) -> Windows:
+    """Return windows on the survey."""
     tiling = tiling_of(readings.points, resolution, options, learning.modes, reach=0.0)
     members = tiling.grid.members(readings.points, tiling.overlap)
     rng = np.random.default_rng(learning.seed)
@@ -150,7 +163,13 @@ def draw_windows(
         return window_of(readings[np.sort(rows)], sources, tiling, tile, resolution)
 
     spread = spread_tiles(tiling, [len(rows) for rows in members], learning.windows)
-    return [window(tile) for tile in spread]
+    rough = rough_tiles(readings, members, learning.rough, spread)
+    return Windows([window(tile) for tile in spread], [window(tile) for tile in rough])
+
+
+def own(window: Window, hyperparameters: Hyperparameters) -> Hyperparameters:
+    """Return the scales and depths of a window by itself."""
+    return local_hyperparameters(window.basis, window.normal, hyperparameters, LocalOptions())
 
 
 def window_of(

@@ -26,8 +26,9 @@ from l2m_gtsam.maps.harmonic.tiling import (
     Tiling,
     TilingOptions,
     affordable,
-    density_of,
+    finest,
     resolution_of,
+    surveyed_area,
     tiling_of,
 )
 from l2m_gtsam.maps.survey import survey_doubts
@@ -64,8 +65,6 @@ class HarmonicOptions(Options):
     disturbances of one passage."""
     modes: int = Field(default=400, ge=50)
     """About how many modes a tile has; tiles are as large as that allows."""
-    most_modes: int = Field(default=1600, ge=50)
-    """The most modes of a tile whose own scales and depths ask for finer ones than the map's."""
     mode_share: float = Field(default=0.05, gt=0, lt=1)
     """A mode is kept if the readings could reduce its prior variance by this share; what is left
     out counts as variance."""
@@ -125,8 +124,8 @@ class Learnt:
         Where the tiles lie.
     resolution
         Largest wave numbers of the modes.
-    options
-        Of the map.
+    local
+        How far the prior of a tile may differ.
     origin
         For the record.
     """
@@ -137,18 +136,13 @@ class Learnt:
     strengths: FloatArray
     tiling: Tiling
     resolution: Resolution
-    options: HarmonicOptions
+    local: LocalOptions
     origin: Origin
 
     @cached_property
     def members(self) -> list[IntArray]:
         """Rows of the readings that take part in each tile."""
         return self.tiling.grid.members(self.readings.points, self.tiling.overlap)
-
-    @cached_property
-    def density(self) -> float:
-        """Readings per square metre of the surveyed area."""
-        return density_of(self.readings)
 
     @property
     def most_variance(self) -> float:
@@ -170,9 +164,9 @@ class Learnt:
             visible,
         )
 
-    def extended(self, new: TrainingSet) -> "Learnt":
+    def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
-        options, together = self.options, joined(self.readings, new)
+        together = joined(self.readings, new)
         survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(together))))
         readings = merged(together, options.merge, options.independent)
         grid = self.tiling.grid
@@ -194,13 +188,16 @@ def laid_out(
     options: HarmonicOptions,
 ) -> Learnt:
     """Return readings and prior with the tiles that suit them."""
-    density = density_of(readings)
-    needed = resolution_of(learning.hyperparameters, density, options.mode_share)
-    resolution = affordable(needed, options.tiling.least_edge, options.modes)
+    density = float(readings.weight.sum()) / surveyed_area(readings.points)
+    needed = [
+        resolution_of(each, density, options.mode_share)
+        for each in (learning.hyperparameters, *learning.roughest)
+    ]
+    resolution = affordable(finest(needed), options.tiling, options.modes)
     tiling = tiling_of(readings.points, resolution, options.tiling, options.modes, options.reach)
     origin = Origin(len(readings), learning)
-    h = learning.hyperparameters
-    return Learnt(readings, h, sources, strengths, tiling, resolution, options, origin)
+    hyperparameters, local = learning.hyperparameters, options.effective_local
+    return Learnt(readings, hyperparameters, sources, strengths, tiling, resolution, local, origin)
 
 
 def reach_of(core: float, options: HarmonicOptions) -> float:

@@ -28,7 +28,7 @@ LEAST_SIZE = 0.4 * LEAST_CORE  # equal tiles over an extent may be half as large
 LEAST, MOST = 1e-9, 1e9
 
 
-def learnt_to_state(kind: str, learnt: Learnt) -> MapState:
+def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapState:
     """Return a map as what its tiles follow from: far smaller than their covariances."""
     values = learnt.hyperparameters.model_dump()
     arrays: dict[str, npt.NDArray[Any]] = {
@@ -43,10 +43,10 @@ def learnt_to_state(kind: str, learnt: Learnt) -> MapState:
         "resolution": np.array([learnt.resolution.floor, learnt.resolution.ceiling]),
     }
     origin = ORIGIN.dump_python(learnt.origin, mode="json")
-    return MapState(kind, arrays, learnt.options.model_dump(mode="json"), origin)
+    return MapState(kind, arrays, options.model_dump(mode="json"), origin)
 
 
-def learnt_from_state(state: MapState) -> Learnt:
+def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
     """Return what ``learnt_to_state`` took apart; the state may come from an untrusted file.
 
     Raises
@@ -64,9 +64,11 @@ def learnt_from_state(state: MapState) -> Learnt:
     sources, strengths = sources_from_state(state)
     resolution = resolution_from_state(state)
     tiling = tiling_from_state(state, readings, resolution, options)
-    return Learnt(
-        readings, hyperparameters, sources, strengths, tiling, resolution, options, origin
+    local = options.effective_local
+    learnt = Learnt(
+        readings, hyperparameters, sources, strengths, tiling, resolution, local, origin
     )
+    return learnt, options
 
 
 def damaged(what: str, complaint: str) -> MapError:

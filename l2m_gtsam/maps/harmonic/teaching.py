@@ -7,7 +7,10 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.evidence import normal_of
-from l2m_gtsam.maps.harmonic.explanation import Patchwork, explanation_of, patchwork
+from l2m_gtsam.maps.harmonic.explanation import (
+    explanation_of,
+    patchwork,
+)
 from l2m_gtsam.maps.harmonic.furnish import COARSE
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
@@ -22,7 +25,6 @@ from l2m_gtsam.maps.harmonic.search import (
 )
 from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import Sources
-from l2m_gtsam.maps.harmonic.suited import suited
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
@@ -67,22 +69,19 @@ def learn_once(readings: TrainingSet, sources: Sources, options: HarmonicOptions
     """Return what readings teach over given sources, and how well that explains them."""
     learning = learn_prior(readings, sources, options)
     plain = laid_out(readings, learning, sources, np.ones(len(sources.pieces)), options)
-    return explained(with_strengths(plain))
+    return explained(with_strengths(plain), options)
 
 
-def explained(learnt: Learnt) -> Learnt:
+def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     """Return the same with a verdict from a few of its tiles."""
-    members, options = learnt.members, learnt.options
-
-    def work(tile: int) -> Patchwork:
-        rows = evenly(members[tile], options.learning.readings)
-        basis = suited(learnt, tile, rows, COARSE).basis
-        return patchwork(basis, learnt.readings[rows], options.learning.seed)
-
+    members = learnt.members
+    works = []
     spread = spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED)
-    rough = rough_tiles(learnt.readings, members, JUDGED_ROUGH, spread)
-    works, local = in_threads(work, spread + rough), options.effective_local
-    explanation = explanation_of(works, learnt.hyperparameters, local, options.sensor_noise)
+    for tile in spread + rough_tiles(learnt.readings, members, JUDGED_ROUGH, spread):
+        rows = evenly(members[tile], options.learning.readings)
+        basis = learnt.basis(tile, rows, COARSE)
+        works.append(patchwork(basis, learnt.readings[rows], options.learning.seed))
+    explanation = explanation_of(works, learnt.hyperparameters, learnt.local, options.sensor_noise)
     return replace(learnt, origin=replace(learnt.origin, explanation=explanation))
 
 
@@ -124,7 +123,7 @@ def with_search(learnt: Learnt, options: HarmonicOptions) -> Learnt:
             if anew or Sources(found, np.arange(len(found))).within(centre, current.tiling.edge)
         ]
     searched = replace(current.origin, searched=True)
-    return explained(with_strengths(replace(current, origin=searched)))
+    return explained(with_strengths(replace(current, origin=searched)), options)
 
 
 def found_in_tiles(plain: Learnt, tiles: list[int], options: HarmonicOptions) -> FloatArray:

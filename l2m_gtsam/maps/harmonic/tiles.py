@@ -4,9 +4,9 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from threading import Lock
 
-from l2m_gtsam.maps.harmonic.evidence import condition
+from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.harmonic.suited import suited
+from l2m_gtsam.maps.harmonic.local import local_hyperparameters
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 
@@ -75,7 +75,9 @@ class Tiles:
 
 def solved_tile(learnt: Learnt, index: int) -> Tile:
     """Return a tile with the posterior of its weights."""
-    fit = suited(learnt, index, learnt.members[index])
-    prior = fit.basis.prior(fit.hyperparameters)
-    weights = condition(fit.normal, prior.log_variance, fit.hyperparameters.noise)
-    return Tile(fit.basis, weights, fit.hyperparameters, fit.resolution)
+    rows = learnt.members[index]
+    basis = learnt.basis(index, rows)
+    normal = normal_of(basis, learnt.readings[rows])
+    own = local_hyperparameters(basis, normal, learnt.hyperparameters, learnt.local)
+    weights = condition(normal, basis.prior(own).log_variance, own.noise)
+    return Tile(basis, weights, own, learnt.resolution)

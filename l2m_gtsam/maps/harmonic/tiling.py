@@ -15,7 +15,6 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid, grid_over
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR
-from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 
 # Modes per square metre of box and squared wave number: a quarter of a disc of half waves.
@@ -35,11 +34,6 @@ class TilingOptions(Options):
     margin: float = Field(default=0.75, gt=0)
     """The box reaches this far beyond its readings: the waves have no slope at its walls, where
     the field knows nothing of them."""
-
-    @property
-    def least_edge(self) -> float:
-        """Edge of the smallest box in metres."""
-        return LEAST_CORE + 2 * (self.overlap + self.margin)
 
 
 @dataclass(frozen=True)
@@ -101,19 +95,20 @@ def finest(needed: Sequence[Resolution]) -> Resolution:
     )
 
 
-def affordable(resolution: Resolution, edge: float, budget: int) -> Resolution:
-    """Return the resolution, coarser where a box of this edge would have more modes than allowed.
+def affordable(resolution: Resolution, options: TilingOptions, budget: int) -> Resolution:
+    """Return the resolution, coarser where the smallest tile would have more modes than allowed.
 
     What is left out counts as variance.
     """
-    over = np.sqrt(max(resolution.modes(edge) / budget, 1.0))
+    smallest = LEAST_CORE + 2 * (options.overlap + options.margin)
+    over = np.sqrt(max(resolution.modes(smallest) / budget, 1.0))
     return Resolution(float(resolution.floor / over), float(resolution.ceiling / over))
 
 
-def density_of(readings: TrainingSet) -> float:
-    """Return readings per square metre of the horizontal area in which there are some."""
-    cells = np.unique(np.floor(readings.points[:, :2] / FILL).astype(np.int64), axis=0)
-    return float(readings.weight.sum()) / (len(cells) * FILL**2)
+def surveyed_area(points: FloatArray) -> float:
+    """Return the horizontal area in square metres in which there are readings."""
+    cells = np.unique(np.floor(points[:, :2] / FILL).astype(np.int64), axis=0)
+    return len(cells) * FILL**2
 
 
 @dataclass(frozen=True)
