@@ -1,5 +1,6 @@
 """Recording + map + options -> calibration. Pure: no files, no terminal."""
 
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -9,6 +10,7 @@ from l2m_gtsam.data import (
     CalibrationResult,
     Distortion,
     FloatArray,
+    FoundStart,
     Readings,
     Recording,
     SensorCalibration,
@@ -19,6 +21,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
+from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.view import Compilable, QueryableMap
@@ -64,10 +67,12 @@ def calibrate(
     synchronised = synchronise(recording, options.sync)
     stuck = stuck_sensors(synchronised.readings)
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
-    t_start = _starts(synchronised.readings.sensors, options)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    found = _starts(alive, solver_map, options, progress)
+    t_start = _start_places(alive.sensors, found, options)
     solution = solve_one_key(alive, solver_map, t_start, options.solve, progress)
     sensors = _assess(synchronised, alive, solution, options)
+    sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
     return CalibrationResult(
@@ -82,18 +87,60 @@ def calibrate(
     )
 
 
-def _starts(sensors: tuple[str, ...], options: CalibrationOptions) -> FloatArray:
-    """Return where each sensor's search starts, shape (S, 3), metres.
+def _starts(
+    readings: Readings,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    progress: Progress | None,
+) -> list[FoundStart | None]:
+    """Look for the start of each sensor; none where it is given or none is found.
 
     Raises
     ------
     CalibrationError
         A start is given for a sensor that the recording does not have.
     """
-    if unknown := sorted(set(options.start) - set(sensors)):
-        msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
+    if unknown := sorted(set(options.start) - set(readings.sensors)):
+        sensors = ", ".join(readings.sensors)
+        msg = f"start: no sensor named {unknown[0]!r}; the recording has {sensors}"
         raise CalibrationError(msg)
-    return np.array([options.start.get(name, (0.0, 0.0, 0.0)) for name in sensors])
+    if not len(readings) or set(options.start) == set(readings.sensors):
+        return [None] * len(readings.sensors)
+    tell = progress or (lambda stage, fraction: None)
+    tell("global start", 0.0)
+    found = find_starts(readings, field_map, np.zeros(3), options.search)
+    tell("global start", 1.0)
+    names = zip(readings.sensors, found, strict=True)
+    return [None if name in options.start else each for name, each in names]
+
+
+def _start_places(
+    sensors: tuple[str, ...], found: list[FoundStart | None], options: CalibrationOptions
+) -> FloatArray:
+    """Return where each sensor starts, shape (S, 3), metres: given, found, or the lidar."""
+    at_lidar = (0.0, 0.0, 0.0)
+    return np.array(
+        [
+            options.start.get(name, at_lidar) if each is None else each.t_lidar_mag
+            for name, each in zip(sensors, found, strict=True)
+        ]
+    )
+
+
+def _with_start(
+    sensor: SensorCalibration, start: FoundStart | None, options: CalibrationOptions
+) -> SensorCalibration:
+    """Return the same with where it started, and a warning if that was not the only place."""
+    if start is None or start.margin >= options.search.clear or start.runner_up is None:
+        return replace(sensor, start=start)
+    place = ", ".join(f"{value:.2f}" for value in start.runner_up)
+    msg = (
+        f"another place, ({place}) m, explains the readings about as well: it leaves "
+        f"{start.margin:.2f} times as much; give `calibration.start` or drive more varied ways"
+    )
+    if sensor.status is not SensorStatus.SOLVED:
+        return replace(sensor, start=start)
+    return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
 
 
 def _assess(

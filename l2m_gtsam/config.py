@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field, ValidationError
 from l2m_gtsam.data import Uncertainty
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.options import Options
@@ -36,8 +37,10 @@ class CalibrationOptions(Options):
     sync: SyncOptions = SyncOptions()
     """Which readings enter, and how they get their poses."""
     start: dict[str, tuple[float, float, float]] = Field(default_factory=dict)
-    """Where to start the search for a sensor's `t_lidar_mag`, by sensor name, metres; the origin
-    of the lidar if not given."""
+    """Where the solve starts for a sensor's `t_lidar_mag`, by sensor name, metres; looked for where
+    it is not given."""
+    search: StartOptions = StartOptions()
+    """How starts are looked for."""
     solve: OneKeyOptions = OneKeyOptions()
     """The one-key solve."""
 

@@ -138,16 +138,19 @@ class Readings:
     def __len__(self) -> int:
         return len(self.sensor)
 
-    def select(self, keep: BoolArray) -> "Readings":
-        """Return the readings where ``keep``, shape (N,), is true."""
+    def __getitem__(self, rows: IntArray) -> "Readings":
         return Readings(
             self.sensors,
-            self.sensor[keep],
-            self.stamp_ns[keep],
-            self.R_map_lidar[keep],
-            self.p_map_lidar[keep],
-            self.field[keep],
+            self.sensor[rows],
+            self.stamp_ns[rows],
+            self.R_map_lidar[rows],
+            self.p_map_lidar[rows],
+            self.field[rows],
         )
+
+    def select(self, keep: BoolArray) -> "Readings":
+        """Return the readings where ``keep``, shape (N,), is true."""
+        return self[np.flatnonzero(keep)]
 
     def rows_of(self, index: int) -> slice:
         """Return the rows of the sensor with this index."""
@@ -293,6 +296,7 @@ class SensorStatus(StrEnum):
     NO_READINGS = "no_readings"
     OUTSIDE_MAP = "outside_map"
     DEAD_AXIS = "dead_axis"
+    AMBIGUOUS = "ambiguous"
     FLIPPED_AXIS = "flipped_axis"
 
 
@@ -317,6 +321,26 @@ class ResidualFigures:
     p95_norm: float
     max_norm: float
     chi2_per_dof: float
+
+
+@dataclass(frozen=True)
+class FoundStart:
+    """Where the search for a start ended for one sensor.
+
+    Attributes
+    ----------
+    t_lidar_mag
+        Where the solve started in the lidar frame in metres, shape (3,).
+    margin
+        How many times more (root mean square) the second best place leaves of the readings;
+        infinite if there is no other.
+    runner_up
+        That place in the lidar frame in metres, shape (3,), if there is one.
+    """
+
+    t_lidar_mag: FloatArray
+    margin: float
+    runner_up: FloatArray | None
 
 
 @dataclass(frozen=True)
@@ -351,6 +375,8 @@ class SensorCalibration:
         Account of the readings.
     outside_map
         Synchronised readings that were not used because the map has no data there.
+    start
+        Where the solve started, if that was looked for; absent where it was given.
     """
 
     sensor: str
@@ -366,6 +392,7 @@ class SensorCalibration:
     undetermined: tuple[str, ...]
     sync: SyncCounts
     outside_map: int
+    start: FoundStart | None = None
 
     @property
     def t_sigma(self) -> FloatArray:

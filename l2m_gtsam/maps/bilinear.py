@@ -202,6 +202,11 @@ class BilinearMap:
         return KIND
 
     @property
+    def readings(self) -> TrainingSet:
+        """Readings in the map frame, averaged over cells."""
+        return TrainingSet(self.cells.points, self.cells.field, self.cells.count)
+
+    @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
         heights, points = self.cells.heights, self.cells.points

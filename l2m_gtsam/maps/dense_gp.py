@@ -25,7 +25,7 @@ from l2m_gtsam.maps.trained import (
     trained_summary,
     trained_to_state,
 )
-from l2m_gtsam.maps.training import checked_points
+from l2m_gtsam.maps.training import TrainingSet, checked_points
 
 KIND = "dense_gp"
 MOST_ROWS = 6000  # the factor of as many takes 290 MB
@@ -122,6 +122,11 @@ class DenseGP:
     def kind(self) -> str:
         """Name of the map kind."""
         return KIND
+
+    @property
+    def readings(self) -> TrainingSet:
+        """Readings in the map frame, thinned."""
+        return self.trained.readings
 
     @property
     def summary(self) -> MapSummary:

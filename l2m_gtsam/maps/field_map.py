@@ -6,6 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from l2m_gtsam.data import FieldSample, FloatArray, MapState
+from l2m_gtsam.maps.training import TrainingSet
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,16 @@ class Summarised(Protocol):
     @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
+        ...
+
+
+@runtime_checkable
+class Surveyed(Protocol):
+    """A map that still knows what it was made of."""
+
+    @property
+    def readings(self) -> TrainingSet:
+        """Readings in the map frame, thinned or averaged."""
         ...
 
 

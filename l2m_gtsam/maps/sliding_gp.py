@@ -28,7 +28,7 @@ from l2m_gtsam.maps.trained import (
     trained_summary,
     trained_to_state,
 )
-from l2m_gtsam.maps.training import checked_points
+from l2m_gtsam.maps.training import TrainingSet, checked_points
 
 KIND = "sliding_gp"
 MOST_IN_BLOCK = 6000  # rows; the factor of such a block takes 290 MB
@@ -148,6 +148,11 @@ class SlidingGP:
     def kind(self) -> str:
         """Name of the map kind."""
         return KIND
+
+    @property
+    def readings(self) -> TrainingSet:
+        """Readings in the map frame, thinned."""
+        return self.trained.readings
 
     @property
     def summary(self) -> MapSummary:

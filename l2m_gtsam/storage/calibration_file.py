@@ -11,6 +11,7 @@ from l2m_gtsam.data import (
     CalibrationResult,
     Distortion,
     FloatArray,
+    FoundStart,
     KnownSensor,
     ResidualFigures,
     RigidTransform,
@@ -117,6 +118,12 @@ class _Counts(_Lenient):
     kept: int
 
 
+class _Start(_Lenient):
+    t_lidar_mag: Vector
+    margin: float
+    runner_up: Vector | None
+
+
 class _Sensor(_Lenient):
     status: SensorStatus
     message: str
@@ -131,6 +138,7 @@ class _Sensor(_Lenient):
     undetermined: tuple[str, ...]
     readings: _Counts
     outside_map: int
+    start: _Start | None = None
 
 
 class _Source(_Lenient):
@@ -254,6 +262,7 @@ def _sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
         "residuals": _residuals_entry(sensor.residuals),
         "readings": vars(sensor.sync).copy(),
         "outside_map": sensor.outside_map,
+        "start": _start_entry(sensor.start),
         "covariance": sensor.covariance.tolist(),
     }
 
@@ -287,6 +296,17 @@ def _quaternion(R: FloatArray) -> list[float]:
     return [float(q) for q in Rotation.from_matrix(R).as_quat(canonical=True)]
 
 
+def _start_entry(start: FoundStart | None) -> dict[str, Any] | None:
+    if start is None:
+        return None
+    other = start.runner_up
+    return {
+        "t_lidar_mag": start.t_lidar_mag.tolist(),
+        "margin": start.margin,
+        "runner_up": None if other is None else other.tolist(),
+    }
+
+
 def _residuals_entry(figures: ResidualFigures | None) -> dict[str, Any] | None:
     if figures is None:
         return None
@@ -295,6 +315,13 @@ def _residuals_entry(figures: ResidualFigures | None) -> dict[str, Any] | None:
 
 def _source(source: SourceFile | None) -> dict[str, str] | None:
     return None if source is None else {"path": source.path, "sha256": source.sha256}
+
+
+def _start(entry: _Start | None) -> FoundStart | None:
+    if entry is None:
+        return None
+    other = None if entry.runner_up is None else np.array(entry.runner_up)
+    return FoundStart(np.array(entry.t_lidar_mag), entry.margin, other)
 
 
 def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
@@ -315,6 +342,7 @@ def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
         undetermined=entry.undetermined,
         sync=SyncCounts(**dict(entry.readings)),
         outside_map=entry.outside_map,
+        start=_start(entry.start),
     )
 
 

@@ -22,6 +22,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.storage.calibration_file import (
     read_calibration,
     read_known_sensors,
@@ -32,6 +33,8 @@ from l2m_gtsam.storage.yaml_file import read_yaml
 from tests.worlds import DipoleWorld, dipole_world, random_sensors
 
 STEP_NS = 50_000_000
+# The sensors sit within a metre of the lidar; the exact field of many dipoles is slow.
+OPTIONS = CalibrationOptions(search=StartOptions(search_radius=1.0))
 
 
 def recorded_drive(
@@ -73,7 +76,7 @@ def mixed(world: DipoleWorld, sensors: tuple[KnownSensor, ...]) -> CalibrationRe
     series[5] = replace(series[5], field=np.full_like(series[5].field, 12.0))
     series[7] = replace(series[7], field=series[7].field * [1, -1, 1])
     source = SourceFile("map.npz", "cd34")
-    return calibrate(replace(recording, series=tuple(series)), world, CalibrationOptions(), source)
+    return calibrate(replace(recording, series=tuple(series)), world, OPTIONS, source)
 
 
 def test_a_dead_axis_is_named(world: DipoleWorld, sensors: tuple[KnownSensor, ...]) -> None:
@@ -82,7 +85,7 @@ def test_a_dead_axis_is_named(world: DipoleWorld, sensors: tuple[KnownSensor, ..
     field = recording.series[0].field.copy()
     field[:, 1] = 3.0 + 0.05 * np.sin(np.arange(len(field)))
     series = (replace(recording.series[0], field=field),)
-    found = calibrate(replace(recording, series=series), world, CalibrationOptions())["mag_00"]
+    found = calibrate(replace(recording, series=series), world, OPTIONS)["mag_00"]
     assert found.status is SensorStatus.DEAD_AXIS
     assert "y axis does not follow the field" in found.message
     assert np.isnan(found.R_lidar_mag).all()
@@ -100,7 +103,7 @@ def test_what_planar_motion_leaves_open_is_named_in_result_and_file(
     b = np.einsum("nji,j->ni", yaw, flat.uniform)
     series = (replace(recording.series[0], field=b + 0.0),)
     planar = replace(recording, series=series, trajectory=replace(recording.trajectory, R=yaw))
-    result = calibrate(planar, flat, CalibrationOptions())
+    result = calibrate(planar, flat, OPTIONS)
     found = result["m"]
     assert found.status is SensorStatus.UNDETERMINED
     for name in ("t_x", "t_y", "t_z", "C_xz with H_x", "C_yz with H_y", "C_zz with H_z"):
@@ -143,7 +146,7 @@ def test_rotation_is_the_mounting(world: DipoleWorld) -> None:
     """A sensor turned by 0.5 rad without distortion: R_lidar_mag undoes C."""
     R_mag_lidar = Rotation.from_rotvec([0.3, -0.2, 0.35]).as_matrix()
     sensor = KnownSensor("m", np.array([0.2, 0.1, -0.1]), Distortion(R_mag_lidar, np.zeros(3)))
-    found = calibrate(recorded_drive(world, (sensor,)), world, CalibrationOptions())["m"]
+    found = calibrate(recorded_drive(world, (sensor,)), world, OPTIONS)["m"]
     turn = Rotation.from_matrix(R_mag_lidar @ found.R_lidar_mag).as_rotvec()
     sigma = np.sqrt(np.diag(found.rotation_covariance))
     assert np.all(np.abs(turn) < 5 * sigma)
@@ -252,7 +255,32 @@ def test_a_map_of_another_place_is_named(
     source = SourceFile("office.npz", "0")
     recording = recorded_drive(world, sensors[:2])
     with pytest.raises(CalibrationError, match=r"office.npz does not cover the drive drive.bag"):
-        calibrate(recording, elsewhere, CalibrationOptions(), source)
+        calibrate(recording, elsewhere, OPTIONS, source)
+
+
+def test_a_given_start_is_not_looked_for(
+    world: DipoleWorld, sensors: tuple[KnownSensor, ...]
+) -> None:
+    a, b = sensors[:2]
+    options = OPTIONS.model_copy(update={"start": {a.sensor: (0.0, 0.0, 0.0)}})
+    result = calibrate(recorded_drive(world, sensors[:2]), world, options)
+    assert result[a.sensor].start is None
+    found = result[b.sensor].start
+    assert found is not None
+    assert np.linalg.norm(found.t_lidar_mag - b.t_lidar_mag) < 0.05
+    assert [sensor.status for sensor in result.sensors] == [SensorStatus.SOLVED] * 2
+
+
+def test_a_second_place_is_named(world: DipoleWorld, sensors: tuple[KnownSensor, ...]) -> None:
+    """With a margin that no field has every second place is one too many."""
+    search = StartOptions(search_radius=2.5, clear=1e6)
+    result = calibrate(recorded_drive(world, sensors[:1]), world, CalibrationOptions(search=search))
+    (sensor,) = result.sensors
+    assert sensor.status is SensorStatus.AMBIGUOUS
+    assert sensor.start is not None
+    assert sensor.start.runner_up is not None
+    assert f"({sensor.start.runner_up[0]:.2f}, " in sensor.message
+    assert sensor.residuals is not None
 
 
 def test_a_start_for_an_unknown_sensor_is_refused(

@@ -17,7 +17,7 @@ from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.tiling import Visit
-from l2m_gtsam.maps.training import checked_points
+from l2m_gtsam.maps.training import TrainingSet, checked_points
 
 MEMORY = 1_000_000_000  # bytes of grids that are kept
 PIECE = 8_192  # points that a thread answers at once
@@ -151,6 +151,11 @@ class CompiledMap:
     def kind(self) -> str:
         """Name of the map kind."""
         return self.exact.kind
+
+    @property
+    def readings(self) -> TrainingSet:
+        """Readings in the map frame, merged."""
+        return self.exact.learnt.readings
 
     @property
     def summary(self) -> MapSummary:

@@ -19,7 +19,7 @@ from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.tiling import Visit
 from l2m_gtsam.maps.survey import narrow
-from l2m_gtsam.maps.training import additional_set, checked_points, training_set
+from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out
@@ -139,6 +139,11 @@ class HarmonicMap:
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""
         return learnt_to_state(KIND, self.learnt, self.options)
+
+    @property
+    def readings(self) -> TrainingSet:
+        """Readings in the map frame, merged."""
+        return self.learnt.readings
 
     @property
     def summary(self) -> MapSummary:

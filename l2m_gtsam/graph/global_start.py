@@ -1,0 +1,323 @@
+"""Where to start: the places that explain the readings best, without a guess.
+
+The cost with C and H eliminated is looked at on a grid of places around the lidar, for all sensors
+at once, on a map that costs nothing: the nearest reading of the survey. Its few best basins are
+followed to their minima on the map itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+from scipy.ndimage import minimum_filter
+
+from l2m_gtsam.data import BoolArray, FloatArray, FoundStart, Readings
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.maps.field_map import Surveyed
+from l2m_gtsam.maps.nearest import NearestReadings
+from l2m_gtsam.options import Options
+from l2m_gtsam.solve.profile import (
+    Linearisation,
+    Prediction,
+    Snapshots,
+    linearised,
+    misfits,
+    snapshots_of,
+)
+
+BATCH = 256  # candidates at a time
+FIRST = 10  # poses that tell whether a candidate lies in the map at all
+STEPS = 30  # of Gauss-Newton; four to eight are usual
+SETTLED = 1e-3  # metres: the solve itself goes on from there
+TINY = np.finfo(float).tiny
+FEWEST = 12  # readings inside: as many components as a distortion has parameters, three times
+
+
+class StartOptions(Options):
+    """How the start of the solve is looked for; lengths in metres."""
+
+    search_radius: float = Field(default=3.0, gt=0)
+    """Sensors are looked for so far around the lidar."""
+    step: float = Field(default=0.25, gt=0)
+    """Of the grid; the field of a building varies over about twice that."""
+    poses: int = Field(default=120, ge=20)
+    """Poses of the drive that take part, spread evenly over it."""
+    reach: float = Field(default=0.5, gt=0)
+    """A place is known to the coarse map when a reading of the survey is this near."""
+    least_known: float = Field(default=0.5, gt=0, le=1)
+    """A candidate counts if this share of the readings would lie in the map."""
+    basins: int = Field(default=4, ge=2)
+    """The most basins of one sensor that are followed to their minima."""
+    follow: float = Field(default=3.0, ge=1)
+    """A basin is followed if on the grid it leaves no more than so many times what the best one
+    leaves (root mean square); there most of what is left is the grid's own coarseness."""
+    apart: float = Field(default=0.2, gt=0)
+    """Minima closer than this are one."""
+    clear: float = Field(default=1.1, gt=1)
+    """If the second best place leaves less than so many times what the best leaves (root mean
+    square), the start is ambiguous."""
+
+
+@dataclass(frozen=True)
+class Basin:
+    """A place that explains a sensor's readings better than those around it.
+
+    Attributes
+    ----------
+    t
+        In the lidar frame in metres, shape (3,).
+    rms
+        What it leaves of the readings per axis in uT.
+    """
+
+    t: FloatArray
+    rms: float
+
+
+def find_starts(
+    readings: Readings, field_map: QueryableMap, centre: FloatArray, options: StartOptions
+) -> list[FoundStart | None]:
+    """Return where each sensor of a drive is; none where no candidate lies in the map.
+
+    Parameters
+    ----------
+    readings
+        Of all sensors.
+    field_map
+        The magnetic map.
+    centre
+        Middle of the search in the lidar frame in metres, shape (3,).
+    options
+        How wide and how fine to look.
+    """
+    together = snapshots_of(readings, options.poses)
+    found = starts_of(together, field_map, centre, options)
+    for sensor in np.flatnonzero(~together.shared()).tolist():
+        # A sensor that reads at other times than the rest is looked for by itself.
+        rows = np.arange(len(readings))[readings.rows_of(sensor)]
+        if len(rows):
+            alone = snapshots_of(readings[rows], options.poses)
+            found[sensor] = starts_of(alone, field_map, centre, options)[sensor]
+    return found
+
+
+def starts_of(
+    snapshots: Snapshots, field_map: QueryableMap, centre: FloatArray, options: StartOptions
+) -> list[FoundStart | None]:
+    """Return where each sensor is from readings at common poses; see ``find_starts``."""
+    grid = Candidates.around(centre, options)
+    left = look(snapshots, coarse_prediction(field_map, options), grid, options)
+    hopes = [hopes_of(grid, left[..., sensor], options) for sensor in range(left.shape[-1])]
+    ends = descend(snapshots, field_map, hopes, options)
+    return [
+        found_start(distinct(basins, options.apart), each)
+        for basins, each in zip(ends, hopes, strict=True)
+    ]
+
+
+def found_start(basins: tuple[Basin, ...], hopes: "Hopes") -> FoundStart | None:
+    """Return the best of a sensor's basins, best first, beside the second best."""
+    if not basins:
+        return None
+    best, margin, runner_up = basins[0], hopes.margin, hopes.runner_up
+    if len(basins) > 1 and (ratio := basins[1].rms / max(best.rms, TINY)) < margin:
+        margin, runner_up = ratio, basins[1].t
+    return FoundStart(best.t, float(margin), runner_up)
+
+
+def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> Prediction:
+    """Return the nearest readings of a map that knows its own, and else the map."""
+    if isinstance(field_map, Surveyed):
+        return NearestReadings(field_map.readings, options.reach).predict
+
+    def predict(points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        sample = field_map.query(points)
+        return np.where(sample.inside[:, None], sample.field, 0.0), sample.inside
+
+    return predict
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Places on a cubic grid, of which those within a ball are looked at.
+
+    Attributes
+    ----------
+    t
+        All nodes in the lidar frame in metres, shape (n, n, n, 3).
+    within
+        Those in the ball, shape (n, n, n).
+    """
+
+    t: FloatArray
+    within: BoolArray
+
+    @classmethod
+    def around(cls, centre: FloatArray, options: StartOptions) -> "Candidates":
+        """Return the candidates about a middle."""
+        half = int(np.ceil(options.search_radius / options.step))
+        axis = options.step * np.arange(-half, half + 1)
+        offset = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+        within = np.linalg.norm(offset, axis=-1) <= options.search_radius
+        return cls(centre + offset, within)
+
+
+def look(
+    snapshots: Snapshots, predict: Prediction, grid: Candidates, options: StartOptions
+) -> FloatArray:
+    """Return the misfits in uT^2 of all nodes and sensors, shape (n, n, n, S).
+
+    They are infinite where too few readings would lie in the map.
+    """
+    left = np.full((*grid.within.shape, snapshots.field.shape[1]), np.inf)
+    nodes = np.argwhere(grid.within)
+    _, inside = predict(snapshots.thinned(FIRST).places(grid.t[tuple(nodes.T)]).reshape(-1, 3))
+    often = inside.reshape(len(nodes), -1).mean(axis=1) >= 0.5 * options.least_known
+    nodes = nodes[often]
+    for start in range(0, len(nodes), BATCH):
+        at = tuple(nodes[start : start + BATCH].T)
+        part = misfits(snapshots, predict, grid.t[at])
+        left[at] = np.where(part.known >= options.least_known, part.left, np.inf)
+    return left
+
+
+@dataclass(frozen=True)
+class Hopes:
+    """Places to follow to their minima, for one sensor.
+
+    Attributes
+    ----------
+    t
+        In the lidar frame in metres, shape (B, 3).
+    margin
+        How many times more (root mean square) the best place that is not followed leaves on the
+        grid than the best of all; infinite if there is none.
+    runner_up
+        That place in metres, shape (3,), if there is one.
+    """
+
+    t: FloatArray
+    margin: float
+    runner_up: FloatArray | None
+
+
+def hopes_of(grid: Candidates, left: FloatArray, options: StartOptions) -> Hopes:
+    """Return the minima on the grid that could, seen finely, still be the best."""
+    nodes = np.argwhere((left == minimum_filter(left, size=3)) & np.isfinite(left))
+    value = left[tuple(nodes.T)]
+    order = np.argsort(value, kind="stable")
+    places, ratio = grid.t[tuple(nodes[order].T)], np.sqrt(value[order])
+    ratio /= max(ratio.min(initial=np.inf), TINY)
+    count = min(options.basins, int(np.count_nonzero(ratio <= options.follow)))
+    if count == len(ratio):
+        return Hopes(places, float("inf"), None)
+    return Hopes(places[:count], float(ratio[count]), places[count])
+
+
+def descend(
+    snapshots: Snapshots, field_map: QueryableMap, hopes: list[Hopes], options: StartOptions
+) -> list[list[Basin]]:
+    """Return the minima that the places of each sensor lead to.
+
+    Gauss-Newton, all places in step: the map is asked once for all of them. Those about which too
+    little is known lead nowhere.
+    """
+    descents = [
+        Descent.begin(snapshots, sensor, t) for sensor, each in enumerate(hopes) for t in each.t
+    ]
+    if not descents:
+        return [[] for _ in hopes]
+    places = np.concatenate([each.places for each in descents])
+    known = split(field_map.query(places).inside, descents)
+    descents = [each.within(rows) for each, rows in zip(descents, known, strict=True)]
+    active = descents = [each for each in descents if len(each.z) >= FEWEST]
+    for _ in range(STEPS):
+        if not active:
+            break
+        told = field_map.field_and_gradient(np.concatenate([each.places for each in active]))
+        answers = zip(*(split(part, active) for part in told), strict=True)
+        for each, (field, gradient) in zip(active, answers, strict=True):
+            each.go_on(linearised(field, gradient, each.R, each.z), options.step)
+        active = [each for each in active if np.linalg.norm(each.step) > SETTLED]
+    return [[each.basin for each in descents if each.sensor == s] for s in range(len(hopes))]
+
+
+@dataclass
+class Descent:
+    """The way of one sensor from a place to a minimum of its cost.
+
+    Attributes
+    ----------
+    sensor
+        Index of the sensor.
+    R, p, z
+        Poses of the lidar in the map and readings in uT, shapes (K, 3, 3), (K, 3) and (K, 3).
+    trial, step
+        Where the cost is asked next, and how far that is from ``t``, shape (3,), metres.
+    t, least
+        The best place so far, shape (3,), and its cost in uT^2.
+    """
+
+    sensor: int
+    R: FloatArray
+    p: FloatArray
+    z: FloatArray
+    trial: FloatArray
+    step: FloatArray
+    t: FloatArray
+    least: float = float("inf")
+
+    @classmethod
+    def begin(cls, snapshots: Snapshots, sensor: int, t: FloatArray) -> "Descent":
+        """Return a descent from a place in metres, shape (3,)."""
+        has = np.isfinite(snapshots.field[:, sensor]).all(axis=1)
+        return cls(
+            sensor,
+            snapshots.R_map_lidar[has],
+            snapshots.p_map_lidar[has],
+            snapshots.field[has, sensor],
+            trial=t,
+            step=np.full(3, np.inf),
+            t=t,
+        )
+
+    def within(self, rows: BoolArray) -> "Descent":
+        """Return the same on some of the readings."""
+        return replace(self, R=self.R[rows], p=self.p[rows], z=self.z[rows])
+
+    @property
+    def places(self) -> FloatArray:
+        """Where the readings would have been taken in the map, metres, shape (K, 3)."""
+        return np.asarray(self.R @ self.trial + self.p)
+
+    @property
+    def basin(self) -> Basin:
+        """The best place so far."""
+        return Basin(self.t, float(np.sqrt(self.least / self.z.size)))
+
+    def go_on(self, seen: Linearisation, longest: float) -> None:
+        """Take the Gauss-Newton step, or a quarter of the last one where that led uphill."""
+        cost = float(seen.residual @ seen.residual)
+        if cost < self.least:
+            self.t, self.least = self.trial, cost
+            step = seen.step()
+            self.step = step * min(1.0, longest / max(float(np.linalg.norm(step)), TINY))
+        else:
+            self.step = 0.25 * self.step
+        self.trial = self.t + self.step
+
+
+def split(values: Any, descents: Sequence[Descent]) -> list[Any]:
+    """Return the rows of each descent."""
+    return np.split(values, np.cumsum([len(each.z) for each in descents])[:-1])
+
+
+def distinct(basins: list[Basin], apart: float) -> tuple[Basin, ...]:
+    """Return basins that are apart, the best first."""
+    kept: list[Basin] = []
+    for basin in sorted(basins, key=lambda each: each.rms):
+        if all(np.linalg.norm(basin.t - other.t) > apart for other in kept):
+            kept.append(basin)
+    return tuple(kept)

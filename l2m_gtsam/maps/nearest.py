@@ -1,0 +1,42 @@
+"""The coarsest map: everywhere the reading that is nearest."""
+
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.maps.training import TrainingSet
+
+CORES = -1  # all of them
+
+
+class NearestReadings:
+    """A map that costs nothing to make, to look for the region where a better one is asked.
+
+    Parameters
+    ----------
+    readings
+        In the map frame.
+    reach
+        A place further from all readings is not known, metres.
+    """
+
+    def __init__(self, readings: TrainingSet, reach: float) -> None:
+        self._readings = readings
+        self._reach = reach
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        return cKDTree(self._readings.points)
+
+    def predict(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return the field in uT at points in metres, both of shape (N, 3), and where it is known.
+
+        Where it is not known the field is zero.
+        """
+        away, row = self._tree.query(points, distance_upper_bound=self._reach, workers=CORES)
+        known = np.isfinite(away)
+        field = np.zeros((len(points), 3))
+        field[known] = self._readings.field[np.asarray(row)[known]]
+        return field, np.asarray(known)
