@@ -16,11 +16,11 @@ from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.harmonic.tiling import Visit
 from l2m_gtsam.maps.training import TrainingSet, checked_points
 
 MEMORY = 1_000_000_000  # bytes of grids that are kept
-PIECE = 8_192  # points that a thread answers at once
+SHARES = 4  # that points are divided into, for as many threads at most
+PIECE = 65_536  # about the most points of a share
 SERIAL = 2_000  # fewer points than this are not worth threads
 
 
@@ -171,16 +171,35 @@ class CompiledMap:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        count = max(SHARES, len(points) // PIECE) if len(points) >= SERIAL else 1
+        ends = np.linspace(0, len(points), count + 1).astype(int)
 
-        def answer(visit: Visit) -> tuple[FloatArray, FloatArray]:
-            return self.tiles.tile(visit.tile).field_and_gradient(points[visit.rows])
+        def answer(share: int) -> None:
+            at = slice(ends[share], ends[share + 1])
+            self._add(points[at], share / count, field[at], gradient[at])
 
-        pieces = [p for visit in self.exact.learnt.tiling.visits(points) for p in cut(visit)]
-        few = len(points) < SERIAL or len(pieces) == 1
-        parts = [answer(piece) for piece in pieces] if few else in_threads(answer, pieces)
-        for piece, (b, g) in zip(pieces, parts, strict=True):
-            add_shares(piece.rows, piece.share, b, g, field, gradient)
+        if count > 1:
+            in_threads(answer, range(count))
+        else:
+            answer(0)
         return field, gradient
+
+    def _add(
+        self, points: FloatArray, first: float, field: FloatArray, gradient: FloatArray
+    ) -> None:
+        """Add what the tiles say at points to field and gradient.
+
+        They are asked from ``first`` on, a share of them: threads that start at different tiles
+        do not wait for each other to compile the same one. What they say is added in their order,
+        whatever the threads.
+        """
+        visits = self.exact.learnt.tiling.visits(points)
+        said = [(np.empty((0, 3)), np.empty((0, 3, 3)))] * len(visits)
+        for index in np.roll(np.arange(len(visits)), -int(first * len(visits))).tolist():
+            visit = visits[index]
+            said[index] = self.tiles.tile(visit.tile).field_and_gradient(points[visit.rows])
+        for visit, (b, g) in zip(visits, said, strict=True):
+            add_shares(visit.rows, visit.share, b, g, field, gradient)
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis, also outside; see ``FieldMap``."""
@@ -197,14 +216,6 @@ class CompiledMap:
     def to_state(self) -> MapState:
         """Return the exact map as plain arrays and facts."""
         return self.exact.to_state()
-
-
-def cut(visit: Visit) -> list[Visit]:
-    """Return the visit in pieces that threads can share."""
-    return [
-        Visit(visit.tile, visit.rows[start : start + PIECE], visit.share[start : start + PIECE])
-        for start in range(0, len(visit.rows), PIECE)
-    ]
 
 
 @njit(cache=True, nogil=True)

@@ -114,7 +114,7 @@ class CompiledTile:
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
         frame = self.tile.basis.frame
-        local = frame.localise(self.tile.within(points))
+        local = self.tile.clipped(frame.localise(points))
         field, gradient = self.grid.field_and_gradient(local)
         self.near.add_to(local, field, gradient)
         R = frame.R_map_tile

@@ -17,7 +17,7 @@ from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.harmonic.tiling import Visit
+from l2m_gtsam.maps.harmonic.visits import Visit
 from l2m_gtsam.maps.survey import narrow
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
 

@@ -50,13 +50,18 @@ class Tile:
         Beyond, waves repeat themselves or grow without bound. So far from the readings nothing is
         known of the field; the variance at the box's walls says so.
         """
-        frame, h = self.basis.frame, self.hyperparameters
+        frame = self.basis.frame
         local = frame.localise(points)
-        low = np.array([0.0, 0.0, -NEAREST * h.floor_depth])
-        high = np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
-        inside = np.clip(local, low, high)
+        inside = self.clipped(local)
         moved = frame.corner + inside @ frame.R_map_tile.T
         return np.where((inside == local).all(axis=1)[:, None], points, moved)
+
+    def clipped(self, local: FloatArray) -> FloatArray:
+        """Return points in the tile's frame moved into the box; see ``within``."""
+        frame, h = self.basis.frame, self.hyperparameters
+        low = np.array([0.0, 0.0, -NEAREST * h.floor_depth])
+        high = np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
+        return np.clip(local, low, high)
 
     def root(self, points: FloatArray) -> FloatArray:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""

@@ -11,10 +11,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid, grid_over
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR
+from l2m_gtsam.maps.harmonic.visits import Visit, shares_of
 from l2m_gtsam.options import Options
 
 # Modes per square metre of box and squared wave number: a quarter of a disc of half waves.
@@ -22,7 +23,6 @@ MODE_DENSITY = 1 / (4 * np.pi)
 WAVE_NUMBERS = (0.5, 60.0)  # 1/m: from a tile's longest wave to one of a decimetre
 FINER = 1.3  # finer waves by less than this are not worth learning anew or smaller tiles
 LEAST_CORE = 1.0  # metres
-ROUNDING = 1e-9  # of a tile: a little wider than the band is harmless
 FILL = 0.15  # metres; cells of this edge with a reading make the surveyed area
 
 
@@ -112,25 +112,6 @@ def surveyed_area(points: FloatArray) -> float:
 
 
 @dataclass(frozen=True)
-class Visit:
-    """Points that one tile has a share in.
-
-    Attributes
-    ----------
-    tile
-        Index of the tile.
-    rows
-        Indices of the points, shape (K,).
-    share
-        How much the tile says at each; over all tiles they sum to one, shape (K,).
-    """
-
-    tile: int
-    rows: IntArray
-    share: FloatArray
-
-
-@dataclass(frozen=True)
 class Tiling:
     """The tiles of a map.
 
@@ -193,73 +174,23 @@ class Tiling:
         points
             Metres, shape (N, 3).
         """
-        rows, tiles, blended = self._candidates(points)
-        share = np.ones(len(rows))
-        share[blended] = self.shares(points[rows[blended]], tiles[blended])
-        total = np.bincount(rows, share, minlength=len(points))
-        lonely = np.flatnonzero(total <= 0)
+        rows, tiles, share = shares_of(points, self.grid, self.blend)
+        lonely = np.flatnonzero(tiles < 0)
         if len(lonely):
-            total[lonely] = 1.0
-            rows, share = np.append(rows, lonely), np.append(share, np.ones(len(lonely)))
-            tiles = np.append(tiles, self.grid.block_of(points[lonely]))
-        some = np.flatnonzero(share > 0)
+            tiles[lonely] = self.grid.block_of(points[rows[lonely]])
         # Of 16 bits: sorted in linear time; a grid has fewer blocks than that holds.
-        order = some[np.argsort(tiles[some].astype(np.uint16), kind="stable")]
-        rows, tiles, share = rows[order], tiles[order], share[order] / total[rows[order]]
+        order = np.argsort(tiles.astype(np.uint16), kind="stable")
+        rows, tiles, share = rows[order], tiles[order], share[order]
         edges = np.flatnonzero(np.diff(tiles, prepend=-1, append=-1)).tolist()
         return [
             Visit(int(tiles[start]), rows[start:stop], share[start:stop])
             for start, stop in pairwise(edges)
         ]
 
-    def _candidates(self, points: FloatArray) -> tuple[IntArray, IntArray, BoolArray]:
-        """Return rows of points, tiles that may have a share in them, and where others have too.
-
-        These are the tile that a point lies in and, near its border, its neighbours.
-        """
-        own, side, near = [], [], []
-        for axis in (0, 1):
-            low, high = self.grid.cells[:, axis].min(), self.grid.cells[:, axis].max()
-            place = (points[:, axis] - self.grid.origin[axis]) / self.grid.size
-            # Far away there is no tile: what is so far need not be told apart.
-            place = np.clip(place, low - 2.0, high + 3.0)
-            cell = np.floor(place)
-            from_middle = place - cell - 0.5
-            own.append(cell.astype(np.int64))
-            side.append(np.where(from_middle < 0, -1, 1))
-            near.append(np.abs(from_middle) > 0.5 - self.blend / self.grid.size - ROUNDING)
-        rows, cells = [np.arange(len(points))], [np.column_stack(own)]
-        blended = [near[0] | near[1]]
-        for x, y, band in ((1, 0, near[0]), (0, 1, near[1]), (1, 1, near[0] & near[1])):
-            some = np.flatnonzero(band)
-            rows.append(some)
-            blended.append(band[some])
-            cells.append(np.column_stack([own[0] + x * side[0], own[1] + y * side[1]])[some])
-        row, tile = np.concatenate(rows), index_of(self.grid.cells, np.concatenate(cells))
-        known = np.flatnonzero(tile >= 0)
-        return row[known], tile[known], np.concatenate(blended)[known]
-
 
 def blend_of(core: float, options: TilingOptions) -> float:
     """Return half the width of the band in which tiles of this core blend, metres."""
     return min(0.25 * core, 0.5, options.overlap)
-
-
-def index_of(known: IntArray, cells: IntArray) -> IntArray:
-    """Return which of the known cells each one is, or -1, shape (N,).
-
-    Parameters
-    ----------
-    known
-        Whole numbers in lexical order, shape (B, 2).
-    cells
-        Whole numbers, at most 4 beyond those of the known cells, shape (N, 2).
-    """
-    corner = known.min(axis=0) - 4
-    stride = np.array([known[:, 1].max() + 5 - corner[1], 1])
-    keys, wanted = (known - corner) @ stride, (cells - corner) @ stride
-    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return np.where(keys[found] == wanted, found, -1)
 
 
 def tiling_of(

@@ -1,0 +1,119 @@
+"""Which tiles have a share in a place: that it lies in and, near a border, its neighbours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.grid import Grid
+
+MOST = 4  # tiles that have a share in one place: bands are at most half a core wide
+
+
+@dataclass(frozen=True)
+class Visit:
+    """Points that one tile has a share in.
+
+    Attributes
+    ----------
+    tile
+        Index of the tile.
+    rows
+        Indices of the points, shape (K,).
+    share
+        How much the tile says at each; over all tiles they sum to one, shape (K,).
+    """
+
+    tile: int
+    rows: IntArray
+    share: FloatArray
+
+
+def shares_of(
+    points: FloatArray, grid: Grid, blend: float
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return rows of points, tiles, and shares that add up to one over a point's tiles.
+
+    A point far from all tiles comes once, with the tile -1.
+
+    Parameters
+    ----------
+    points
+        Metres, shape (N, 3).
+    grid
+        Cores of the tiles.
+    blend
+        Half the width in metres of the band in which neighbours blend.
+    """
+    rows, tiles = np.empty((2, MOST * len(points)), dtype=np.int64)
+    share = np.empty(MOST * len(points))
+    count = write_shares(points, grid.origin, grid.size, grid.cells, blend, rows, tiles, share)
+    return rows[:count], tiles[:count], share[:count]
+
+
+@njit(cache=True, nogil=True)
+def write_shares(
+    points: FloatArray,
+    origin: FloatArray,
+    size: float,
+    cells: IntArray,
+    blend: float,
+    rows: IntArray,
+    tiles: IntArray,
+    share: FloatArray,
+) -> int:
+    """Write rows, tiles and shares of ``shares_of`` and return how many there are."""
+    low, high = cells[0].copy(), cells[0].copy()
+    for cell in cells:
+        for axis in range(2):
+            low[axis], high[axis] = min(low[axis], cell[axis]), max(high[axis], cell[axis])
+    own, along = np.empty((2, 2), dtype=np.int64), np.empty((2, 2))
+    count = 0
+    for n in range(len(points)):
+        for axis in range(2):
+            place = (points[n, axis] - origin[axis]) / size
+            # Far away there is no tile: what is so far need not be told apart.
+            place = min(max(place, low[axis] - 2.0), high[axis] + 3.0)
+            own[axis, 0] = int(np.floor(place))
+            own[axis, 1] = own[axis, 0] + (1 if place - own[axis, 0] >= 0.5 else -1)
+            for side in range(2):
+                centre = origin[axis] + (own[axis, side] + 0.5) * size
+                along[axis, side] = ramp(abs(points[n, axis] - centre) - 0.5 * size, blend)
+        first, total = count, 0.0
+        for i in range(2):
+            for j in range(2):
+                product = along[0, i] * along[1, j]
+                tile = index_of(cells, own[0, i], own[1, j]) if product > 0 else -1
+                if tile >= 0:
+                    rows[count], tiles[count], share[count] = n, tile, product
+                    total += product
+                    count += 1
+        for each in range(first, count):
+            share[each] /= total
+        if count == first:
+            rows[count], tiles[count], share[count] = n, -1, 1.0
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def ramp(away: float, blend: float) -> float:
+    """Return a share along one axis, twice differentiable, at a distance from the core's wall."""
+    r = min(max(0.5 - 0.5 * away / blend, 0.0), 1.0)
+    return float(r * r * r * (10 + r * (6 * r - 15)))
+
+
+@njit(cache=True, nogil=True)
+def index_of(cells: IntArray, x: int, y: int) -> int:
+    """Return which of the cells, in lexical order, shape (B, 2), this one is, or -1."""
+    low, high = 0, len(cells)
+    while low < high:
+        middle = (low + high) // 2
+        if cells[middle, 0] < x or (cells[middle, 0] == x and cells[middle, 1] < y):
+            low = middle + 1
+        else:
+            high = middle
+    if low < len(cells) and cells[low, 0] == x and cells[low, 1] == y:
+        return low
+    return -1
