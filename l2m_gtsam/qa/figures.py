@@ -22,6 +22,7 @@ from l2m_gtsam.storage.atomic import atomic_path
 
 # Cells along the longer side of a map picture.
 CELLS = 240
+AROUND = 3.0  # metres of the map around a drive that are drawn with it
 ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision
 
 
@@ -44,9 +45,15 @@ class MapSlice:
     sigma: FloatArray
 
 
-def slice_map(field_map: FieldMap, height: float) -> MapSlice:
-    """Ask a map on a horizontal grid at a height in metres."""
-    low, high = field_map.summary.lower, field_map.summary.upper
+def slice_map(field_map: FieldMap, height: float, places: FloatArray | None = None) -> MapSlice:
+    """Ask a map on a horizontal grid at a height in metres: all of it, or that around places.
+
+    A drive crosses little of a large map, and to ask the rest takes longer than to calibrate.
+    """
+    low, high = field_map.summary.lower[:2], field_map.summary.upper[:2]
+    if places is not None:
+        near, far = places[:, :2].min(axis=0) - AROUND, places[:, :2].max(axis=0) + AROUND
+        low, high = np.clip(near, low, high), np.clip(far, low, high)
     cell = max(high[0] - low[0], high[1] - low[1]) / CELLS
     x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -95,7 +102,7 @@ def calibration_figure(
     result: CalibrationResult,
     truth: tuple[KnownSensor, ...],
 ) -> Figure:
-    """Draw the map with the drive, and the sensors on the vehicle from above and from the side.
+    """Draw the map around the drive, and the sensors on the vehicle from above and from the side.
 
     Parameters
     ----------
@@ -113,7 +120,7 @@ def calibration_figure(
     place, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     side = figure.add_subplot(grid[1, 1])
     height = _middle(field_map)
-    cut = slice_map(field_map, height)
+    cut = slice_map(field_map, height, trajectory.p)
     _draw_slice(figure, place, cut.strength, cut.extent, "field strength (uT)", "viridis")
     place.plot(*trajectory.p[:, :2].T, color="white", linewidth=2.2)
     place.plot(*trajectory.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label="drive of the lidar")
