@@ -133,13 +133,13 @@ def _with_start(
     """Return the same with where it started, and a warning if that was not the only place."""
     if start is None or start.margin >= options.search.clear or start.runner_up is None:
         return replace(sensor, start=start)
+    if sensor.status is not SensorStatus.SOLVED:
+        return replace(sensor, start=start)
     place = ", ".join(f"{value:.2f}" for value in start.runner_up)
     msg = (
         f"another place, ({place}) m, explains the readings about as well: it leaves "
         f"{start.margin:.2f} times as much; give `calibration.start` or drive more varied ways"
     )
-    if sensor.status is not SensorStatus.SOLVED:
-        return replace(sensor, start=start)
     return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
 
 

@@ -333,7 +333,8 @@ class FoundStart:
         Where the solve started in the lidar frame in metres, shape (3,).
     margin
         How many times more (root mean square) the second best place leaves of the readings;
-        infinite if there is no other.
+        infinite if there is no other. Seen coarsely, which makes it smaller than it is, where
+        that place was too bad to be followed.
     runner_up
         That place in the lidar frame in metres, shape (3,), if there is one.
     """

@@ -38,10 +38,11 @@ FEWEST = 12  # readings inside: as many components as a distortion has parameter
 class StartOptions(Options):
     """How the start of the solve is looked for; lengths in metres."""
 
-    search_radius: float = Field(default=3.0, gt=0)
+    search_radius: float = Field(default=3.0, gt=0, le=5)
     """Sensors are looked for so far around the lidar."""
-    step: float = Field(default=0.25, gt=0)
-    """Of the grid; the field of a building varies over about twice that."""
+    step: float = Field(default=0.25, ge=0.1)
+    """Of the grid; the field of a building varies over about twice that. Finer grids than a
+    decimetre would fill the memory."""
     poses: int = Field(default=120, ge=20)
     """Poses of the drive that take part, spread evenly over it."""
     reach: float = Field(default=0.5, gt=0)
