@@ -7,11 +7,11 @@ from l2m_gtsam.maps.harmonic.near_sources import PointSources, near_sources
 from l2m_gtsam.maps.harmonic.potential_grid import Lattice
 
 RADIUS = 0.7
-LOWER, UPPER = np.array([-1.0, -1.3]), np.array([2.1, 1.6])
+LOWER, UPPER = np.array([-1.0, -1.3, -0.3]), np.array([2.1, 1.6, 1.2])
 
 
 def sources(count: int = 30, seed: int = 0) -> PointSources:
-    """Return sources inside and beside the rectangle."""
+    """Return sources inside and beside the box."""
     rng = np.random.default_rng(seed)
     positions = rng.uniform([-1.5, -1.8, -0.5], [2.6, 2.1, 1.5], (count, 3))
     return PointSources(positions, rng.normal(0, 0.3, (count, 3)))
@@ -19,7 +19,7 @@ def sources(count: int = 30, seed: int = 0) -> PointSources:
 
 def places(count: int, seed: int = 1) -> FloatArray:
     rng = np.random.default_rng(seed)
-    return rng.uniform([*LOWER, -0.3], [*UPPER, 1.2], (count, 3))
+    return rng.uniform(LOWER, UPPER, (count, 3))
 
 
 def exact(of: PointSources, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -92,6 +92,19 @@ def test_the_smooth_part_is_the_dipole_beyond_the_radius_and_none_at_the_source(
     assert np.abs(phi[~outside]).max() < 4 * np.linalg.norm(of.moments[0]) / RADIUS**2
 
 
+def test_a_weak_source_is_split_nearer() -> None:
+    """With two moments the part that is left ends where the tenth root of their ratio says."""
+    at = np.array([[0.0, 0.0, 0.0], [1.5, 0.0, 0.0]])
+    of = PointSources(at, np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1e-3]]))
+    np.testing.assert_allclose(of.radii(RADIUS), [RADIUS, RADIUS * 1e-3**0.1])
+    for source, radius in zip(at, of.radii(RADIUS), strict=True):
+        up = np.array([0.0, 0.0, radius])
+        within, beyond = source + 0.9 * up, source + 1.001 * up
+        field, _ = near(of, np.stack([within, beyond]))
+        assert np.abs(field[0]).max() > 1e-9
+        assert np.abs(field[1]).max() < 1e-13
+
+
 def test_columns_that_are_not_needed_are_left_out() -> None:
     needed = np.zeros((4, 5, 6), dtype=np.bool_)
     needed[2, 3, 1] = True
@@ -101,8 +114,8 @@ def test_columns_that_are_not_needed_are_left_out() -> None:
     assert not phi.any()
 
 
-@pytest.mark.parametrize("point", [[-1.0, -1.3, 0.5], [2.1, 1.6, 0.5], [2.0999, -1.2999, 0.0]])
-def test_corners_of_the_rectangle_have_their_sources(point: list[float]) -> None:
+@pytest.mark.parametrize("point", [[-1.0, -1.3, -0.3], [2.1, 1.6, 1.2], [2.0999, -1.2999, 0.0]])
+def test_corners_of_the_box_have_their_sources(point: list[float]) -> None:
     at = np.array([point])
     of = PointSources(at + np.full(3, 0.1), np.array([[0.1, 0.2, 0.3]]))
     field, _ = near(of, at)
@@ -111,7 +124,7 @@ def test_corners_of_the_rectangle_have_their_sources(point: list[float]) -> None
     np.testing.assert_allclose(field[0], truth[0] - smooth_field, rtol=1e-4)
 
 
-def test_beside_the_rectangle_nothing_is_added() -> None:
+def test_beside_the_box_nothing_is_added() -> None:
     beyond = np.array([[-1.01, 0, 0], [0, -1.31, 0], [2.6, 0, 0], [1e300, 0, 0], [np.nan, 0, 0]])
     of = PointSources(beyond[:3] + 0.05, np.ones((3, 3)))
     field, gradient = near(of, beyond)

@@ -21,6 +21,8 @@ from l2m_gtsam.maps.training import TrainingSet, checked_points
 MEMORY = 1_000_000_000  # bytes of grids that are kept
 SHARES = 4  # that points are divided into, for as many threads at most
 PIECE = 65_536  # about the most points of a share
+AT_ONCE = 4_096  # points asked of a tile: what it says stays in the processor's cache
+BLOCK = 0.5  # metres: what a map knows of a square of this size fits the processor's cache
 SERIAL = 2_000  # fewer points than this are not worth threads
 
 
@@ -102,10 +104,12 @@ class CompiledTiles:
             found = self.made.get(index)
             if found is None:
                 found = compile_tile(self.exact.tiles[index], self._places(index))
+                with self.locks[-1]:
+                    self.made[index] = found
+                    self._forget()
             with self.locks[-1]:
-                self.made[index] = found
-                self.made.move_to_end(index)
-                self._forget()
+                if index in self.made:
+                    self.made.move_to_end(index)
         return found
 
     def _places(self, index: int) -> Places:
@@ -170,36 +174,25 @@ class CompiledMap:
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
-        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
-        count = max(SHARES, len(points) // PIECE) if len(points) >= SERIAL else 1
-        ends = np.linspace(0, len(points), count + 1).astype(int)
+        if len(points) < SERIAL:
+            return self._said(points)
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
 
-        def answer(share: int) -> None:
-            at = slice(ends[share], ends[share + 1])
-            self._add(points[at], share / count, field[at], gradient[at])
+        def answer(rows: IntArray) -> None:
+            field[rows], gradient[rows] = self._said(points[rows])
 
-        if count > 1:
-            in_threads(answer, range(count))
-        else:
-            answer(0)
+        in_threads(answer, np.array_split(by_place(points), max(SHARES, len(points) // PIECE)))
         return field, gradient
 
-    def _add(
-        self, points: FloatArray, first: float, field: FloatArray, gradient: FloatArray
-    ) -> None:
-        """Add what the tiles say at points to field and gradient.
-
-        They are asked from ``first`` on, a share of them: threads that start at different tiles
-        do not wait for each other to compile the same one. What they say is added in their order,
-        whatever the threads.
-        """
-        visits = self.exact.learnt.tiling.visits(points)
-        said = [(np.empty((0, 3)), np.empty((0, 3, 3)))] * len(visits)
-        for index in np.roll(np.arange(len(visits)), -int(first * len(visits))).tolist():
-            visit = visits[index]
-            said[index] = self.tiles.tile(visit.tile).field_and_gradient(points[visit.rows])
-        for visit, (b, g) in zip(visits, said, strict=True):
-            add_shares(visit.rows, visit.share, b, g, field, gradient)
+    def _said(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return what the tiles say at points."""
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        for visit in self.exact.learnt.tiling.visits(points):
+            tile = self.tiles.tile(visit.tile)
+            for start in range(0, len(visit.rows), AT_ONCE):
+                rows, share = visit.rows[start : start + AT_ONCE], visit.share[start:]
+                add_shares(rows, share, *tile.field_and_gradient(points[rows]), field, gradient)
+        return field, gradient
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis, also outside; see ``FieldMap``."""
@@ -216,6 +209,17 @@ class CompiledMap:
     def to_state(self) -> MapState:
         """Return the exact map as plain arrays and facts."""
         return self.exact.to_state()
+
+
+def by_place(points: FloatArray) -> IntArray:
+    """Return the indices of points, shape (N,), in an order that stays in one place at a time.
+
+    Threads that are given parts of it meet few tiles in common.
+    """
+    across, along = (np.floor((at - at.min()) / BLOCK) for at in points[:, :2].T)
+    # Numbers of 16 bits are sorted in linear time; where they run over, places take turns.
+    numbers = (across * (along.max() + 1) + along) % 2**16
+    return np.argsort(numbers.astype(np.uint16), kind="stable")
 
 
 @njit(cache=True, nogil=True)

@@ -22,7 +22,7 @@ SAFETY = 0.5  # of the tolerance: places that were not checked may be somewhat w
 WAVE = 1.0  # spacing times the largest wave number: waves that short are never strong
 # The gradient of sources' smooth parts errs by this times moment, spacing^6 and radius^-10.
 SOURCE = 3e4
-WIDEST = 0.85  # metres: within a larger radius too many sources are summed one by one
+WIDEST = 0.75  # metres: within a larger radius too many sources are summed one by one
 CHECKS = 300  # places, and as many beside sources
 ATTEMPTS = 4
 
@@ -108,8 +108,8 @@ class CompiledTile:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the grid in bytes."""
-        return self.grid.coefficients.nbytes
+        """Memory in bytes."""
+        return self.grid.coefficients.nbytes + self.near.nbytes
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
@@ -231,4 +231,4 @@ def with_grid(
     readings = frame.localise(places.readings)
     grid = potential_grid(potential, readings, places.reach, spacing, places.box(frame))
     upper = grid.lower + spacing * np.array(grid.coefficients.shape)
-    return CompiledTile(tile, grid, near_sources(sources, grid.lower[:2], upper[:2], radius))
+    return CompiledTile(tile, grid, near_sources(sources, grid.lower, upper, radius))

@@ -7,6 +7,9 @@ S is the Taylor polynomial of ``s^(-3/2)`` about ``r0^2`` for ``s < r0^2``, and 
 itself beyond. The first part is smooth everywhere, also at the source, and goes into a grid. The
 second is zero beyond ``r0`` and is added to what the grid says, source by source. The split is
 exact.
+
+What a grid makes of the first part errs by the moment over the tenth power of ``r0``: a source a
+thousand times weaker than another is split at half the radius.
 """
 
 from dataclasses import dataclass
@@ -20,7 +23,9 @@ from l2m_gtsam.maps.harmonic.potential_grid import Lattice
 
 ORDER = 7  # of the polynomial: the smooth part is as smooth as the grid's spline
 TAYLOR = binom(-1.5, np.arange(ORDER + 1))  # of (1 + t)^(-3/2)
-CELL = 0.25  # metres: edge of the cells, in x and y, that know the sources within reach
+CELL = 0.2  # metres: edge of the cells that know the sources within reach
+WEAKEST = 1e-4  # of the strongest source: weaker ones are split as if they were that strong
+LANES = 4  # of vector registers: a cell's list is filled up to a multiple, or its rest is slow
 
 # Sums in any order, fused products, and reciprocals: the loops run in vector registers.
 FAST = {"reassoc", "contract", "nsz", "arcp"}
@@ -44,15 +49,29 @@ class PointSources:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def radii(self, radius: float) -> FloatArray:
+        """Return where to split each source if the strongest is split at this radius, metres."""
+        strength = np.linalg.norm(self.moments, axis=1)
+        strongest = max(strength.max(initial=0.0), np.finfo(float).tiny)
+        return np.asarray(radius * np.maximum(strength / strongest, WEAKEST) ** 0.1)
+
     def smooth_potential(self, lattice: Lattice, radius: float) -> FloatArray:
         """Return the smooth part of the potential at the nodes in uT m, shape (nx, ny, nz).
 
         Only columns with a node that is needed are computed, the others are zero.
+
+        Parameters
+        ----------
+        lattice
+            The nodes.
+        radius
+            At which the strongest source is split, in metres.
         """
         phi = np.zeros(lattice.needed.shape)
         if len(self):
             columns = np.asarray(lattice.needed.any(axis=2))
-            add_smooth(*lattice.axes, columns, self.positions, self.moments, radius, phi)
+            radii = self.radii(radius)
+            add_smooth(*lattice.axes, columns, self.positions, self.moments, radii, phi)
         return phi
 
 
@@ -62,55 +81,68 @@ class NearSources:
 
     Attributes
     ----------
-    radius
-        Where these parts end, in metres.
     corner
-        Lower corner of the cells in metres, shape (2,).
+        Lower corner of the cells in metres, shape (3,).
     shape
-        Number of cells along x and y.
+        Number of cells along x, y and z.
     starts
-        Where each cell starts in ``table``, shape (nx ny + 1,).
+        Where each cell starts in ``table``, shape (nx ny nz + 1,).
     table
-        Positions and moments (x, y, z, mx, my, mz) of the sources within the radius of a cell,
-        cell by cell, shape (6, E).
+        Positions, moments and squared radii (x, y, z, mx, my, mz, edge, 1 / edge) of the sources
+        that are felt in a cell, cell by cell, shape (8, E); some without a moment to fill lists up.
     """
 
-    radius: float
     corner: FloatArray
-    shape: tuple[int, int]
+    shape: tuple[int, int, int]
     starts: IntArray
     table: FloatArray
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        return self.starts.nbytes + self.table.nbytes
 
     def add_to(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> None:
         """Add field in uT and gradient in uT/m at points (N, 3) to those of the smooth part."""
         if self.table.size:
-            add_near(
-                points,
-                self.corner,
-                self.shape,
-                self.starts,
-                self.table,
-                self.radius,
-                field,
-                gradient,
-            )
+            add_near(points, self.corner, self.shape, self.starts, self.table, field, gradient)
 
 
 def near_sources(
     sources: PointSources, lower: FloatArray, upper: FloatArray, radius: float
 ) -> NearSources:
-    """Return the near parts for places in a rectangle (corners (2,), metres)."""
-    nx, ny = (int(count) for count in np.floor((upper - lower) / CELL) + 1)
+    """Return the near parts of sources.
+
+    Parameters
+    ----------
+    sources
+        All of them.
+    lower, upper
+        Corners of the box in which they will be asked for, metres, shape (3,).
+    radius
+        At which the strongest source is split, in metres.
+    """
+    edge = sources.radii(radius) ** 2
+    nx, ny, nz = (int(count) for count in np.floor((upper - lower) / CELL) + 1)
     gaps = []
-    for axis, count in ((0, nx), (1, ny)):
+    for axis, count in enumerate((nx, ny, nz)):
         left = lower[axis] + CELL * np.arange(count)[:, None]
         place = sources.positions[:, axis]
-        gaps.append(np.maximum(np.maximum(left - place, place - left - CELL), 0.0))
-    near = np.hypot(gaps[0][:, None], gaps[1]) < radius
-    starts = np.append(0, np.cumsum(near.sum(axis=2)))
-    members = np.nonzero(near)[2]
-    table = np.vstack([sources.positions[members].T, sources.moments[members].T])
-    return NearSources(radius, lower, (nx, ny), starts, np.ascontiguousarray(table))
+        gaps.append(np.maximum(np.maximum(left - place, place - left - CELL), 0.0) ** 2)
+    near = gaps[0][:, None, None] + gaps[1][:, None] + gaps[2] < edge
+    cells, members = np.nonzero(near.reshape(nx * ny * nz, len(sources)))
+    counts = np.bincount(cells, minlength=nx * ny * nz)
+    lengths = -(-counts // LANES) * LANES
+    starts = np.append(0, np.cumsum(lengths))
+    # What fills the lists up is far away, and has no moment.
+    table = np.ones((8, starts[-1]))
+    table[:3], table[3:6] = lower[:, None] - 10, 0.0
+    before = np.cumsum(counts) - counts
+    places = starts[cells] + np.arange(len(cells)) - before[cells]
+    table[:3, places] = sources.positions[members].T
+    table[3:6, places] = sources.moments[members].T
+    table[6:, places] = edge[members], 1 / edge[members]
+    return NearSources(lower, (nx, ny, nz), starts, table)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -121,11 +153,10 @@ def add_smooth(
     columns: BoolArray,
     positions: FloatArray,
     moments: FloatArray,
-    radius: float,
+    radii: FloatArray,
     phi: FloatArray,
 ) -> None:
     """Add the smooth part of all sources to the potential of the columns that are asked for."""
-    edge = radius * radius
     for i in range(len(x)):
         for j in range(len(y)):
             if not columns[i, j]:
@@ -134,6 +165,7 @@ def add_smooth(
             for k in range(len(positions)):
                 dx, dy = x[i] - positions[k, 0], y[j] - positions[k, 1]
                 flat = dx * dx + dy * dy
+                edge = radii[k] * radii[k]
                 level = moments[k, 0] * dx + moments[k, 1] * dy
                 if flat >= edge:
                     for c in range(len(z)):
@@ -156,29 +188,28 @@ def add_smooth(
 def add_near(
     points: FloatArray,
     corner: FloatArray,
-    shape: tuple[int, int],
+    shape: tuple[int, int, int],
     starts: IntArray,
     table: FloatArray,
-    radius: float,
     field: FloatArray,
     gradient: FloatArray,
 ) -> None:
     """Add the near part of the sources at points (N, 3)."""
-    edge = radius * radius
-    scale = 1 / (radius * edge)
-    px, py, pz, ux, uy, uz = table
+    px, py, pz, ux, uy, uz, edges, per_edges = table
     for n in range(len(points)):
-        across, along = (points[n, 0] - corner[0]) / CELL, (points[n, 1] - corner[1]) / CELL
-        if not (0 <= across < shape[0] and 0 <= along < shape[1]):
+        i, j = (points[n, 0] - corner[0]) / CELL, (points[n, 1] - corner[1]) / CELL
+        k = (points[n, 2] - corner[2]) / CELL
+        if not (0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]):
             continue
-        cell = int(across) * shape[1] + int(along)
+        cell = (int(i) * shape[1] + int(j)) * shape[2] + int(k)
         bx = by = bz = xx = yy = zz = xy = xz = yz = 0.0
         for e in range(starts[cell], starts[cell + 1]):
             x, y, z = points[n, 0] - px[e], points[n, 1] - py[e], points[n, 2] - pz[e]
             # At the edge all that follows vanishes to rounding, so that no branch is needed.
+            edge, per_edge = edges[e], per_edges[e]
             s = min(x * x + y * y + z * z, edge)
             # S and its derivatives by s over the powers of the edge, by Horner's rule.
-            t = s / edge - 1
+            t = s * per_edge - 1
             value, slope, half_curvature = TAYLOR[ORDER], 0.0, 0.0
             for p in range(ORDER - 1, -1, -1):
                 half_curvature = half_curvature * t + slope
@@ -186,9 +217,10 @@ def add_near(
                 value = value * t + TAYLOR[p]
             inverse = 1 / s
             cube = inverse * np.sqrt(inverse)
+            scale = per_edge * np.sqrt(per_edge)
             q0 = cube - scale * value
-            q1 = -1.5 * cube * inverse - scale / edge * slope
-            q2 = 3.75 * cube * inverse * inverse - scale / (edge * edge) * 2 * half_curvature
+            q1 = -1.5 * cube * inverse - scale * per_edge * slope
+            q2 = 3.75 * cube * inverse * inverse - scale * per_edge * per_edge * 2 * half_curvature
             mx, my, mz = ux[e], uy[e], uz[e]
             mr = mx * x + my * y + mz * z
             a, b, c = 2 * q1, 2 * mr * q1, 4 * mr * q2

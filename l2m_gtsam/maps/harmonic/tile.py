@@ -7,6 +7,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Weights
+from l2m_gtsam.maps.harmonic.frame import clip_rows
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import left_out
 from l2m_gtsam.maps.harmonic.tiling import Resolution
@@ -61,7 +62,9 @@ class Tile:
         frame, h = self.basis.frame, self.hyperparameters
         low = np.array([0.0, 0.0, -NEAREST * h.floor_depth])
         high = np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
-        return np.clip(local, low, high)
+        inside = np.empty_like(local)
+        clip_rows(local, low, high, inside)
+        return inside
 
     def root(self, points: FloatArray) -> FloatArray:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""

@@ -69,26 +69,35 @@ def write_shares(
         for axis in range(2):
             low[axis], high[axis] = min(low[axis], cell[axis]), max(high[axis], cell[axis])
     own, along = np.empty((2, 2), dtype=np.int64), np.empty((2, 2))
+    last = np.zeros((2, 2), dtype=np.int64)  # places that follow each other are in the same cells
+    per_size, per_width = 1 / size, 0.5 / blend
     count = 0
     for n in range(len(points)):
         for axis in range(2):
-            place = (points[n, axis] - origin[axis]) / size
+            place = (points[n, axis] - origin[axis]) * per_size
             # Far away there is no tile: what is so far need not be told apart.
             place = min(max(place, low[axis] - 2.0), high[axis] + 3.0)
             own[axis, 0] = int(np.floor(place))
             own[axis, 1] = own[axis, 0] + (1 if place - own[axis, 0] >= 0.5 else -1)
             for side in range(2):
                 centre = origin[axis] + (own[axis, side] + 0.5) * size
-                along[axis, side] = ramp(abs(points[n, axis] - centre) - 0.5 * size, blend)
+                away = abs(points[n, axis] - centre) - 0.5 * size
+                along[axis, side] = ramp(0.5 - away * per_width)
         first, total = count, 0.0
         for i in range(2):
             for j in range(2):
                 product = along[0, i] * along[1, j]
-                tile = index_of(cells, own[0, i], own[1, j]) if product > 0 else -1
-                if tile >= 0:
-                    rows[count], tiles[count], share[count] = n, tile, product
-                    total += product
-                    count += 1
+                if product == 0:
+                    continue
+                tile = last[i, j]
+                if cells[tile, 0] != own[0, i] or cells[tile, 1] != own[1, j]:
+                    tile = index_of(cells, own[0, i], own[1, j])
+                    if tile < 0:
+                        continue
+                    last[i, j] = tile
+                rows[count], tiles[count], share[count] = n, tile, product
+                total += product
+                count += 1
         for each in range(first, count):
             share[each] /= total
         if count == first:
@@ -98,9 +107,9 @@ def write_shares(
 
 
 @njit(cache=True, nogil=True)
-def ramp(away: float, blend: float) -> float:
-    """Return a share along one axis, twice differentiable, at a distance from the core's wall."""
-    r = min(max(0.5 - 0.5 * away / blend, 0.0), 1.0)
+def ramp(within: float) -> float:
+    """Return a share along one axis, twice differentiable, at a part of the way into the band."""
+    r = min(max(within, 0.0), 1.0)
     return float(r * r * r * (10 + r * (6 * r - 15)))
 
 
