@@ -4,6 +4,11 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# Machines are as fast as they are, and the first call of a compiled function compiles it.
+settings.register_profile("l2m", deadline=None)
+settings.load_profile("l2m")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

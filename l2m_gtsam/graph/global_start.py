@@ -26,12 +26,17 @@ from l2m_gtsam.solve.profile import (
     misfits,
     snapshots_of,
 )
+from l2m_gtsam.solve.robust import RobustOptions, consistent
+from l2m_gtsam.threads import in_threads
 
 BATCH = 256  # candidates at a time
 FIRST = 10  # poses that tell whether a candidate lies in the map at all
 STEPS = 30  # of Gauss-Newton; four to eight are usual
 SETTLED = 1e-3  # metres: the solve itself goes on from there
+STRIDE = 1.9  # steps of the grid: places nearer to a better one are not followed
 TINY = np.finfo(float).tiny
+# A whitened residual this long is an outlier; from a start that is only near most are long.
+LARGEST = RobustOptions().largest
 FEWEST = 12  # readings inside: as many components as a distortion has parameters, three times
 
 
@@ -49,11 +54,13 @@ class StartOptions(Options):
     """A place is known to the coarse map when a reading of the survey is this near."""
     least_known: float = Field(default=0.5, gt=0, le=1)
     """A candidate counts if this share of the readings would lie in the map."""
-    basins: int = Field(default=4, ge=2)
-    """The most basins of one sensor that are followed to their minima."""
+    basins: int = Field(default=8, ge=2)
+    """The most places of one sensor that are followed to their minima."""
     follow: float = Field(default=3.0, ge=1)
-    """A basin is followed if on the grid it leaves no more than so many times what the best one
+    """A place is followed if on the grid it leaves no more than so many times what the best one
     leaves (root mean square); there most of what is left is the grid's own coarseness."""
+    outliers: float = Field(default=0.25, ge=0, lt=0.5)
+    """Share of a sensor's readings that may be wrong: so many do not count."""
     apart: float = Field(default=0.2, gt=0)
     """Minima closer than this are one."""
     clear: float = Field(default=1.1, gt=1)
@@ -70,7 +77,7 @@ class Basin:
     t
         In the lidar frame in metres, shape (3,).
     rms
-        What it leaves of the readings per axis in uT.
+        What it leaves of the readings that it explains best, per axis in uT.
     """
 
     t: FloatArray
@@ -133,6 +140,12 @@ def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> Predict
     if isinstance(field_map, Surveyed):
         return NearestReadings(field_map.readings, options.reach).predict
 
+    return whole_prediction(field_map)
+
+
+def whole_prediction(field_map: QueryableMap) -> Prediction:
+    """Return the map itself."""
+
     def predict(points: FloatArray) -> tuple[FloatArray, BoolArray]:
         sample = field_map.query(points)
         return np.where(sample.inside[:, None], sample.field, 0.0), sample.inside
@@ -168,7 +181,7 @@ class Candidates:
 def look(
     snapshots: Snapshots, predict: Prediction, grid: Candidates, options: StartOptions
 ) -> FloatArray:
-    """Return the misfits in uT^2 of all nodes and sensors, shape (n, n, n, S).
+    """Return the misfits in uT of all nodes and sensors, shape (n, n, n, S).
 
     They are infinite where too few readings would lie in the map.
     """
@@ -177,10 +190,13 @@ def look(
     _, inside = predict(snapshots.thinned(FIRST).places(grid.t[tuple(nodes.T)]).reshape(-1, 3))
     often = inside.reshape(len(nodes), -1).mean(axis=1) >= 0.5 * options.least_known
     nodes = nodes[often]
-    for start in range(0, len(nodes), BATCH):
+
+    def write(start: int) -> None:
         at = tuple(nodes[start : start + BATCH].T)
-        part = misfits(snapshots, predict, grid.t[at])
-        left[at] = np.where(part.known >= options.least_known, part.left, np.inf)
+        part = misfits(snapshots, predict, grid.t[at], 1 - options.outliers)
+        left[at] = np.where(part.known >= options.least_known, part.rms, np.inf)
+
+    in_threads(write, range(0, len(nodes), BATCH))
     return left
 
 
@@ -205,16 +221,34 @@ class Hopes:
 
 
 def hopes_of(grid: Candidates, left: FloatArray, options: StartOptions) -> Hopes:
-    """Return the minima on the grid that could, seen finely, still be the best."""
-    nodes = np.argwhere((left == minimum_filter(left, size=3)) & np.isfinite(left))
+    """Return the places on the grid that could, seen finely, lead to the best.
+
+    Beside minima these are nodes some steps from better ones: the coarse map knows little of
+    heights, and its minimum may lie over or under the true one.
+    """
+    nodes = np.argwhere(np.isfinite(left))
     value = left[tuple(nodes.T)]
     order = np.argsort(value, kind="stable")
-    places, ratio = grid.t[tuple(nodes[order].T)], np.sqrt(value[order])
-    ratio /= max(ratio.min(initial=np.inf), TINY)
-    count = min(options.basins, int(np.count_nonzero(ratio <= options.follow)))
-    if count == len(ratio):
-        return Hopes(places, float("inf"), None)
-    return Hopes(places[:count], float(ratio[count]), places[count])
+    places, ratio = grid.t[tuple(nodes[order].T)], value[order]
+    ratio = ratio / max(ratio.min(initial=np.inf), TINY)
+    picked = spread_out(places[ratio <= options.follow], STRIDE * options.step, options.basins)
+    lowest = (left == minimum_filter(left, size=3))[tuple(nodes[order].T)]
+    away = np.linalg.norm(places[:, None] - picked, axis=2).min(axis=1, initial=np.inf)
+    rest = np.flatnonzero(lowest & (away >= STRIDE * options.step))
+    if not len(rest):
+        return Hopes(picked, float("inf"), None)
+    return Hopes(picked, float(ratio[rest[0]]), places[rest[0]])
+
+
+def spread_out(places: FloatArray, apart: float, most: int) -> FloatArray:
+    """Return at most so many places, the first ones that keep a distance from those before."""
+    picked: list[FloatArray] = []
+    for place in places:
+        if len(picked) == most:
+            break
+        if all(np.linalg.norm(place - other) >= apart for other in picked):
+            picked.append(place)
+    return np.array(picked).reshape(-1, 3)
 
 
 def descend(
@@ -230,9 +264,9 @@ def descend(
     ]
     if not descents:
         return [[] for _ in hopes]
-    places = np.concatenate([each.places for each in descents])
-    known = split(field_map.query(places).inside, descents)
-    descents = [each.within(rows) for each, rows in zip(descents, known, strict=True)]
+    sample = field_map.query(np.concatenate([each.places for each in descents]))
+    fields, inside = split(sample.field, descents), split(sample.inside, descents)
+    descents = [each.starting(*at) for each, *at in zip(descents, fields, inside, strict=True)]
     active = descents = [each for each in descents if len(each.z) >= FEWEST]
     for _ in range(STEPS):
         if not active:
@@ -242,7 +276,22 @@ def descend(
         for each, (field, gradient) in zip(active, answers, strict=True):
             each.go_on(linearised(field, gradient, each.R, each.z), options.step)
         active = [each for each in active if np.linalg.norm(each.step) > SETTLED]
-    return [[each.basin for each in descents if each.sensor == s] for s in range(len(hopes))]
+    rms = at_ends(snapshots, field_map, descents, 1 - options.outliers)
+    return [
+        [Basin(d.t, left) for d, left in zip(descents, rms, strict=True) if d.sensor == s]
+        for s in range(len(hopes))
+    ]
+
+
+def at_ends(
+    snapshots: Snapshots, field_map: QueryableMap, descents: list["Descent"], good: float
+) -> list[float]:
+    """Return what each descent's end leaves of its sensor's readings in uT."""
+    if not descents:
+        return []
+    predict = whole_prediction(field_map)
+    ends = misfits(snapshots, predict, np.stack([each.t for each in descents]), good)
+    return [float(ends.rms[row, each.sensor]) for row, each in enumerate(descents)]
 
 
 @dataclass
@@ -284,19 +333,21 @@ class Descent:
             t=t,
         )
 
-    def within(self, rows: BoolArray) -> "Descent":
-        """Return the same on some of the readings."""
+    def starting(self, field: FloatArray, inside: BoolArray) -> "Descent":
+        """Return the same on readings inside the map that are no outliers seen from here.
+
+        ``field`` in uT, shape (K, 3), is that of the map at ``places``.
+        """
+        rows = np.flatnonzero(inside)
+        b = np.einsum("kji,kj->ki", self.R[rows], field[rows])
+        if len(rows) >= FEWEST:
+            rows = rows[consistent(b, self.z[rows], np.zeros(len(rows)), LARGEST)]
         return replace(self, R=self.R[rows], p=self.p[rows], z=self.z[rows])
 
     @property
     def places(self) -> FloatArray:
         """Where the readings would have been taken in the map, metres, shape (K, 3)."""
         return np.asarray(self.R @ self.trial + self.p)
-
-    @property
-    def basin(self) -> Basin:
-        """The best place so far."""
-        return Basin(self.t, float(np.sqrt(self.least / self.z.size)))
 
     def go_on(self, seen: Linearisation, longest: float) -> None:
         """Take the Gauss-Newton step, or a quarter of the last one where that led uphill."""

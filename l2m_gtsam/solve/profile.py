@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
 
@@ -21,6 +22,9 @@ MOST_STEP = 0.3  # metres
 MOST_TURN = 0.3  # radians, of the rotation's Frobenius distance over sqrt(2)
 # Normal equations hold half of the digits: what follows from the rest only is not regressed on.
 TIE = 1e-10
+TINY = 1e-300
+REGRESSORS = 4  # a one and the field
+CONCENTRATIONS = 4  # fits, each on the readings that the one before explains best
 
 Prediction = Callable[[FloatArray], tuple[FloatArray, BoolArray]]
 """Field in uT at points (N, 3) in metres, shape (N, 3), and whether it is known, shape (N,)."""
@@ -104,19 +108,23 @@ class Misfits:
 
     Attributes
     ----------
-    left
-        Sum of squares in uT^2 of each of G candidates and S sensors, shape (G, S). Where the map
-        does not know the field a candidate explains nothing but the mean.
+    rms
+        Root mean square per axis in uT of each of G candidates and S sensors, over the readings
+        that are explained best, shape (G, S). Where the map does not know the field a candidate
+        explains nothing but the mean.
     known
         Share of each sensor's readings that lie inside the map, shape (G, S).
     """
 
-    left: FloatArray
+    rms: FloatArray
     known: FloatArray
 
 
-def misfits(snapshots: Snapshots, predict: Prediction, t: FloatArray) -> Misfits:
+def misfits(snapshots: Snapshots, predict: Prediction, t: FloatArray, good: float = 1.0) -> Misfits:
     """Return how well candidates in the lidar frame, shape (G, 3), explain every sensor.
+
+    Least trimmed squares by concentration (P. J. Rousseeuw, K. Van Driessen, "Computing LTS
+    regression for large data sets", 2006): readings that are wrong, up to a share, do not count.
 
     Parameters
     ----------
@@ -126,22 +134,34 @@ def misfits(snapshots: Snapshots, predict: Prediction, t: FloatArray) -> Misfits
         The map.
     t
         Candidates in metres.
+    good
+        Share of the readings that counts.
     """
     places = snapshots.places(t)
     field, inside = predict(places.reshape(-1, 3))
     inside = inside.reshape(places.shape[:2])
     b = np.einsum("kji,gkj->gki", snapshots.R_map_lidar, field.reshape(places.shape))
     has = np.asarray(np.isfinite(snapshots.field).all(axis=2))
-    z = np.where(has[..., None], snapshots.field, 0.0)
-    z = np.where(has[..., None], z - z.sum(axis=0) / np.maximum(has.sum(axis=0), 1)[:, None], 0.0)
-    total = np.einsum("ksi,ksi->s", z, z)
-    left = total - explained(b, inside, z, has)
+    z = snapshots.field - middle(snapshots.field)
+    rms = np.empty((len(t), z.shape[1]))
+    write_trimmed(b, inside, np.where(has[..., None], z, 0.0), has, good, rms)
     known = inside.astype(float) @ has / np.maximum(has.sum(axis=0), 1)
-    return Misfits(np.maximum(left, 0.0), known)
+    return Misfits(rms, known)
 
 
-def explained(b: FloatArray, inside: BoolArray, z: FloatArray, has: BoolArray) -> FloatArray:
-    """Return the sum of squares that a regression on (1, b) takes from readings inside, (G, S).
+def middle(field: FloatArray) -> FloatArray:
+    """Return the median of each sensor's readings in uT, shape (S, 3); 0 where there are none."""
+    ordered = np.sort(field, axis=0)  # what is missing comes last
+    count = np.isfinite(field).sum(axis=0)
+    rows = np.maximum(count - 1, 0) // 2
+    return np.where(count > 0, np.take_along_axis(ordered, rows[None], axis=0)[0], 0.0)
+
+
+@njit(cache=True, nogil=True)
+def write_trimmed(
+    b: FloatArray, inside: BoolArray, z: FloatArray, has: BoolArray, good: float, rms: FloatArray
+) -> None:
+    """Write what regressions on (1, b) leave of the readings that they explain best.
 
     Parameters
     ----------
@@ -150,19 +170,106 @@ def explained(b: FloatArray, inside: BoolArray, z: FloatArray, has: BoolArray) -
     inside
         Where it is known, shape (G, K).
     z, has
-        Centred readings, shape (K, S, 3), zero where there are none, and where there are some.
+        Readings about their middle, shape (K, S, 3), and where there are some.
+    good
+        Share of the readings that counts.
+    rms
+        Root mean square of what is left, shape (G, S).
     """
-    count = np.maximum(inside.sum(axis=1), 1)
-    mean = np.einsum("gki,gk->gi", b, inside.astype(float)) / count[:, None]
-    ones = np.ones((*b.shape[:2], 1))
-    regressors = np.concatenate([ones, b - mean[:, None]], axis=2) * inside[..., None]
-    products = regressors[..., :, None] * regressors[..., None, :]
-    gram = np.einsum("gkab,ks->gsab", products, has.astype(float), optimize=True)
-    cross = np.einsum("gka,ksi->gsai", regressors, z, optimize=True)
-    gram[..., range(4), range(4)] *= 1 + TIE
-    gram[..., range(4), range(4)] += np.finfo(float).tiny
-    solved = np.linalg.solve(gram, cross)
-    return np.asarray(np.einsum("gsai,gsai->gs", cross, solved))
+    G, K, S = len(b), z.shape[0], z.shape[1]
+    regressors, left, ordered = np.empty((K, REGRESSORS)), np.empty(K), np.empty(K)
+    for g in range(G):
+        write_regressors(b[g], inside[g], regressors)
+        for s in range(S):
+            count, limit, total = 0, np.inf, 0.0
+            for k in range(K):
+                left[k] = 0.0
+                count += has[k, s]
+            kept = int(np.ceil(good * count))
+            for _ in range(CONCENTRATIONS if kept < count else 1):
+                X = fitted(regressors, z[:, s], inside[g], has[:, s], left, limit)
+                n = 0
+                for k in range(K):
+                    if has[k, s]:
+                        left[k] = length2(regressors[k], z[k, s], X, inside[g, k])
+                        ordered[n] = left[k]
+                        n += 1
+                chosen = np.sort(ordered[:n])[:kept]
+                limit, total = chosen[-1] if kept else 0.0, chosen.sum()
+            rms[g, s] = np.sqrt(total / max(3 * kept, 1))
+
+
+@njit(cache=True, nogil=True)
+def write_regressors(b: FloatArray, inside: BoolArray, regressors: FloatArray) -> None:
+    """Write a one and the field about its mean inside the map, shape (K, 4)."""
+    mean, count = np.zeros(3), 0
+    for k in range(len(b)):
+        if inside[k]:
+            mean += b[k]
+            count += 1
+    mean /= max(count, 1)
+    for k in range(len(b)):
+        regressors[k, 0] = 1.0
+        regressors[k, 1:] = b[k] - mean
+
+
+@njit(cache=True, nogil=True)
+def fitted(
+    regressors: FloatArray,
+    z: FloatArray,
+    inside: BoolArray,
+    has: BoolArray,
+    left: FloatArray,
+    limit: float,
+) -> FloatArray:
+    """Return the regression of the readings that left no more than a limit, shape (4, 3)."""
+    gram, X = np.zeros((REGRESSORS, REGRESSORS)), np.zeros((REGRESSORS, 3))
+    for k in range(len(z)):
+        if inside[k] and has[k] and left[k] <= limit:
+            for i in range(REGRESSORS):
+                for j in range(i + 1):
+                    gram[i, j] += regressors[k, i] * regressors[k, j]
+                for c in range(3):
+                    X[i, c] += regressors[k, i] * z[k, c]
+    for i in range(REGRESSORS):
+        gram[i, i] += TIE * gram[i, i] + TINY
+    solve_in_place(gram, X)
+    return X
+
+
+@njit(cache=True, nogil=True)
+def solve_in_place(gram: FloatArray, X: FloatArray) -> None:
+    """Replace X, shape (n, 3), by the solution; of ``gram`` the lower half, by Cholesky."""
+    n = len(gram)
+    for i in range(n):
+        for j in range(i + 1):
+            total = gram[i, j]
+            for k in range(j):
+                total -= gram[i, k] * gram[j, k]
+            # Rounding may leave less than nothing of a column that follows from the others.
+            gram[i, j] = np.sqrt(max(total, TINY)) if i == j else total / gram[j, j]
+    for c in range(X.shape[1]):
+        for i in range(n):
+            for k in range(i):
+                X[i, c] -= gram[i, k] * X[k, c]
+            X[i, c] /= gram[i, i]
+        for i in range(n - 1, -1, -1):
+            for k in range(i + 1, n):
+                X[i, c] -= gram[k, i] * X[k, c]
+            X[i, c] /= gram[i, i]
+
+
+@njit(cache=True, nogil=True)
+def length2(regressor: FloatArray, z: FloatArray, X: FloatArray, inside: bool) -> float:
+    """Return the squared length of what a regression leaves of one reading, all if outside."""
+    total = 0.0
+    for c in range(3):
+        e = z[c]
+        if inside:
+            for i in range(REGRESSORS):
+                e -= regressor[i] * X[i, c]
+        total += e * e
+    return total
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ def whitenings(seed: int, count: int) -> FloatArray:
     return np.random.default_rng(seed + 3).normal(size=(count, 3, 3)) + 3 * np.eye(3)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), tile=st.sampled_from(sorted(TILES)))
 def test_jacobians_match_central_differences(seed: int, tile: int) -> None:
     """Random poses, t, C, H, weights and features, any rows; 1e-6 as for all factors."""
@@ -99,7 +99,7 @@ def test_weights_are_shared_by_the_sensors_of_a_tile() -> None:
     assert set(first.keys()) & set(second.keys()) == {M(2)}
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 1000))
 def test_the_prior_is_that_of_the_covariance(seed: int) -> None:
     rng = np.random.default_rng(seed)

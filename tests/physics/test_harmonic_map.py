@@ -107,7 +107,7 @@ def test_between_tiles_the_field_has_the_gradient_to_its_own_sigma(field_map: Ha
     assert rms(seam) < 0.6 * sigma * 1.9 / (2 * field_map.learnt.tiling.blend)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     place=st.tuples(*[st.floats(-1, 1)] * 3),
     moment=st.tuples(*[st.floats(-30, 30)] * 3),

@@ -54,7 +54,7 @@ def assert_close(one: FieldSample, other: FieldSample) -> None:
         np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0, atol=1e-8)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(kind=ANY_KIND, uniform=st.tuples(*[st.floats(-60, 60)] * 3), seed=st.integers(0, 1000))
 def test_a_uniform_field_changes_only_the_mean(
     kind: str, uniform: tuple[float, float, float], seed: int
@@ -68,7 +68,7 @@ def test_a_uniform_field_changes_only_the_mean(
     assert_close(added, shifted)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(
     kind=ANY_KIND,
     turn=st.tuples(*[st.floats(-3, 3)] * 3),
@@ -122,7 +122,7 @@ def test_far_from_data_the_prior_comes_back(kind: str) -> None:
     assert not ours.query(at).inside.any()
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(kind=ANY_KIND, seed=st.integers(0, 1000))
 def test_more_readings_never_make_a_map_less_certain(kind: str, seed: int) -> None:
     points, field = readings(seed)

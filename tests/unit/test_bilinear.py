@@ -54,7 +54,7 @@ def slopes(points: FloatArray) -> FloatArray:
     return np.array(rows).transpose(2, 1, 0)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.floats(-50, 50), min_size=24, max_size=24), st.sampled_from([0.1, 0.25, 0.4]))
 def test_a_trilinear_field_read_at_the_nodes_is_reproduced(
     values: list[float], spacing: float
@@ -207,7 +207,7 @@ def test_layers_gather_readings_of_one_height(heights: list[float], expected: li
     assert layers_of(np.array(heights), np.ones(len(heights)), 0.25).tolist() == expected
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.lists(st.floats(-5, 5), min_size=1, max_size=40))
 def test_layers_count_upward_and_keep_their_distance(heights: list[float]) -> None:
     layer = layers_of(np.array(heights), np.ones(len(heights)), 0.25)
@@ -216,7 +216,7 @@ def test_layers_count_upward_and_keep_their_distance(heights: list[float]) -> No
     assert np.diff(means).min(initial=np.inf) >= bilinear.LEAST_STEP * 0.25
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3), min_size=1, max_size=20

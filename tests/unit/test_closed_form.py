@@ -28,7 +28,7 @@ def pairs(seed: int, count: int, noise: float) -> tuple[FloatArray, FloatArray, 
 
 
 @pytest.mark.parametrize("method", list(Method))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 1000))
 def test_noiseless_pairs_give_the_truth(method: Method, seed: int) -> None:
     """The default ridge of a billionth moves C by 1e-10 and H by fields of 50 uT times that."""

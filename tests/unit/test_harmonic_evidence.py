@@ -131,7 +131,7 @@ def assert_same_sums(one: Normal, other: Normal) -> None:
     assert one.log_weight == pytest.approx(other.log_weight, abs=1e-11)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(cut=st.integers(1, 59), seed=st.integers(0, 100))
 def test_sums_over_readings_add_and_subtract(cut: int, seed: int) -> None:
     rows = np.random.default_rng(seed).permutation(60)

@@ -86,7 +86,7 @@ def test_the_order_of_queries_does_not_matter(harmonic: HarmonicMap) -> None:
     np.testing.assert_allclose(one.variance, other.variance[order], rtol=1e-10)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(*[st.floats(-1e3, 1e3, allow_nan=False)] * 3), min_size=1, max_size=10))
 def test_a_trial_step_to_anywhere_is_finite(
     harmonic: HarmonicMap, anywhere: list[tuple[float, float, float]]

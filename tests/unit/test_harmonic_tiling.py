@@ -20,7 +20,7 @@ from tests.harmonic_models import GIVEN
 POSITIVE = st.floats(0.05, 20.0)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(scale=POSITIVE, depth=st.floats(0.05, 5.0), density=st.floats(0.5, 1000), noise=POSITIVE)
 def test_the_resolution_is_where_readings_tell_the_share(
     scale: float, depth: float, density: float, noise: float
@@ -42,7 +42,7 @@ def test_the_resolution_is_where_readings_tell_the_share(
         assert ratio(found) == pytest.approx(share, rel=1e-6)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(scale=POSITIVE, depth=st.floats(0.05, 5.0), density=st.floats(0.5, 1000), noise=POSITIVE)
 def test_better_surveys_never_resolve_less(
     scale: float, depth: float, density: float, noise: float
@@ -76,7 +76,7 @@ def test_readings_tell_of_a_mode_what_the_resolution_assumes() -> None:
 AREA = np.random.default_rng(6).uniform([-3, -2, 0.3], [9, 7, 0.9], (2000, 3))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(k=st.floats(2.0, 12.0), budget=st.integers(50, 2000))
 def test_tiles_share_every_place_of_the_survey(k: float, budget: int) -> None:
     tiling = tiling_of(AREA, Resolution(k, 0.5 * k), TilingOptions(), budget, reach=0.5)

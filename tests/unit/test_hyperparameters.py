@@ -46,7 +46,7 @@ def test_the_value_is_the_density_of_a_multivariate_normal() -> None:
     assert log_likelihood(near, TRUTH).value == pytest.approx(expected, rel=1e-10)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     length_scale=st.floats(0.2, 3),

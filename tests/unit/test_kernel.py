@@ -10,7 +10,7 @@ from l2m_gtsam.maps.kernel import kernel_matrix, mean_and_gradient, mean_weights
 ROUNDING = 1e-12
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), signal=st.floats(0.01, 100), spread=st.floats(0.1, 5))
 def test_the_matrix_is_the_formula(seed: int, signal: float, spread: float) -> None:
     rng = np.random.default_rng(seed)

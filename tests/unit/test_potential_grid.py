@@ -111,7 +111,7 @@ def errors(source: Dipole | Wave, spacing: float) -> tuple[float, float]:
     return float(np.abs(field - true_field).max()), float(np.abs(gradient - true_gradient).max())
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1), spacing=st.floats(0.04, 0.5))
 def test_polynomials_are_reproduced(seed: int, spacing: float) -> None:
     rng = np.random.default_rng(seed)
@@ -237,7 +237,7 @@ def test_the_grid_ends_beyond_the_reach(reach: float, corner: list[float]) -> No
         assert not grid.covers(np.array([lowest - beyond, highest + beyond])).any()
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), reach=st.floats(0, 0.3), spacing=st.floats(0.05, 0.3))
 def test_covered_is_where_field_and_gradient_are_known(
     seed: int, reach: float, spacing: float

@@ -11,7 +11,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.solve.rotation import polar_rotation
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seed=st.integers(0, 10_000))
 def test_it_is_the_polar_factor(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -20,7 +20,7 @@ def test_it_is_the_polar_factor(seed: int) -> None:
     np.testing.assert_allclose(found.R_mag_lidar, polar(C)[0], atol=1e-12)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_delta_method_agrees_with_differences(seed: int) -> None:
     """Perturb C, watch the rotation: covariance J J^T from central differences, step 1e-6."""

@@ -119,7 +119,7 @@ def test_the_order_of_queries_does_not_matter(sliding: SlidingGP) -> None:
     np.testing.assert_allclose(one.variance, other.variance[order], rtol=0, atol=1e-10)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(*[st.floats(allow_nan=False, allow_infinity=False)] * 3), min_size=1, max_size=20

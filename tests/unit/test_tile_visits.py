@@ -25,7 +25,7 @@ def by_the_rule(of: Tiling, points: FloatArray) -> FloatArray:
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_visits_are_those_of_the_rule(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -13,10 +13,10 @@ from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
-from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.training import TrainingSet, checked_points
+from l2m_gtsam.threads import in_threads
 
 MEMORY = 1_000_000_000  # bytes of grids that are kept
 SHARES = 4  # that points are divided into, for as many threads at most

@@ -24,9 +24,9 @@ from l2m_gtsam.maps.grid import Grid
 from l2m_gtsam.maps.harmonic.basis import batches
 from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.learnt import Learnt
-from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.threads import in_threads
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,11 @@ from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
-from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.visits import Visit
 from l2m_gtsam.maps.survey import narrow
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
+from l2m_gtsam.threads import in_threads
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out

@@ -15,7 +15,6 @@ from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
 from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
 from l2m_gtsam.maps.harmonic.structure import Sources
-from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tiling import (
     FINER,
     Resolution,
@@ -28,6 +27,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
 )
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
+from l2m_gtsam.threads import in_threads
 
 ROUNDS = 2  # learning is repeated while it asks for finer modes than it looked at
 BOUND_TOLERANCE = 1e-6

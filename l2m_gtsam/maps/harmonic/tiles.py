@@ -7,8 +7,8 @@ from threading import Lock
 from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.local import local_hyperparameters
-from l2m_gtsam.maps.harmonic.threads import in_threads
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.threads import in_threads
 
 MEMORY = 2_000_000_000  # bytes of the tiles' covariances that are kept
 

@@ -1,0 +1,159 @@
+r"""Readings that the model cannot explain: how far to trust each.
+
+With the squared length r^2 of a whitened residual and the largest c^2 that noise leaves, the
+truncated loss min(r^2, c^2) is approached by graduated non-convexity (H. Yang, P. Antonante,
+V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception", 2020): for a
+growing mu a reading weighs
+
+.. math::
+    w = 1 \;\text{if}\; r^2 \le \tfrac{\mu}{\mu + 1} c^2, \quad
+    w = 0 \;\text{if}\; r^2 \ge \tfrac{\mu + 1}{\mu} c^2, \quad
+    w = \tfrac{c}{r} \sqrt{\mu (\mu + 1)} - \mu \;\text{between}.
+"""
+
+from collections.abc import Callable
+from enum import StrEnum
+
+import numpy as np
+from pydantic import Field
+from scipy.optimize import brentq
+from scipy.stats import chi2
+
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.options import Options
+from l2m_gtsam.solve.noise import NOISE_RANGE
+
+AXES = 3
+MEDIAN = float(chi2.median(AXES))  # of r^2 where only noise is left
+FIRST_ROUNDS = 10  # of least absolute deviations: an outlier pulls no more than a good reading
+TRIMMINGS = 30
+SMALL = 1e-3  # of the median length: residuals shorter than that weigh alike
+
+
+class Loss(StrEnum):
+    """What a residual costs."""
+
+    TRUNCATED = "truncated"
+    HUBER = "huber"
+    CAUCHY = "cauchy"
+    SQUARED = "squared"
+
+
+class RobustOptions(Options):
+    """How readings are treated that the model cannot explain."""
+
+    loss: Loss = Loss.TRUNCATED
+    """`truncated` (they are rejected and named, by graduated non-convexity), `huber` or `cauchy`
+    (they pull less, none is rejected), or `squared` (all count in full)."""
+    confidence: float = Field(default=0.999, gt=0.9, lt=1)
+    """Of readings with nothing but noise so many are taken for good."""
+
+    @property
+    def largest(self) -> float:
+        """Largest squared length of a whitened residual that passes for noise."""
+        return float(chi2.ppf(self.confidence, AXES))
+
+
+def truncated_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
+    """Return the weights of the truncated loss, shape (N,), at a stage of its graduation.
+
+    Parameters
+    ----------
+    r2
+        Squared lengths of whitened residuals, shape (N,).
+    largest
+        c^2.
+    mu
+        Small for a loss that is nearly convex; infinite for the truncated loss itself.
+    """
+    if np.isinf(mu):
+        return np.asarray(r2 <= largest, dtype=float)
+    between = np.sqrt(largest * mu * (mu + 1) / np.maximum(r2, np.finfo(float).tiny)) - mu
+    return np.clip(between, 0.0, 1.0)
+
+
+def huber_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
+    """Return the weights of Huber's loss, quadratic up to c; see ``truncated_weights``."""
+    return np.sqrt(largest / np.maximum(r2, largest))
+
+
+def cauchy_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
+    """Return the weights of Cauchy's loss with the scale c; see ``truncated_weights``."""
+    return 1 / (1 + r2 / largest)
+
+
+def equal_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
+    """Return ones; see ``truncated_weights``."""
+    return np.ones_like(r2)
+
+
+WEIGHTS: dict[Loss, Callable[[FloatArray, float, float], FloatArray]] = {
+    Loss.TRUNCATED: truncated_weights,
+    Loss.HUBER: huber_weights,
+    Loss.CAUCHY: cauchy_weights,
+    Loss.SQUARED: equal_weights,
+}
+
+
+def median_noise(residual: FloatArray, map_variance: FloatArray) -> float:
+    """Return the noise in uT that explains half of the residuals, whatever the other half is.
+
+    Parameters
+    ----------
+    residual
+        Residuals in uT, shape (N, 3).
+    map_variance
+        Mean variance of the map's prediction in uT^2, shape (N,).
+    """
+    e2 = np.einsum("ni,ni->n", residual, residual)
+
+    def excess(log_sigma: float) -> float:
+        return float(np.median(e2 / (np.exp(2 * log_sigma) + map_variance))) - MEDIAN
+
+    low, high = np.log(NOISE_RANGE)
+    if excess(low) <= 0:
+        return NOISE_RANGE[0]
+    if excess(high) >= 0:
+        return NOISE_RANGE[1]
+    return float(np.exp(brentq(excess, low, high, xtol=1e-4)))
+
+
+def consistent(
+    b_lidar: FloatArray, field: FloatArray, map_variance: FloatArray, largest: float
+) -> BoolArray:
+    """Return which readings one distortion explains, up to noise that half of them show, (N,).
+
+    Least absolute deviations give the first distortion; then readings beyond ``largest`` are left
+    out and the others fitted again, until the same ones stay.
+
+    Parameters
+    ----------
+    b_lidar
+        Predicted field in the lidar frame in uT, shape (N, 3).
+    field
+        Readings in uT, shape (N, 3).
+    map_variance
+        Mean variance of the prediction in uT^2, shape (N,).
+    largest
+        Largest squared length of a whitened residual that passes for noise.
+    """
+    regressors = np.column_stack([np.ones(len(b_lidar)), b_lidar - b_lidar.mean(axis=0)])
+    e = deviations(regressors, field, np.ones(len(field)))
+    for _ in range(FIRST_ROUNDS):
+        length = np.linalg.norm(e, axis=1)
+        e = deviations(regressors, field, 1 / np.maximum(length, SMALL * np.median(length)))
+    keep = np.ones(len(field), dtype=np.bool_)
+    for _ in range(TRIMMINGS):
+        variance = median_noise(e, map_variance) ** 2 + map_variance
+        before, keep = keep, np.einsum("ni,ni->n", e, e) <= largest * variance
+        if np.array_equal(keep, before):
+            break
+        e = deviations(regressors, field, keep / variance)
+    return np.asarray(keep)
+
+
+def deviations(regressors: FloatArray, field: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return what a weighted regression leaves of all readings in uT, shape (N, 3)."""
+    root = np.sqrt(weights)[:, None]
+    X = np.linalg.lstsq(root * regressors, root * field, rcond=None)[0]
+    return np.asarray(field - regressors @ X)
