@@ -21,6 +21,7 @@ from l2m_gtsam.solve.closed_form import (
 )
 from l2m_gtsam.solve.noise import estimate_noise
 from l2m_gtsam.solve.rank import RankOptions
+from l2m_gtsam.solve.robust import RobustOptions
 
 Progress = Callable[[str, float], None]
 
@@ -59,6 +60,8 @@ class OneKeyOptions(Options):
     """Standard deviation of the sensors' noise; estimated for each sensor if not given."""
     min_readings: int = Field(default=30, ge=5)
     """A sensor with fewer readings inside the map is not solved; five have 15 components."""
+    robust: RobustOptions = RobustOptions()
+    """What becomes of readings that the map and one distortion cannot explain."""
     rank: RankOptions = RankOptions()
     """When a direction counts as determined."""
 

@@ -19,7 +19,13 @@ from l2m_gtsam.graph.calibration import (
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.view import QueryableMap, View
 from l2m_gtsam.solve.figures import residual_figures
-from l2m_gtsam.solve.noise import estimate_noise, map_covariance, reading_covariance, whitening
+from l2m_gtsam.solve.noise import (
+    HALF,
+    estimate_noise,
+    map_covariance,
+    reading_covariance,
+    whitening,
+)
 from l2m_gtsam.solve.rank import Determinacy, determinacy
 
 # Of each round; two rounds at least are made, and each step shortens what remains fourfold.
@@ -94,7 +100,7 @@ def joint_problem(
     """Build the joint graph at an estimate: rank test first, undetermined directions held."""
     sensor = view.readings.sensor
     share = map_covariance(estimate.C()[sensor], view.readings.R_map_lidar, view.map_variance)
-    covariance = reading_covariance(estimate.noise[sensor], share)
+    covariance = reading_covariance(estimate.noise[sensor], share, view.trust)
     batch = batch_readings(view.readings, field_map)
     values, W = estimate.values(view.sensors), whitening(covariance)
     jacobians = {s: whitened_jacobian(batch, W, values, s) for s in view.sensors}
@@ -122,6 +128,7 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
     variance = np.trace(problem.map_share, axis1=1, axis2=2) / 3
     for s in problem.view.sensors:
         rows, taken = problem.batch.rows_of(s), problem.determinacies[s].free
+        rows = rows[problem.view.trust[rows] > HALF]
         residual = problem.batch.residuals(values, s).residual[rows]
         noise[s] = estimate_noise(residual, variance[rows], taken)
     return noise

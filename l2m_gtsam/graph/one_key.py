@@ -7,7 +7,7 @@ moves the sensors, with the same weights inside and outside. The *joint* graph o
 uncertainty. All sensors are in one graph and share one evaluation of the map.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,10 +19,17 @@ from l2m_gtsam.graph.alternation import (
     start_estimate,
 )
 from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.joint import SensorSolution, joint_problem, joint_step, sensor_solutions
+from l2m_gtsam.graph.joint import (
+    JointProblem,
+    SensorSolution,
+    joint_problem,
+    joint_step,
+    sensor_solutions,
+)
 from l2m_gtsam.graph.optimise import Ending
+from l2m_gtsam.graph.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.graph.uncertain import UncertainMap, solve_uncertain
-from l2m_gtsam.graph.view import QueryableMap, observe
+from l2m_gtsam.graph.view import QueryableMap, View, observe
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
@@ -44,6 +51,8 @@ class OneKeySolution:
         Solutions of the sensors that have enough readings inside the map.
     inside
         Which readings lie inside the map at the estimate, shape (N,).
+    rejected
+        Which of them do not count, for no distortion explains them beside the others, shape (N,).
     steps
         Alternations taken.
     ending
@@ -57,6 +66,7 @@ class OneKeySolution:
     estimate: Estimate
     solved: tuple[SensorSolution, ...]
     inside: BoolArray
+    rejected: BoolArray
     steps: int
     ending: Ending
     settled: bool
@@ -86,38 +96,102 @@ def solve_one_key(
         Called with a stage and the fraction of it that is done.
     """
     tell = progress or (lambda stage, fraction: None)
-    near = alternate(readings, field_map, start_estimate(t_start, options), options, tell)
-    estimate, ending, settled = near.estimate, Ending.TOLERANCE, False
-    view = observe(readings, field_map, estimate, options.min_readings)
-    if not view.sensors:
-        return OneKeySolution(estimate, (), view.inside, near.steps, ending, settled)
+    good = readings.select(plausible(readings, field_map, t_start, options.robust))
+    near = alternate(good, field_map, start_estimate(t_start, options), options, tell)
+    joint = settle(readings, field_map, near.estimate, options, tell)
+    outcome = OneKeySolution(
+        estimate=joint.estimate,
+        solved=(),
+        inside=joint.whole.inside,
+        rejected=joint.rejected,
+        steps=near.steps,
+        ending=joint.ending,
+        settled=joint.settled,
+    )
+    if joint.problem is None:
+        return outcome
+    view, tests = joint.problem.view, joint.problem.determinacies
+    if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
+        tell("map uncertainty", 0.0)
+        full = solve_uncertain(view, field_map, field_map, joint.estimate, tests, options)
+        tell("map uncertainty", 1.0)
+        return replace(
+            outcome,
+            estimate=full.estimate,
+            solved=full.solved,
+            settled=joint.settled and full.settled,
+            uncertainty=Uncertainty.FULL,
+        )
+    return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Where the joint graph settled.
+
+    Attributes
+    ----------
+    estimate
+        All sensors.
+    whole
+        All readings inside the map.
+    weights
+        How far each of them counts, shape (M,).
+    problem
+        The graph of those that count; none if no sensor has enough.
+    ending
+        How the last optimisation ended.
+    settled
+        Whether another round would repeat the last.
+    """
+
+    estimate: Estimate
+    whole: View
+    weights: FloatArray
+    problem: JointProblem | None
+    ending: Ending
+    settled: bool
+
+    @property
+    def rejected(self) -> BoolArray:
+        """Which of all readings lie inside the map and do not count, shape (N,)."""
+        rejected = np.zeros(len(self.whole.inside), dtype=np.bool_)
+        rejected[self.whole.rows] = self.weights <= NOTHING
+        return rejected
+
+
+def settle(
+    readings: Readings,
+    field_map: QueryableMap,
+    estimate: Estimate,
+    options: OneKeyOptions,
+    tell: Progress,
+) -> Joint:
+    """Solve the joint graph again and again, until the weights are those of its result.
+
+    That is the graduated loop too: each round trusts readings as the residuals of the last say.
+    """
+    whole = observe(readings, field_map, estimate, options.min_readings)
+    ending, settled = Ending.TOLERANCE, False
+    last: Trusted | None = None
+    problem: JointProblem | None = None
     for round_ in range(MAX_ROUNDS):
         tell("joint graph", round_ / MAX_ROUNDS)
-        problem = joint_problem(view, field_map, estimate, options)
+        now = trusted(whole, field_map, estimate, options, round_, last)
+        if not now.view.sensors:
+            return Joint(estimate, whole, now.weights, None, ending, settled=False)
+        problem = joint_problem(now.view, field_map, estimate, options)
         step = joint_step(problem, estimate, options)
         moved = float(np.abs(step.estimate.t - estimate.t).max())
-        settled = moved < SETTLED_M and step.estimate.same_noise(estimate)
-        estimate, ending = step.estimate, step.ending
+        quiet = moved < SETTLED_M and step.estimate.same_noise(estimate)
+        settled = quiet and now.agrees(last)
+        estimate, ending, last = step.estimate, step.ending, now
         if settled:
             break
         if moved > REOBSERVE_M:
-            view = observe(readings, field_map, estimate, options.min_readings)
+            whole = observe(readings, field_map, estimate, options.min_readings)
     tell("joint graph", 1.0)
-    if not settled:  # the weights of the last round are not those of its result
-        problem = joint_problem(view, field_map, estimate, options)
-    full_asked = options.uncertainty is Uncertainty.FULL and bool(view.sensors)
-    if full_asked and isinstance(field_map, UncertainMap):
-        tell("map uncertainty", 0.0)
-        full = solve_uncertain(view, field_map, field_map, estimate, problem.determinacies, options)
-        tell("map uncertainty", 1.0)
-        return OneKeySolution(
-            estimate=full.estimate,
-            solved=full.solved,
-            inside=view.inside,
-            steps=near.steps,
-            ending=ending,
-            settled=settled and full.settled,
-            uncertainty=Uncertainty.FULL,
-        )
-    solved = sensor_solutions(problem, estimate)
-    return OneKeySolution(estimate, solved, view.inside, near.steps, ending, settled)
+    if last is None or not settled:  # the last round's weights are not those of its result
+        last = trusted(whole, field_map, estimate, options, MAX_ROUNDS, None)
+        problem = joint_problem(last.view, field_map, estimate, options)
+    return Joint(estimate, whole, last.weights, problem, ending, settled)

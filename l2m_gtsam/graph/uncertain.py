@@ -26,7 +26,13 @@ from l2m_gtsam.graph.elimination import Eliminated, eliminate
 from l2m_gtsam.graph.joint import SensorSolution, with_infinities
 from l2m_gtsam.graph.view import QueryableMap, View
 from l2m_gtsam.solve.figures import residual_figures
-from l2m_gtsam.solve.noise import estimate_noise, map_covariance, reading_covariance, whitening
+from l2m_gtsam.solve.noise import (
+    HALF,
+    estimate_noise,
+    map_covariance,
+    reading_covariance,
+    whitening,
+)
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6
@@ -221,7 +227,7 @@ class UncertainProblem:
         share = map_covariance(estimate.C()[sensor], view.readings.R_map_lidar, coverage.rest)
         self._view, self._coverage, self._tests = view, coverage, tests
         self._rest = np.trace(share, axis1=1, axis2=2) / 3
-        self._W = whitening(reading_covariance(estimate.noise[sensor], share))
+        self._W = whitening(reading_covariance(estimate.noise[sensor], share, view.trust))
         self._batch = batch_readings(view.readings, field_map)
         self._graph = gtsam.NonlinearFactorGraph()
         for group in coverage.groups:
@@ -247,6 +253,7 @@ class UncertainProblem:
         system = self._eliminated(values)
         for s in self._view.sensors:
             rows, taken = self._batch.rows_of(s), self._taken(system, s)
+            rows = rows[self._view.trust[rows] > HALF]
             noise[s] = estimate_noise(residual[rows], self._rest[rows], taken)
         return noise
 

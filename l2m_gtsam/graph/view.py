@@ -5,7 +5,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, Readings
 from l2m_gtsam.graph.calibration import Estimate
 
 
@@ -42,6 +42,10 @@ class View:
         Field that the map predicts there, in the lidar frame in uT, shape (N, 3).
     map_variance
         Its variance per axis of the map frame in uT^2, shape (N, 3).
+    trust
+        How far each counts, from 0 to 1, shape (N,).
+    rows
+        Which of all M readings these are, shape (N,).
     inside
         Which of all M readings lie inside the map, shape (M,).
     sensors
@@ -51,6 +55,8 @@ class View:
     readings: Readings
     b_lidar: FloatArray
     map_variance: FloatArray
+    trust: FloatArray
+    rows: IntArray
     inside: BoolArray
     sensors: list[int]
 
@@ -67,4 +73,12 @@ def observe(
     keep = sample.inside & usable[readings.sensor]
     b_lidar = np.einsum("nji,nj->ni", R[keep], sample.field[keep])
     sensors = [int(s) for s in np.flatnonzero(usable)]
-    return View(readings.select(keep), b_lidar, sample.variance[keep], sample.inside, sensors)
+    return View(
+        readings=readings.select(keep),
+        b_lidar=b_lidar,
+        map_variance=sample.variance[keep],
+        trust=np.ones(int(keep.sum())),
+        rows=np.flatnonzero(keep),
+        inside=sample.inside,
+        sensors=sensors,
+    )

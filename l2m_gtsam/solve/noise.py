@@ -8,6 +8,7 @@ from l2m_gtsam.data import FloatArray
 # Search range for a sensor's noise in uT: from below the resolution of any vehicle's magnetometer
 # to above the Earth's field.
 NOISE_RANGE = (1e-4, 1e3)
+HALF = 0.5  # readings that count for less tell nothing of the noise
 
 
 def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatArray) -> FloatArray:
@@ -26,8 +27,10 @@ def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatAr
     return np.asarray(np.einsum("nik,nk,njk->nij", A, map_variance, A))
 
 
-def reading_covariance(noise: FloatArray, map_share: FloatArray) -> FloatArray:
-    """Return ``sigma^2 I + map_share``, the covariance of each residual in uT^2, (N, 3, 3).
+def reading_covariance(
+    noise: FloatArray, map_share: FloatArray, trust: FloatArray | float = 1.0
+) -> FloatArray:
+    """Return ``(sigma^2 I + map_share) / trust``, of each residual in uT^2, (N, 3, 3).
 
     Parameters
     ----------
@@ -35,8 +38,11 @@ def reading_covariance(noise: FloatArray, map_share: FloatArray) -> FloatArray:
         Standard deviation of the sensor that made the reading in uT, shape (N,).
     map_share
         What the map contributes, shape (N, 3, 3).
+    trust
+        How far each reading counts, shape (N,).
     """
-    return np.asarray((noise**2)[:, None, None] * np.eye(3) + map_share)
+    covariance = (noise**2)[:, None, None] * np.eye(3) + map_share
+    return np.asarray(covariance / np.reshape(trust, (-1, 1, 1)))
 
 
 def whitening(covariance: FloatArray) -> FloatArray:

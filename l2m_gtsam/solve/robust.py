@@ -16,6 +16,7 @@ from enum import StrEnum
 
 import numpy as np
 from pydantic import Field
+from scipy.ndimage import label, uniform_filter1d
 from scipy.optimize import brentq
 from scipy.stats import chi2
 
@@ -25,8 +26,11 @@ from l2m_gtsam.solve.noise import NOISE_RANGE
 
 AXES = 3
 MEDIAN = float(chi2.median(AXES))  # of r^2 where only noise is left
+TINY = 1e-12  # a squared length of a whitened residual that is as good as none
 FIRST_ROUNDS = 10  # of least absolute deviations: an outlier pulls no more than a good reading
 TRIMMINGS = 30
+WINDOWS = (9, 25)  # readings of a mean
+SEEDS = 3  # readings wrong by themselves that make a stretch of what lies about them
 SMALL = 1e-3  # of the median length: residuals shorter than that weigh alike
 
 
@@ -45,7 +49,7 @@ class RobustOptions(Options):
     loss: Loss = Loss.TRUNCATED
     """`truncated` (they are rejected and named, by graduated non-convexity), `huber` or `cauchy`
     (they pull less, none is rejected), or `squared` (all count in full)."""
-    confidence: float = Field(default=0.999, gt=0.9, lt=1)
+    confidence: float = Field(default=0.9999, gt=0.9, lt=1)
     """Of readings with nothing but noise so many are taken for good."""
 
     @property
@@ -68,7 +72,7 @@ def truncated_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
     """
     if np.isinf(mu):
         return np.asarray(r2 <= largest, dtype=float)
-    between = np.sqrt(largest * mu * (mu + 1) / np.maximum(r2, np.finfo(float).tiny)) - mu
+    between = np.sqrt(largest * mu * (mu + 1) / np.maximum(r2, TINY)) - mu
     return np.clip(between, 0.0, 1.0)
 
 
@@ -118,6 +122,31 @@ def median_noise(residual: FloatArray, map_variance: FloatArray) -> float:
     return float(np.exp(brentq(excess, low, high, xtol=1e-4)))
 
 
+def difference_noise(residual: FloatArray) -> float:
+    """Return the noise in uT that differences of residuals in order of time, shape (N, 3), show.
+
+    What is wrong with the field over some readings in a row cancels.
+    """
+    steps = np.diff(residual, axis=0)
+    length2 = np.einsum("ni,ni->n", steps, steps)
+    if not len(steps):
+        return NOISE_RANGE[1]
+    return max(float(np.sqrt(np.median(length2) / (2 * MEDIAN))), NOISE_RANGE[0])
+
+
+def resistant_noise(residual: FloatArray, map_variance: FloatArray) -> float:
+    """Return the noise in uT that is not taken in by wrong readings, few or many in a row.
+
+    Parameters
+    ----------
+    residual
+        In order of time in uT, shape (N, 3).
+    map_variance
+        Mean variance of the map's prediction in uT^2, shape (N,).
+    """
+    return min(median_noise(residual, map_variance), difference_noise(residual))
+
+
 def consistent(
     b_lidar: FloatArray, field: FloatArray, map_variance: FloatArray, largest: float
 ) -> BoolArray:
@@ -157,3 +186,49 @@ def deviations(regressors: FloatArray, field: FloatArray, weights: FloatArray) -
     root = np.sqrt(weights)[:, None]
     X = np.linalg.lstsq(root * regressors, root * field, rcond=None)[0]
     return np.asarray(field - regressors @ X)
+
+
+def grown(
+    rejected: BoolArray,
+    residual: FloatArray,
+    noise: float,
+    map_variance: FloatArray,
+    largest: float,
+) -> BoolArray:
+    """Return the rejected readings of a drive and those about them that deviate together, (N,).
+
+    Where something was moved the field fades from plainly wrong to right: at the ends of such a
+    stretch each reading could be noise, their mean could not. The map's error counts as common to
+    all readings of a mean.
+
+    Parameters
+    ----------
+    rejected
+        Readings that are wrong by themselves, in order of time, shape (N,).
+    residual
+        Of all readings in uT, shape (N, 3).
+    noise
+        Of the sensor in uT.
+    map_variance
+        Mean variance of the map's prediction in uT^2, shape (N,).
+    largest
+        Largest squared length of a whitened mean that passes for noise.
+    """
+    together = np.zeros_like(rejected)
+    for window in WINDOWS:
+        count = windowed(np.where(rejected, 0.0, 1.0), window)
+        total = [windowed(np.where(rejected, 0.0, axis), window) for axis in residual.T]
+        mean = np.stack(total, axis=1) / np.maximum(count, 1)[:, None]
+        common = windowed(map_variance, window) / windowed(np.ones(len(mean)), window)
+        variance = noise**2 / np.maximum(count, 1) + common
+        together |= (count > 0) & (np.einsum("ni,ni->n", mean, mean) > largest * variance)
+    pieces, found = label(rejected | together)
+    seeds = np.bincount(pieces, weights=rejected, minlength=found + 1)
+    grows = seeds >= SEEDS
+    grows[0] = False
+    return np.asarray(rejected | grows[pieces])
+
+
+def windowed(values: FloatArray, window: int) -> FloatArray:
+    """Return the sum over a window about each value, shape (N,)."""
+    return np.asarray(uniform_filter1d(values, window, mode="constant") * window)
