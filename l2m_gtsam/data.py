@@ -344,6 +344,47 @@ class FoundStart:
     runner_up: FloatArray | None
 
 
+class Return(StrEnum):
+    """What was read when a place was passed again at another time."""
+
+    NEVER = "not passed again"
+    AS_MAPPED = "as mapped"
+    DIFFERS = "differs again"
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A stretch of a drive over which readings fit neither the map nor any distortion.
+
+    Attributes
+    ----------
+    sensors
+        Names of those that disagree.
+    start_ns, end_ns
+        When, in nanoseconds.
+    p_from, p_to
+        Where the lidar was at the first and the last of these readings, metres, map frame, (3,).
+    length
+        Way of the lidar in metres.
+    readings
+        Number of readings rejected.
+    size
+        Median length of their residuals in uT.
+    passed_again
+        What was read at the same place at another time.
+    """
+
+    sensors: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+    p_from: FloatArray
+    p_to: FloatArray
+    length: float
+    readings: int
+    size: float
+    passed_again: Return
+
+
 @dataclass(frozen=True)
 class SensorCalibration:
     """The calibration of one magnetometer and how far to trust it.
