@@ -21,6 +21,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
+from l2m_gtsam.graph.explanation import undetermined
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
@@ -71,7 +72,8 @@ def calibrate(
     found = _starts(alive, solver_map, options, progress)
     t_start = _start_places(alive.sensors, found, options)
     solution = solve_one_key(alive, solver_map, t_start, options.solve, progress)
-    sensors = _assess(synchronised, alive, solution, options)
+    words = _words(alive, solver_map, solution, options)
+    sensors = _assess(synchronised, alive, solution, words, options)
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
@@ -143,10 +145,28 @@ def _with_start(
     return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
 
 
+def _words(
+    alive: Readings, field_map: QueryableMap, solution: OneKeySolution, options: CalibrationOptions
+) -> dict[int, tuple[str, ...]]:
+    """Return what each solved sensor's readings leave open, in sentences."""
+    used = alive.select(solution.inside)
+    return {
+        found.sensor: undetermined(
+            found.determinacy,
+            used.select(used.sensor == found.sensor),
+            solution.estimate.t[found.sensor],
+            field_map,
+            options.solve.rank,
+        )
+        for found in solution.solved
+    }
+
+
 def _assess(
     synchronised: Synchronised,
     alive: Readings,
     solution: OneKeySolution,
+    words: dict[int, tuple[str, ...]],
     options: CalibrationOptions,
 ) -> tuple[SensorCalibration, ...]:
     """Return a verdict on every sensor of the recording."""
@@ -155,7 +175,9 @@ def _assess(
     sensors = []
     for index, (name, counts) in enumerate(zip(alive.sensors, synchronised.counts, strict=True)):
         if index in solved:
-            entry = _solved(name, solved[index], solution, counts, int(outside[index]))
+            entry = _solved(
+                name, solved[index], solution, words[index], counts, int(outside[index])
+            )
         else:
             usable = alive.rows_of(index)
             read = usable.stop - usable.start
@@ -168,12 +190,13 @@ def _solved(
     name: str,
     found: SensorSolution,
     solution: OneKeySolution,
+    words: tuple[str, ...],
     counts: SyncCounts,
     outside: int,
 ) -> SensorCalibration:
     vector = solution.estimate.distortion[found.sensor]
     distortion = Distortion.from_vector(vector)
-    status, message = _verdict(found, solution)
+    status, message = _verdict(found, solution, words)
     rotation = _no_rotation()
     if axis := dead_axis(distortion.C):
         status = SensorStatus.DEAD_AXIS
@@ -196,13 +219,15 @@ def _solved(
         rotation_covariance=rotation.covariance,
         noise=float(solution.estimate.noise[found.sensor]),
         residuals=found.figures,
-        undetermined=found.determinacy.names,
+        undetermined=words,
         sync=counts,
         outside_map=outside,
     )
 
 
-def _verdict(found: SensorSolution, solution: OneKeySolution) -> tuple[SensorStatus, str]:
+def _verdict(
+    found: SensorSolution, solution: OneKeySolution, words: tuple[str, ...]
+) -> tuple[SensorStatus, str]:
     if not solution.settled:
         return SensorStatus.NOT_CONVERGED, "estimate and weights still change, round after round"
     if found.remaining_sigmas > CONVERGED_SIGMAS:
@@ -210,10 +235,8 @@ def _verdict(found: SensorSolution, solution: OneKeySolution) -> tuple[SensorSta
             f"{solution.ending.value}, {found.remaining_sigmas:.2g} standard deviations from the "
             "optimum"
         )
-    if found.determinacy.names:
-        return SensorStatus.UNDETERMINED, (
-            f"this drive and map do not determine {'; '.join(found.determinacy.names)}"
-        )
+    if words:
+        return SensorStatus.UNDETERMINED, f"this drive and map do not determine {'. '.join(words)}"
     return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings"
 
 

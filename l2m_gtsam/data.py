@@ -371,7 +371,7 @@ class SensorCalibration:
     residuals
         Figures of fit, absent when nothing was solved.
     undetermined
-        Names of the directions that the data cannot determine.
+        What the data cannot determine, a sentence for each reason with the parameters by name.
     sync
         Account of the readings.
     outside_map

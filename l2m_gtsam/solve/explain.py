@@ -1,0 +1,210 @@
+"""What a drive leaves open, in words: which parameters, and the figure of the drive that shows why.
+
+Every sentence is about directions that the rank test found, and every figure is measured on the
+poses and the map that it was made of.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.solve.rank import Determinacy, RankOptions, members
+
+AXES = ("x", "y", "z")
+COLUMNS = ("first", "second", "third")
+ALONG = 0.95  # cosine from which a direction is called after the lidar's axis
+# A vehicle within these did not drive: what its poses still tell is their own noise.
+REST_M, REST_DEG = 0.1, 3.0
+
+
+@dataclass(frozen=True)
+class DriveFacts:
+    """What a sensor met along a drive.
+
+    Attributes
+    ----------
+    extent
+        Diagonal of the box around the lidar's positions in metres.
+    turn
+        Largest rotation away from the first pose in degrees.
+    heights
+        Range of the lidar's height in metres.
+    tilt
+        Largest angle between the lidar's z axis and its mean in degrees.
+    b_lidar
+        Field in the lidar frame in uT, shape (N, 3).
+    slope
+        ``R^T G R``: how the field in the lidar frame changes with t in uT/m, shape (N, 3, 3).
+    seen
+        What of it no choice of C and H imitates, shape (N, 3, 3).
+    """
+
+    extent: float
+    turn: float
+    heights: float
+    tilt: float
+    b_lidar: FloatArray
+    slope: FloatArray
+    seen: FloatArray
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the vehicle did not drive."""
+        return self.extent < REST_M and self.turn < REST_DEG
+
+
+def drive_facts(
+    R_map_lidar: FloatArray, p_map_lidar: FloatArray, field: FloatArray, gradient: FloatArray
+) -> DriveFacts:
+    """Measure a drive.
+
+    Parameters
+    ----------
+    R_map_lidar, p_map_lidar
+        Poses of the lidar, shapes (N, 3, 3) and (N, 3), metres.
+    field, gradient
+        The map's at the sensor in the map frame, shapes (N, 3) in uT and (N, 3, 3) in uT/m.
+    """
+    R_lidar_map = R_map_lidar.transpose(0, 2, 1)
+    b_lidar = np.einsum("nij,nj->ni", R_lidar_map, field)
+    slope = R_lidar_map @ gradient @ R_map_lidar
+    turned = Rotation.from_matrix(R_lidar_map[0] @ R_map_lidar).magnitude()
+    up = R_map_lidar[:, :, 2]
+    upright = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
+    return DriveFacts(
+        extent=float(np.linalg.norm(np.ptp(p_map_lidar, axis=0))),
+        turn=float(np.degrees(turned.max())),
+        heights=float(np.ptp(p_map_lidar[:, 2])),
+        tilt=float(np.degrees(np.arccos(np.clip(up @ upright, -1, 1)).max())),
+        b_lidar=b_lidar,
+        slope=slope,
+        seen=_not_imitated(slope, b_lidar),
+    )
+
+
+def explain(test: Determinacy, drive: DriveFacts, options: RankOptions) -> tuple[str, ...]:
+    """Return what a drive does not determine, a sentence for each reason; none if it is nothing.
+
+    Parameters
+    ----------
+    test
+        The directions that are open.
+    drive
+        What the sensor met.
+    options
+        The scales of the test.
+    """
+    if test.touched.all() and drive.at_rest:
+        return (f"everything ({'; '.join(test.names)}): {at_rest(drive)}",)
+    steps = test.directions * options.scale()
+    kinds = np.array([_kind(row) for row in test.directions])
+    reasons = {"position": _position, "distortion": _distortion, "both": _both}
+    sentences = []
+    for kind, reason in reasons.items():
+        rows = np.flatnonzero(kinds == kind)
+        if len(rows):
+            what, why = reason(steps[rows], drive)
+            sentences.append(f"{what} ({'; '.join(test.names[row] for row in rows)}): {why}")
+    return tuple(sentences)
+
+
+def at_rest(drive: DriveFacts) -> str:
+    """Say that the vehicle did not drive."""
+    return f"the vehicle did not move ({drive.extent:.2f} m, {drive.turn:.1f} deg)"
+
+
+def _kind(row: FloatArray) -> str:
+    found = members(row)
+    if found[-1] < 3:
+        return "position"
+    return "distortion" if found[0] >= 3 else "both"
+
+
+def _position(rows: FloatArray, drive: DriveFacts) -> tuple[str, str]:
+    """Say what of t is open, and how little moving the sensor would show."""
+    basis = _span(rows[:, :3])
+    why = _change(basis, drive)
+    if len(basis) == 3:
+        return "position unobservable", why
+    if len(basis) == 1 and abs(basis[0, 2]) > ALONG:
+        return "height", f"{_upright(drive)}, {why}"
+    return "position in part", why
+
+
+def _change(basis: FloatArray, drive: DriveFacts) -> str:
+    """Say how the field changes along directions of t, and what of it C and H imitate."""
+    slope, seen = drive.slope @ basis.T, drive.seen @ basis.T
+    most = float(np.linalg.norm(slope, ord=2, axis=(1, 2)).max())
+    shown, left = _rms(slope), _rms(seen)
+    if left >= 0.5 * shown:
+        whose = "vertical gradient" if len(basis) == 1 and abs(basis[0, 2]) > ALONG else "gradient"
+        return f"the map's {whose} there is at most {_figure(most)} uT/m"
+    return (
+        f"a metre changes the readings by {_figure(shown)} uT (rms), all but {_figure(left)} uT of "
+        "which another C and H would do as well"
+    )
+
+
+def _distortion(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
+    """Say which columns of C are open against H, and how little the field varies along them."""
+    basis = _span(steps[:, 3:12].reshape(-1, 3))
+    along = (drive.b_lidar - drive.b_lidar.mean(axis=0)) @ basis.T
+    across = _figure(float(np.linalg.norm(along, ord=2)) / np.sqrt(len(along)))
+    axes = [axis for axis in range(3) if np.linalg.norm(basis[:, axis]) > ALONG]
+    if len(basis) == 1 and axes:
+        what, where = f"{COLUMNS[axes[0]]} column of C against H", f"the lidar's {AXES[axes[0]]}"
+    else:
+        what, where = "C against H", " and ".join(_vector(direction) for direction in basis)
+    if len(basis) == 3:
+        return what, f"the field in the lidar frame varies by only {across} uT"
+    why = f"the field along {where} varies by only {across} uT; {_upright(drive)}"
+    return what, why
+
+
+def _both(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
+    """Say that t and the distortion are not told apart: what a step of both would show."""
+    t, C, H = steps[:, :3], steps[:, 3:12].reshape(-1, 3, 3), steps[:, 12:]
+    change = drive.slope @ t.T + (C @ drive.b_lidar.T).transpose(2, 1, 0) + H.T
+    shown = np.sqrt(np.mean(np.sum(change**2, axis=1), axis=0)).max()
+    why = (
+        f"changed together, t by {np.linalg.norm(t, axis=1).max():.2g} m, they alter the readings "
+        f"by {_figure(float(shown))} uT (rms)"
+    )
+    return "position against C and H", why
+
+
+def _upright(drive: DriveFacts) -> str:
+    return (
+        f"the vehicle changes height by {drive.heights:.2f} m and tilts by {drive.tilt:.1f} deg "
+        "at most"
+    )
+
+
+def _not_imitated(slope: FloatArray, b_lidar: FloatArray) -> FloatArray:
+    """Return what a regression on (1, b) leaves of the slopes, shape (N, 3, 3)."""
+    Q, _ = np.linalg.qr(np.column_stack([np.ones(len(b_lidar)), b_lidar]))
+    flat = slope.reshape(len(slope), -1)
+    return np.asarray((flat - Q @ (Q.T @ flat)).reshape(slope.shape))
+
+
+def _span(rows: FloatArray) -> FloatArray:
+    """Return orthonormal directions that rows of three numbers point in, shape (k, 3)."""
+    _, s, Vt = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(Vt[s > 0.2 * s[0]])
+
+
+def _rms(slope: FloatArray) -> float:
+    """Return the root of the mean square change of a reading per metre, in the worst direction."""
+    moment = np.einsum("nik,nil->kl", slope, slope) / len(slope)
+    return float(np.sqrt(max(np.linalg.eigvalsh(moment)[-1], 0.0)))
+
+
+def _figure(value: float) -> str:
+    """Return two digits; what is far below any sensor's resolution is not spelt out."""
+    return f"{value:.2g}" if value >= 1e-3 else "less than 0.001"
+
+
+def _vector(direction: FloatArray) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in direction) + ")"
