@@ -27,6 +27,7 @@ from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.solve.explain import Movement, movement
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
 from l2m_gtsam.sync import stuck_sensors, synchronise
 
@@ -73,7 +74,8 @@ def calibrate(
     t_start = _start_places(alive.sensors, found, options)
     solution = solve_one_key(alive, solver_map, t_start, options.solve, progress)
     words = _words(alive, solver_map, solution, options)
-    sensors = _assess(synchronised, alive, solution, words, options)
+    moved = movement(recording.trajectory.R, recording.trajectory.p)
+    sensors = _assess(synchronised, alive, solution, words, moved, options)
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
@@ -167,6 +169,7 @@ def _assess(
     alive: Readings,
     solution: OneKeySolution,
     words: dict[int, tuple[str, ...]],
+    moved: Movement,
     options: CalibrationOptions,
 ) -> tuple[SensorCalibration, ...]:
     """Return a verdict on every sensor of the recording."""
@@ -181,7 +184,8 @@ def _assess(
         else:
             usable = alive.rows_of(index)
             read = usable.stop - usable.start
-            entry = _unsolved(name, read, counts, int(outside[index]), options.solve.min_readings)
+            needed = options.solve.min_readings
+            entry = _unsolved(name, read, counts, int(outside[index]), moved, needed)
         sensors.append(entry)
     return tuple(sensors)
 
@@ -241,14 +245,14 @@ def _verdict(
 
 
 def _unsolved(
-    name: str, usable: int, counts: SyncCounts, outside: int, needed: int
+    name: str, usable: int, counts: SyncCounts, outside: int, moved: Movement, needed: int
 ) -> SensorCalibration:
     status, message = (
         SensorStatus.OUTSIDE_MAP,
         (f"{outside} of {usable} readings lie outside the map, at least {needed} must lie inside"),
     )
     if usable < needed:
-        status, message = SensorStatus.NO_READINGS, _why_silent(usable, counts, needed)
+        status, message = SensorStatus.NO_READINGS, _why_silent(usable, counts, moved, needed)
     rotation = _no_rotation()
     return SensorCalibration(
         sensor=name,
@@ -267,14 +271,15 @@ def _unsolved(
     )
 
 
-def _why_silent(usable: int, counts: SyncCounts, needed: int) -> str:
+def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -> str:
     if counts.kept >= needed:
         return "the sensor reports one constant value: it is stuck"
+    reason = f"{moved.rest}: " if moved.at_rest else ""
     return (
-        f"{usable} usable readings of {counts.received} received ({counts.not_finite} not finite, "
-        f"{counts.repeated} repeated, {counts.outside_trajectory} without a pose, "
-        f"{counts.in_pose_gap} in a gap between poses, {counts.thinned} at a place already read), "
-        f"at least {needed} are needed"
+        f"{reason}{usable} usable readings of {counts.received} received "
+        f"({counts.not_finite} not finite, {counts.repeated} repeated, "
+        f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
+        f"{counts.thinned} at a place already read), at least {needed} are needed"
     )
 
 

@@ -20,8 +20,8 @@ REST_M, REST_DEG = 0.1, 3.0
 
 
 @dataclass(frozen=True)
-class DriveFacts:
-    """What a sensor met along a drive.
+class Movement:
+    """How a vehicle moved.
 
     Attributes
     ----------
@@ -33,6 +33,40 @@ class DriveFacts:
         Range of the lidar's height in metres.
     tilt
         Largest angle between the lidar's z axis and its mean in degrees.
+    """
+
+    extent: float
+    turn: float
+    heights: float
+    tilt: float
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the vehicle did not drive."""
+        return self.extent < REST_M and self.turn < REST_DEG
+
+    @property
+    def rest(self) -> str:
+        """The sentence that says so."""
+        return f"the vehicle did not move ({self.extent:.2f} m, {self.turn:.1f} deg)"
+
+    @property
+    def upright(self) -> str:
+        """The sentence that says how little it heaved and tilted."""
+        return (
+            f"the vehicle changes height by {self.heights:.2f} m and tilts by {self.tilt:.1f} deg "
+            "at most"
+        )
+
+
+@dataclass(frozen=True)
+class DriveFacts:
+    """What a sensor met along a drive.
+
+    Attributes
+    ----------
+    movement
+        Of the vehicle.
     b_lidar
         Field in the lidar frame in uT, shape (N, 3).
     slope
@@ -41,18 +75,23 @@ class DriveFacts:
         What of it no choice of C and H imitates, shape (N, 3, 3).
     """
 
-    extent: float
-    turn: float
-    heights: float
-    tilt: float
+    movement: Movement
     b_lidar: FloatArray
     slope: FloatArray
     seen: FloatArray
 
-    @property
-    def at_rest(self) -> bool:
-        """Whether the vehicle did not drive."""
-        return self.extent < REST_M and self.turn < REST_DEG
+
+def movement(R_map_lidar: FloatArray, p_map_lidar: FloatArray) -> Movement:
+    """Measure how the lidar's poses, shapes (N, 3, 3) and (N, 3) in metres, move."""
+    turned = Rotation.from_matrix(R_map_lidar[0].T @ R_map_lidar).magnitude()
+    up = R_map_lidar[:, :, 2]
+    upright = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
+    return Movement(
+        extent=float(np.linalg.norm(np.ptp(p_map_lidar, axis=0))),
+        turn=float(np.degrees(turned.max())),
+        heights=float(np.ptp(p_map_lidar[:, 2])),
+        tilt=float(np.degrees(np.arccos(np.clip(up @ upright, -1, 1)).max())),
+    )
 
 
 def drive_facts(
@@ -70,18 +109,8 @@ def drive_facts(
     R_lidar_map = R_map_lidar.transpose(0, 2, 1)
     b_lidar = np.einsum("nij,nj->ni", R_lidar_map, field)
     slope = R_lidar_map @ gradient @ R_map_lidar
-    turned = Rotation.from_matrix(R_lidar_map[0] @ R_map_lidar).magnitude()
-    up = R_map_lidar[:, :, 2]
-    upright = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
-    return DriveFacts(
-        extent=float(np.linalg.norm(np.ptp(p_map_lidar, axis=0))),
-        turn=float(np.degrees(turned.max())),
-        heights=float(np.ptp(p_map_lidar[:, 2])),
-        tilt=float(np.degrees(np.arccos(np.clip(up @ upright, -1, 1)).max())),
-        b_lidar=b_lidar,
-        slope=slope,
-        seen=_not_imitated(slope, b_lidar),
-    )
+    moved = movement(R_map_lidar, p_map_lidar)
+    return DriveFacts(moved, b_lidar, slope, _not_imitated(slope, b_lidar))
 
 
 def explain(test: Determinacy, drive: DriveFacts, options: RankOptions) -> tuple[str, ...]:
@@ -96,8 +125,8 @@ def explain(test: Determinacy, drive: DriveFacts, options: RankOptions) -> tuple
     options
         The scales of the test.
     """
-    if test.touched.all() and drive.at_rest:
-        return (f"everything ({'; '.join(test.names)}): {at_rest(drive)}",)
+    if test.touched.all() and drive.movement.at_rest:
+        return (f"everything ({'; '.join(test.names)}): {drive.movement.rest}",)
     steps = test.directions * options.scale()
     kinds = np.array([_kind(row) for row in test.directions])
     reasons = {"position": _position, "distortion": _distortion, "both": _both}
@@ -110,11 +139,6 @@ def explain(test: Determinacy, drive: DriveFacts, options: RankOptions) -> tuple
     return tuple(sentences)
 
 
-def at_rest(drive: DriveFacts) -> str:
-    """Say that the vehicle did not drive."""
-    return f"the vehicle did not move ({drive.extent:.2f} m, {drive.turn:.1f} deg)"
-
-
 def _kind(row: FloatArray) -> str:
     found = members(row)
     if found[-1] < 3:
@@ -122,28 +146,27 @@ def _kind(row: FloatArray) -> str:
     return "distortion" if found[0] >= 3 else "both"
 
 
-def _position(rows: FloatArray, drive: DriveFacts) -> tuple[str, str]:
+def _position(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
     """Say what of t is open, and how little moving the sensor would show."""
-    basis = _span(rows[:, :3])
-    why = _change(basis, drive)
+    basis = _span(steps[:, :3])
     if len(basis) == 3:
-        return "position unobservable", why
+        return "position unobservable", _change(basis, drive, "gradient")
     if len(basis) == 1 and abs(basis[0, 2]) > ALONG:
-        return "height", f"{_upright(drive)}, {why}"
-    return "position in part", why
+        why = _change(basis, drive, "vertical gradient")
+        return "height", f"{drive.movement.upright}, {why}"
+    return "position in part", _change(basis, drive, "gradient")
 
 
-def _change(basis: FloatArray, drive: DriveFacts) -> str:
+def _change(basis: FloatArray, drive: DriveFacts, whose: str) -> str:
     """Say how the field changes along directions of t, and what of it C and H imitate."""
-    slope, seen = drive.slope @ basis.T, drive.seen @ basis.T
-    most = float(np.linalg.norm(slope, ord=2, axis=(1, 2)).max())
-    shown, left = _rms(slope), _rms(seen)
+    slope = drive.slope @ basis.T
+    shown, left = _rms(slope), _rms(drive.seen @ basis.T)
     if left >= 0.5 * shown:
-        whose = "vertical gradient" if len(basis) == 1 and abs(basis[0, 2]) > ALONG else "gradient"
+        most = float(np.linalg.norm(slope, ord=2, axis=(1, 2)).max())
         return f"the map's {whose} there is at most {_figure(most)} uT/m"
     return (
-        f"a metre changes the readings by {_figure(shown)} uT (rms), all but {_figure(left)} uT of "
-        "which another C and H would do as well"
+        f"a metre changes the readings by {_figure(shown)} uT (rms), and all but {_figure(left)} "
+        "uT of it another C and H would do as well"
     )
 
 
@@ -151,16 +174,15 @@ def _distortion(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
     """Say which columns of C are open against H, and how little the field varies along them."""
     basis = _span(steps[:, 3:12].reshape(-1, 3))
     along = (drive.b_lidar - drive.b_lidar.mean(axis=0)) @ basis.T
-    across = _figure(float(np.linalg.norm(along, ord=2)) / np.sqrt(len(along)))
-    axes = [axis for axis in range(3) if np.linalg.norm(basis[:, axis]) > ALONG]
-    if len(basis) == 1 and axes:
-        what, where = f"{COLUMNS[axes[0]]} column of C against H", f"the lidar's {AXES[axes[0]]}"
-    else:
-        what, where = "C against H", " and ".join(_vector(direction) for direction in basis)
+    varies = f"varies by no more than {_figure(_rms(along[:, None, :]))} uT (rms)"
     if len(basis) == 3:
-        return what, f"the field in the lidar frame varies by only {across} uT"
-    why = f"the field along {where} varies by only {across} uT; {_upright(drive)}"
-    return what, why
+        return "C against H", f"the field in the lidar frame {varies}"
+    axes = [axis for axis in range(3) if np.linalg.norm(basis[:, axis]) > ALONG]
+    what, where = "C against H", " and ".join(_vector(direction) for direction in basis)
+    if len(basis) == 1 and axes:
+        what = f"{COLUMNS[axes[0]]} column of C against H"
+        where = f"the lidar's {AXES[axes[0]]} axis"
+    return what, f"the field along {where} {varies}; {drive.movement.upright}"
 
 
 def _both(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
@@ -173,13 +195,6 @@ def _both(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
         f"by {_figure(float(shown))} uT (rms)"
     )
     return "position against C and H", why
-
-
-def _upright(drive: DriveFacts) -> str:
-    return (
-        f"the vehicle changes height by {drive.heights:.2f} m and tilts by {drive.tilt:.1f} deg "
-        "at most"
-    )
 
 
 def _not_imitated(slope: FloatArray, b_lidar: FloatArray) -> FloatArray:
@@ -195,16 +210,18 @@ def _span(rows: FloatArray) -> FloatArray:
     return np.asarray(Vt[s > 0.2 * s[0]])
 
 
-def _rms(slope: FloatArray) -> float:
-    """Return the root of the mean square change of a reading per metre, in the worst direction."""
-    moment = np.einsum("nik,nil->kl", slope, slope) / len(slope)
+def _rms(change: FloatArray) -> float:
+    """Return the root mean square over readings of ``change @ u``, (N, i, k), in the worst u."""
+    moment = np.einsum("nik,nil->kl", change, change) / len(change)
     return float(np.sqrt(max(np.linalg.eigvalsh(moment)[-1], 0.0)))
 
 
 def _figure(value: float) -> str:
-    """Return two digits; what is far below any sensor's resolution is not spelt out."""
-    return f"{value:.2g}" if value >= 1e-3 else "less than 0.001"
+    """Return two digits of a bound; far below any sensor's resolution zeros are not told apart."""
+    return f"{max(value, 1e-3):.2g}"
 
 
 def _vector(direction: FloatArray) -> str:
-    return "(" + ", ".join(f"{value:.2f}" for value in direction) + ")"
+    towards = direction * np.sign(direction[np.argmax(np.abs(direction))])
+    # Added zero turns -0.00 into 0.00.
+    return "(" + ", ".join(f"{round(value, 2) + 0.0:.2f}" for value in towards.tolist()) + ")"
