@@ -23,7 +23,7 @@ class MotionOptions(Options):
     """Roll and pitch by so much either way."""
     loop_m: float = Field(default=0.5, gt=0)
     """Radius of a loop where the gradient is strong."""
-    detour_m: float = Field(default=3.0, gt=0)
+    detour_m: float = Field(default=2.0, gt=0)
     """Such a place is looked for so far around the drive."""
 
 
