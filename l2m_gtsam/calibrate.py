@@ -21,9 +21,8 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
-from l2m_gtsam.graph.explanation import undetermined
+from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
-from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
@@ -73,9 +72,9 @@ def calibrate(
     found = _starts(alive, solver_map, options, progress)
     t_start = _start_places(alive.sensors, found, options)
     solution = solve_one_key(alive, solver_map, t_start, options.solve, progress)
-    words = _words(alive, solver_map, solution, options)
+    told = explained(alive, solver_map, t_start, solution, options.solve)
     moved = movement(recording.trajectory.R, recording.trajectory.p)
-    sensors = _assess(synchronised, alive, solution, words, moved, options)
+    sensors = _assess(synchronised, alive, solution, told, moved, options)
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
@@ -147,40 +146,20 @@ def _with_start(
     return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
 
 
-def _words(
-    alive: Readings, field_map: QueryableMap, solution: OneKeySolution, options: CalibrationOptions
-) -> dict[int, tuple[str, ...]]:
-    """Return what each solved sensor's readings leave open, in sentences."""
-    used = alive.select(solution.inside)
-    return {
-        found.sensor: undetermined(
-            found.determinacy,
-            used.select(used.sensor == found.sensor),
-            solution.estimate.t[found.sensor],
-            field_map,
-            options.solve.rank,
-        )
-        for found in solution.solved
-    }
-
-
 def _assess(
     synchronised: Synchronised,
     alive: Readings,
     solution: OneKeySolution,
-    words: dict[int, tuple[str, ...]],
+    solved: dict[int, Explained],
     moved: Movement,
     options: CalibrationOptions,
 ) -> tuple[SensorCalibration, ...]:
     """Return a verdict on every sensor of the recording."""
-    solved = {entry.sensor: entry for entry in solution.solved}
     outside = np.bincount(alive.sensor[~solution.inside], minlength=len(alive.sensors))
     sensors = []
     for index, (name, counts) in enumerate(zip(alive.sensors, synchronised.counts, strict=True)):
         if index in solved:
-            entry = _solved(
-                name, solved[index], solution, words[index], counts, int(outside[index])
-            )
+            entry = _solved(name, solved[index], solution, counts, int(outside[index]))
         else:
             usable = alive.rows_of(index)
             read = usable.stop - usable.start
@@ -192,17 +171,19 @@ def _assess(
 
 def _solved(
     name: str,
-    found: SensorSolution,
+    told: Explained,
     solution: OneKeySolution,
-    words: tuple[str, ...],
     counts: SyncCounts,
     outside: int,
 ) -> SensorCalibration:
+    found = told.solution
     vector = solution.estimate.distortion[found.sensor]
     distortion = Distortion.from_vector(vector)
-    status, message = _verdict(found, solution, words)
+    status, message = _verdict(told, solution)
     rotation = _no_rotation()
-    if axis := dead_axis(distortion.C):
+    axis = dead_axis(distortion.C)
+    # what is not determined may be short without a fault of the sensor
+    if axis and np.isfinite(found.covariance[3:12, 3:12].diagonal()).all():
         status = SensorStatus.DEAD_AXIS
         message = f"the sensor's {axis} axis does not follow the field; check its wiring"
     else:
@@ -223,24 +204,27 @@ def _solved(
         rotation_covariance=rotation.covariance,
         noise=float(solution.estimate.noise[found.sensor]),
         residuals=found.figures,
-        undetermined=words,
+        undetermined=told.words,
         sync=counts,
         outside_map=outside,
     )
 
 
-def _verdict(
-    found: SensorSolution, solution: OneKeySolution, words: tuple[str, ...]
-) -> tuple[SensorStatus, str]:
+def _verdict(told: Explained, solution: OneKeySolution) -> tuple[SensorStatus, str]:
+    found, words = told.solution, ". ".join(told.words)
+    open_ = f"this drive and map do not determine {words}" if words else ""
+    because = f"; {open_}" if words else ""
     if not solution.settled:
-        return SensorStatus.NOT_CONVERGED, "estimate and weights still change, round after round"
+        return SensorStatus.NOT_CONVERGED, (
+            f"estimate and weights still change, round after round{because}"
+        )
     if found.remaining_sigmas > CONVERGED_SIGMAS:
         return SensorStatus.NOT_CONVERGED, (
             f"{solution.ending.value}, {found.remaining_sigmas:.2g} standard deviations from the "
-            "optimum"
+            f"optimum{because}"
         )
     if words:
-        return SensorStatus.UNDETERMINED, f"this drive and map do not determine {'. '.join(words)}"
+        return SensorStatus.UNDETERMINED, open_
     return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings"
 
 

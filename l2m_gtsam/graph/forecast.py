@@ -59,18 +59,60 @@ def forecast(
     options
         How the solve would go.
     """
-    options = options.model_copy(update={"sensor_noise_ut": noise})
-    ideal = start_estimate(t_lidar_mag, options)
-    view = observe(readings, field_map, ideal, options.min_readings)
-    view = replace(view, readings=replace(view.readings, field=view.b_lidar))
+    every = np.full(len(t_lidar_mag), noise)
+    ideal = ideal_estimate(readings, field_map, t_lidar_mag, every, options)
+    view = ideal.view
     if not view.sensors:
         return Forecast(view, (), options.uncertainty)
-    ideal = replace(ideal, ridge=fit_distortions(view, ideal, options).ridge)
-    problem = joint_problem(view, field_map, ideal, options)
+    problem = joint_problem(view, field_map, ideal.estimate, options)
     if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
-        solved = _uncertain(view, field_map, field_map, ideal, problem.determinacies)
+        tests = problem.determinacies
+        solved = _uncertain(view, field_map, field_map, ideal.estimate, tests)
         return Forecast(view, solved, Uncertainty.FULL)
-    return Forecast(view, sensor_solutions(problem, ideal), Uncertainty.INDEPENDENT)
+    return Forecast(view, sensor_solutions(problem, ideal.estimate), Uncertainty.INDEPENDENT)
+
+
+def rank_tests(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_lidar_mag: FloatArray,
+    noise: FloatArray,
+    options: OneKeyOptions,
+) -> dict[int, Determinacy]:
+    """Return what a drive would determine of ideal sensors; parameters as of ``forecast``.
+
+    Parameters
+    ----------
+    noise
+        Standard deviation of each sensor's noise in uT, shape (S,).
+    """
+    ideal = ideal_estimate(readings, field_map, t_lidar_mag, noise, options)
+    if not ideal.view.sensors:
+        return {}
+    return joint_problem(ideal.view, field_map, ideal.estimate, options).determinacies
+
+
+@dataclass(frozen=True)
+class Ideal:
+    """Ideal sensors and the readings that they would give."""
+
+    estimate: Estimate
+    view: View
+
+
+def ideal_estimate(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_lidar_mag: FloatArray,
+    noise: FloatArray,
+    options: OneKeyOptions,
+) -> Ideal:
+    """Return sensors at places, shape (S, 3), with C = I, H = 0 and the solve's own ridge."""
+    options = options.model_copy(update={"sensor_noise_ut": float(noise.max())})  # it is given
+    start = replace(start_estimate(t_lidar_mag, options), noise=noise)
+    view = observe(readings, field_map, start, options.min_readings)
+    view = replace(view, readings=replace(view.readings, field=view.b_lidar))
+    return Ideal(replace(start, ridge=fit_distortions(view, start, options).ridge), view)
 
 
 def _uncertain(

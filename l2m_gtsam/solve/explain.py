@@ -17,6 +17,8 @@ COLUMNS = ("first", "second", "third")
 ALONG = 0.95  # cosine from which a direction is called after the lidar's axis
 # A vehicle within these did not drive: what its poses still tell is their own noise.
 REST_M, REST_DEG = 0.1, 3.0
+# Below any sensor's resolution, in uT: what is less is not spelt out.
+RESOLVED_UT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,7 @@ def _change(basis: FloatArray, drive: DriveFacts, whose: str) -> str:
     """Say how the field changes along directions of t, and what of it C and H imitate."""
     slope = drive.slope @ basis.T
     shown, left = _rms(slope), _rms(drive.seen @ basis.T)
-    if left >= 0.5 * shown:
+    if left >= 0.5 * shown or shown < RESOLVED_UT:
         most = float(np.linalg.norm(slope, ord=2, axis=(1, 2)).max())
         return f"the map's {whose} there is at most {_figure(most)} uT/m"
     return (
@@ -217,8 +219,8 @@ def _rms(change: FloatArray) -> float:
 
 
 def _figure(value: float) -> str:
-    """Return two digits of a bound; far below any sensor's resolution zeros are not told apart."""
-    return f"{max(value, 1e-3):.2g}"
+    """Return two digits of a bound."""
+    return f"{max(value, RESOLVED_UT):.2g}"
 
 
 def _vector(direction: FloatArray) -> str:
