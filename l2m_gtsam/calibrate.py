@@ -33,6 +33,10 @@ from l2m_gtsam.sync import stuck_sensors, synchronise
 # A Newton step of a tenth of a standard deviation would still be worth taking.
 CONVERGED_SIGMAS = 0.1
 
+# Squared distance of two sensors in sigmas, three degrees of freedom: exceeded by 1 % of those at
+# one point.
+ONE_POINT = 11.3
+
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 
 
@@ -76,6 +80,7 @@ def calibrate(
     moved = movement(recording.trajectory.R, recording.trajectory.p)
     sensors = _assess(synchronised, alive, solution, told, moved, options)
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
+    sensors = tuple(_with_neighbours(sensor, sensors) for sensor in sensors)
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
     return CalibrationResult(
@@ -146,6 +151,27 @@ def _with_start(
     return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
 
 
+def _with_neighbours(
+    sensor: SensorCalibration, others: tuple[SensorCalibration, ...]
+) -> SensorCalibration:
+    """Return the same with a word on sensors at the same point: no baseline between them."""
+    names = [other.sensor for other in others if _at_one_point(sensor, other)]
+    if not names:
+        return sensor
+    place = f"its place is not told apart from {', '.join(names)}"
+    return replace(sensor, message=f"{sensor.message}; {place}")
+
+
+def _at_one_point(one: SensorCalibration, other: SensorCalibration) -> bool:
+    """Whether two solved sensors lie so close that their sigmas do not separate them."""
+    solved = SensorStatus.SOLVED
+    if one is other or not one.status is other.status is solved:
+        return False
+    apart = one.t_lidar_mag - other.t_lidar_mag
+    covariance = one.covariance[:3, :3] + other.covariance[:3, :3]
+    return bool(apart @ np.linalg.solve(covariance, apart) < ONE_POINT)
+
+
 def _assess(
     synchronised: Synchronised,
     alive: Readings,
@@ -212,7 +238,7 @@ def _solved(
 
 def _verdict(told: Explained, solution: OneKeySolution) -> tuple[SensorStatus, str]:
     found, words = told.solution, ". ".join(told.words)
-    open_ = f"this drive and map do not determine {words}" if words else ""
+    open_ = f"this drive and map leave open: {words}" if words else ""
     because = f"; {open_}" if words else ""
     if not solution.settled:
         return SensorStatus.NOT_CONVERGED, (

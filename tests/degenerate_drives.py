@@ -18,9 +18,9 @@ from l2m_gtsam.data import (
 from tests.worlds import DipoleWorld, dipole_world
 
 NOISE = 0.2
-COUNT = 400
+COUNT = 300
 STEP_NS = 50_000_000
-STRONG = dipole_world(11)
+STRONG = dipole_world(11, 15)
 CALM = DipoleWorld(STRONG.uniform, STRONG.positions, 0.03 * STRONG.moments)
 UNIFORM = DipoleWorld(STRONG.uniform, STRONG.positions, 0.0 * STRONG.moments)
 

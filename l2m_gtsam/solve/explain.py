@@ -129,14 +129,13 @@ def explain(test: Determinacy, drive: DriveFacts, options: RankOptions) -> tuple
     """
     if test.touched.all() and drive.movement.at_rest:
         return (f"everything ({'; '.join(test.names)}): {drive.movement.rest}",)
-    steps = test.directions * options.scale()
     kinds = np.array([_kind(row) for row in test.directions])
     reasons = {"position": _position, "distortion": _distortion, "both": _both}
     sentences = []
     for kind, reason in reasons.items():
         rows = np.flatnonzero(kinds == kind)
         if len(rows):
-            what, why = reason(steps[rows], drive)
+            what, why = reason(test.directions[rows], drive, options)
             sentences.append(f"{what} ({'; '.join(test.names[row] for row in rows)}): {why}")
     return tuple(sentences)
 
@@ -148,9 +147,9 @@ def _kind(row: FloatArray) -> str:
     return "distortion" if found[0] >= 3 else "both"
 
 
-def _position(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
+def _position(rows: FloatArray, drive: DriveFacts, _: RankOptions) -> tuple[str, str]:
     """Say what of t is open, and how little moving the sensor would show."""
-    basis = _span(steps[:, :3])
+    basis = _span(rows[:, :3])
     if len(basis) == 3:
         return "position unobservable", _change(basis, drive, "gradient")
     if len(basis) == 1 and abs(basis[0, 2]) > ALONG:
@@ -172,9 +171,9 @@ def _change(basis: FloatArray, drive: DriveFacts, whose: str) -> str:
     )
 
 
-def _distortion(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
+def _distortion(rows: FloatArray, drive: DriveFacts, _: RankOptions) -> tuple[str, str]:
     """Say which columns of C are open against H, and how little the field varies along them."""
-    basis = _span(steps[:, 3:12].reshape(-1, 3))
+    basis = _span(rows[:, 3:12].reshape(-1, 3))
     along = (drive.b_lidar - drive.b_lidar.mean(axis=0)) @ basis.T
     varies = f"varies by no more than {_figure(_rms(along[:, None, :]))} uT (rms)"
     if len(basis) == 3:
@@ -187,16 +186,20 @@ def _distortion(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
     return what, f"the field along {where} {varies}; {drive.movement.upright}"
 
 
-def _both(steps: FloatArray, drive: DriveFacts) -> tuple[str, str]:
+def _both(rows: FloatArray, drive: DriveFacts, options: RankOptions) -> tuple[str, str]:
     """Say that t and the distortion are not told apart: what a step of both would show."""
+    steps = rows / np.linalg.norm(rows, axis=1)[:, None] * options.scale()
     t, C, H = steps[:, :3], steps[:, 3:12].reshape(-1, 3, 3), steps[:, 12:]
     change = drive.slope @ t.T + (C @ drive.b_lidar.T).transpose(2, 1, 0) + H.T
     shown = np.sqrt(np.mean(np.sum(change**2, axis=1), axis=0)).max()
-    why = (
+    together = (
         f"changed together, t by {np.linalg.norm(t, axis=1).max():.2g} m, they alter the readings "
         f"by {_figure(float(shown))} uT (rms)"
     )
-    return "position against C and H", why
+    if not any(3 <= member < 12 for row in rows for member in members(row)):
+        return "position against H", together
+    what, why = _distortion(rows, drive, options)
+    return f"position and {what}", f"{together}; {why}"
 
 
 def _not_imitated(slope: FloatArray, b_lidar: FloatArray) -> FloatArray:
