@@ -82,7 +82,7 @@ def loop(drive: Motion, centre: FloatArray, options: MotionOptions) -> Motion:
     angle = np.linspace(0, 2 * np.pi, options.poses)
     around = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     upright = _turns(angle + np.pi / 2 - _heading(drive.R[0]), [0.0, 0.0, 1.0]) @ drive.R[0]
-    name = f"a loop of {options.loop_m:g} m radius about {_place(centre)}"
+    name = f"a loop of {options.loop_m:g} m radius about {_place(centre)}, if it is free"
     return Motion(name, upright, centre + options.loop_m * around)
 
 
