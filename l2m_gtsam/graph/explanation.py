@@ -56,6 +56,8 @@ def explained(
     options
         How it was solved.
     """
+    if not solution.solved:
+        return {}
     tests = rank_tests(readings, field_map, t_start, solution.estimate.noise, options)
     used, told = readings.select(solution.inside), {}
     for found in solution.solved:

@@ -59,7 +59,7 @@ def deviations(sensor: SensorCalibration, places: FloatArray = PLACES) -> FloatA
     return np.asarray(error / np.sqrt(np.diag(sensor.covariance)))
 
 
-CASES = {
+CASES: dict[str, tuple[Trajectory, World, tuple[str, ...], tuple[str, ...]]] = {
     "straight line, calm": (straight(), CALM, (*T, "C_xx", "C_yy", *THIRD), ("C against H",)),
     "straight line, posts": (straight(), POSTS, ("t_z", *THIRD), ("height (t_z): ", LEVEL, *FLAT)),
     "circle, calm": (circle(), CALM, (*T, *THIRD), ("position", *FLAT)),
