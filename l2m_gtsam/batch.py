@@ -10,7 +10,14 @@ import numpy as np
 
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import CalibrationResult, FloatArray, KnownSensor, MapState, Recording
+from l2m_gtsam.data import (
+    CalibrationResult,
+    DrivePlan,
+    FloatArray,
+    KnownSensor,
+    MapState,
+    Recording,
+)
 from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.mapping import (
     compare_recordings,
@@ -20,11 +27,12 @@ from l2m_gtsam.mapping import (
 from l2m_gtsam.maps.build import map_from_state, refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.plan import assumed_recording, plan
 from l2m_gtsam.qa.figures import calibration_figure, map_figure, save_figure
 from l2m_gtsam.qa.tables import MapDescription
 from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
-from l2m_gtsam.storage.bag import read_recording
+from l2m_gtsam.storage.bag import has_fields, read_recording, read_trajectory
 from l2m_gtsam.storage.calibration_file import (
     read_known_sensors,
     write_calibration,
@@ -371,6 +379,51 @@ def calibrate_bag(
     write_calibration(out / CALIBRATION_FILE, result)
     save_figure(figure, out / OVERVIEW_FILE)
     return result
+
+
+def plan_bag(
+    bag: Path,
+    map_path: Path,
+    config: Config,
+    at: Sequence[tuple[float, float, float]],
+    progress: Progress,
+) -> DrivePlan:
+    """Say what a drive will determine of its magnetometers, from poses and map alone.
+
+    Parameters
+    ----------
+    bag
+        A drive through the mapped place.
+    map_path
+        Map file.
+    config
+        Configuration; `calibration.start` says where the bag's sensors are assumed.
+    at
+        Places of sensors in the lidar frame in metres that are assumed instead of the bag's own; a
+        bag without magnetometers has one at the lidar if none is given.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    state = load_map(map_path)
+    if at or not has_fields(bag):
+        names = {_named(place): place for place in at or [(0.0, 0.0, 0.0)]}
+        trajectory, source = read_trajectory(bag, config.bag), source_file(bag)
+        recording = assumed_recording(trajectory, source, tuple(names), config.plan.rate_hz)
+        calibration = config.calibration.model_copy(update={"start": names})
+    else:
+        recording, calibration = _read(bag, config, progress), config.calibration
+    _check_frame(map_path, state.provenance.get("frame"), recording)
+    return plan(recording, map_of(state, progress), calibration, config.plan, progress)
+
+
+def _named(place: tuple[float, float, float]) -> str:
+    """Return the name of a sensor that is only assumed."""
+    return f"at {place[0]:g},{place[1]:g},{place[2]:g}"
 
 
 def _check_frame(map_path: Path, map_frame: object, recording: Recording) -> None:

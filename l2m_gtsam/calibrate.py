@@ -21,16 +21,21 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
+from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
-from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.solve.explain import Movement, movement
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
 from l2m_gtsam.sync import stuck_sensors, synchronise
 
 # A Newton step of a tenth of a standard deviation would still be worth taking.
 CONVERGED_SIGMAS = 0.1
+
+# Squared distance of two sensors in sigmas, three degrees of freedom: exceeded by 1 % of those at
+# one point.
+ONE_POINT = 11.3
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 
@@ -71,8 +76,11 @@ def calibrate(
     found = _starts(alive, solver_map, options, progress)
     t_start = _start_places(alive.sensors, found, options)
     solution = solve_one_key(alive, solver_map, t_start, options.solve, progress)
-    sensors = _assess(synchronised, alive, solution, options)
+    told = explained(alive, solver_map, t_start, solution, options.solve)
+    moved = movement(recording.trajectory.R, recording.trajectory.p)
+    sensors = _assess(synchronised, alive, solution, told, moved, options)
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
+    sensors = tuple(_with_neighbours(sensor, sensors) for sensor in sensors)
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
     return CalibrationResult(
@@ -143,14 +151,36 @@ def _with_start(
     return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
 
 
+def _with_neighbours(
+    sensor: SensorCalibration, others: tuple[SensorCalibration, ...]
+) -> SensorCalibration:
+    """Return the same with a word on sensors at the same point: no baseline between them."""
+    names = [other.sensor for other in others if _at_one_point(sensor, other)]
+    if not names:
+        return sensor
+    place = f"its place is not told apart from {', '.join(names)}"
+    return replace(sensor, message=f"{sensor.message}; {place}")
+
+
+def _at_one_point(one: SensorCalibration, other: SensorCalibration) -> bool:
+    """Whether two solved sensors lie so close that their sigmas do not separate them."""
+    solved = SensorStatus.SOLVED
+    if one is other or not one.status is other.status is solved:
+        return False
+    apart = one.t_lidar_mag - other.t_lidar_mag
+    covariance = one.covariance[:3, :3] + other.covariance[:3, :3]
+    return bool(apart @ np.linalg.solve(covariance, apart) < ONE_POINT)
+
+
 def _assess(
     synchronised: Synchronised,
     alive: Readings,
     solution: OneKeySolution,
+    solved: dict[int, Explained],
+    moved: Movement,
     options: CalibrationOptions,
 ) -> tuple[SensorCalibration, ...]:
     """Return a verdict on every sensor of the recording."""
-    solved = {entry.sensor: entry for entry in solution.solved}
     outside = np.bincount(alive.sensor[~solution.inside], minlength=len(alive.sensors))
     sensors = []
     for index, (name, counts) in enumerate(zip(alive.sensors, synchronised.counts, strict=True)):
@@ -159,23 +189,27 @@ def _assess(
         else:
             usable = alive.rows_of(index)
             read = usable.stop - usable.start
-            entry = _unsolved(name, read, counts, int(outside[index]), options.solve.min_readings)
+            needed = options.solve.min_readings
+            entry = _unsolved(name, read, counts, int(outside[index]), moved, needed)
         sensors.append(entry)
     return tuple(sensors)
 
 
 def _solved(
     name: str,
-    found: SensorSolution,
+    told: Explained,
     solution: OneKeySolution,
     counts: SyncCounts,
     outside: int,
 ) -> SensorCalibration:
+    found = told.solution
     vector = solution.estimate.distortion[found.sensor]
     distortion = Distortion.from_vector(vector)
-    status, message = _verdict(found, solution)
+    status, message = _verdict(told, solution)
     rotation = _no_rotation()
-    if axis := dead_axis(distortion.C):
+    axis = dead_axis(distortion.C)
+    # what is not determined may be short without a fault of the sensor
+    if axis and np.isfinite(found.covariance[3:12, 3:12].diagonal()).all():
         status = SensorStatus.DEAD_AXIS
         message = f"the sensor's {axis} axis does not follow the field; check its wiring"
     else:
@@ -196,36 +230,39 @@ def _solved(
         rotation_covariance=rotation.covariance,
         noise=float(solution.estimate.noise[found.sensor]),
         residuals=found.figures,
-        undetermined=found.determinacy.names,
+        undetermined=told.words,
         sync=counts,
         outside_map=outside,
     )
 
 
-def _verdict(found: SensorSolution, solution: OneKeySolution) -> tuple[SensorStatus, str]:
+def _verdict(told: Explained, solution: OneKeySolution) -> tuple[SensorStatus, str]:
+    found, words = told.solution, ". ".join(told.words)
+    open_ = f"this drive and map leave open: {words}" if words else ""
+    because = f"; {open_}" if words else ""
     if not solution.settled:
-        return SensorStatus.NOT_CONVERGED, "estimate and weights still change, round after round"
+        return SensorStatus.NOT_CONVERGED, (
+            f"estimate and weights still change, round after round{because}"
+        )
     if found.remaining_sigmas > CONVERGED_SIGMAS:
         return SensorStatus.NOT_CONVERGED, (
             f"{solution.ending.value}, {found.remaining_sigmas:.2g} standard deviations from the "
-            "optimum"
+            f"optimum{because}"
         )
-    if found.determinacy.names:
-        return SensorStatus.UNDETERMINED, (
-            f"this drive and map do not determine {'; '.join(found.determinacy.names)}"
-        )
+    if words:
+        return SensorStatus.UNDETERMINED, open_
     return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings"
 
 
 def _unsolved(
-    name: str, usable: int, counts: SyncCounts, outside: int, needed: int
+    name: str, usable: int, counts: SyncCounts, outside: int, moved: Movement, needed: int
 ) -> SensorCalibration:
     status, message = (
         SensorStatus.OUTSIDE_MAP,
         (f"{outside} of {usable} readings lie outside the map, at least {needed} must lie inside"),
     )
     if usable < needed:
-        status, message = SensorStatus.NO_READINGS, _why_silent(usable, counts, needed)
+        status, message = SensorStatus.NO_READINGS, _why_silent(usable, counts, moved, needed)
     rotation = _no_rotation()
     return SensorCalibration(
         sensor=name,
@@ -244,14 +281,15 @@ def _unsolved(
     )
 
 
-def _why_silent(usable: int, counts: SyncCounts, needed: int) -> str:
+def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -> str:
     if counts.kept >= needed:
         return "the sensor reports one constant value: it is stuck"
+    reason = f"{moved.rest}: " if moved.at_rest else ""
     return (
-        f"{usable} usable readings of {counts.received} received ({counts.not_finite} not finite, "
-        f"{counts.repeated} repeated, {counts.outside_trajectory} without a pose, "
-        f"{counts.in_pose_gap} in a gap between poses, {counts.thinned} at a place already read), "
-        f"at least {needed} are needed"
+        f"{reason}{usable} usable readings of {counts.received} received "
+        f"({counts.not_finite} not finite, {counts.repeated} repeated, "
+        f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
+        f"{counts.thinned} at a place already read), at least {needed} are needed"
     )
 
 

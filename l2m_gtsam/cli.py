@@ -165,6 +165,40 @@ def calibrate(
 
 
 @app.command()
+def plan(
+    bag: BagArgument,
+    map_path: MapOption,
+    config: ConfigOption = None,
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Assume a sensor at this place in the lidar frame (metres), instead of those of "
+            "the bag; may be repeated.",
+        ),
+    ] = None,
+) -> None:
+    """Say what a drive will determine, how well, and which extra motion would help most.
+
+    From poses and map alone: the bag needs no readings. Sensors of the bag are assumed where
+    `calibration.start` puts them, else at the lidar, aligned with it and without distortion.
+    """
+    from l2m_gtsam.batch import plan_bag
+    from l2m_gtsam.config import load_config
+    from l2m_gtsam.qa.plan_tables import advice, motion_table, plan_table
+    from l2m_gtsam.storage.calibration_file import UNCERTAINTY
+
+    chosen, places = load_config(config), [_place(text) for text in at or []]
+    with _progress() as progress:
+        found = plan_bag(bag, map_path, chosen, places, progress)
+    _print(plan_table(found))
+    _print(motion_table(found))
+    typer.echo(advice(found))
+    typer.echo(UNCERTAINTY[found.uncertainty])
+    _warn(found.doubts)
+
+
+@app.command()
 def demo(
     out: OutOption = Path("demo_out"),
     seed: Annotated[int, typer.Option(min=0, help="Seed of world, drives and sensors.")] = 1,
@@ -267,6 +301,23 @@ def map_plot(
     with _progress() as progress:
         plot_map_file(map_path, out, height, progress)
     typer.echo(f"written: {out}")
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    """Return the three numbers of an option."""
+    from math import isfinite
+
+    from l2m_gtsam.errors import ConfigError
+
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = float("nan")
+    if not (isfinite(x) and isfinite(y) and isfinite(z)):
+        raise ConfigError(
+            f"--at: {text!r} is not a place; accepted: three numbers, x,y,z in metres"
+        )
+    return x, y, z
 
 
 def _warn(doubts: Sequence[str]) -> None:

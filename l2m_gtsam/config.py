@@ -11,6 +11,7 @@ from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
+from l2m_gtsam.motion import MotionOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
@@ -45,6 +46,19 @@ class CalibrationOptions(Options):
     """The one-key solve."""
 
 
+class PlanOptions(Options):
+    """What is assumed and tried before a drive is calibrated."""
+
+    rate_hz: float = Field(default=10.0, gt=0, le=1000)
+    """Readings per second of sensors that the bag does not have yet."""
+    noise_ut: float = Field(default=0.2, gt=0)
+    """Standard deviation of the sensors' noise in microtesla, where neither
+    `calibration.solve.sensor_noise_ut` nor the map says one: a map that learns it gives that of
+    the mapping suite."""
+    motion: MotionOptions = MotionOptions()
+    """Extra motions that are tried."""
+
+
 class Config(Options):
     """Everything that can be configured."""
 
@@ -53,7 +67,9 @@ class Config(Options):
     mapping: MappingOptions = MappingOptions()
     """`l2m map build`, `l2m map update` and `l2m map compare`."""
     calibration: CalibrationOptions = CalibrationOptions()
-    """`l2m calibrate`."""
+    """`l2m calibrate`, and `l2m plan` before it."""
+    plan: PlanOptions = PlanOptions()
+    """`l2m plan`."""
 
 
 def load_config(path: Path | None) -> Config:

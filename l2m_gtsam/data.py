@@ -412,7 +412,7 @@ class SensorCalibration:
     residuals
         Figures of fit, absent when nothing was solved.
     undetermined
-        Names of the directions that the data cannot determine.
+        What the data cannot determine, a sentence for each reason with the parameters by name.
     sync
         Account of the readings.
     outside_map
@@ -484,6 +484,111 @@ class CalibrationResult:
     versions: dict[str, str]
 
     def __getitem__(self, sensor: str) -> SensorCalibration:
+        for entry in self.sensors:
+            if entry.sensor == sensor:
+                return entry
+        raise KeyError(sensor)
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """What a drive will tell of one sensor.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    t_lidar_mag
+        Where it is assumed in the lidar frame in metres, shape (3,).
+    readings, outside_map
+        Readings that will be used, and those for which the map has no data.
+    covariance
+        Of (t, C row by row, H) in m and uT, shape (15, 15); infinite on the diagonal for what
+        will not be determined.
+    rotation_covariance
+        Of the rotation error in the sensor frame in rad^2, shape (3, 3).
+    undetermined
+        What will not be determined, a sentence for each reason with the parameters by name.
+    """
+
+    sensor: str
+    t_lidar_mag: FloatArray
+    readings: int
+    outside_map: int
+    covariance: FloatArray
+    rotation_covariance: FloatArray
+    undetermined: tuple[str, ...]
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of (t, C row by row, H) in m and uT, shape (15,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The parameter that is known least, measured by the largest useful sigma of its kind.
+
+    Attributes
+    ----------
+    undetermined
+        Parameters of all sensors without any sigma.
+    sensor, parameter
+        Of the least known of the others, by name; empty if there is none.
+    sigma
+        Of it in its own unit.
+    share
+        The same in largest useful sigmas.
+    """
+
+    undetermined: int
+    sensor: str
+    parameter: str
+    sigma: float
+    share: float
+
+    @property
+    def badness(self) -> tuple[int, float]:
+        """What a better drive has less of; parameters without a sigma count first."""
+        return self.undetermined, self.share
+
+
+@dataclass(frozen=True)
+class MotionPlan:
+    """What would be known least if a motion were added to the drive."""
+
+    motion: str
+    worst: Worst
+
+
+@dataclass(frozen=True)
+class DrivePlan:
+    """What a drive will determine and what would help.
+
+    Attributes
+    ----------
+    sensors
+        One entry per sensor.
+    noise
+        Standard deviation of the sensors' noise in uT that is assumed.
+    uncertainty
+        How the map's errors are counted.
+    worst
+        What is known least.
+    motions
+        Extra motions, the most helpful first.
+    doubts
+        What speaks against the map, and therefore against the sigmas, a sentence each.
+    """
+
+    sensors: tuple[SensorPlan, ...]
+    noise: float
+    uncertainty: Uncertainty
+    worst: Worst
+    motions: tuple[MotionPlan, ...]
+    doubts: tuple[str, ...]
+
+    def __getitem__(self, sensor: str) -> SensorPlan:
         for entry in self.sensors:
             if entry.sensor == sensor:
                 return entry

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field
 from scipy.linalg import qr
 
-from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.options import Options
 
 PARAMETERS = (
@@ -41,13 +41,17 @@ class Determinacy:
     held
         Rows over the parameters that span what is not determined, shape (K, 15): a prior of unit
         variance on each holds it.
+    directions
+        The same space in units of the useful sigmas, shape (K, 15): each row has one parameter to
+        itself.
     names
-        One name per undetermined direction: the parameters that take part in it.
+        One name per row of ``directions``: the parameters that take part in it.
     touched
         Parameters that take part in an undetermined direction, shape (15,).
     """
 
     held: FloatArray
+    directions: FloatArray
     names: tuple[str, ...]
     touched: BoolArray
 
@@ -80,7 +84,7 @@ def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
     touched = np.sum(weak**2, axis=0) > 1e-4  # a share of one per cent in length
     # Stiff enough to be factorised beside the best determined direction.
     stiffness = max(1.0, 1e-5 * float(s[0]))
-    return Determinacy(stiffness * weak / options.scale(), names, touched)
+    return Determinacy(stiffness * weak / options.scale(), simple, names, touched)
 
 
 def _simple_basis(rows: FloatArray) -> FloatArray:
@@ -93,6 +97,10 @@ def _simple_basis(rows: FloatArray) -> FloatArray:
     return basis
 
 
+def members(row: FloatArray) -> IntArray:
+    """Return which of the 15 parameters take part in a direction."""
+    return np.flatnonzero(np.abs(row) > 0.2 * np.abs(row).max())
+
+
 def _name(row: FloatArray) -> str:
-    members = np.flatnonzero(np.abs(row) > 0.2 * np.abs(row).max())
-    return " with ".join(PARAMETERS[i] for i in members)
+    return " with ".join(PARAMETERS[i] for i in members(row))

@@ -91,6 +91,18 @@ def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:
     return _all_series(path, buffers, fields, options)
 
 
+def has_fields(path: Path) -> bool:
+    """Return whether a bag has any topic of a magnetometer.
+
+    Raises
+    ------
+    BagError
+        The bag cannot be opened.
+    """
+    with open_bag(path) as bag:
+        return any(connection.msgtype == FIELD_TYPE for connection in bag.connections)
+
+
 def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
     """Read poses alone.
 

@@ -1,0 +1,100 @@
+"""What a solution leaves open, in words, from the readings that it used.
+
+What is open is looked for twice: at the solution, and at ideal sensors where the solve started. An
+estimate that nothing holds may run away to where the map seems to hold it; the start has not.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.graph.forecast import rank_tests
+from l2m_gtsam.graph.joint import SensorSolution, with_infinities
+from l2m_gtsam.graph.one_key import OneKeySolution
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.solve.explain import drive_facts, explain
+from l2m_gtsam.solve.rank import Determinacy, RankOptions
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A sensor's solution and in words what it leaves open.
+
+    Attributes
+    ----------
+    solution
+        With infinite variances for all of that.
+    words
+        A sentence for each reason, with the parameters by name; none if nothing is open.
+    """
+
+    solution: SensorSolution
+    words: tuple[str, ...]
+
+
+def explained(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    solution: OneKeySolution,
+    options: OneKeyOptions,
+) -> dict[int, Explained]:
+    """Return every solved sensor with what its readings leave open.
+
+    Parameters
+    ----------
+    readings
+        All that the solve was given.
+    field_map
+        The map.
+    t_start
+        Where each sensor started in the lidar frame in metres, shape (S, 3).
+    solution
+        What the solve found.
+    options
+        How it was solved.
+    """
+    if not solution.solved:
+        return {}
+    tests = rank_tests(readings, field_map, t_start, solution.estimate.noise, options)
+    used, told = readings.select(solution.inside), {}
+    for found in solution.solved:
+        s, after = found.sensor, found.determinacy
+        before, own = tests.get(s, after), used.select(used.sensor == s)
+        words = undetermined(before, own, t_start[s], field_map, options.rank)
+        if (after.touched & ~before.touched).any():
+            words += undetermined(after, own, solution.estimate.t[s], field_map, options.rank)
+        covariance = with_infinities(found.covariance, before)
+        told[s] = Explained(replace(found, covariance=covariance), words)
+    return told
+
+
+def undetermined(
+    test: Determinacy,
+    readings: Readings,
+    t_lidar_mag: FloatArray,
+    field_map: QueryableMap,
+    options: RankOptions,
+) -> tuple[str, ...]:
+    """Return what the readings of one sensor leave open, a sentence for each reason.
+
+    Parameters
+    ----------
+    test
+        The rank test of the sensor.
+    readings
+        Those of it that were used.
+    t_lidar_mag
+        Where it sits in the lidar frame in metres, shape (3,).
+    field_map
+        The map.
+    options
+        The scales of the test.
+    """
+    if not test.names:
+        return ()
+    R, p = readings.R_map_lidar, readings.p_map_lidar
+    field, gradient = field_map.field_and_gradient(np.asarray(R @ t_lidar_mag + p))
+    return explain(test, drive_facts(R, p, field, gradient), options)

@@ -1,0 +1,243 @@
+"""What a drive will determine, from its poses and the map alone. Pure: no files, no terminal."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.config import CalibrationOptions, PlanOptions
+from l2m_gtsam.data import (
+    DrivePlan,
+    FieldSeries,
+    FloatArray,
+    MotionPlan,
+    Readings,
+    Recording,
+    SensorPlan,
+    SourceFile,
+    SyncCounts,
+    Synchronised,
+    Trajectory,
+    Worst,
+)
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.graph.alternation import Progress
+from l2m_gtsam.graph.explanation import undetermined
+from l2m_gtsam.graph.forecast import Forecast, forecast
+from l2m_gtsam.graph.joint import SensorSolution
+from l2m_gtsam.graph.view import Compilable, QueryableMap
+from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.motion import Motion, extra_motions, loop, places_around, strongest
+from l2m_gtsam.solve.explain import Movement, movement
+from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
+from l2m_gtsam.solve.rotation import polar_rotation
+from l2m_gtsam.sync import synchronise
+
+NANOSECONDS = 1e9
+NOISE_FACT = "noise of a reading (uT)"  # of the summary of maps that learn it
+
+
+@dataclass(frozen=True)
+class Task:
+    """What every forecast of one plan has in common.
+
+    Attributes
+    ----------
+    field_map
+        The map, in its form for solvers.
+    t
+        Assumed places of the sensors in the lidar frame in metres, shape (S, 3).
+    noise
+        Of the sensors in uT.
+    options
+        How the solve would go.
+    """
+
+    field_map: QueryableMap
+    t: FloatArray
+    noise: float
+    options: CalibrationOptions
+
+    def forecast(self, readings: Readings) -> Forecast:
+        """Return what a solve would say."""
+        return forecast(readings, self.field_map, self.t, self.noise, self.options.solve)
+
+
+def plan(
+    recording: Recording,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    planning: PlanOptions,
+    progress: Progress | None = None,
+) -> DrivePlan:
+    """Say what a drive will determine, to what sigma, and which extra motion would help most.
+
+    Parameters
+    ----------
+    recording
+        The drive; of its readings only the times count.
+    field_map
+        The magnetic map, in the frame of the recording's poses.
+    options
+        How it would be calibrated; sensors are assumed where ``start`` puts them, else at the
+        lidar, without distortion.
+    planning
+        What is assumed and tried.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    SyncError
+        Readings and poses do not overlap.
+    CalibrationError
+        The map does not cover the drive, or a place is given for an unknown sensor.
+    """
+    tell = progress or (lambda stage, fraction: None)
+    synchronised = synchronise(recording, options.sync)
+    readings = synchronised.readings
+    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    noise = _noise(field_map, options, planning)
+    task = Task(solver_map, _places(readings.sensors, options), noise, options)
+    tell("what the drive tells", 0.0)
+    found = task.forecast(readings)
+    tell("what the drive tells", 1.0)
+    if not found.view.inside.any():
+        raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
+    motions = []
+    tried = _motions(readings, solver_map, planning)
+    for index, motion in enumerate(tried):
+        tell("extra motions", index / len(tried))
+        known = task.forecast(with_motion(readings, motion)).solved
+        motions.append(MotionPlan(motion.name, worst(readings.sensors, known, options.solve.rank)))
+    tell("extra motions", 1.0)
+    return DrivePlan(
+        sensors=_sensor_plans(synchronised, recording.trajectory, found, task),
+        noise=noise,
+        uncertainty=found.uncertainty,
+        worst=worst(readings.sensors, found.solved, options.solve.rank),
+        motions=tuple(sorted(motions, key=lambda each: each.worst.badness)),
+        doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
+    )
+
+
+def assumed_recording(
+    trajectory: Trajectory, source: SourceFile, sensors: tuple[str, ...], rate_hz: float
+) -> Recording:
+    """Return a drive with sensors that it does not have yet: readings at a rate, all zero."""
+    first, last = trajectory.stamp_ns[[0, -1]]
+    stamps = np.arange(first, last + 1, int(NANOSECONDS / rate_hz), dtype=np.int64)
+    silent = np.zeros((len(stamps), 3))
+    series = tuple(FieldSeries(name, "", "", stamps, silent) for name in sensors)
+    return Recording(trajectory, series, source)
+
+
+def with_motion(readings: Readings, motion: Motion) -> Readings:
+    """Return the readings of a drive to which a motion is added: one per sensor and pose."""
+    S, K = len(readings.sensors), len(motion.p)
+    sensor = np.concatenate([readings.sensor, np.repeat(np.arange(S), K)])
+    joined = Readings(
+        readings.sensors,
+        sensor,
+        np.concatenate([readings.stamp_ns, np.zeros(S * K, dtype=np.int64)]),
+        np.concatenate([readings.R_map_lidar, np.tile(motion.R, (S, 1, 1))]),
+        np.concatenate([readings.p_map_lidar, np.tile(motion.p, (S, 1))]),
+        np.concatenate([readings.field, np.zeros((S * K, 3))]),
+    )
+    return joined[np.argsort(sensor, kind="stable")]
+
+
+def worst(sensors: tuple[str, ...], known: tuple[SensorSolution, ...], rank: RankOptions) -> Worst:
+    """Return the least known parameter of all sensors; those that are not solved know nothing."""
+    sigma = np.full((len(sensors), len(PARAMETERS)), np.inf)
+    for each in known:
+        sigma[each.sensor] = np.sqrt(np.diag(each.covariance))
+    unknown = np.isinf(sigma)
+    share = np.where(unknown, 0.0, sigma / rank.scale())
+    if unknown.all():
+        return Worst(unknown.size, "", "", float("inf"), float("inf"))
+    row, column = np.unravel_index(np.argmax(share), share.shape)
+    return Worst(
+        undetermined=int(unknown.sum()),
+        sensor=sensors[row],
+        parameter=PARAMETERS[column],
+        sigma=float(sigma[row, column]),
+        share=float(share[row, column]),
+    )
+
+
+def _noise(field_map: QueryableMap, options: CalibrationOptions, planning: PlanOptions) -> float:
+    """Return the noise to assume in uT: as given, else that of the mapping suite."""
+    if options.solve.sensor_noise_ut is not None:
+        return options.solve.sensor_noise_ut
+    if isinstance(field_map, Summarised):
+        return float(field_map.summary.facts.get(NOISE_FACT, planning.noise_ut))
+    return planning.noise_ut
+
+
+def _places(sensors: tuple[str, ...], options: CalibrationOptions) -> FloatArray:
+    """Return where sensors are assumed in metres, shape (S, 3)."""
+    if unknown := sorted(set(options.start) - set(sensors)):
+        msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
+        raise CalibrationError(msg)
+    at_lidar = (0.0, 0.0, 0.0)
+    return np.array([options.start.get(name, at_lidar) for name in sensors])
+
+
+def _motions(
+    readings: Readings, field_map: QueryableMap, planning: PlanOptions
+) -> tuple[Motion, ...]:
+    """Return the motions to try on a drive."""
+    order = np.argsort(readings.stamp_ns, kind="stable")
+    drive = Motion("drive", readings.R_map_lidar[order], readings.p_map_lidar[order])
+    motions = extra_motions(drive, planning.motion)
+    places = places_around(drive, planning.motion)
+    strong = strongest(places, field_map.query(places))
+    return motions if strong is None else (*motions, loop(drive, strong, planning.motion))
+
+
+def _sensor_plans(
+    synchronised: Synchronised, trajectory: Trajectory, found: Forecast, task: Task
+) -> tuple[SensorPlan, ...]:
+    readings, solved = synchronised.readings, {each.sensor: each for each in found.solved}
+    outside = np.bincount(readings.sensor[~found.view.inside], minlength=len(readings.sensors))
+    moved = movement(trajectory.R, trajectory.p)
+    plans = []
+    for index, counts in enumerate(synchronised.counts):
+        inside = counts.kept - int(outside[index])
+        if index in solved:
+            covariance, words = _foretold(solved[index], found, task)
+        else:
+            covariance = np.diag(np.full(len(PARAMETERS), np.inf))
+            words = (_too_few(counts, inside, moved, task.options.solve.min_readings),)
+        plans.append(
+            SensorPlan(
+                sensor=readings.sensors[index],
+                t_lidar_mag=task.t[index],
+                readings=inside,
+                outside_map=int(outside[index]),
+                covariance=covariance,
+                rotation_covariance=polar_rotation(np.eye(3), covariance[3:12, 3:12]).covariance,
+                undetermined=words,
+            )
+        )
+    return tuple(plans)
+
+
+def _foretold(
+    solution: SensorSolution, found: Forecast, task: Task
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return a sensor's covariance, and in words what it leaves open."""
+    used = found.view.readings.select(found.view.readings.sensor == solution.sensor)
+    t, rank = task.t[solution.sensor], task.options.solve.rank
+    words = undetermined(solution.determinacy, used, t, task.field_map, rank)
+    return solution.covariance, words
+
+
+def _too_few(counts: SyncCounts, inside: int, moved: Movement, needed: int) -> str:
+    """Say why nothing will be known of a sensor."""
+    if moved.at_rest:
+        return f"everything: {moved.rest}"
+    return (
+        f"everything: {inside} of {counts.kept} places lie inside the map, at least {needed} must "
+        f"({counts.received} readings in all)"
+    )
