@@ -139,7 +139,8 @@ def _with_start(
     sensor: SensorCalibration, start: FoundStart | None, options: CalibrationOptions
 ) -> SensorCalibration:
     """Return the same with where it started, and a warning if that was not the only place."""
-    if start is None or start.margin >= options.search.clear or start.runner_up is None:
+    clear = options.search.clear
+    if start is None or start.runner_up is None or not start.ambiguous(clear):
         return replace(sensor, start=start)
     if sensor.status is not SensorStatus.SOLVED:
         return replace(sensor, start=start)

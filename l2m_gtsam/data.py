@@ -343,6 +343,10 @@ class FoundStart:
     margin: float
     runner_up: FloatArray | None
 
+    def ambiguous(self, clear: float) -> bool:
+        """Return whether the second best place leaves less than so many times as much."""
+        return self.runner_up is not None and self.margin < clear
+
 
 class Return(StrEnum):
     """What was read when a place was passed again at another time."""

@@ -82,9 +82,20 @@ def random_array(options: ArrayOptions, rng: np.random.Generator) -> tuple[Known
         Source of randomness.
     """
     return tuple(
-        KnownSensor(f"mag_{index:02d}", place, _random_distortion(options, rng))
+        KnownSensor(f"mag_{index:02d}", place, random_distortion(options, rng))
         for index, place in enumerate(_random_places(options, rng))
     )
+
+
+def random_distortion(options: ArrayOptions, rng: np.random.Generator) -> Distortion:
+    """Return a random C and H; see ``random_array``."""
+    R_mag_lidar = Rotation.from_rotvec(
+        rng.normal(0.0, np.deg2rad(options.misalignment), 3)
+    ).as_matrix()
+    coupling = np.triu(rng.normal(0.0, options.soft_iron, (3, 3)), 1)
+    stretch = np.diag(1 + rng.normal(0.0, options.scale, 3)) + coupling + coupling.T
+    offset = rng.uniform(-options.offset, options.offset, 3)
+    return Distortion(stretch @ R_mag_lidar, offset)
 
 
 def mapping_suite(options: SuiteOptions) -> tuple[KnownSensor, ...]:
@@ -162,14 +173,3 @@ def _random_places(options: ArrayOptions, rng: np.random.Generator) -> FloatArra
     height = np.resize(options.heights, options.count)
     places = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height])
     return places + rng.uniform(-options.placing, options.placing, places.shape)
-
-
-def _random_distortion(options: ArrayOptions, rng: np.random.Generator) -> Distortion:
-    """Return a random C and H."""
-    R_mag_lidar = Rotation.from_rotvec(
-        rng.normal(0.0, np.deg2rad(options.misalignment), 3)
-    ).as_matrix()
-    coupling = np.triu(rng.normal(0.0, options.soft_iron, (3, 3)), 1)
-    stretch = np.diag(1 + rng.normal(0.0, options.scale, 3)) + coupling + coupling.T
-    offset = rng.uniform(-options.offset, options.offset, 3)
-    return Distortion(stretch @ R_mag_lidar, offset)

@@ -1,0 +1,1 @@
+"""Studies: many calibrations whose truth is known, counted."""

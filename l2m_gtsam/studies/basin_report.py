@@ -1,0 +1,87 @@
+"""The basin study as a table in Markdown and as the paper's figure."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.studies.basin import BasinOptions, BasinTable, RingRow
+from l2m_gtsam.studies.share import Share
+
+# Blue and vermilion differ for all kinds of colour vision.
+ONE_KEY, LM = {"color": "#0072b2"}, {"color": "#d55e00"}
+NEAR, WIDE = {"fmt": "o-"}, {"fmt": "s--", "markerfacecolor": "white"}
+
+
+def basin_markdown(table: BasinTable) -> str:
+    """Return the table of a study with 95 % intervals, and under it what was counted."""
+    small, medium = sizes(table.options)
+    head = (
+        f"| initial offset (m) | starts | one-key within {small} | within {medium} "
+        f"| LM within {small} | within {medium} | ambiguous | wrong, not ambiguous |"
+    )
+    note = (
+        "Each start is calibrated by both methods, with "
+        f"{table.options.site.scenario.noise.field:g} uT of noise. In brackets Wilson's 95 % "
+        "intervals, which take the starts for independent; those of one distortion share a drive. "
+        f"Wrong: not within {small}. Ambiguous: marked so by one-key, right or wrong."
+    )
+    rows = [table_line(row) for row in table.rows]
+    return "\n".join([head, "|---" * 8 + "|", *rows, "", note, ""])
+
+
+def sizes(options: BasinOptions) -> tuple[str, str]:
+    """Return what counts as a small and as a medium error."""
+    return f"{100 * options.small:g} cm", f"{100 * options.medium:g} cm"
+
+
+def table_line(row: RingRow) -> str:
+    """Return one ring as a line of Markdown."""
+    shares = (row.one_key_small, row.one_key_medium, row.lm_small, row.lm_medium)
+    cells = [
+        f"{row.inner:.2f}-{row.outer:.2f}",
+        f"{row.one_key_small.trials:,}",
+        *(said(share) for share in shares),
+        str(row.ambiguous),
+        str(row.unwarned),
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def said(share: Share) -> str:
+    """Return a share in per cent with its interval."""
+    low, high = share.interval
+    return f"{100 * share.rate:.2f} % ({100 * low:.2f}-{100 * high:.2f})"
+
+
+def basin_figure(table: BasinTable) -> Figure:
+    """Draw success rates against the initial offset: two methods, two thresholds."""
+    figure = Figure(figsize=(7, 4.2), layout="constrained", dpi=150)
+    axes = figure.add_subplot()
+    small, medium = sizes(table.options)
+    rows = table.rows
+    offset = np.array([(row.inner + row.outer) / 2 for row in rows])
+    for name, style, shares in (
+        (f"one-key, within {small}", ONE_KEY | NEAR, [row.one_key_small for row in rows]),
+        (f"one-key, within {medium}", ONE_KEY | WIDE, [row.one_key_medium for row in rows]),
+        (f"LM, within {small}", LM | NEAR, [row.lm_small for row in rows]),
+        (f"LM, within {medium}", LM | WIDE, [row.lm_medium for row in rows]),
+    ):
+        draw_rates(axes, offset, shares, label=name, **style)
+    axes.set(xlabel="initial offset (m)", ylabel="success rate (%)", ylim=(-3, 103))
+    axes.set_xlim(0, max(row.outer for row in rows))
+    axes.grid(alpha=0.3)
+    axes.legend(loc="lower left")
+    return figure
+
+
+def draw_rates(axes: Axes, offset: FloatArray, shares: Sequence[Share], **style: Any) -> None:
+    """Draw rates in per cent, with their intervals, at offsets in metres, shape (N,)."""
+    rate = 100 * np.array([share.rate for share in shares])
+    low, high = 100 * np.array([share.interval for share in shares]).T
+    # Rounding may put the end of an interval a hair on the wrong side of the rate.
+    reach = np.maximum([rate - low, high - rate], 0.0)
+    axes.errorbar(offset, rate, reach, capsize=2.5, linewidth=1.3, markersize=5, **style)

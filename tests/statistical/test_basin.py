@@ -1,0 +1,135 @@
+"""The basin study: its counts, that it repeats itself, and (`make study`) what it promises."""
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from l2m_gtsam.config import MappingOptions
+from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
+from l2m_gtsam.simulate.route import CalibrationRouteOptions
+from l2m_gtsam.simulate.scenario import ScenarioOptions
+from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
+from l2m_gtsam.studies.basin import BasinOptions, Cell, basin_table, cell
+from l2m_gtsam.studies.basin_file import BasinStudy, read_study, write_study
+from l2m_gtsam.studies.basin_report import basin_markdown
+from l2m_gtsam.studies.basin_run import FIGURE_FILE, STUDY_FILE, TABLE_FILE, run_basin
+from l2m_gtsam.studies.share import Share
+from l2m_gtsam.studies.site import SiteOptions
+from tests.quick_maps import quick
+
+HALL = ScenarioOptions(
+    floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
+    suite=SuiteOptions(lateral=(0.0,)),
+    array=ArrayOptions(count=1),
+    noise=NoiseOptions(field=0.2),
+    calibration_route=CalibrationRouteOptions(turns=1),
+    calibration_sampling=SamplingOptions(field_rate=3.0),
+)
+SITE = SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("harmonic")))
+TINY = BasinOptions(distortions=1, starts=3, rings=2, width=1.5, site=SITE)
+
+
+@lru_cache
+def tiny_cells() -> tuple[Cell, ...]:
+    return tuple(cell(TINY, 0, ring) for ring in range(TINY.rings))
+
+
+def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
+    """A cell where one-key ends with these errors, is never sure, and LM never moves."""
+    count = len(errors)
+    t_start = np.full((count, 3), 1.0)
+    return Cell(
+        distortion=distortion,
+        ring=ring,
+        t_true=np.zeros(3),
+        t_start=t_start,
+        t_found=t_start,
+        margin=np.full(count, np.inf),
+        ambiguous=np.arange(count) == 0,
+        t_one_key=np.array(errors)[:, None] * np.array([1.0, 0.0, 0.0]),
+        t_lm=t_start,
+    )
+
+
+def test_one_key_finds_the_sensor_from_every_start() -> None:
+    table = basin_table(TINY, tiny_cells())
+    assert [(row.inner, row.outer) for row in table.rows] == [(0.0, 1.5), (1.5, 3.0)]
+    for row in table.rows:
+        assert row.one_key_medium == Share(3, 3)
+
+
+def test_starts_lie_in_their_ring() -> None:
+    for each in tiny_cells():
+        offset = each.error(each.t_start) / TINY.width
+        assert ((offset >= each.ring) & (offset < each.ring + 1)).all()
+
+
+def test_a_cell_repeats_itself() -> None:
+    again = cell(TINY, 0, 1)
+    for name, value in vars(tiny_cells()[1]).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+
+
+def test_all_cells_of_a_distortion_share_its_sensor_and_no_two_their_starts() -> None:
+    near, far = tiny_cells()
+    np.testing.assert_array_equal(near.t_true, far.t_true)
+    assert not np.allclose(near.t_start - near.t_true, far.t_start - far.t_true)
+
+
+def test_the_table_counts_what_cells_hold() -> None:
+    cells = [made_up(0, 0, [0.01, 0.03, np.nan]), made_up(1, 0, [0.06, 0.02])]
+    (row,) = basin_table(TINY, cells).rows
+    assert (row.one_key_small, row.one_key_medium) == (Share(2, 5), Share(3, 5))
+    assert (row.lm_small, row.lm_medium) == (Share(0, 5), Share(0, 5))
+    # Ambiguous are the first of both cells; of the others 3 cm and the missing one are wrong.
+    assert (row.ambiguous, row.unwarned) == (2, 2)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 20), (7, 20), (1995, 2000), (2000, 2000)])
+def test_intervals_are_wilsons(successes: int, trials: int) -> None:
+    expected = binomtest(successes, trials).proportion_ci(0.95, method="wilson")
+    assert Share(successes, trials).interval == pytest.approx((expected.low, expected.high))
+
+
+def test_a_study_comes_back_from_its_file(tmp_path: Path) -> None:
+    lost = replace(tiny_cells()[0], t_one_key=np.full((3, 3), np.nan), margin=np.full(3, np.inf))
+    study = BasinStudy(TINY, (lost, tiny_cells()[1]))
+    write_study(tmp_path / STUDY_FILE, study)
+    back = read_study(tmp_path / STUDY_FILE)
+    assert back.options == TINY
+    for before, after in zip(study.cells, back.cells, strict=True):
+        for name, value in vars(before).items():
+            np.testing.assert_array_equal(getattr(after, name), value)
+
+
+def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    write_study(tmp_path / STUDY_FILE, BasinStudy(TINY, tiny_cells()[:1]))
+    new: list[Cell] = []
+    table = run_basin(TINY, tmp_path, 1, lambda each, share: new.append(each))
+    assert [each.ring for each in new] == [1]
+    assert table == basin_table(TINY, tiny_cells())
+    assert (tmp_path / TABLE_FILE).read_text() == basin_markdown(table)
+    assert (tmp_path / FIGURE_FILE).stat().st_size > 1000
+
+
+def test_a_folder_holds_one_study(tmp_path: Path) -> None:
+    write_study(tmp_path / STUDY_FILE, BasinStudy(TINY, tiny_cells()))
+    other = TINY.model_copy(update={"seed": 2})
+    with pytest.raises(ConfigError, match="other options"):
+        run_basin(other, tmp_path, 1, lambda each, share: None)
+
+
+@pytest.mark.study
+def test_the_global_start_forgives_any_guess_within_three_metres(tmp_path: Path) -> None:
+    """The paper's protocol: 99.5 % within 2 cm in every ring, where plain LM falls off."""
+    table = run_basin(BasinOptions(), tmp_path, 2, lambda each, share: None)
+    assert len(table.rows) == 12
+    for row in table.rows:
+        assert row.one_key_small.trials == 2000
+        assert row.one_key_small.rate >= 0.995, str(row)
+    assert table.rows[-1].lm_medium.rate < 0.5
