@@ -24,8 +24,10 @@ from l2m_gtsam.graph.alternation import Progress
 from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.solve.disagreement import disagreements
 from l2m_gtsam.solve.explain import Movement, movement
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
 from l2m_gtsam.sync import stuck_sensors, synchronise
@@ -36,6 +38,9 @@ CONVERGED_SIGMAS = 0.1
 # Squared distance of two sensors in sigmas, three degrees of freedom: exceeded by 1 % of those at
 # one point.
 ONE_POINT = 11.3
+
+# With more of its readings rejected than this, what a sensor's others agree on may be chance.
+MOST_REJECTED = 0.4
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 
@@ -88,6 +93,9 @@ def calibrate(
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
+        disagreements=disagreements(
+            judged(alive, solver_map, solution.estimate, solution.rejected)
+        ),
         bag=recording.source,
         map=map_source,
         options=options.model_dump(mode="json"),
@@ -183,6 +191,7 @@ def _assess(
 ) -> tuple[SensorCalibration, ...]:
     """Return a verdict on every sensor of the recording."""
     outside = np.bincount(alive.sensor[~solution.inside], minlength=len(alive.sensors))
+    rejected = np.bincount(alive.sensor[solution.rejected], minlength=len(alive.sensors))
     sensors = []
     for index, (name, counts) in enumerate(zip(alive.sensors, synchronised.counts, strict=True)):
         if index in solved:
@@ -192,8 +201,23 @@ def _assess(
             read = usable.stop - usable.start
             needed = options.solve.min_readings
             entry = _unsolved(name, read, counts, int(outside[index]), moved, needed)
-        sensors.append(entry)
+        sensors.append(_with_rejected(entry, int(rejected[index])))
     return tuple(sensors)
+
+
+def _with_rejected(sensor: SensorCalibration, rejected: int) -> SensorCalibration:
+    """Return the same with the number of its readings that nothing explains, and what follows."""
+    sensor = replace(sensor, rejected=rejected)
+    used = 0 if sensor.residuals is None else sensor.residuals.readings
+    if rejected <= MOST_REJECTED * (used + rejected):
+        return sensor
+    msg = (
+        f"{rejected} of {used + rejected} readings inside the map fit no distortion that explains "
+        "the others: is it the right map, and are the poses in its frame?"
+    )
+    if sensor.status not in (SensorStatus.SOLVED, SensorStatus.OUTSIDE_MAP):
+        return sensor
+    return replace(sensor, status=SensorStatus.CONTRADICTED, message=msg)
 
 
 def _solved(

@@ -297,6 +297,7 @@ class SensorStatus(StrEnum):
     OUTSIDE_MAP = "outside_map"
     DEAD_AXIS = "dead_axis"
     AMBIGUOUS = "ambiguous"
+    CONTRADICTED = "contradicted"
     FLIPPED_AXIS = "flipped_axis"
 
 
@@ -423,6 +424,8 @@ class SensorCalibration:
         Synchronised readings that were not used because the map has no data there.
     start
         Where the solve started, if that was looked for; absent where it was given.
+    rejected
+        Readings inside the map that did not count: no distortion explains them beside the others.
     """
 
     sensor: str
@@ -439,6 +442,7 @@ class SensorCalibration:
     sync: SyncCounts
     outside_map: int
     start: FoundStart | None = None
+    rejected: int = 0
 
     @property
     def t_sigma(self) -> FloatArray:
@@ -470,6 +474,8 @@ class CalibrationResult:
         How the sigmas count the map's errors.
     doubts
         What speaks against the map, and therefore against the sigmas, a sentence each.
+    disagreements
+        Stretches of the drive over which readings were rejected, in order of time.
     bag, map
         Sources with hashes; absent when the data did not come from files.
     options
@@ -482,6 +488,7 @@ class CalibrationResult:
     iterations: int
     uncertainty: Uncertainty
     doubts: tuple[str, ...]
+    disagreements: tuple[Disagreement, ...]
     bag: SourceFile | None
     map: SourceFile | None
     options: dict[str, Any]

@@ -59,7 +59,7 @@ def explained(
     if not solution.solved:
         return {}
     tests = rank_tests(readings, field_map, t_start, solution.estimate.noise, options)
-    used, told = readings.select(solution.inside), {}
+    used, told = readings.select(solution.used), {}
     for found in solution.solved:
         s, after = found.sensor, found.determinacy
         before, own = tests.get(s, after), used.select(used.sensor == s)

@@ -72,6 +72,11 @@ class OneKeySolution:
     settled: bool
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
 
+    @property
+    def used(self) -> BoolArray:
+        """Which readings count, shape (N,)."""
+        return self.inside & ~self.rejected
+
 
 def solve_one_key(
     readings: Readings,

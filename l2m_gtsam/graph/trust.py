@@ -12,6 +12,7 @@ from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate, batch_readings
 from l2m_gtsam.graph.view import QueryableMap, View
+from l2m_gtsam.solve.disagreement import Judged
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import (
     WEIGHTS,
@@ -196,3 +197,12 @@ def residuals(readings: Readings, field_map: QueryableMap, estimate: Estimate) -
     batch = batch_readings(readings, field_map, estimate.distortion)
     values = estimate.positions(batch.sensors)
     return np.asarray(batch.residuals(values, batch.sensors[0]).residual)
+
+
+def judged(
+    readings: Readings, field_map: QueryableMap, estimate: Estimate, rejected: BoolArray
+) -> Judged:
+    """Return readings with their places, residuals and the verdict, shape (N,), of the solve."""
+    t = estimate.t[readings.sensor]
+    place = np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar
+    return Judged(readings, place, residuals(readings, field_map, estimate), rejected)

@@ -31,6 +31,7 @@ def calibration_table(result: CalibrationResult) -> Table:
         "|residual| rms (uT)",
         "readings used",
         "outside map",
+        "rejected",
     ):
         table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("status")
@@ -137,7 +138,8 @@ def _bags(provenance: dict[str, Any]) -> list[dict[str, Any]]:
 def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
     status = _status(sensor)
     if sensor.residuals is None:
-        return (escape(sensor.sensor), *("-",) * 7, f"{sensor.outside_map:,}", status)
+        counts = (f"{sensor.outside_map:,}", f"{sensor.rejected:,}")
+        return (escape(sensor.sensor), *("-",) * 7, *counts, status)
     distortion, R = sensor.distortion, sensor.R_lidar_mag.T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
     return (
@@ -150,6 +152,7 @@ def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
         f"{sensor.residuals.rms:.3f}",
         f"{sensor.residuals.readings:,}",
         f"{sensor.outside_map:,}",
+        f"{sensor.rejected:,}",
         status,
     )
 

@@ -9,11 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import (
     CalibrationResult,
+    Disagreement,
     Distortion,
     FloatArray,
     FoundStart,
     KnownSensor,
     ResidualFigures,
+    Return,
     RigidTransform,
     SensorCalibration,
     SensorStatus,
@@ -52,6 +54,10 @@ MODEL = {
     ),
     "rotation_covariance": "of the error e in the mag frame: true = exp(e) @ R_mag_lidar",
     "covariance_order": "t_x t_y t_z C_xx C_xy C_xz C_yx C_yy C_yz C_zx C_zy C_zz H_x H_y H_z",
+    "disagreements": (
+        "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
+        "ns, the lidar's way from p_from to p_to in m in the map, median residual (size) in uT"
+    ),
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
 
@@ -139,6 +145,19 @@ class _Sensor(_Lenient):
     readings: _Counts
     outside_map: int
     start: _Start | None = None
+    rejected: int = 0
+
+
+class _Disagreement(_Lenient):
+    sensors: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+    p_from: Vector
+    p_to: Vector
+    length: float
+    readings: int
+    size: float
+    passed_again: Return
 
 
 class _Source(_Lenient):
@@ -153,6 +172,7 @@ class _CalibrationFile(_Lenient):
     # Files of the first version do not say; their sigmas are of this kind.
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
     doubts: tuple[str, ...] = ()
+    disagreements: tuple[_Disagreement, ...] = ()
     bag: _Source | None
     map: _Source | None
     options: dict[str, Any]
@@ -168,6 +188,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
         "uncertainty": str(result.uncertainty),
         "doubts": list(result.doubts),
+        "disagreements": [_disagreement_entry(each) for each in result.disagreements],
         "bag": _source(result.bag),
         "map": _source(result.map),
         "versions": result.versions,
@@ -192,6 +213,7 @@ def read_calibration(path: Path) -> CalibrationResult:
         iterations=parsed.iterations,
         uncertainty=parsed.uncertainty,
         doubts=parsed.doubts,
+        disagreements=tuple(_disagreement(each) for each in parsed.disagreements),
         bag=SourceFile(parsed.bag.path, parsed.bag.sha256) if parsed.bag else None,
         map=SourceFile(parsed.map.path, parsed.map.sha256) if parsed.map else None,
         options=parsed.options,
@@ -262,6 +284,7 @@ def _sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
         "residuals": _residuals_entry(sensor.residuals),
         "readings": vars(sensor.sync).copy(),
         "outside_map": sensor.outside_map,
+        "rejected": sensor.rejected,
         "start": _start_entry(sensor.start),
         "covariance": sensor.covariance.tolist(),
     }
@@ -307,6 +330,21 @@ def _start_entry(start: FoundStart | None) -> dict[str, Any] | None:
     }
 
 
+def _disagreement_entry(stretch: Disagreement) -> dict[str, Any]:
+    return {
+        **vars(stretch),
+        "sensors": list(stretch.sensors),
+        "p_from": stretch.p_from.tolist(),
+        "p_to": stretch.p_to.tolist(),
+        "passed_again": stretch.passed_again.value,
+    }
+
+
+def _disagreement(entry: _Disagreement) -> Disagreement:
+    places = {"p_from": np.array(entry.p_from), "p_to": np.array(entry.p_to)}
+    return Disagreement(**{**dict(entry), **places})
+
+
 def _residuals_entry(figures: ResidualFigures | None) -> dict[str, Any] | None:
     if figures is None:
         return None
@@ -343,6 +381,7 @@ def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
         sync=SyncCounts(**dict(entry.readings)),
         outside_map=entry.outside_map,
         start=_start(entry.start),
+        rejected=entry.rejected,
     )
 
 
