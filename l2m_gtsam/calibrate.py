@@ -88,14 +88,13 @@ def calibrate(
     sensors = tuple(_with_neighbours(sensor, sensors) for sensor in sensors)
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
+    verdicts = judged(alive, solver_map, solution.estimate, solution.rejected)
     return CalibrationResult(
         sensors=sensors,
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
-        disagreements=disagreements(
-            judged(alive, solver_map, solution.estimate, solution.rejected)
-        ),
+        disagreements=disagreements(verdicts),
         bag=recording.source,
         map=map_source,
         options=options.model_dump(mode="json"),

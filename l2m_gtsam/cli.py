@@ -152,7 +152,7 @@ def calibrate(
     """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
     from l2m_gtsam.batch import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
     from l2m_gtsam.config import load_config, with_uncertainty
-    from l2m_gtsam.qa.tables import calibration_table
+    from l2m_gtsam.qa.tables import calibration_table, disagreement_note
     from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
@@ -161,6 +161,7 @@ def calibrate(
     _print(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
     _warn(result.doubts)
+    _warn([disagreement_note(each) for each in result.disagreements])
     typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
 
 

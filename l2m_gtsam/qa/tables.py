@@ -9,8 +9,10 @@ from rich.table import Table
 
 from l2m_gtsam.data import (
     CalibrationResult,
+    Disagreement,
     FloatArray,
     KnownSensor,
+    Return,
     SensorCalibration,
     SensorStatus,
 )
@@ -38,6 +40,22 @@ def calibration_table(result: CalibrationResult) -> Table:
     for sensor in result.sensors:
         table.add_row(*_calibration_row(sensor))
     return table
+
+
+def disagreement_note(stretch: Disagreement) -> str:
+    """Return where, when and by how much readings and map disagree, as a sentence."""
+    (x0, y0), (x1, y1) = stretch.p_from[:2], stretch.p_to[:2]
+    meaning = {
+        Return.NEVER: "not passed again, so that a passing source and a changed place look alike",
+        Return.AS_MAPPED: "passed again it was as mapped: something moved by",
+        Return.DIFFERS: "passed again it differed too: the field has changed there",
+    }[stretch.passed_again]
+    return (
+        f"{', '.join(stretch.sensors)}: {stretch.readings} readings fit neither map nor distortion "
+        f"and do not count, {1e-9 * stretch.start_ns:.2f} to {1e-9 * stretch.end_ns:.2f} s, "
+        f"{stretch.length:.1f} m from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m, "
+        f"{stretch.size:.2g} uT off; {meaning}"
+    )
 
 
 def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Table:
