@@ -20,7 +20,7 @@ from l2m_gtsam.solve.robust import (
     RobustOptions,
     consistent,
     grown,
-    resistant_noise,
+    median_noise,
 )
 
 # Stages of the graduation; what is wrong by far is left out before, so that few are enough.
@@ -124,9 +124,10 @@ def trusted(
     e = residuals(view.readings, field_map, estimate)
     for sensor in view.sensors:
         rows = view.readings.rows_of(sensor)
-        noise = estimate.noise[sensor]
-        if options.sensor_noise_ut is None:
-            noise = min(noise, resistant_noise(e[rows], view.map_variance[rows].mean(axis=1)))
+        # The estimate's noise counts wrong readings in; but no more than half can be wrong.
+        noise = median_noise(e[rows], view.map_variance[rows].mean(axis=1))
+        if options.sensor_noise_ut is not None:
+            noise = max(noise, options.sensor_noise_ut)
         weights[rows] = weigh(view, rows, e[rows], estimate, noise, options.robust, stage)
     return counting(view, weights, options.min_readings, final=bool(np.isinf(stage)))
 

@@ -122,31 +122,6 @@ def median_noise(residual: FloatArray, map_variance: FloatArray) -> float:
     return float(np.exp(brentq(excess, low, high, xtol=1e-4)))
 
 
-def difference_noise(residual: FloatArray) -> float:
-    """Return the noise in uT that differences of residuals in order of time, shape (N, 3), show.
-
-    What is wrong with the field over some readings in a row cancels.
-    """
-    steps = np.diff(residual, axis=0)
-    length2 = np.einsum("ni,ni->n", steps, steps)
-    if not len(steps):
-        return NOISE_RANGE[1]
-    return max(float(np.sqrt(np.median(length2) / (2 * MEDIAN))), NOISE_RANGE[0])
-
-
-def resistant_noise(residual: FloatArray, map_variance: FloatArray) -> float:
-    """Return the noise in uT that is not taken in by wrong readings, few or many in a row.
-
-    Parameters
-    ----------
-    residual
-        In order of time in uT, shape (N, 3).
-    map_variance
-        Mean variance of the map's prediction in uT^2, shape (N,).
-    """
-    return min(median_noise(residual, map_variance), difference_noise(residual))
-
-
 def consistent(
     b_lidar: FloatArray, field: FloatArray, map_variance: FloatArray, largest: float
 ) -> BoolArray:
@@ -198,8 +173,7 @@ def grown(
     """Return the rejected readings of a drive and those about them that deviate together, (N,).
 
     Where something was moved the field fades from plainly wrong to right: at the ends of such a
-    stretch each reading could be noise, their mean could not. The map's error counts as common to
-    all readings of a mean.
+    stretch each reading could be noise, their mean could not.
 
     Parameters
     ----------
@@ -219,9 +193,12 @@ def grown(
         count = windowed(np.where(rejected, 0.0, 1.0), window)
         total = [windowed(np.where(rejected, 0.0, axis), window) for axis in residual.T]
         mean = np.stack(total, axis=1) / np.maximum(count, 1)[:, None]
+        m2 = np.einsum("ni,ni->n", mean, mean)
         common = windowed(map_variance, window) / windowed(np.ones(len(mean)), window)
         variance = noise**2 / np.maximum(count, 1) + common
-        together |= (count > 0) & (np.einsum("ni,ni->n", mean, mean) > largest * variance)
+        # A map that errs everywhere, and along the drive, makes no stretch: half of all means pass.
+        scale = np.median((m2 / variance)[count > 0]) / MEDIAN if (count > 0).any() else 1.0
+        together |= (count > 0) & (m2 > largest * variance * max(scale, 1.0))
     pieces, found = label(rejected | together)
     seeds = np.bincount(pieces, weights=rejected, minlength=found + 1)
     grows = seeds >= SEEDS
