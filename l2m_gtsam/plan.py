@@ -114,29 +114,32 @@ def plan(
     tell("what the drive tells", 1.0)
     if not found.view.inside.any():
         raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
-    sensors, rank = (
-        _sensor_plans(synchronised, recording.trajectory, found, task),
-        options.solve.rank,
-    )
-    least = max(
-        range(len(sensors)),
-        key=lambda index: worst(sensors[index].sensor, sensors[index].covariance, rank).badness,
-    )
+    sensors = _sensor_plans(synchronised, recording.trajectory, found, task)
+    worsts = [worst(each.sensor, each.covariance, options.solve.rank) for each in sensors]
+    least = max(range(len(sensors)), key=lambda index: worsts[index].badness)
     # The other sensors are known better: what a motion does for them need not be asked.
     one, alone = task.of(least), only(readings, least)
-    tried, motions = _motions(readings, solver_map, planning), []
-    for index, motion in enumerate(tried):
-        tell("extra motions", index / len(tried))
-        motions.append(MotionPlan(motion.name, one.worst(with_motion(alone, motion))))
-    tell("extra motions", 1.0)
+    motions = _with_motions(one, alone, _motions(readings, solver_map, planning), tell)
     return DrivePlan(
         sensors=sensors,
         noise=noise,
         uncertainty=found.uncertainty,
         worst=one.worst(alone),
-        motions=tuple(sorted(motions, key=lambda each: each.worst.badness)),
+        motions=motions,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
     )
+
+
+def _with_motions(
+    task: Task, readings: Readings, motions: tuple[Motion, ...], tell: Progress
+) -> tuple[MotionPlan, ...]:
+    """Return what each motion would leave of a sensor, the best first."""
+    plans = []
+    for index, motion in enumerate(motions):
+        tell("extra motions", index / len(motions))
+        plans.append(MotionPlan(motion.name, task.worst(with_motion(readings, motion))))
+    tell("extra motions", 1.0)
+    return tuple(sorted(plans, key=lambda each: each.worst.badness))
 
 
 def assumed_recording(

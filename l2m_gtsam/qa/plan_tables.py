@@ -52,7 +52,8 @@ def advice(plan: DrivePlan) -> str:
     best = plan.motions[0]
     if best.worst.badness >= plan.worst.badness:
         return "no motion that was tried helps"
-    return f"helps {plan.worst.sensor} most: {best.motion} ({_told(plan.worst)}; with it {_told(best.worst)})"
+    told = f"{_told(plan.worst)}; with it {_told(best.worst)}"
+    return f"helps {plan.worst.sensor} most: {best.motion} ({told})"
 
 
 def _told(worst: Worst) -> str:
