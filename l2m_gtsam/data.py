@@ -538,14 +538,16 @@ class SensorPlan:
 
 @dataclass(frozen=True)
 class Worst:
-    """The parameter that is known least, measured by the largest useful sigma of its kind.
+    """The parameter of a sensor that is known least, in largest useful sigmas of its kind.
 
     Attributes
     ----------
     undetermined
-        Parameters of all sensors without any sigma.
-    sensor, parameter
-        Of the least known of the others, by name; empty if there is none.
+        Number of its parameters without any sigma.
+    sensor
+        Its name.
+    parameter
+        The least known of the others, by name; empty if there is none.
     sigma
         Of it in its own unit.
     share
@@ -585,9 +587,10 @@ class DrivePlan:
     uncertainty
         How the map's errors are counted.
     worst
-        What is known least.
+        What is known least of the sensor that is known least, by itself: without what the readings
+        of others tell of the map's errors.
     motions
-        Extra motions, the most helpful first.
+        The same with an extra motion, the most helpful first.
     doubts
         What speaks against the map, and therefore against the sigmas, a sentence each.
     """

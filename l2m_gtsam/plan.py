@@ -1,6 +1,6 @@
 """What a drive will determine, from its poses and the map alone. Pure: no files, no terminal."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from l2m_gtsam.solve.rotation import polar_rotation
 from l2m_gtsam.sync import synchronise
 
 NANOSECONDS = 1e9
+UNKNOWN = np.diag(np.full(len(PARAMETERS), np.inf))
 NOISE_FACT = "noise of a reading (uT)"  # of the summary of maps that learn it
 
 
@@ -60,6 +61,16 @@ class Task:
     def forecast(self, readings: Readings) -> Forecast:
         """Return what a solve would say."""
         return forecast(readings, self.field_map, self.t, self.noise, self.options.solve)
+
+    def worst(self, readings: Readings) -> Worst:
+        """Return what would be known least of a sensor by itself."""
+        solved = self.forecast(readings).solved
+        covariance = solved[0].covariance if solved else UNKNOWN
+        return worst(readings.sensors[0], covariance, self.options.solve.rank)
+
+    def of(self, sensor: int) -> "Task":
+        """Return the task of one sensor by itself."""
+        return replace(self, t=self.t[[sensor]])
 
 
 def plan(
@@ -103,21 +114,32 @@ def plan(
     tell("what the drive tells", 1.0)
     if not found.view.inside.any():
         raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
-    motions = []
-    tried = _motions(readings, solver_map, planning)
-    for index, motion in enumerate(tried):
-        tell("extra motions", index / len(tried))
-        known = task.forecast(with_motion(readings, motion)).solved
-        motions.append(MotionPlan(motion.name, worst(readings.sensors, known, options.solve.rank)))
-    tell("extra motions", 1.0)
+    sensors = _sensor_plans(synchronised, recording.trajectory, found, task)
+    worsts = [worst(each.sensor, each.covariance, options.solve.rank) for each in sensors]
+    least = max(range(len(sensors)), key=lambda index: worsts[index].badness)
+    # The other sensors are known better: what a motion does for them need not be asked.
+    one, alone = task.of(least), only(readings, least)
+    motions = _with_motions(one, alone, _motions(readings, solver_map, planning), tell)
     return DrivePlan(
-        sensors=_sensor_plans(synchronised, recording.trajectory, found, task),
+        sensors=sensors,
         noise=noise,
         uncertainty=found.uncertainty,
-        worst=worst(readings.sensors, found.solved, options.solve.rank),
-        motions=tuple(sorted(motions, key=lambda each: each.worst.badness)),
+        worst=one.worst(alone),
+        motions=motions,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
     )
+
+
+def _with_motions(
+    task: Task, readings: Readings, motions: tuple[Motion, ...], tell: Progress
+) -> tuple[MotionPlan, ...]:
+    """Return what each motion would leave of a sensor, the best first."""
+    plans = []
+    for index, motion in enumerate(motions):
+        tell("extra motions", index / len(motions))
+        plans.append(MotionPlan(motion.name, task.worst(with_motion(readings, motion))))
+    tell("extra motions", 1.0)
+    return tuple(sorted(plans, key=lambda each: each.worst.badness))
 
 
 def assumed_recording(
@@ -129,6 +151,12 @@ def assumed_recording(
     silent = np.zeros((len(stamps), 3))
     series = tuple(FieldSeries(name, "", "", stamps, silent) for name in sensors)
     return Recording(trajectory, series, source)
+
+
+def only(readings: Readings, sensor: int) -> Readings:
+    """Return the readings of one sensor, as the only one."""
+    own = readings[np.flatnonzero(readings.sensor == sensor)]
+    return replace(own, sensors=(readings.sensors[sensor],), sensor=np.zeros_like(own.sensor))
 
 
 def with_motion(readings: Readings, motion: Motion) -> Readings:
@@ -146,23 +174,16 @@ def with_motion(readings: Readings, motion: Motion) -> Readings:
     return joined[np.argsort(sensor, kind="stable")]
 
 
-def worst(sensors: tuple[str, ...], known: tuple[SensorSolution, ...], rank: RankOptions) -> Worst:
-    """Return the least known parameter of all sensors; those that are not solved know nothing."""
-    sigma = np.full((len(sensors), len(PARAMETERS)), np.inf)
-    for each in known:
-        sigma[each.sensor] = np.sqrt(np.diag(each.covariance))
-    unknown = np.isinf(sigma)
-    share = np.where(unknown, 0.0, sigma / rank.scale())
-    if unknown.all():
-        return Worst(unknown.size, "", "", float("inf"), float("inf"))
-    row, column = np.unravel_index(np.argmax(share), share.shape)
-    return Worst(
-        undetermined=int(unknown.sum()),
-        sensor=sensors[row],
-        parameter=PARAMETERS[column],
-        sigma=float(sigma[row, column]),
-        share=float(share[row, column]),
-    )
+def worst(sensor: str, covariance: FloatArray, rank: RankOptions) -> Worst:
+    """Return the parameter of a sensor that is known least, from its covariance, (15, 15)."""
+    sigma = np.sqrt(np.diag(covariance))
+    known = np.isfinite(sigma)
+    if not known.any():
+        return Worst(len(sigma), sensor, "", float("inf"), float("inf"))
+    share = np.where(known, sigma / rank.scale(), 0.0)
+    least = int(np.argmax(share))
+    unknown = len(sigma) - int(known.sum())
+    return Worst(unknown, sensor, PARAMETERS[least], float(sigma[least]), float(share[least]))
 
 
 def _noise(field_map: QueryableMap, options: CalibrationOptions, planning: PlanOptions) -> float:
@@ -207,7 +228,7 @@ def _sensor_plans(
         if index in solved:
             covariance, words = _foretold(solved[index], found, task)
         else:
-            covariance = np.diag(np.full(len(PARAMETERS), np.inf))
+            covariance = UNKNOWN
             words = (_too_few(counts, inside, moved, task.options.solve.min_readings),)
         plans.append(
             SensorPlan(

@@ -36,8 +36,9 @@ def plan_table(plan: DrivePlan) -> Table:
 
 
 def motion_table(plan: DrivePlan) -> Table:
-    """Return one row per extra motion, the most helpful first, and the drive as it is."""
-    table = Table(title="What an extra motion would add", title_justify="left")
+    """Return one row per extra motion for the sensor that is known least, the best first."""
+    title = f"What an extra motion would add for {escape(plan.worst.sensor)}, by itself"
+    table = Table(title=title, title_justify="left")
     for heading in ("motion", "parameters not determined", "known least", "its sigma"):
         table.add_column(heading, overflow="fold")
     table.add_row("(the drive as it is)", *_worst_cells(plan.worst))
@@ -51,7 +52,8 @@ def advice(plan: DrivePlan) -> str:
     best = plan.motions[0]
     if best.worst.badness >= plan.worst.badness:
         return "no motion that was tried helps"
-    return f"helps most: {best.motion} ({_told(plan.worst)}; with it {_told(best.worst)})"
+    told = f"{_told(plan.worst)}; with it {_told(best.worst)}"
+    return f"helps {plan.worst.sensor} most: {best.motion} ({told})"
 
 
 def _told(worst: Worst) -> str:
@@ -66,7 +68,7 @@ def _worst_cells(worst: Worst) -> tuple[str, str, str]:
         return str(worst.undetermined), "", ""
     factor, unit = UNITS[worst.parameter[0]]
     sigma = f"{factor * worst.sigma:.2g} {unit}".strip()
-    return str(worst.undetermined), escape(f"{worst.parameter} of {worst.sensor}"), sigma
+    return str(worst.undetermined), worst.parameter, sigma
 
 
 def _sensor_row(sensor: SensorPlan) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ def test_the_sensors_of_a_bag(yard: Yard, field_map: Path) -> None:
     assert "│ mag │ 0.000 0.000 0.000 │" in out
     for motion in ("heave", "roll", "pitch", "turn round", "other way round", "a loop of 0.5 m"):
         assert motion in out
-    assert "helps most: " in out
+    assert "helps mag most: " in out
     assert "sigmas carry the map's errors as they are" in out
     assert "l2m: warning: " in run.err
 
