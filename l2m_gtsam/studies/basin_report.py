@@ -13,7 +13,10 @@ from l2m_gtsam.studies.share import Share
 
 # Blue and vermilion differ for all kinds of colour vision.
 ONE_KEY, LM = {"color": "#0072b2"}, {"color": "#d55e00"}
-NEAR, WIDE = {"fmt": "o-"}, {"fmt": "s--", "markerfacecolor": "white"}
+# Where both thresholds have one rate, the small mark stands in the large one.
+NEAR = {"fmt": "o-", "markersize": 3.5}
+WIDE = {"fmt": "s--", "markersize": 8, "markerfacecolor": "white"}
+ASIDE = 0.06  # of a ring's width: the methods' intervals stand side by side
 
 
 def basin_markdown(table: BasinTable) -> str:
@@ -64,13 +67,14 @@ def basin_figure(table: BasinTable) -> Figure:
     small, medium = sizes(table.options)
     rows = table.rows
     offset = np.array([(row.inner + row.outer) / 2 for row in rows])
-    for name, style, shares in (
-        (f"one-key, within {small}", ONE_KEY | NEAR, [row.one_key_small for row in rows]),
-        (f"one-key, within {medium}", ONE_KEY | WIDE, [row.one_key_medium for row in rows]),
-        (f"LM, within {small}", LM | NEAR, [row.lm_small for row in rows]),
-        (f"LM, within {medium}", LM | WIDE, [row.lm_medium for row in rows]),
+    left, right = offset - ASIDE * table.options.width, offset + ASIDE * table.options.width
+    for name, style, at, shares in (
+        (f"LM, within {medium}", LM | WIDE, right, [row.lm_medium for row in rows]),
+        (f"LM, within {small}", LM | NEAR, right, [row.lm_small for row in rows]),
+        (f"one-key, within {medium}", ONE_KEY | WIDE, left, [row.one_key_medium for row in rows]),
+        (f"one-key, within {small}", ONE_KEY | NEAR, left, [row.one_key_small for row in rows]),
     ):
-        draw_rates(axes, offset, shares, label=name, **style)
+        draw_rates(axes, at, shares, label=name, **style)
     axes.set(xlabel="initial offset (m)", ylabel="success rate (%)", ylim=(-3, 103))
     axes.set_xlim(0, max(row.outer for row in rows))
     axes.grid(alpha=0.3)
@@ -84,4 +88,4 @@ def draw_rates(axes: Axes, offset: FloatArray, shares: Sequence[Share], **style:
     low, high = 100 * np.array([share.interval for share in shares]).T
     # Rounding may put the end of an interval a hair on the wrong side of the rate.
     reach = np.maximum([rate - low, high - rate], 0.0)
-    axes.errorbar(offset, rate, reach, capsize=2.5, linewidth=1.3, markersize=5, **style)
+    axes.errorbar(offset, rate, reach, capsize=2.5, linewidth=1.3, **style)
