@@ -116,9 +116,10 @@ def starts_of(
 ) -> list[FoundStart | None]:
     """Return where each sensor is from readings at common poses; see ``find_starts``."""
     grid = Candidates.around(centre, options)
-    left = look(snapshots, coarse_prediction(field_map, options), grid, options)
+    coarse = coarse_prediction(field_map, options)
+    left = look(snapshots, coarse, grid, options)
     hopes = [hopes_of(grid, left[..., sensor], options) for sensor in range(left.shape[-1])]
-    ends = descend(snapshots, field_map, hopes, options)
+    ends = descend(snapshots, fine_prediction(field_map, coarse), field_map, hopes, options)
     return [
         found_start(distinct(basins, options.apart), each)
         for basins, each in zip(ends, hopes, strict=True)
@@ -140,15 +141,21 @@ def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> Predict
     if isinstance(field_map, Surveyed):
         return NearestReadings(field_map.readings, options.reach).predict
 
-    return whole_prediction(field_map)
-
-
-def whole_prediction(field_map: QueryableMap) -> Prediction:
-    """Return the map itself."""
-
     def predict(points: FloatArray) -> tuple[FloatArray, BoolArray]:
         sample = field_map.query(points)
         return np.where(sample.inside[:, None], sample.field, 0.0), sample.inside
+
+    return predict
+
+
+def fine_prediction(field_map: QueryableMap, coarse: Prediction) -> Prediction:
+    """Return the map itself where the coarse one knows something: its variance is not asked."""
+
+    def predict(points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        _, inside = coarse(points)
+        field = np.zeros((len(points), 3))
+        field[inside], _ = field_map.field_and_gradient(points[inside])
+        return field, inside
 
     return predict
 
@@ -252,7 +259,11 @@ def spread_out(places: FloatArray, apart: float, most: int) -> FloatArray:
 
 
 def descend(
-    snapshots: Snapshots, field_map: QueryableMap, hopes: list[Hopes], options: StartOptions
+    snapshots: Snapshots,
+    predict: Prediction,
+    field_map: QueryableMap,
+    hopes: list[Hopes],
+    options: StartOptions,
 ) -> list[list[Basin]]:
     """Return the minima that the places of each sensor lead to.
 
@@ -264,19 +275,19 @@ def descend(
     ]
     if not descents:
         return [[] for _ in hopes]
-    sample = field_map.query(np.concatenate([each.places for each in descents]))
-    fields, inside = split(sample.field, descents), split(sample.inside, descents)
+    told = predict(np.concatenate([each.places for each in descents]))
+    fields, inside = (split(part, descents) for part in told)
     descents = [each.starting(*at) for each, *at in zip(descents, fields, inside, strict=True)]
     active = descents = [each for each in descents if len(each.z) >= FEWEST]
     for _ in range(STEPS):
         if not active:
             break
-        told = field_map.field_and_gradient(np.concatenate([each.places for each in active]))
-        answers = zip(*(split(part, active) for part in told), strict=True)
+        asked = field_map.field_and_gradient(np.concatenate([each.places for each in active]))
+        answers = zip(*(split(part, active) for part in asked), strict=True)
         for each, (field, gradient) in zip(active, answers, strict=True):
             each.go_on(linearised(field, gradient, each.R, each.z), options.step)
         active = [each for each in active if np.linalg.norm(each.step) > SETTLED]
-    rms = at_ends(snapshots, field_map, descents, 1 - options.outliers)
+    rms = at_ends(snapshots, predict, descents, 1 - options.outliers)
     return [
         [Basin(d.t, left) for d, left in zip(descents, rms, strict=True) if d.sensor == s]
         for s in range(len(hopes))
@@ -284,12 +295,11 @@ def descend(
 
 
 def at_ends(
-    snapshots: Snapshots, field_map: QueryableMap, descents: list["Descent"], good: float
+    snapshots: Snapshots, predict: Prediction, descents: list["Descent"], good: float
 ) -> list[float]:
     """Return what each descent's end leaves of its sensor's readings in uT."""
     if not descents:
         return []
-    predict = whole_prediction(field_map)
     ends = misfits(snapshots, predict, np.stack([each.t for each in descents]), good)
     return [float(ends.rms[row, each.sensor]) for row, each in enumerate(descents)]
 

@@ -1,9 +1,6 @@
 """The coarsest map: everywhere the reading that is nearest."""
 
-from functools import cached_property
-
 import numpy as np
-from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.maps.training import TrainingSet
@@ -26,16 +23,13 @@ class NearestReadings:
         self._readings = readings
         self._reach = reach
 
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self._readings.points)
-
     def predict(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return the field in uT at points in metres, both of shape (N, 3), and where it is known.
 
         Where it is not known the field is zero.
         """
-        away, row = self._tree.query(points, distance_upper_bound=self._reach, workers=CORES)
+        near = self._readings.tree.query(points, distance_upper_bound=self._reach, workers=CORES)
+        away, row = near
         known = np.isfinite(away)
         field = np.zeros((len(points), 3))
         field[known] = self._readings.field[np.asarray(row)[known]]

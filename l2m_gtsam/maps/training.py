@@ -1,9 +1,11 @@
 """The readings that a map is trained on: checked, and thinned to what they can tell."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
@@ -53,6 +55,11 @@ class TrainingSet:
 
     def __getitem__(self, rows: IntArray) -> "TrainingSet":
         return TrainingSet(self.points[rows], self.field[rows], self.weight[rows])
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """The positions, to be looked up."""
+        return cKDTree(self.points)
 
     @property
     def mean(self) -> FloatArray:

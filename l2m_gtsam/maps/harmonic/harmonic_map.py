@@ -264,9 +264,7 @@ class HarmonicMap:
     def _sample(
         self, points: FloatArray, field: FloatArray, gradient: FloatArray, variance: FloatArray
     ) -> FieldSample:
-        away, _ = cKDTree(self.learnt.readings.points).query(
-            points, distance_upper_bound=self.options.reach
-        )
+        away, _ = self.learnt.readings.tree.query(points, distance_upper_bound=self.options.reach)
         inside = np.isfinite(away) & (variance.sum(axis=1) <= self.learnt.most_variance)
         return masked(FieldSample(field, gradient, variance, inside))
 
