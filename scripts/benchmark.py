@@ -6,7 +6,14 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-MODULES = ("map_queries", "harmonic_build", "compiled_map", "one_key", "map_uncertainty")
+MODULES = (
+    "map_queries",
+    "harmonic_build",
+    "compiled_map",
+    "global_start",
+    "one_key",
+    "map_uncertainty",
+)
 
 for name in MODULES:
     runpy.run_module(f"benchmarks.{name}", run_name="__main__")

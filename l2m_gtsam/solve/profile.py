@@ -26,6 +26,9 @@ TINY = 1e-300
 REGRESSORS = 4  # a one and the field
 CONCENTRATIONS = 4  # fits, each on the readings that the one before explains best
 
+# Sums in any order and fused products: loops over readings run in vector registers.
+FAST = {"reassoc", "contract", "nsz"}
+
 Prediction = Callable[[FloatArray], tuple[FloatArray, BoolArray]]
 """Field in uT at points (N, 3) in metres, shape (N, 3), and whether it is known, shape (N,)."""
 
@@ -141,11 +144,18 @@ def misfits(snapshots: Snapshots, predict: Prediction, t: FloatArray, good: floa
     field, inside = predict(places.reshape(-1, 3))
     inside = inside.reshape(places.shape[:2])
     b = np.einsum("kji,gkj->gki", snapshots.R_map_lidar, field.reshape(places.shape))
-    has = np.asarray(np.isfinite(snapshots.field).all(axis=2))
-    z = snapshots.field - middle(snapshots.field)
-    rms = np.empty((len(t), z.shape[1]))
-    write_trimmed(b, inside, np.where(has[..., None], z, 0.0), has, good, rms)
-    known = inside.astype(float) @ has / np.maximum(has.sum(axis=0), 1)
+    has = np.asarray(np.isfinite(snapshots.field).all(axis=2).T)
+    z = (snapshots.field - middle(snapshots.field)).transpose(1, 2, 0)
+    rms = np.empty((len(t), len(z)))
+    write_trimmed(
+        np.ascontiguousarray(b.transpose(0, 2, 1)),
+        inside.astype(float),
+        np.where(has[:, None], z, 0.0),
+        has.astype(float),
+        good,
+        rms,
+    )
+    known = inside.astype(float) @ has.T / np.maximum(has.sum(axis=1), 1)
     return Misfits(rms, known)
 
 
@@ -159,82 +169,75 @@ def middle(field: FloatArray) -> FloatArray:
 
 @njit(cache=True, nogil=True)
 def write_trimmed(
-    b: FloatArray, inside: BoolArray, z: FloatArray, has: BoolArray, good: float, rms: FloatArray
+    b: FloatArray,
+    inside: FloatArray,
+    z: FloatArray,
+    has: FloatArray,
+    good: float,
+    rms: FloatArray,
 ) -> None:
     """Write what regressions on (1, b) leave of the readings that they explain best.
 
     Parameters
     ----------
     b
-        Predicted field in the lidar frame, shape (G, K, 3).
+        Predicted field in the lidar frame, shape (G, 3, K).
     inside
-        Where it is known, shape (G, K).
+        1 where it is known and 0 elsewhere, shape (G, K).
     z, has
-        Readings about their middle, shape (K, S, 3), and where there are some.
+        Readings about their middle, shape (S, 3, K), and 1 where there are some, shape (S, K).
     good
         Share of the readings that counts.
     rms
         Root mean square of what is left, shape (G, S).
     """
-    G, K, S = len(b), z.shape[0], z.shape[1]
-    regressors, left, ordered = np.empty((K, REGRESSORS)), np.empty(K), np.empty(K)
-    for g in range(G):
-        write_regressors(b[g], inside[g], regressors)
-        for s in range(S):
-            count, limit, total = 0, np.inf, 0.0
-            for k in range(K):
-                left[k] = 0.0
-                count += has[k, s]
-            kept = int(np.ceil(good * count))
+    K = z.shape[2]
+    regressors, used, left, pool = np.ones((REGRESSORS, K)), np.empty(K), np.empty(K), np.empty(K)
+    gram, X = np.empty((REGRESSORS, REGRESSORS)), np.empty((REGRESSORS, 3))
+    for g in range(len(b)):
+        write_centred(b[g], inside[g], regressors[1:])
+        for s in range(len(z)):
+            used[:] = inside[g] * has[s]
+            count = int(has[s].sum())
+            kept, total = int(np.ceil(good * count)), 0.0
             for _ in range(CONCENTRATIONS if kept < count else 1):
-                X = fitted(regressors, z[:, s], inside[g], has[:, s], left, limit)
-                n = 0
+                write_fit(regressors, z[s], used, gram, X)
+                write_left(regressors, z[s], inside[g], X, left)
+                limit = least(left, has[s], kept, pool)
+                total = 0.0
                 for k in range(K):
-                    if has[k, s]:
-                        left[k] = length2(regressors[k], z[k, s], X, inside[g, k])
-                        ordered[n] = left[k]
-                        n += 1
-                chosen = np.sort(ordered[:n])[:kept]
-                limit, total = chosen[-1] if kept else 0.0, chosen.sum()
+                    chosen = has[s, k] * (left[k] <= limit)
+                    used[k] = inside[g, k] * chosen
+                    total += left[k] * chosen
             rms[g, s] = np.sqrt(total / max(3 * kept, 1))
 
 
-@njit(cache=True, nogil=True)
-def write_regressors(b: FloatArray, inside: BoolArray, regressors: FloatArray) -> None:
-    """Write a one and the field about its mean inside the map, shape (K, 4)."""
-    mean, count = np.zeros(3), 0
-    for k in range(len(b)):
-        if inside[k]:
-            mean += b[k]
-            count += 1
-    mean /= max(count, 1)
-    for k in range(len(b)):
-        regressors[k, 0] = 1.0
-        regressors[k, 1:] = b[k] - mean
+@njit(cache=True, nogil=True, fastmath=FAST)
+def write_centred(b: FloatArray, inside: FloatArray, centred: FloatArray) -> None:
+    """Write the field, shape (3, K), about its mean inside the map."""
+    count = max(inside.sum(), 1.0)
+    for i in range(3):
+        centred[i] = b[i] - (b[i] * inside).sum() / count
 
 
-@njit(cache=True, nogil=True)
-def fitted(
-    regressors: FloatArray,
-    z: FloatArray,
-    inside: BoolArray,
-    has: BoolArray,
-    left: FloatArray,
-    limit: float,
-) -> FloatArray:
-    """Return the regression of the readings that left no more than a limit, shape (4, 3)."""
-    gram, X = np.zeros((REGRESSORS, REGRESSORS)), np.zeros((REGRESSORS, 3))
-    for k in range(len(z)):
-        if inside[k] and has[k] and left[k] <= limit:
-            for i in range(REGRESSORS):
-                for j in range(i + 1):
-                    gram[i, j] += regressors[k, i] * regressors[k, j]
-                for c in range(3):
-                    X[i, c] += regressors[k, i] * z[k, c]
+@njit(cache=True, nogil=True, fastmath=FAST)
+def write_fit(
+    regressors: FloatArray, z: FloatArray, used: FloatArray, gram: FloatArray, X: FloatArray
+) -> None:
+    """Write the regression, shape (4, 3), of the readings (3, K) that are used, by Cholesky."""
     for i in range(REGRESSORS):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(len(used)):
+                total += used[k] * regressors[i, k] * regressors[j, k]
+            gram[i, j] = total
+        for c in range(3):
+            total = 0.0
+            for k in range(len(used)):
+                total += used[k] * regressors[i, k] * z[c, k]
+            X[i, c] = total
         gram[i, i] += TIE * gram[i, i] + TINY
     solve_in_place(gram, X)
-    return X
 
 
 @njit(cache=True, nogil=True)
@@ -259,17 +262,48 @@ def solve_in_place(gram: FloatArray, X: FloatArray) -> None:
             X[i, c] /= gram[i, i]
 
 
-@njit(cache=True, nogil=True)
-def length2(regressor: FloatArray, z: FloatArray, X: FloatArray, inside: bool) -> float:
-    """Return the squared length of what a regression leaves of one reading, all if outside."""
-    total = 0.0
+@njit(cache=True, nogil=True, fastmath=FAST)
+def write_left(
+    regressors: FloatArray, z: FloatArray, inside: FloatArray, X: FloatArray, left: FloatArray
+) -> None:
+    """Write the squared length of what is left of each reading, all of it outside the map."""
+    left[:] = 0.0
     for c in range(3):
-        e = z[c]
-        if inside:
+        for k in range(len(left)):
+            told = 0.0
             for i in range(REGRESSORS):
-                e -= regressor[i] * X[i, c]
-        total += e * e
-    return total
+                told += regressors[i, k] * X[i, c]
+            e = z[c, k] - inside[k] * told
+            left[k] += e * e
+
+
+@njit(cache=True, nogil=True)
+def least(values: FloatArray, has: FloatArray, rank: int, pool: FloatArray) -> float:
+    """Return the value of a rank, counted from 1, among those that there are (Hoare's select)."""
+    count = 0
+    for k in range(len(values)):
+        if has[k] > 0:
+            pool[count] = values[k]
+            count += 1
+    if not 0 < rank <= count:
+        return np.inf
+    low, high = 0, count - 1
+    while low < high:
+        pivot, i, j = pool[rank - 1], low, high
+        while i <= j:
+            while pool[i] < pivot:
+                i += 1
+            while pool[j] > pivot:
+                j -= 1
+            if i <= j:
+                pool[i], pool[j] = pool[j], pool[i]
+                i += 1
+                j -= 1
+        if j < rank - 1:
+            low = i
+        if i > rank - 1:
+            high = j
+    return float(pool[rank - 1])
 
 
 @dataclass(frozen=True)
