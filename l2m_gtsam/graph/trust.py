@@ -169,7 +169,7 @@ def weigh(
     weights = WEIGHTS[options.loss](r2, options.largest, mu)
     if options.loss is Loss.TRUNCATED and np.isinf(mu):
         rejected = weights < NOTHING
-        weights[grown(rejected, residual, noise, variance.mean(axis=1), options.largest)] = 0.0
+        weights[grown(rejected, residual, noise, variance.mean(axis=1))] = 0.0
     return weights
 
 

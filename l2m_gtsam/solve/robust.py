@@ -30,6 +30,8 @@ TINY = 1e-12  # a squared length of a whitened residual that is as good as none
 FIRST_ROUNDS = 10  # of least absolute deviations: an outlier pulls no more than a good reading
 TRIMMINGS = 30
 WINDOWS = (9, 25)  # readings of a mean
+# Beside readings that are wrong for certain a mean is believed to be wrong sooner.
+LEAST_TOGETHER = float(chi2.ppf(0.99, AXES))
 SEEDS = 3  # readings wrong by themselves that make a stretch of what lies about them
 SMALL = 1e-3  # of the median length: residuals shorter than that weigh alike
 
@@ -164,11 +166,7 @@ def deviations(regressors: FloatArray, field: FloatArray, weights: FloatArray) -
 
 
 def grown(
-    rejected: BoolArray,
-    residual: FloatArray,
-    noise: float,
-    map_variance: FloatArray,
-    largest: float,
+    rejected: BoolArray, residual: FloatArray, noise: float, map_variance: FloatArray
 ) -> BoolArray:
     """Return the rejected readings of a drive and those about them that deviate together, (N,).
 
@@ -185,8 +183,6 @@ def grown(
         Of the sensor in uT.
     map_variance
         Mean variance of the map's prediction in uT^2, shape (N,).
-    largest
-        Largest squared length of a whitened mean that passes for noise.
     """
     together = np.zeros_like(rejected)
     for window in WINDOWS:
@@ -198,7 +194,7 @@ def grown(
         variance = noise**2 / np.maximum(count, 1) + common
         # A map that errs everywhere, and along the drive, makes no stretch: half of all means pass.
         scale = np.median((m2 / variance)[count > 0]) / MEDIAN if (count > 0).any() else 1.0
-        together |= (count > 0) & (m2 > largest * variance * max(scale, 1.0))
+        together |= (count > 0) & (m2 > LEAST_TOGETHER * variance * max(scale, 1.0))
     pieces, found = label(rejected | together)
     seeds = np.bincount(pieces, weights=rejected, minlength=found + 1)
     grows = seeds >= SEEDS

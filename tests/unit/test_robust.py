@@ -105,7 +105,7 @@ def test_a_stretch_grows_to_where_the_field_is_right() -> None:
     e = 0.2 * rng.standard_normal((400, 3))
     e[:, 1] += bump
     rejected = np.einsum("ni,ni->n", e, e) > LARGEST * 0.2**2
-    stretch = grown(rejected, e, 0.2, np.zeros(400), LARGEST)
+    stretch = grown(rejected, e, 0.2, np.zeros(400))
     assert (stretch >= rejected).all()
     # Twice the noise is told by a mean of nine, half of it is not.
     assert stretch[bump > 0.4].all()
@@ -118,7 +118,7 @@ def test_stray_readings_do_not_grow() -> None:
     stray = np.zeros(2000, dtype=np.bool_)
     stray[::10] = True
     e[stray] += 30.0
-    np.testing.assert_array_equal(grown(stray, e, 0.2, np.zeros(2000), LARGEST), stray)
+    np.testing.assert_array_equal(grown(stray, e, 0.2, np.zeros(2000)), stray)
 
 
 def test_what_the_map_does_not_know_is_no_stretch() -> None:
@@ -127,8 +127,8 @@ def test_what_the_map_does_not_know_is_no_stretch() -> None:
     e[100:200] = 0.8
     seeds = np.zeros(400, dtype=np.bool_)
     seeds[140:145] = True
-    assert grown(seeds, e, 0.2, np.zeros(400), LARGEST).sum() > 90
-    assert grown(seeds, e, 0.2, np.full(400, 0.8**2), LARGEST).sum() == 5
+    assert grown(seeds, e, 0.2, np.zeros(400)).sum() > 90
+    assert grown(seeds, e, 0.2, np.full(400, 0.8**2)).sum() == 5
 
 
 def test_a_map_that_errs_everywhere_makes_no_stretch() -> None:
@@ -137,7 +137,7 @@ def test_a_map_that_errs_everywhere_makes_no_stretch() -> None:
     e = np.column_stack([np.sin(n / 30), np.cos(n / 41), np.sin(n / 53 + 1)])
     seeds = np.zeros(2000, dtype=np.bool_)
     seeds[1000:1005] = True
-    assert grown(seeds, e, 0.2, np.zeros(2000), LARGEST).sum() == 5
+    assert grown(seeds, e, 0.2, np.zeros(2000)).sum() == 5
 
 
 def there_and_back(count: int = 100) -> Readings:
