@@ -8,12 +8,13 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.one_key import NOISE, hall, seconds, survey
-from l2m_gtsam.data import FloatArray, FoundStart, KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions, find_starts
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.results import FoundStart
 from tests.worlds import DipoleWorld, drive, random_sensors
 
 SENSORS, READINGS = 12, 2_000

@@ -7,10 +7,10 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.one_key import NOISE, hall, seconds, survey
-from l2m_gtsam.data import Uncertainty
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.results import Uncertainty
 from tests.worlds import drive, random_sensors
 
 SENSORS = 12

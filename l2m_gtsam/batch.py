@@ -10,14 +10,7 @@ import numpy as np
 
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import (
-    CalibrationResult,
-    DrivePlan,
-    FloatArray,
-    KnownSensor,
-    MapState,
-    Recording,
-)
+from l2m_gtsam.data import FloatArray, KnownSensor, MapState, Recording
 from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.mapping import (
     compare_recordings,
@@ -30,6 +23,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.plan import assumed_recording, plan
 from l2m_gtsam.qa.figures import calibration_figure, map_figure, save_figure
 from l2m_gtsam.qa.tables import MapDescription
+from l2m_gtsam.results import CalibrationResult, DrivePlan
 from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.bag import has_fields, read_recording, read_trajectory

@@ -7,14 +7,10 @@ import numpy as np
 
 from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import (
-    CalibrationResult,
     Distortion,
     FloatArray,
-    FoundStart,
     Readings,
     Recording,
-    SensorCalibration,
-    SensorStatus,
     SourceFile,
     SyncCounts,
     Synchronised,
@@ -27,6 +23,7 @@ from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.results import CalibrationResult, FoundStart, SensorCalibration, SensorStatus
 from l2m_gtsam.solve.disagreement import disagreements
 from l2m_gtsam.solve.explain import Movement, movement
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation

@@ -5,7 +5,6 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError
 
-from l2m_gtsam.data import Uncertainty
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions
@@ -13,6 +12,7 @@ from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
 from l2m_gtsam.options import Options
+from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
 from l2m_gtsam.storage.yaml_file import read_yaml

@@ -14,7 +14,8 @@ from l2m_gtsam.batch import (
     simulate_bags,
 )
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import CalibrationResult, KnownSensor
+from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 

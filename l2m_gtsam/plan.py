@@ -6,18 +6,14 @@ import numpy as np
 
 from l2m_gtsam.config import CalibrationOptions, PlanOptions
 from l2m_gtsam.data import (
-    DrivePlan,
     FieldSeries,
     FloatArray,
-    MotionPlan,
     Readings,
     Recording,
-    SensorPlan,
     SourceFile,
     SyncCounts,
     Synchronised,
     Trajectory,
-    Worst,
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
@@ -27,6 +23,7 @@ from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.motion import Motion, extra_motions, loop, places_around, strongest
+from l2m_gtsam.results import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
 from l2m_gtsam.solve.rotation import polar_rotation

@@ -8,11 +8,12 @@ import numpy as np
 from pydantic import Field
 
 from l2m_factors import T
-from l2m_gtsam.data import FloatArray, Readings, Uncertainty
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.calibration import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.graph.optimise import Optimizer, optimise
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.options import Options
+from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.closed_form import (
     ClosedFormOptions,
     fit_distortion,

@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_factors import M
-from l2m_gtsam.data import FloatArray, Readings, Uncertainty
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions, fit_distortions, start_estimate
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.graph.uncertain import UncertainMap, UncertainProblem, cover
 from l2m_gtsam.graph.view import QueryableMap, View, observe
+from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
 
 

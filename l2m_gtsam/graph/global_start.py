@@ -13,11 +13,12 @@ import numpy as np
 from pydantic import Field
 from scipy.ndimage import minimum_filter
 
-from l2m_gtsam.data import BoolArray, FloatArray, FoundStart, Readings
+from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.field_map import Surveyed
 from l2m_gtsam.maps.nearest import NearestReadings
 from l2m_gtsam.options import Options
+from l2m_gtsam.results import FoundStart
 from l2m_gtsam.solve.profile import (
     Linearisation,
     Prediction,

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from l2m_factors import BatchedReadings, D, T
-from l2m_gtsam.data import FloatArray, ResidualFigures
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import (
     Estimate,
@@ -18,6 +18,7 @@ from l2m_gtsam.graph.calibration import (
 )
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.view import QueryableMap, View
+from l2m_gtsam.results import ResidualFigures
 from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.noise import (
     HALF,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray, Readings, Uncertainty
+from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.graph.alternation import (
     OneKeyOptions,
     Progress,
@@ -30,6 +30,7 @@ from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.graph.uncertain import UncertainMap, solve_uncertain
 from l2m_gtsam.graph.view import QueryableMap, View, observe
+from l2m_gtsam.results import Uncertainty
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.

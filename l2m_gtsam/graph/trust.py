@@ -51,8 +51,6 @@ class Trusted:
 
     def agrees(self, other: "Trusted | None") -> bool:
         """Return whether both leave out the same readings, and will go on to do so."""
-        if self is other:
-            return True
         if other is None or len(self.weights) != len(other.weights):
             return False
         same = np.array_equal(self.weights > NOTHING, other.weights > NOTHING)
@@ -118,7 +116,7 @@ def trusted(
         Those of the round before.
     """
     if last is not None and round_ >= FREEZE and len(last.weights) == len(view.readings):
-        return last
+        return counting(view, last.weights, options.min_readings, final=True)
     stage = GRADUATION[min(round_, len(GRADUATION) - 1)]
     weights = np.empty(len(view.readings))
     e = residuals(view.readings, field_map, estimate)

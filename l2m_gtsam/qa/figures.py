@@ -9,15 +9,10 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from l2m_gtsam.data import (
-    CalibrationResult,
-    FloatArray,
-    KnownSensor,
-    SensorCalibration,
-    Trajectory,
-)
+from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.storage.atomic import atomic_path
 
 # Cells along the longer side of a map picture.

@@ -7,16 +7,15 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.data import (
+from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.maps.field_map import MapSummary
+from l2m_gtsam.results import (
     CalibrationResult,
     Disagreement,
-    FloatArray,
-    KnownSensor,
     Return,
     SensorCalibration,
     SensorStatus,
 )
-from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.storage.inspect import BagReport, TopicReport
 
 

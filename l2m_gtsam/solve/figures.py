@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, ResidualFigures
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.results import ResidualFigures
 
 
 def residual_figures(residual: FloatArray, whitening: FloatArray, taken: float) -> ResidualFigures:

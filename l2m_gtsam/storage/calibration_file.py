@@ -8,22 +8,24 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import (
-    CalibrationResult,
-    Disagreement,
     Distortion,
     FloatArray,
-    FoundStart,
     KnownSensor,
-    ResidualFigures,
-    Return,
     RigidTransform,
-    SensorCalibration,
-    SensorStatus,
     SourceFile,
     SyncCounts,
-    Uncertainty,
 )
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.results import (
+    CalibrationResult,
+    Disagreement,
+    FoundStart,
+    ResidualFigures,
+    Return,
+    SensorCalibration,
+    SensorStatus,
+    Uncertainty,
+)
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
 
 FORMAT = "l2m-calibration"

@@ -16,12 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import BoolArray, FloatArray, FoundStart, Readings, Uncertainty
+from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions, find_starts
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.options import Options
+from l2m_gtsam.results import FoundStart, Uncertainty
 from l2m_gtsam.studies.levenberg_marquardt import levenberg_marquardt
 from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive

@@ -10,19 +10,18 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import (
-    CalibrationResult,
     Distortion,
     FieldSample,
     FieldSeries,
     FloatArray,
     KnownSensor,
     Recording,
-    SensorStatus,
     SourceFile,
     Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.global_start import StartOptions
+from l2m_gtsam.results import CalibrationResult, SensorStatus
 from l2m_gtsam.storage.calibration_file import (
     read_calibration,
     read_known_sensors,

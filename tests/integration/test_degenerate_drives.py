@@ -5,10 +5,11 @@ import pytest
 
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import CalibrationOptions, PlanOptions
-from l2m_gtsam.data import DrivePlan, FloatArray, SensorCalibration, SensorStatus, Trajectory
+from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.plan import plan
+from l2m_gtsam.results import DrivePlan, SensorCalibration, SensorStatus
 from tests.degenerate_drives import (
     CALM,
     NOISE,

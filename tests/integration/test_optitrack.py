@@ -8,9 +8,10 @@ import pytest
 
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import Config, load_config
-from l2m_gtsam.data import FloatArray, KnownSensor, SensorCalibration, SensorStatus
+from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.mapping import map_fields, map_recordings, sensor_positions
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.results import SensorCalibration, SensorStatus
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.sync import synchronise
 

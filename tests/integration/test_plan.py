@@ -7,12 +7,13 @@ import pytest
 
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import CalibrationOptions, PlanOptions
-from l2m_gtsam.data import FieldSeries, Recording, SourceFile, Uncertainty
+from l2m_gtsam.data import FieldSeries, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.plan import assumed_recording, plan
+from l2m_gtsam.results import Uncertainty
 from tests.degenerate_drives import STRONG, eight
 from tests.harmonic_models import PRIOR, fitted_map
 

@@ -9,12 +9,13 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings, Uncertainty
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.results import Uncertainty
 
 MAPPED = slice(0, 5)  # runs of the array that make its map
 HALF = 2  # every second of the 800 readings of a run: neighbours are 5 mm apart

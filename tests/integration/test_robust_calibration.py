@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import BoolArray, FloatArray, Readings, Uncertainty
+from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions, find_starts
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.robust import Loss, RobustOptions
 from tests.disturbances import Disturbed, bursts, moved_steel, spikes
 from tests.steel import CloudVariant, steel_hall, structure_cloud

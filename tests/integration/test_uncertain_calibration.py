@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import block_diag, eigh
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Uncertainty
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
@@ -18,6 +18,7 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
+from l2m_gtsam.results import Uncertainty
 from tests.worlds import DipoleWorld, dipole_world, random_sensors
 
 NOISE = 0.1

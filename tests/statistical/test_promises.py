@@ -5,13 +5,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FloatArray, Readings, Uncertainty
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
+from l2m_gtsam.results import Uncertainty
 from tests.statistical.study_calibration import (
     Calibrate,
     CalibrationCase,

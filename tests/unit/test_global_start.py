@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FieldSample, FloatArray, FoundStart, Readings
+from l2m_gtsam.data import FieldSample, FloatArray, Readings
 from l2m_gtsam.graph.global_start import Basin, StartOptions, distinct, find_starts
 from l2m_gtsam.maps.sliding_gp import SlidingGP
+from l2m_gtsam.results import FoundStart
 from tests.worlds import DipoleWorld, dipole_world, drive, random_sensors
 
 # The exact field of these worlds is slow to compute: fewer poses, fewer dipoles.

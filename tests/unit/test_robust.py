@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from l2m_gtsam.data import FloatArray, IntArray, Readings, Return
+from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.results import Return
 from l2m_gtsam.solve.disagreement import Judged, disagreements
 from l2m_gtsam.solve.robust import (
     WEIGHTS,

@@ -1,0 +1,334 @@
+"""What comes out of a solve or a plan: frozen records, with shapes and units.
+
+Frames and units are those of ``data``.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from l2m_gtsam.data import Distortion, FloatArray, SourceFile, SyncCounts
+
+
+class SensorStatus(StrEnum):
+    """How the solve of one sensor ended."""
+
+    SOLVED = "solved"
+    UNDETERMINED = "undetermined"
+    NOT_CONVERGED = "not_converged"
+    NO_READINGS = "no_readings"
+    OUTSIDE_MAP = "outside_map"
+    DEAD_AXIS = "dead_axis"
+    AMBIGUOUS = "ambiguous"
+    CONTRADICTED = "contradicted"
+    FLIPPED_AXIS = "flipped_axis"
+
+
+class Uncertainty(StrEnum):
+    """How a calibration counts the map's errors."""
+
+    FULL = "full"
+    INDEPENDENT = "independent"
+
+
+@dataclass(frozen=True)
+class ResidualFigures:
+    """Residuals ``C b + H - z`` of one sensor over the readings used, in microtesla.
+
+    ``chi2_per_dof`` compares them with the noise that the solve assumed: 1 is consistent.
+    """
+
+    readings: int
+    rms_axes: FloatArray
+    rms: float
+    median_norm: float
+    p95_norm: float
+    max_norm: float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True)
+class FoundStart:
+    """Where the search for a start ended for one sensor.
+
+    Attributes
+    ----------
+    t_lidar_mag
+        Where the solve started in the lidar frame in metres, shape (3,).
+    margin
+        How many times more (root mean square) the second best place leaves of the readings;
+        infinite if there is no other. Seen coarsely, which makes it smaller than it is, where
+        that place was too bad to be followed.
+    runner_up
+        That place in the lidar frame in metres, shape (3,), if there is one.
+    """
+
+    t_lidar_mag: FloatArray
+    margin: float
+    runner_up: FloatArray | None
+
+    def ambiguous(self, clear: float) -> bool:
+        """Return whether the second best place leaves less than so many times as much."""
+        return self.runner_up is not None and self.margin < clear
+
+
+class Return(StrEnum):
+    """What was read when a place was passed again at another time."""
+
+    NEVER = "not passed again"
+    AS_MAPPED = "as mapped"
+    DIFFERS = "differs again"
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A stretch of a drive over which readings fit neither the map nor any distortion.
+
+    Attributes
+    ----------
+    sensors
+        Names of those that disagree.
+    start_ns, end_ns
+        When, in nanoseconds.
+    p_from, p_to
+        Where the lidar was at the first and the last of these readings, metres, map frame, (3,).
+    length
+        Way of the lidar in metres.
+    readings
+        Number of readings rejected.
+    size
+        Median length of their residuals in uT.
+    passed_again
+        What was read at the same place at another time.
+    """
+
+    sensors: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+    p_from: FloatArray
+    p_to: FloatArray
+    length: float
+    readings: int
+    size: float
+    passed_again: Return
+
+
+@dataclass(frozen=True)
+class SensorCalibration:
+    """The calibration of one magnetometer and how far to trust it.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    status, message
+        How the solve ended, and a sentence about it.
+    t_lidar_mag
+        Position of the sensor in the lidar frame in metres, shape (3,).
+    distortion
+        C and H.
+    R_lidar_mag
+        Rotation from sensor to lidar: transpose of the proper polar factor of C, shape (3, 3).
+    covariance
+        Covariance of (t, C row by row, H) in m and uT, shape (15, 15); infinite on the diagonal
+        for what the data cannot determine.
+    rotation_covariance
+        Covariance of the rotation error in the sensor frame in rad^2, shape (3, 3): true
+        R_mag_lidar = exp(error) @ estimate.
+    noise
+        Standard deviation of the sensor's noise in microtesla that the solve used.
+    residuals
+        Figures of fit, absent when nothing was solved.
+    undetermined
+        What the data cannot determine, a sentence for each reason with the parameters by name.
+    sync
+        Account of the readings.
+    outside_map
+        Synchronised readings that were not used because the map has no data there.
+    start
+        Where the solve started, if that was looked for; absent where it was given.
+    rejected
+        Readings inside the map that did not count: no distortion explains them beside the others.
+    """
+
+    sensor: str
+    status: SensorStatus
+    message: str
+    t_lidar_mag: FloatArray
+    distortion: Distortion
+    R_lidar_mag: FloatArray
+    covariance: FloatArray
+    rotation_covariance: FloatArray
+    noise: float
+    residuals: ResidualFigures | None
+    undetermined: tuple[str, ...]
+    sync: SyncCounts
+    outside_map: int
+    start: FoundStart | None = None
+    rejected: int = 0
+
+    @property
+    def t_sigma(self) -> FloatArray:
+        """Standard deviations of ``t_lidar_mag`` in metres, shape (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[:3]))
+
+    @property
+    def C_sigma(self) -> FloatArray:
+        """Standard deviations of the entries of C, shape (3, 3)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:12]).reshape(3, 3))
+
+    @property
+    def H_sigma(self) -> FloatArray:
+        """Standard deviations of H in microtesla, shape (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[12:]))
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The outcome of one calibration run over all sensors.
+
+    Attributes
+    ----------
+    sensors
+        One entry per magnetometer, in the order of the recording.
+    iterations
+        Outer steps of the one-key loop that were taken.
+    uncertainty
+        How the sigmas count the map's errors.
+    doubts
+        What speaks against the map, and therefore against the sigmas, a sentence each.
+    disagreements
+        Stretches of the drive over which readings were rejected, in order of time.
+    bag, map
+        Sources with hashes; absent when the data did not come from files.
+    options
+        The effective options, plain values.
+    versions
+        Versions of the packages that computed it.
+    """
+
+    sensors: tuple[SensorCalibration, ...]
+    iterations: int
+    uncertainty: Uncertainty
+    doubts: tuple[str, ...]
+    disagreements: tuple[Disagreement, ...]
+    bag: SourceFile | None
+    map: SourceFile | None
+    options: dict[str, Any]
+    versions: dict[str, str]
+
+    def __getitem__(self, sensor: str) -> SensorCalibration:
+        for entry in self.sensors:
+            if entry.sensor == sensor:
+                return entry
+        raise KeyError(sensor)
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """What a drive will tell of one sensor.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    t_lidar_mag
+        Where it is assumed in the lidar frame in metres, shape (3,).
+    readings, outside_map
+        Readings that will be used, and those for which the map has no data.
+    covariance
+        Of (t, C row by row, H) in m and uT, shape (15, 15); infinite on the diagonal for what
+        will not be determined.
+    rotation_covariance
+        Of the rotation error in the sensor frame in rad^2, shape (3, 3).
+    undetermined
+        What will not be determined, a sentence for each reason with the parameters by name.
+    """
+
+    sensor: str
+    t_lidar_mag: FloatArray
+    readings: int
+    outside_map: int
+    covariance: FloatArray
+    rotation_covariance: FloatArray
+    undetermined: tuple[str, ...]
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of (t, C row by row, H) in m and uT, shape (15,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The parameter of a sensor that is known least, in largest useful sigmas of its kind.
+
+    Attributes
+    ----------
+    undetermined
+        Number of its parameters without any sigma.
+    sensor
+        Its name.
+    parameter
+        The least known of the others, by name; empty if there is none.
+    sigma
+        Of it in its own unit.
+    share
+        The same in largest useful sigmas.
+    """
+
+    undetermined: int
+    sensor: str
+    parameter: str
+    sigma: float
+    share: float
+
+    @property
+    def badness(self) -> tuple[int, float]:
+        """What a better drive has less of; parameters without a sigma count first."""
+        return self.undetermined, self.share
+
+
+@dataclass(frozen=True)
+class MotionPlan:
+    """What would be known least if a motion were added to the drive."""
+
+    motion: str
+    worst: Worst
+
+
+@dataclass(frozen=True)
+class DrivePlan:
+    """What a drive will determine and what would help.
+
+    Attributes
+    ----------
+    sensors
+        One entry per sensor.
+    noise
+        Standard deviation of the sensors' noise in uT that is assumed.
+    uncertainty
+        How the map's errors are counted.
+    worst
+        What is known least of the sensor that is known least, by itself: without what the readings
+        of others tell of the map's errors.
+    motions
+        The same with an extra motion, the most helpful first.
+    doubts
+        What speaks against the map, and therefore against the sigmas, a sentence each.
+    """
+
+    sensors: tuple[SensorPlan, ...]
+    noise: float
+    uncertainty: Uncertainty
+    worst: Worst
+    motions: tuple[MotionPlan, ...]
+    doubts: tuple[str, ...]
+
+    def __getitem__(self, sensor: str) -> SensorPlan:
+        for entry in self.sensors:
+            if entry.sensor == sensor:
+                return entry
+        raise KeyError(sensor)
