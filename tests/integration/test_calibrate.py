@@ -21,6 +21,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.global_start import StartOptions
+from l2m_gtsam.qa.tables import disagreement_note
 from l2m_gtsam.results import CalibrationResult, SensorStatus
 from l2m_gtsam.storage.calibration_file import (
     read_calibration,
@@ -288,3 +289,55 @@ def test_a_start_for_an_unknown_sensor_is_refused(
     options = CalibrationOptions(start={"mag_99": (0.0, 0.0, 0.0)})
     with pytest.raises(CalibrationError, match=r"no sensor named 'mag_99'; .* mag_00, mag_01"):
         calibrate(recorded_drive(world, sensors[:2]), world, options)
+
+
+def with_change(recording: Recording, sensor: int, change: FloatArray) -> Recording:
+    """Return a recording with something in uT, shape (N, 3), added to what one sensor read."""
+    series = list(recording.series)
+    series[sensor] = replace(series[sensor], field=series[sensor].field + change)
+    return replace(recording, series=tuple(series))
+
+
+def test_what_passes_by_is_named_with_time_and_place(
+    world: DipoleWorld, sensors: tuple[KnownSensor, ...], tmp_path: Path
+) -> None:
+    """For two seconds both sensors read 25 uT more than there is."""
+    recording = recorded_drive(world, sensors[:2])
+    change = np.zeros((len(recording.trajectory), 3))
+    change[200:240] = [15.0, 0.0, 20.0]
+    for index in range(2):
+        recording = with_change(recording, index, change)
+    result = calibrate(recording, world, OPTIONS)
+    (stretch,) = result.disagreements
+    stamps, p = recording.trajectory.stamp_ns, recording.trajectory.p
+    assert stretch.sensors == tuple(sensor.sensor for sensor in sensors[:2])
+    assert stamps[200] <= stretch.start_ns <= stretch.end_ns <= stamps[239]
+    assert stretch.size == pytest.approx(25.0, abs=0.5)
+    way = float(np.linalg.norm(np.diff(p[200:240], axis=0), axis=1).sum())
+    assert stretch.length == pytest.approx(way, rel=0.05)
+    assert stretch.readings == sum(sensor.rejected for sensor in result.sensors)
+    for sensor, truth in zip(result.sensors, sensors, strict=False):
+        assert sensor.status is SensorStatus.SOLVED
+        assert np.linalg.norm(sensor.t_lidar_mag - truth.t_lidar_mag) < 0.01
+    note = disagreement_note(stretch)
+    assert f"{stretch.readings} readings" in note
+    assert f"({p[200, 0]:.1f}, {p[200, 1]:.1f})" in note
+    write_calibration(tmp_path / "c.yaml", result)
+    assert_equal(read_calibration(tmp_path / "c.yaml"), result)
+
+
+def test_a_sensor_that_contradicts_itself_is_marked(
+    world: DipoleWorld, sensors: tuple[KnownSensor, ...]
+) -> None:
+    recording = recorded_drive(world, sensors[:2])
+    wrong = np.random.default_rng(0).random(len(recording.trajectory)) < 0.45
+    noise = np.random.default_rng(1).normal(0, 30, (len(wrong), 3))
+    near = OPTIONS.model_copy(
+        update={"start": {sensors[1].sensor: tuple(sensors[1].t_lidar_mag.tolist())}}
+    )
+    result = calibrate(with_change(recording, 1, wrong[:, None] * noise), world, near)
+    good, bad = result.sensors
+    assert good.status is SensorStatus.SOLVED
+    assert bad.status is SensorStatus.CONTRADICTED
+    assert "fit no distortion" in bad.message
+    assert bad.rejected > 0.4 * wrong.size
