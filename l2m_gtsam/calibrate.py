@@ -16,14 +16,20 @@ from l2m_gtsam.data import (
     Synchronised,
 )
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.graph.alternation import Progress
+from l2m_gtsam.graph.alternation import OneKeyOptions, Progress
 from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
-from l2m_gtsam.results import CalibrationResult, FoundStart, SensorCalibration, SensorStatus
+from l2m_gtsam.results import (
+    CalibrationResult,
+    FoundStart,
+    SensorCalibration,
+    SensorStatus,
+    TimeOffset,
+)
 from l2m_gtsam.solve.disagreement import disagreements
 from l2m_gtsam.solve.explain import Movement, movement
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
@@ -71,13 +77,16 @@ def calibrate(
     CalibrationError
         No sensor can be solved: the map does not cover the drive, or nothing was read.
     """
-    synchronised = synchronise(recording, options.sync)
+    synchronised = synchronise(recording, options.sync, options.solve.largest_offset_s)
     stuck = stuck_sensors(synchronised.readings)
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     found = _starts(alive, solver_map, options, progress)
     t_start = _start_places(alive.sensors, found, options)
-    solution = solve_one_key(alive, solver_map, t_start, options.solve, progress)
+    if not options.solve.largest_offset_s:
+        alive = replace(alive, motion=None)
+    poses = recording.trajectory
+    solution = solve_one_key(alive, solver_map, t_start, options.solve, progress, poses)
     told = explained(alive, solver_map, t_start, solution, options.solve)
     moved = movement(recording.trajectory.R, recording.trajectory.p)
     sensors = _assess(synchronised, alive, solution, told, moved, options)
@@ -85,7 +94,7 @@ def calibrate(
     sensors = tuple(_with_neighbours(sensor, sensors) for sensor in sensors)
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
-    verdicts = judged(alive, solver_map, solution.estimate, solution.rejected)
+    verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
     return CalibrationResult(
         sensors=sensors,
         iterations=solution.steps,
@@ -191,7 +200,9 @@ def _assess(
     sensors = []
     for index, (name, counts) in enumerate(zip(alive.sensors, synchronised.counts, strict=True)):
         if index in solved:
-            entry = _solved(name, solved[index], solution, counts, int(outside[index]))
+            entry = _solved(
+                name, solved[index], solution, counts, int(outside[index]), options.solve
+            )
         else:
             usable = alive.rows_of(index)
             read = usable.stop - usable.start
@@ -222,11 +233,12 @@ def _solved(
     solution: OneKeySolution,
     counts: SyncCounts,
     outside: int,
+    options: OneKeyOptions,
 ) -> SensorCalibration:
     found = told.solution
     vector = solution.estimate.distortion[found.sensor]
     distortion = Distortion.from_vector(vector)
-    status, message = _verdict(told, solution)
+    status, message = _verdict(told, solution, options)
     rotation = _no_rotation()
     axis = dead_axis(distortion.C)
     # what is not determined may be short without a fault of the sensor
@@ -247,20 +259,38 @@ def _solved(
         t_lidar_mag=solution.estimate.t[found.sensor],
         distortion=distortion,
         R_lidar_mag=np.ascontiguousarray(rotation.R_mag_lidar.T),
-        covariance=found.covariance,
+        covariance=found.covariance[:15, :15],
         rotation_covariance=rotation.covariance,
         noise=float(solution.estimate.noise[found.sensor]),
         residuals=found.figures,
         undetermined=told.words,
         sync=counts,
         outside_map=outside,
+        time_offset=_time_offset(told, solution),
     )
 
 
-def _verdict(told: Explained, solution: OneKeySolution) -> tuple[SensorStatus, str]:
+def _time_offset(told: Explained, solution: OneKeySolution) -> TimeOffset:
+    covariance = told.solution.covariance
+    return TimeOffset(
+        seconds=float(solution.estimate.offset[told.solution.sensor]),
+        sigma=float(np.sqrt(covariance[15, 15])),
+        cross_covariance=covariance[:15, 15],
+        held=told.held,
+    )
+
+
+def _verdict(
+    told: Explained, solution: OneKeySolution, options: OneKeyOptions
+) -> tuple[SensorStatus, str]:
     found, words = told.solution, ". ".join(told.words)
     open_ = f"this drive and map leave open: {words}" if words else ""
     because = f"; {open_}" if words else ""
+    if abs(solution.estimate.offset[found.sensor]) >= options.largest_offset_s > 0:
+        return SensorStatus.NOT_CONVERGED, (
+            f"its clock seems to be off by {options.largest_offset_s:g} s or more: correct its "
+            "stamps, or raise `calibration.solve.largest_offset_s`"
+        )
     if not solution.settled:
         return SensorStatus.NOT_CONVERGED, (
             f"estimate and weights still change, round after round{because}"

@@ -108,6 +108,25 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class PoseMotion:
+    """How the lidar moves at N readings, and when their poses were taken.
+
+    Attributes
+    ----------
+    twist_lidar
+        Angular velocity in rad/s and linear velocity in m/s, both in the lidar frame, shape (N, 6).
+    offset
+        Time offset in seconds: the poses are those at stamp + offset, shape (N,).
+    """
+
+    twist_lidar: FloatArray
+    offset: FloatArray
+
+    def __getitem__(self, rows: IntArray) -> "PoseMotion":
+        return PoseMotion(self.twist_lidar[rows], self.offset[rows])
+
+
+@dataclass(frozen=True)
 class Readings:
     """Readings of all sensors with the lidar's pose at each, as one batch.
 
@@ -125,6 +144,8 @@ class Readings:
         Positions of the lidar in the map in metres, shape (N, 3).
     field
         Measured field in the sensor's frame in microtesla, finite, shape (N, 3).
+    motion
+        How the lidar moves there, if that is known: without it no time offset can be.
     """
 
     sensors: tuple[str, ...]
@@ -133,6 +154,7 @@ class Readings:
     R_map_lidar: FloatArray
     p_map_lidar: FloatArray
     field: FloatArray
+    motion: PoseMotion | None = None
 
     def __len__(self) -> int:
         return len(self.sensor)
@@ -145,6 +167,7 @@ class Readings:
             self.R_map_lidar[rows],
             self.p_map_lidar[rows],
             self.field[rows],
+            None if self.motion is None else self.motion[rows],
         )
 
     def select(self, keep: BoolArray) -> "Readings":

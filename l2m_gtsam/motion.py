@@ -23,6 +23,8 @@ class MotionOptions(Options):
     """Roll and pitch by so much either way."""
     loop_m: float = Field(default=0.5, gt=0)
     """Radius of a loop where the gradient is strong."""
+    turn_rad_s: float = Field(default=0.5, gt=0)
+    """How fast the vehicle turns on the spot and in a loop."""
     detour_m: float = Field(default=2.0, gt=0)
     """Such a place is looked for so far around the drive."""
 
@@ -37,11 +39,24 @@ class Motion:
         What the driver does.
     R, p
         Shapes (N, 3, 3) and (N, 3), metres.
+    seconds
+        When, shape (N,).
     """
 
     name: str
     R: FloatArray
     p: FloatArray
+    seconds: FloatArray
+
+    @property
+    def twist(self) -> FloatArray:
+        """Angular velocity in rad/s and linear velocity in m/s, lidar frame, shape (N, 6)."""
+        rows = np.arange(len(self.p))
+        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(rows) - 1)
+        between = np.maximum(self.seconds[after] - self.seconds[before], np.finfo(float).tiny)
+        turn = Rotation.from_matrix(self.R[before].transpose(0, 2, 1) @ self.R[after]).as_rotvec()
+        way = np.einsum("nji,nj->ni", self.R, self.p[after] - self.p[before])
+        return np.asarray(np.hstack([turn, way]) / between[:, None])
 
 
 def extra_motions(drive: Motion, options: MotionOptions) -> tuple[Motion, ...]:
@@ -55,25 +70,38 @@ def extra_motions(drive: Motion, options: MotionOptions) -> tuple[Motion, ...]:
         How much of each.
     """
     rows = np.linspace(0, len(drive.p) - 1, options.poses).round().astype(int)
-    R, p = drive.R[rows], drive.p[rows]
+    R, p, seconds = drive.R[rows], drive.p[rows], drive.seconds[rows]
     swing = np.sin(2 * np.pi * SWINGS * np.linspace(0, 1, options.poses))
     up = np.array([0.0, 0.0, 1.0])
     tilt, round_ = np.deg2rad(options.tilt_deg) * swing, np.linspace(0, 2 * np.pi, len(swing))
     middle = len(p) // 2
     spot = np.broadcast_to(p[middle], p.shape)
     return (
-        Motion("the same drive once more", R, p),
+        Motion("the same drive once more", R, p, seconds),
         Motion(
             f"heave by {options.heave_m:g} m up and down",
             R,
             p + options.heave_m * swing[:, None] * up,
+            seconds,
         ),
-        Motion(f"roll by {options.tilt_deg:g} deg either way", R @ _turns(tilt, [1, 0, 0]), p),
-        Motion(f"pitch by {options.tilt_deg:g} deg either way", R @ _turns(tilt, [0, 1, 0]), p),
         Motion(
-            f"turn round on the spot at {_place(p[middle])}", _turns(round_, up) @ R[middle], spot
+            f"roll by {options.tilt_deg:g} deg either way", R @ _turns(tilt, [1, 0, 0]), p, seconds
         ),
-        Motion("the same path the other way round", (_turns(np.pi, up) @ R)[::-1], p[::-1]),
+        Motion(
+            f"pitch by {options.tilt_deg:g} deg either way", R @ _turns(tilt, [0, 1, 0]), p, seconds
+        ),
+        Motion(
+            f"turn round on the spot at {_place(p[middle])}",
+            _turns(round_, up) @ R[middle],
+            spot,
+            round_ / options.turn_rad_s,
+        ),
+        Motion(
+            "the same path the other way round",
+            (_turns(np.pi, up) @ R)[::-1],
+            p[::-1],
+            seconds[-1] - seconds[::-1],
+        ),
     )
 
 
@@ -83,7 +111,8 @@ def loop(drive: Motion, centre: FloatArray, options: MotionOptions) -> Motion:
     around = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     upright = _turns(angle + np.pi / 2 - _heading(drive.R[0]), [0.0, 0.0, 1.0]) @ drive.R[0]
     name = f"a loop of {options.loop_m:g} m radius about {_place(centre)}, if it is free"
-    return Motion(name, upright, centre + options.loop_m * around)
+    seconds = angle / options.turn_rad_s
+    return Motion(name, upright, centre + options.loop_m * around, seconds)
 
 
 def places_around(drive: Motion, options: MotionOptions) -> FloatArray:

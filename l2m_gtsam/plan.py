@@ -8,6 +8,7 @@ from l2m_gtsam.config import CalibrationOptions, PlanOptions
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
+    PoseMotion,
     Readings,
     Recording,
     SourceFile,
@@ -24,7 +25,7 @@ from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.motion import Motion, extra_motions, loop, places_around, strongest
 from l2m_gtsam.results import DrivePlan, MotionPlan, SensorPlan, Worst
-from l2m_gtsam.solve.explain import Movement, movement
+from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
 from l2m_gtsam.solve.rotation import polar_rotation
 from l2m_gtsam.sync import synchronise
@@ -62,7 +63,7 @@ class Task:
     def worst(self, readings: Readings) -> Worst:
         """Return what would be known least of a sensor by itself."""
         solved = self.forecast(readings).solved
-        covariance = solved[0].covariance if solved else UNKNOWN
+        covariance = solved[0].covariance[:15, :15] if solved else UNKNOWN
         return worst(readings.sensors[0], covariance, self.options.solve.rank)
 
     def of(self, sensor: int) -> "Task":
@@ -101,8 +102,10 @@ def plan(
         The map does not cover the drive, or a place is given for an unknown sensor.
     """
     tell = progress or (lambda stage, fraction: None)
-    synchronised = synchronise(recording, options.sync)
+    synchronised = synchronise(recording, options.sync, options.solve.largest_offset_s)
     readings = synchronised.readings
+    if not options.solve.largest_offset_s:
+        readings = replace(readings, motion=None)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     noise = _noise(field_map, options, planning)
     task = Task(solver_map, _places(readings.sensors, options), noise, options)
@@ -158,7 +161,10 @@ def only(readings: Readings, sensor: int) -> Readings:
 
 def with_motion(readings: Readings, motion: Motion) -> Readings:
     """Return the readings of a drive to which a motion is added: one per sensor and pose."""
-    S, K = len(readings.sensors), len(motion.p)
+    S, K, moving = len(readings.sensors), len(motion.p), None
+    if readings.motion is not None:
+        twist = np.concatenate([readings.motion.twist_lidar, np.tile(motion.twist, (S, 1))])
+        moving = PoseMotion(twist, np.zeros(len(twist)))
     sensor = np.concatenate([readings.sensor, np.repeat(np.arange(S), K)])
     joined = Readings(
         readings.sensors,
@@ -167,6 +173,7 @@ def with_motion(readings: Readings, motion: Motion) -> Readings:
         np.concatenate([readings.R_map_lidar, np.tile(motion.R, (S, 1, 1))]),
         np.concatenate([readings.p_map_lidar, np.tile(motion.p, (S, 1))]),
         np.concatenate([readings.field, np.zeros((S * K, 3))]),
+        moving,
     )
     return joined[np.argsort(sensor, kind="stable")]
 
@@ -206,7 +213,9 @@ def _motions(
 ) -> tuple[Motion, ...]:
     """Return the motions to try on a drive."""
     order = np.argsort(readings.stamp_ns, kind="stable")
-    drive = Motion("drive", readings.R_map_lidar[order], readings.p_map_lidar[order])
+    seconds = (readings.stamp_ns - readings.stamp_ns.min()) / NANOSECONDS
+    R, p = readings.R_map_lidar[order], readings.p_map_lidar[order]
+    drive = Motion("drive", R, p, seconds[order])
     motions = extra_motions(drive, planning.motion)
     places = places_around(drive, planning.motion)
     strong = strongest(places, field_map.query(places))
@@ -222,8 +231,11 @@ def _sensor_plans(
     plans = []
     for index, counts in enumerate(synchronised.counts):
         inside = counts.kept - int(outside[index])
+        held, late = "", float("inf")
         if index in solved:
             covariance, words = _foretold(solved[index], found, task)
+            held = held_offset(solved[index].determinacy)
+            late = float(np.sqrt(covariance[15, 15]))
         else:
             covariance = UNKNOWN
             words = (_too_few(counts, inside, moved, task.options.solve.min_readings),)
@@ -233,9 +245,11 @@ def _sensor_plans(
                 t_lidar_mag=task.t[index],
                 readings=inside,
                 outside_map=int(outside[index]),
-                covariance=covariance,
+                covariance=covariance[:15, :15],
                 rotation_covariance=polar_rotation(np.eye(3), covariance[3:12, 3:12]).covariance,
                 undetermined=words,
+                offset_sigma=late,
+                offset_held=held,
             )
         )
     return tuple(plans)

@@ -74,6 +74,33 @@ class FoundStart:
         return self.runner_up is not None and self.margin < clear
 
 
+@dataclass(frozen=True)
+class TimeOffset:
+    """How far a sensor's clock is off the lidar's: a reading's pose is that at stamp + offset.
+
+    Attributes
+    ----------
+    seconds
+        The offset; zero where it is held.
+    sigma
+        Its standard deviation in seconds, infinite where it is held.
+    cross_covariance
+        Of (t, C row by row, H) with it, in m s, s and uT s, shape (15,); zero where it is held.
+    held
+        Why it is held at zero; empty where it is estimated.
+    """
+
+    seconds: float
+    sigma: float
+    cross_covariance: FloatArray
+    held: str
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the drive told it."""
+        return not self.held
+
+
 class Return(StrEnum):
     """What was read when a place was passed again at another time."""
 
@@ -151,6 +178,8 @@ class SensorCalibration:
         Where the solve started, if that was looked for; absent where it was given.
     rejected
         Readings inside the map that did not count: no distortion explains them beside the others.
+    time_offset
+        Of the sensor's clock; absent where nothing was solved.
     """
 
     sensor: str
@@ -168,6 +197,15 @@ class SensorCalibration:
     outside_map: int
     start: FoundStart | None = None
     rejected: int = 0
+    time_offset: TimeOffset | None = None
+
+    @property
+    def offset_correlation(self) -> FloatArray:
+        """Correlation of ``t_lidar_mag`` with the time offset, shape (3,); zero if it is held."""
+        if self.time_offset is None or not self.time_offset.estimated:
+            return np.zeros(3)
+        sigmas = self.t_sigma * self.time_offset.sigma
+        return np.asarray(self.time_offset.cross_covariance[:3] / sigmas)
 
     @property
     def t_sigma(self) -> FloatArray:
@@ -245,6 +283,10 @@ class SensorPlan:
         Of the rotation error in the sensor frame in rad^2, shape (3, 3).
     undetermined
         What will not be determined, a sentence for each reason with the parameters by name.
+    offset_sigma
+        Of the time offset in seconds, infinite where it will be held.
+    offset_held
+        Why it will be held at zero; empty where it will be estimated.
     """
 
     sensor: str
@@ -254,6 +296,8 @@ class SensorPlan:
     covariance: FloatArray
     rotation_covariance: FloatArray
     undetermined: tuple[str, ...]
+    offset_sigma: float = float("inf")
+    offset_held: str = ""
 
     @property
     def sigma(self) -> FloatArray:

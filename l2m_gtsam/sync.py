@@ -1,5 +1,7 @@
 """Bring readings and poses together in time, and keep what says something new."""
 
+from dataclasses import replace
+
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation, Slerp
@@ -9,6 +11,7 @@ from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
     IntArray,
+    PoseMotion,
     Readings,
     Recording,
     SyncCounts,
@@ -34,10 +37,23 @@ class SyncOptions(Options):
 
 # Readings that vary less than this are stuck: a moving magnetometer's noise alone is larger.
 STUCK_UT = 1e-3
+# Velocities are taken over this time: between two poses their noise would be a large part.
+TWIST_S = 0.2
 
 
-def synchronise(recording: Recording, options: SyncOptions) -> Synchronised:
+def synchronise(
+    recording: Recording, options: SyncOptions, largest_offset_s: float = 0.0
+) -> Synchronised:
     """Interpolate the lidar's pose at every reading.
+
+    Parameters
+    ----------
+    recording
+        Poses and readings.
+    options
+        Which readings are kept.
+    largest_offset_s
+        Readings need poses so much earlier and later, too, because their clock may be off.
 
     Raises
     ------
@@ -46,21 +62,24 @@ def synchronise(recording: Recording, options: SyncOptions) -> Synchronised:
     """
     parts, counts = [], []
     for index, series in enumerate(recording.series):
-        readings, count = _synchronise_one(recording.trajectory, index, series, options)
+        readings, count = _synchronise_one(
+            recording.trajectory, index, series, options, round(largest_offset_s * 1e9)
+        )
         parts.append(readings)
         counts.append(count)
     if not any(count.kept for count in counts):
-        raise SyncError(_nothing_left(recording, options))
+        raise SyncError(_nothing_left(recording, options, largest_offset_s))
     return Synchronised(_concatenate(recording, parts), tuple(counts))
 
 
 def _synchronise_one(
-    trajectory: Trajectory, index: int, series: FieldSeries, options: SyncOptions
+    trajectory: Trajectory, index: int, series: FieldSeries, options: SyncOptions, around_ns: int
 ) -> tuple[Readings, SyncCounts]:
     finite = np.asarray(np.isfinite(series.field).all(axis=1))
     repeated = _repeated(series.stamp_ns, finite)
-    spanned = _spanned(trajectory.stamp_ns, series.stamp_ns)
-    near = _bracket_ns(trajectory.stamp_ns, series.stamp_ns) <= options.max_pose_gap_s * 1e9
+    spanned = _spanned(trajectory.stamp_ns, series.stamp_ns, around_ns)
+    gap = _longest_gap_ns(trajectory.stamp_ns, series.stamp_ns, around_ns)
+    near = gap <= options.max_pose_gap_s * 1e9
     fresh = finite & ~repeated
     keep = fresh & spanned & near
     readings = _with_poses(trajectory, index, series.stamp_ns[keep], series.field[keep])
@@ -93,34 +112,86 @@ def stuck_sensors(readings: Readings) -> list[int]:
     return [index for index, spread in enumerate(spreads) if spread < STUCK_UT]
 
 
-def _spanned(pose_ns: IntArray, stamp_ns: IntArray) -> BoolArray:
+def _spanned(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int) -> BoolArray:
     if len(pose_ns) < 2:
         return np.zeros(len(stamp_ns), dtype=np.bool_)
-    return np.asarray((stamp_ns >= pose_ns[0]) & (stamp_ns <= pose_ns[-1]))
+    first, last = pose_ns[0] + around_ns, pose_ns[-1] - around_ns
+    return np.asarray((stamp_ns >= first) & (stamp_ns <= last))
 
 
-def _bracket_ns(pose_ns: IntArray, stamp_ns: IntArray) -> IntArray:
-    """Return the time between the two poses around each reading, 0 on a pose."""
+def _longest_gap_ns(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int) -> IntArray:
+    """Return the longest time between two poses around each reading, 0 on a pose."""
     if len(pose_ns) < 2:
         return np.zeros(len(stamp_ns), dtype=np.int64)
-    after = np.clip(np.searchsorted(pose_ns, stamp_ns), 1, len(pose_ns) - 1)
-    gap = pose_ns[after] - pose_ns[after - 1]
-    on_pose = (pose_ns[after] == stamp_ns) | (pose_ns[after - 1] == stamp_ns)
-    return np.where(on_pose, 0, gap)
+    # The brackets that the time around a reading touches: from one pose to another.
+    before = np.searchsorted(pose_ns, stamp_ns - around_ns, side="right") - 1
+    after = np.searchsorted(pose_ns, stamp_ns + around_ns, side="left")
+    before, after = np.maximum(before, 0), np.minimum(after, len(pose_ns) - 1)
+    return longest_between(np.diff(pose_ns), before, after)
+
+
+def longest_between(gap: IntArray, first: IntArray, last: IntArray) -> IntArray:
+    """Return the largest of ``gap[first:last]`` for each pair, 0 for none, shape (N,)."""
+    pairs = np.column_stack([first, np.maximum(first, last)]).ravel()
+    # reduceat takes a single entry where a range is empty; a zero at the end gives it a place.
+    largest = np.maximum.reduceat(np.append(gap, 0), pairs)[::2]
+    return np.where(last > first, largest, 0)
 
 
 def _with_poses(
     trajectory: Trajectory, index: int, stamp_ns: IntArray, field: FloatArray
 ) -> Readings:
-    """Interpolate on SE(3): rotations along the shortest arc, positions along the line."""
-    if len(stamp_ns):
-        seconds = (trajectory.stamp_ns - trajectory.stamp_ns[0]) * 1e-9
-        at = (stamp_ns - trajectory.stamp_ns[0]) * 1e-9
-        R = Slerp(seconds, Rotation.from_matrix(trajectory.R))(at).as_matrix()
-        p = np.column_stack([np.interp(at, seconds, axis) for axis in trajectory.p.T])
-    else:
-        R, p = np.empty((0, 3, 3)), np.empty((0, 3))
-    return Readings((), np.full(len(stamp_ns), index, dtype=np.int64), stamp_ns, R, p, field)
+    """Return the readings of one sensor with the pose at each stamp."""
+    sensor = np.full(len(stamp_ns), index, dtype=np.int64)
+    none = np.empty((len(stamp_ns), 3, 3)), np.empty((len(stamp_ns), 3))
+    bare = Readings((), sensor, stamp_ns, *none, field)
+    return with_offsets(bare, trajectory, np.zeros(index + 1))
+
+
+def with_offsets(readings: Readings, trajectory: Trajectory, offset: FloatArray) -> Readings:
+    """Return readings with the poses that they have if their clocks are off.
+
+    Parameters
+    ----------
+    readings
+        Of S sensors.
+    trajectory
+        The lidar's poses; beyond its ends the lidar stands still.
+    offset
+        Time offset of each sensor in seconds, shape (S,): poses are those at stamp + offset.
+    """
+    own = offset[readings.sensor]
+    if not len(readings):
+        motion = PoseMotion(np.empty((0, 6)), own)
+        return replace(
+            readings, R_map_lidar=np.empty((0, 3, 3)), p_map_lidar=np.empty((0, 3)), motion=motion
+        )
+    at = 1e-9 * (readings.stamp_ns - trajectory.stamp_ns[0]) + own
+    R, p = _poses_at(trajectory, at)
+    motion = PoseMotion(_twist_at(trajectory, at, R), own)
+    return replace(readings, R_map_lidar=R, p_map_lidar=p, motion=motion)
+
+
+def _poses_at(trajectory: Trajectory, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Interpolate on SE(3): rotations along the shortest arc, positions along the line.
+
+    ``at`` are seconds after the first pose, shape (N,); rotations (N, 3, 3), positions (N, 3).
+    """
+    seconds = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
+    at = np.clip(at, 0.0, seconds[-1])
+    R = Slerp(seconds, Rotation.from_matrix(trajectory.R))(at).as_matrix()
+    return R, np.column_stack([np.interp(at, seconds, axis) for axis in trajectory.p.T])
+
+
+def _twist_at(trajectory: Trajectory, at: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the lidar's twist in its own frame where it has these rotations, shape (N, 6)."""
+    end = 1e-9 * float(trajectory.stamp_ns[-1] - trajectory.stamp_ns[0])
+    early, late = np.clip([at - TWIST_S / 2, at + TWIST_S / 2], 0.0, end)
+    between = np.maximum(late - early, np.finfo(float).tiny)[:, None]
+    (R_early, p_early), (R_late, p_late) = (_poses_at(trajectory, t) for t in (early, late))
+    turn = Rotation.from_matrix(R_early.transpose(0, 2, 1) @ R_late).as_rotvec()
+    way = np.einsum("nji,nj->ni", R, p_late - p_early)
+    return np.asarray(np.hstack([turn, way]) / between)
 
 
 def _first_in_cell(readings: Readings, options: SyncOptions) -> BoolArray:
@@ -139,24 +210,31 @@ def _first_in_cell(readings: Readings, options: SyncOptions) -> BoolArray:
 
 
 def _concatenate(recording: Recording, parts: list[Readings]) -> Readings:
+    motions = [part.motion for part in parts if part.motion is not None]
     return Readings(
-        tuple(series.sensor for series in recording.series),
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("sensor", "stamp_ns", "R_map_lidar", "p_map_lidar", "field")
+        sensors=tuple(series.sensor for series in recording.series),
+        sensor=np.concatenate([part.sensor for part in parts]),
+        stamp_ns=np.concatenate([part.stamp_ns for part in parts]),
+        R_map_lidar=np.concatenate([part.R_map_lidar for part in parts]),
+        p_map_lidar=np.concatenate([part.p_map_lidar for part in parts]),
+        field=np.concatenate([part.field for part in parts]),
+        motion=PoseMotion(
+            np.concatenate([motion.twist_lidar for motion in motions]),
+            np.concatenate([motion.offset for motion in motions]),
         ),
     )
 
 
-def _nothing_left(recording: Recording, options: SyncOptions) -> str:
+def _nothing_left(recording: Recording, options: SyncOptions, largest_offset_s: float) -> str:
     trajectory = recording.trajectory
     stamps = [s.stamp_ns for s in recording.series if len(s)]
     if not stamps or not len(trajectory):
         return f"{recording.source.path}: no readings or no poses to synchronise"
     span = f"{min(s[0] for s in stamps) * 1e-9:.3f} to {max(s[-1] for s in stamps) * 1e-9:.3f} s"
     poses = f"{trajectory.stamp_ns[0] * 1e-9:.3f} to {trajectory.stamp_ns[-1] * 1e-9:.3f} s"
+    around = f" for {largest_offset_s:g} s around each reading" if largest_offset_s else ""
     return (
         f"{recording.source.path}: no finite reading has a pose: readings run from {span}, poses "
-        f"from {poses}, and poses may be {options.max_pose_gap_s:g} s apart at most "
+        f"from {poses}, and poses may be {options.max_pose_gap_s:g} s apart at most{around} "
         "(`sync.max_pose_gap_s`); if their clocks differ, try `bag.stamps: record`"
     )

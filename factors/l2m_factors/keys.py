@@ -13,6 +13,11 @@ def D(sensor: int) -> int:
     return int(gtsam.symbol("D", sensor))
 
 
+def S(sensor: int) -> int:
+    """Return the key of this sensor's time offset: double, seconds to add to its stamps."""
+    return int(gtsam.symbol("S", sensor))
+
+
 def M(tile: int) -> int:
     """Return the key of the map's error in this tile: Vector of its modes, unit variance each."""
     return int(gtsam.symbol("M", tile))

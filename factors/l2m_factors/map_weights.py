@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_factors.field_map import FloatArray
-from l2m_factors.keys import D, M, T
+from l2m_factors.keys import D, M
 from l2m_factors.reading import BatchedReadings
 
 
@@ -27,7 +27,9 @@ def uncertain_block_factor(
     features: FloatArray,
     whitening: FloatArray,
 ) -> gtsam.CustomFactor:
-    """Return one factor on ``T(i)``, ``D(i)``, ``M(b)`` for readings of one sensor in one tile.
+    """Return one factor for readings of one sensor in one tile.
+
+    It is on ``T(i)``, ``D(i)``, for readings with motion on ``S(i)``, and on ``M(b)``.
 
     Parameters
     ----------
@@ -54,16 +56,15 @@ def uncertain_block_factor(
         more = A_lidar @ values.atVector(M(tile))
         e = residuals.residual[rows] + more @ C.T
         if jacobians is not None:
-            by_D = residuals.de_dD[rows]
+            by_T, by_D, *by_S = (each[rows] for each in batch.jacobians(residuals))
             for axis in range(3):
                 by_D[:, axis, 3 * axis : 3 * axis + 3] += more
-            by_M = C @ A_lidar
-            for slot, jacobian in enumerate((residuals.de_dt[rows], by_D, by_M)):
+            for slot, jacobian in enumerate((by_T, by_D, *by_S, C @ A_lidar)):
                 jacobians[slot] = (whitening @ jacobian).reshape(3 * len(rows), -1)
         return np.asarray(np.einsum("nij,nj->ni", whitening, e).ravel())
 
     unit = gtsam.noiseModel.Unit.Create(3 * len(rows))
-    return gtsam.CustomFactor(unit, [T(sensor), D(sensor), M(tile)], error)
+    return gtsam.CustomFactor(unit, [*batch.keys_of(sensor), M(tile)], error)
 
 
 def map_weights_prior(sizes: Mapping[int, int], root_information: FloatArray) -> gtsam.CustomFactor:

@@ -4,12 +4,14 @@ GTSAM asks every factor for its error separately. The numbers come out of one ev
 readings, made when the first factor of a linearisation asks and kept until a variable changes.
 """
 
+import struct
+
 import gtsam
 import numpy as np
 import numpy.typing as npt
 
 from l2m_factors.field_map import FieldMap, FloatArray
-from l2m_factors.keys import D, T
+from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
 
 
@@ -21,10 +23,11 @@ class BatchedReadings:
     field_map
         The map.
     readings
-        N readings; sensor indices count from 0.
+        N readings; sensor indices count from 0. With motion the factors depend on the time
+        offsets ``S(i)``.
     distortion
-        Fixed distortions (C row by row, H in uT), shape (S, 12); the factors then depend on
-        ``T(i)`` alone. Without it they depend on ``T(i)`` and ``D(i)``.
+        Fixed distortions (C row by row, H in uT), shape (S, 12). Without it the factors depend on
+        ``D(i)``; they always do on ``T(i)``.
     """
 
     def __init__(
@@ -37,9 +40,10 @@ class BatchedReadings:
         self._readings = readings
         self._fixed = distortion
         self._sensors = [int(s) for s in np.unique(readings.sensor)]
-        self._keys = {s: [T(s)] if distortion is not None else [T(s), D(s)] for s in self._sensors}
+        self._timed = readings.motion is not None
+        self._keys = {s: self._variables(s) for s in self._sensors}
         self._seen: dict[int, bytes] = {}
-        self._residuals = ReadingResiduals(*(np.empty(0),) * 3)
+        self._residuals = ReadingResiduals(*(np.empty(0),) * 4)
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -73,27 +77,34 @@ class BatchedReadings:
 
     def jacobians(self, residuals: ReadingResiduals) -> list[FloatArray]:
         """Return the derivatives by each of ``keys_of``, each of shape (N, 3, .)."""
-        by_t = residuals.de_dt
-        return [by_t, residuals.de_dD] if self._fixed is None else [by_t]
+        by_D = [residuals.de_dD] if self._fixed is None else []
+        return [residuals.de_dt, *by_D, *([residuals.de_dS] if self._timed else [])]
+
+    def _variables(self, sensor: int) -> list[int]:
+        distortion = [D(sensor)] if self._fixed is None else []
+        return [T(sensor), *distortion, *([S(sensor)] if self._timed else [])]
 
     def _stamp(self, values: gtsam.Values, sensor: int) -> bytes:
         """Return the sensor's values as bytes, which compare faster than arrays."""
-        keys = self._keys[sensor]
-        stamp: bytes = values.atPoint3(keys[0]).tobytes()
-        return stamp + values.atVector(keys[1]).tobytes() if self._fixed is None else stamp
+        stamp: bytes = values.atPoint3(T(sensor)).tobytes()
+        if self._fixed is None:
+            stamp += values.atVector(D(sensor)).tobytes()
+        return stamp + struct.pack("d", values.atDouble(S(sensor))) if self._timed else stamp
 
     def _evaluate(self, values: gtsam.Values) -> None:
         # A sensor without values, as when one factor is used alone, is evaluated at zero; nobody
         # asks for it, because its stamp is not kept.
         count = self._sensors[-1] + 1
-        t = np.zeros((count, 3))
+        t, offset = np.zeros((count, 3)), np.zeros(count) if self._timed else None
         distortion = np.zeros((count, 12)) if self._fixed is None else self._fixed
-        present = [s for s in self._sensors if values.exists(self._keys[s][0])]
+        present = [s for s in self._sensors if values.exists(T(s))]
         for sensor in present:
-            t[sensor] = values.atPoint3(self._keys[sensor][0])
+            t[sensor] = values.atPoint3(T(sensor))
             if self._fixed is None:
-                distortion[sensor] = values.atVector(self._keys[sensor][1])
-        self._residuals = reading_residuals(self._readings, self._map, t, distortion)
+                distortion[sensor] = values.atVector(D(sensor))
+            if offset is not None:
+                offset[sensor] = values.atDouble(S(sensor))
+        self._residuals = reading_residuals(self._readings, self._map, t, distortion, offset)
         self._seen = {sensor: self._stamp(values, sensor) for sensor in present}
 
 

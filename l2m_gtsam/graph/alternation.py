@@ -1,7 +1,7 @@
 """The paper's two-step loop: a closed form for C and H, then a graph for t, until t settles."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -61,6 +61,9 @@ class OneKeyOptions(Options):
     """Standard deviation of the sensors' noise; estimated for each sensor if not given."""
     min_readings: int = Field(default=30, ge=5)
     """A sensor with fewer readings inside the map is not solved; five have 15 components."""
+    largest_offset_s: float = Field(default=0.25, ge=0, le=10)
+    """How far a sensor's clock may be off the lidar's, seconds. The time offset is part of the
+    solve where the drive tells it from the position; 0 takes all clocks for one."""
     robust: RobustOptions = RobustOptions()
     """What becomes of readings that the map and one distortion cannot explain."""
     rank: RankOptions = RankOptions()
@@ -81,7 +84,7 @@ def start_estimate(t_start: FloatArray, options: OneKeyOptions) -> Estimate:
     ideal = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
     unknown = options.sensor_noise_ut is None  # then the first closed form replaces it
     noise = np.full(count, 1.0 if unknown else options.sensor_noise_ut)
-    return Estimate(t_start, np.tile(ideal, (count, 1)), noise, np.zeros(count))
+    return Estimate(t_start, np.tile(ideal, (count, 1)), noise, np.zeros(count), np.zeros(count))
 
 
 def alternate(
@@ -130,7 +133,7 @@ def fit_distortions(view: View, estimate: Estimate, options: OneKeyOptions) -> E
         if options.sensor_noise_ut is None:
             noise[s] = estimate_noise(fit.distortion.apply(b_lidar) - b_meas, v, DISTORTION)
         ridge[s] = fit.ridge * ridge_unit(b_lidar, 1 / (v + noise[s] ** 2))
-    return Estimate(estimate.t, distortion, noise, ridge)
+    return replace(estimate, distortion=distortion, noise=noise, ridge=ridge)
 
 
 def move_sensors(

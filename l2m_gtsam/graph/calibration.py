@@ -13,6 +13,8 @@ from l2m_factors import (
     D,
     FieldMap,
     MagneticReadings,
+    PoseMotion,
+    S,
     T,
     block_factor,
     distortion_prior,
@@ -21,6 +23,9 @@ from l2m_factors import (
 )
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.noise import whitening
+from l2m_gtsam.solve.rank import Determinacy
+
+HOLD_S = 1e-6  # a time offset that is held: far below what any clock of a vehicle resolves
 
 
 class FactorForm(StrEnum):
@@ -45,12 +50,15 @@ class Estimate:
     ridge
         Strength of each sensor's ridge: the information that it adds to each entry of C,
         shape (S,).
+    offset
+        Time offsets in seconds, shape (S,): a reading's pose is that at stamp + offset.
     """
 
     t: FloatArray
     distortion: FloatArray
     noise: FloatArray
     ridge: FloatArray
+    offset: FloatArray
 
     def C(self) -> FloatArray:
         """Return the distortion matrices, shape (S, 3, 3)."""
@@ -68,10 +76,11 @@ class Estimate:
         return values
 
     def values(self, sensors: list[int]) -> gtsam.Values:
-        """Return T(i) and D(i) of these sensors."""
+        """Return T(i), D(i) and S(i) of these sensors."""
         values = self.positions(sensors)
         for sensor in sensors:
             values.insert(D(sensor), self.distortion[sensor])
+            values.insert(S(sensor), float(self.offset[sensor]))
         return values
 
     def same_noise(self, other: "Estimate") -> bool:
@@ -79,21 +88,31 @@ class Estimate:
         return bool(np.abs(np.log(self.noise / other.noise)).max() < 1e-3)
 
     def updated(self, values: gtsam.Values, sensors: list[int]) -> "Estimate":
-        """Return the estimate with these sensors' T(i), and D(i) where present, taken over."""
-        t, distortion = self.t.copy(), self.distortion.copy()
+        """Return the estimate with these sensors' T(i), and the rest where present, taken over."""
+        t, distortion, offset = self.t.copy(), self.distortion.copy(), self.offset.copy()
         for sensor in sensors:
             t[sensor] = values.atPoint3(T(sensor))
             if values.exists(D(sensor)):
                 distortion[sensor] = values.atVector(D(sensor))
-        return replace(self, t=t, distortion=distortion)
+            if values.exists(S(sensor)):
+                offset[sensor] = values.atDouble(S(sensor))
+        return replace(self, t=t, distortion=distortion, offset=offset)
 
 
 def batch_readings(
     readings: Readings, field_map: FieldMap, distortion: FloatArray | None = None
 ) -> BatchedReadings:
-    """Return the readings as one batch for the factors; ``distortion`` (S, 12) holds D fixed."""
+    """Return the readings as one batch for the factors: on T(i), D(i) and S(i).
+
+    With ``distortion``, shape (S, 12), they are on T(i) alone, and poses stay as they are.
+    """
+    motion = None
+    if distortion is None:
+        at_rest = np.zeros((len(readings), 6)), np.zeros(len(readings))
+        known = readings.motion
+        motion = PoseMotion(*(at_rest if known is None else (known.twist_lidar, known.offset)))
     magnetic = MagneticReadings(
-        readings.sensor, readings.R_map_lidar, readings.p_map_lidar, readings.field
+        readings.sensor, readings.R_map_lidar, readings.p_map_lidar, readings.field, motion
     )
     return BatchedReadings(field_map, magnetic, distortion)
 
@@ -124,38 +143,46 @@ def reading_graph(
     return graph
 
 
-def prior_graph(estimate: Estimate, held: Mapping[int, FloatArray]) -> gtsam.NonlinearFactorGraph:
-    """Return the ridge towards an ideal sensor and the directions that are held.
+def prior_graph(estimate: Estimate, tests: Mapping[int, Determinacy]) -> gtsam.NonlinearFactorGraph:
+    """Return the ridge towards an ideal sensor and a hold on what cannot be determined.
 
     Parameters
     ----------
     estimate
-        Strength of the ridge, and where directions are held.
-    held
-        For each sensor of the graph the directions of its 15 parameters that stay, shape (K, 15).
+        Strength of the ridge, and where directions are held; a time offset is held at zero.
+    tests
+        Rank test of each sensor of the graph, which says what is held.
     """
     graph = gtsam.NonlinearFactorGraph()
-    for sensor, directions in held.items():
+    tight = gtsam.noiseModel.Isotropic.Sigma(1, HOLD_S)
+    for sensor, test in tests.items():
         if estimate.ridge[sensor] > 0:
             sigma = float(estimate.ridge[sensor] ** -0.5)
             graph.add(distortion_prior(sensor, np.eye(3), sigma))
-        if len(directions):
-            graph.add(held_directions(sensor, directions, estimate.vector(sensor)))
+        if len(test.held):
+            graph.add(held_directions(sensor, test.held, estimate.vector(sensor)))
+        if not test.offset:
+            graph.add(gtsam.PriorFactorDouble(S(sensor), 0.0, tight))
     return graph
 
 
 def whitened_jacobian(
     batch: BatchedReadings, W: FloatArray, values: gtsam.Values, sensor: int
 ) -> FloatArray:
-    """Return the derivatives of a sensor's white residuals by (t, C row by row, H), (3 n, 15)."""
+    """Return derivatives of a sensor's white residuals by (t, C by row, H, offset), (3 n, 16)."""
     jacobian, _ = block_factor(batch, sensor, W).linearize(values).jacobian()
     return np.asarray(jacobian)
+
+
+def variables(sensor: int) -> tuple[int, int, int]:
+    """Return the keys of a sensor in the order of its parameters: t, C row by row, H, offset."""
+    return T(sensor), D(sensor), S(sensor)
 
 
 def sensor_covariances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, sensors: list[int]
 ) -> dict[int, FloatArray]:
-    """Return the marginal covariance of (t, C row by row, H) of each sensor, shape (15, 15).
+    """Return the marginal covariance of (t, C row by row, H, offset) of each sensor, (16, 16).
 
     Where one direction is thousands of times better known than another, GTSAM's marginals, which
     are made by Cholesky, call the system indeterminate; QR of the same factors still has it.
@@ -171,21 +198,21 @@ def sensor_covariances(
 
 
 def _marginal_covariance(marginals: gtsam.Marginals, sensor: int) -> FloatArray:
-    keys = (T(sensor), D(sensor))
+    keys = variables(sensor)
     joint = marginals.jointMarginalCovariance(list(keys))
     return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
 
 
 def _covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensor: int) -> FloatArray:
     ordering = gtsam.Ordering()
-    ordering.push_back(T(sensor))
-    ordering.push_back(D(sensor))
+    for key in variables(sensor):
+        ordering.push_back(key)
     own = gtsam.GaussianFactorGraph()
     for index in range(linear.size()):
-        if set(linear.at(index).keys()) <= {T(sensor), D(sensor)}:
+        if set(linear.at(index).keys()) <= set(variables(sensor)):
             own.push_back(linear.at(index))
     jacobian, _ = own.jacobian(ordering)
     scale = 1 / np.linalg.norm(jacobian, axis=0)
     triangular = np.asarray(np.linalg.qr(jacobian * scale, mode="r"))
-    root = scale[:, None] * solve_triangular(triangular, np.eye(15))
+    root = scale[:, None] * solve_triangular(triangular, np.eye(len(scale)))
     return np.asarray(root @ root.T)

@@ -1,6 +1,6 @@
 r"""Solving the linear graph of sensors and map weights, block by block.
 
-Each sensor's fifteen parameters are eliminated by QR ``X = Q R`` of the rows ``X x + E beta = b``
+Each sensor's sixteen parameters are eliminated by QR ``X = Q R`` of the rows ``X x + E beta = b``
 that touch it, which does not mind directions of very different strength. What remains speaks of
 the map's weights alone; their prior has unit variance, so that a Cholesky factor of their
 information is safe:
@@ -21,10 +21,11 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from l2m_factors import D, M, T
+from l2m_factors import D, M, S, T
 from l2m_gtsam.data import FloatArray, IntArray
 
-SENSOR = 15  # parameters of a sensor: t, C row by row, H
+SENSOR = 16  # parameters of a sensor: t, C row by row, H, time offset
+PLACES = {T: slice(0, 3), D: slice(3, 15), S: slice(15, 16)}
 NONE = np.empty(0, dtype=np.int64)
 
 
@@ -43,7 +44,7 @@ class SensorRows:
     Attributes
     ----------
     R, S, d
-        Shapes (15, 15), (15, K) and (15,).
+        Shapes (16, 16), (16, K) and (16,).
     weights
         ``E^T E``: what its readings would say of the weights if its parameters were known.
     """
@@ -73,12 +74,12 @@ class Eliminated:
     beta: FloatArray
 
     def covariance(self, sensor: int) -> FloatArray:
-        """Return the marginal covariance of a sensor's (t, C row by row, H), shape (15, 15)."""
+        """Return the marginal covariance of (t, C row by row, H, offset), shape (16, 16)."""
         R = self.sensors[sensor].R
         return np.asarray(solve_triangular(R, solve_triangular(R, self._spread(sensor)).T))
 
     def step(self, sensor: int) -> FloatArray:
-        """Return the step of a sensor's parameters, shape (15,)."""
+        """Return the step of a sensor's parameters, shape (16,)."""
         rows = self.sensors[sensor]
         return np.asarray(solve_triangular(rows.R, rows.d - rows.S @ self.beta))
 
@@ -106,7 +107,7 @@ class Eliminated:
         return alone - float(np.trace(self._spread(sensor)) - SENSOR)
 
     def _spread(self, sensor: int) -> FloatArray:
-        """Return ``I + S Lambda^-1 S^T``: the covariance of ``R x``, shape (15, 15)."""
+        """Return ``I + S Lambda^-1 S^T``: the covariance of ``R x``, shape (16, 16)."""
         S = self.sensors[sensor].S
         half = solve_triangular(self.factor, S.T, lower=True, check_finite=False)
         return np.asarray(np.eye(SENSOR) + half.T @ half)
@@ -116,8 +117,8 @@ class Eliminated:
         delta = gtsam.VectorValues()
         for sensor in self.sensors:
             step = self.step(sensor)
-            delta.insert(T(sensor), step[:3])
-            delta.insert(D(sensor), step[3:])
+            for key, at in PLACES.items():
+                delta.insert(key(sensor), step[at])
         for tile, columns in tile_columns(sizes).items():
             delta.insert(M(tile), self.beta[columns])
         return values.retract(delta)
@@ -130,7 +131,7 @@ class Rows:
     Attributes
     ----------
     X, E, b
-        Shapes (J, 15), (J, r) and (J,).
+        Shapes (J, 16), (J, r) and (J,).
     columns
         Which of all weights, shape (r,).
     """
@@ -139,6 +140,15 @@ class Rows:
     E: FloatArray
     b: FloatArray
     columns: IntArray
+
+    def fewer(self) -> "Rows":
+        """Return rows of the same ``|X x + E beta - b|^2``, one more than columns at most."""
+        width = SENSOR + self.E.shape[1]
+        if len(self.b) <= width + 1:
+            return self
+        R = np.linalg.qr(np.column_stack([self.X, self.E, self.b]), mode="r")
+        X, E, b = np.split(R, [SENSOR, width], axis=1)
+        return Rows(X, E, b.ravel(), self.columns)
 
     @property
     def block(self) -> Block:
@@ -154,7 +164,7 @@ def eliminate(
     Parameters
     ----------
     linear
-        Factors on ``T(i)``, ``D(i)`` and ``M(b)``.
+        Factors on ``T(i)``, ``D(i)``, ``S(i)`` and ``M(b)``.
     sensors
         Sensors of the graph.
     sizes
@@ -189,7 +199,7 @@ def rows_by_sensor(
 ) -> dict[int, list[Rows]]:
     """Return the rows of each sensor, and under -1 those of the weights alone."""
     tiles = tile_columns(sizes)
-    place = {T(s): (s, slice(0, 3)) for s in sensors} | {D(s): (s, slice(3, 15)) for s in sensors}
+    place = {key(s): (s, at) for key, at in PLACES.items() for s in sensors}
     weights = {M(tile): np.arange(at.start, at.stop) for tile, at in tiles.items()}
     found: dict[int, list[Rows]] = {sensor: [] for sensor in [*sensors, -1]}
     for index in range(linear.size()):
@@ -206,7 +216,7 @@ def rows_by_sensor(
                 width = at.stop - at.start
                 X[:, at] = jacobian[:, start : start + width]
             start += width
-        found[sensor].append(Rows(X, np.hstack(E), b, np.concatenate(columns)))
+        found[sensor].append(Rows(X, np.hstack(E), b, np.concatenate(columns)).fewer())
     return found
 
 

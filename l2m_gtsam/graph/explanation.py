@@ -14,7 +14,7 @@ from l2m_gtsam.graph.forecast import rank_tests
 from l2m_gtsam.graph.joint import SensorSolution, with_infinities
 from l2m_gtsam.graph.one_key import OneKeySolution
 from l2m_gtsam.graph.view import QueryableMap
-from l2m_gtsam.solve.explain import drive_facts, explain
+from l2m_gtsam.solve.explain import drive_facts, explain, held_offset
 from l2m_gtsam.solve.rank import Determinacy, RankOptions
 
 
@@ -28,10 +28,13 @@ class Explained:
         With infinite variances for all of that.
     words
         A sentence for each reason, with the parameters by name; none if nothing is open.
+    held
+        Why the time offset is held at zero; empty if it is not.
     """
 
     solution: SensorSolution
     words: tuple[str, ...]
+    held: str
 
 
 def explained(
@@ -59,15 +62,16 @@ def explained(
     if not solution.solved:
         return {}
     tests = rank_tests(readings, field_map, t_start, solution.estimate.noise, options)
-    used, told = readings.select(solution.used), {}
+    used, told = solution.readings.select(solution.used), {}
     for found in solution.solved:
         s, after = found.sensor, found.determinacy
         before, own = tests.get(s, after), used.select(used.sensor == s)
         words = undetermined(before, own, t_start[s], field_map, options.rank)
         if (after.touched & ~before.touched).any():
             words += undetermined(after, own, solution.estimate.t[s], field_map, options.rank)
-        covariance = with_infinities(found.covariance, before)
-        told[s] = Explained(replace(found, covariance=covariance), words)
+        open_ = replace(before, offset=after.offset)
+        covariance = with_infinities(found.covariance, open_)
+        told[s] = Explained(replace(found, covariance=covariance), words, held_offset(after))
     return told
 
 

@@ -1,11 +1,11 @@
-"""The joint graph over ``T(i)`` and ``D(i)``: the finish of the solve, and its uncertainty."""
+"""The joint graph over ``T(i)``, ``D(i)`` and ``S(i)``: the finish of the solve, and how sure."""
 
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from l2m_factors import BatchedReadings, D, T
+from l2m_factors import BatchedReadings
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import (
@@ -14,6 +14,7 @@ from l2m_gtsam.graph.calibration import (
     prior_graph,
     reading_graph,
     sensor_covariances,
+    variables,
     whitened_jacobian,
 )
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
@@ -27,7 +28,7 @@ from l2m_gtsam.solve.noise import (
     reading_covariance,
     whitening,
 )
-from l2m_gtsam.solve.rank import Determinacy, determinacy
+from l2m_gtsam.solve.rank import Determinacy, timed_determinacy
 
 # Of each round; two rounds at least are made, and each step shortens what remains fourfold.
 POLISHING_STEPS = 2
@@ -42,8 +43,8 @@ class SensorSolution:
     sensor
         Index of the sensor.
     covariance
-        Of (t, C row by row, H) in m and uT; undetermined parameters have infinite variance and
-        no correlation, shape (15, 15).
+        Of (t, C row by row, H, time offset) in m, uT and s; undetermined parameters have infinite
+        variance and no correlation, shape (16, 16).
     figures
         Residuals of the readings used.
     determinacy
@@ -105,19 +106,21 @@ def joint_problem(
     batch = batch_readings(view.readings, field_map)
     values, W = estimate.values(view.sensors), whitening(covariance)
     jacobians = {s: whitened_jacobian(batch, W, values, s) for s in view.sensors}
-    tests = {s: determinacy(J, options.rank) for s, J in jacobians.items()}
+    tests = {s: timed_determinacy(J, options.rank) for s, J in jacobians.items()}
     graph = reading_graph(batch, covariance, options.factors)
-    graph.push_back(prior_graph(estimate, {s: test.held for s, test in tests.items()}))
+    graph.push_back(prior_graph(estimate, tests))
     return JointProblem(view, batch, share, covariance, tests, graph)
 
 
 def joint_step(problem: JointProblem, estimate: Estimate, options: OneKeyOptions) -> JointStep:
-    """Optimise T(i) and D(i) of all sensors, then the noise from the residuals that remain."""
+    """Optimise T(i), D(i), S(i) of all sensors, then the noise from the residuals that remain."""
     sensors = problem.view.sensors
     start = estimate.values(sensors)
     optimised = optimise(problem.graph, start, options.optimizer, options.joint_iterations)
     values = polish(problem.graph, optimised.values, POLISHING_STEPS)
     after = estimate.updated(values, sensors)
+    most = options.largest_offset_s
+    after = replace(after, offset=np.clip(after.offset, -most, most))
     if options.sensor_noise_ut is None:
         after = replace(after, noise=_noise(problem, after))
     return JointStep(after, optimised.ending)
@@ -145,7 +148,7 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
     for s in problem.view.sensors:
         rows, test = problem.batch.rows_of(s), problem.determinacies[s]
         residual = problem.batch.residuals(values, s).residual[rows]
-        gradient = np.concatenate([gradients.at(T(s)), gradients.at(D(s))])
+        gradient = np.concatenate([gradients.at(key) for key in variables(s)])
         solutions.append(
             SensorSolution(
                 sensor=s,
@@ -160,8 +163,8 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
 
 def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
     """Return the covariance without the made-up figures of directions that were held."""
-    honest = covariance.copy()
-    honest[test.touched, :] = 0.0
-    honest[:, test.touched] = 0.0
-    honest[test.touched, test.touched] = np.inf
+    honest, touched = covariance.copy(), np.append(test.touched, not test.offset)
+    honest[touched, :] = 0.0
+    honest[:, touched] = 0.0
+    honest[touched, touched] = np.inf
     return honest

@@ -5,13 +5,16 @@ closed form from what the map predicts at the current t (w-RRTLS), then the grap
 moves the sensors, with the same weights inside and outside. The *joint* graph over ``T(i)`` and
 ``D(i)`` then finishes both, with the full covariance of each reading, and its marginals are the
 uncertainty. All sensors are in one graph and share one evaluation of the map.
+
+Where the lidar's motion tells a sensor's time offset from its place, ``S(i)`` is a variable, too;
+the readings' poses are taken anew as it moves.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray, Readings
+from l2m_gtsam.data import BoolArray, FloatArray, Readings, Trajectory
 from l2m_gtsam.graph.alternation import (
     OneKeyOptions,
     Progress,
@@ -31,6 +34,7 @@ from l2m_gtsam.graph.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.graph.uncertain import UncertainMap, solve_uncertain
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.sync import with_offsets
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
@@ -38,6 +42,8 @@ MAX_ROUNDS = 10
 SETTLED_M = 1e-5
 # The map's variance changes over decimetres: after a shorter move it is not asked for again.
 REOBSERVE_M = 5e-3
+# A vehicle moves a tenth of a millimetre meanwhile.
+SETTLED_S = 1e-4
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,8 @@ class OneKeySolution:
 
     Attributes
     ----------
+    readings
+        All N readings, with their poses at the estimated time offsets.
     estimate
         Values of all S sensors; what stands for one that is not solved means nothing.
     solved
@@ -64,6 +72,7 @@ class OneKeySolution:
         How the map's errors were counted: full needs a map that knows them.
     """
 
+    readings: Readings
     estimate: Estimate
     solved: tuple[SensorSolution, ...]
     inside: BoolArray
@@ -85,6 +94,7 @@ def solve_one_key(
     t_start: FloatArray,
     options: OneKeyOptions,
     progress: Progress | None = None,
+    trajectory: Trajectory | None = None,
 ) -> OneKeySolution:
     """Calibrate all sensors of a batch of readings.
 
@@ -100,12 +110,16 @@ def solve_one_key(
         How to solve.
     progress
         Called with a stage and the fraction of it that is done.
+    trajectory
+        The lidar's poses, to take those of the readings anew for other time offsets; without it
+        they go on as they move.
     """
     tell = progress or (lambda stage, fraction: None)
     good = readings.select(plausible(readings, field_map, t_start, options.robust))
     near = alternate(good, field_map, start_estimate(t_start, options), options, tell)
-    joint = settle(readings, field_map, near.estimate, options, tell)
+    joint = settle(readings, field_map, near.estimate, options, tell, trajectory)
     outcome = OneKeySolution(
+        readings=joint.readings,
         estimate=joint.estimate,
         solved=(),
         inside=joint.whole.inside,
@@ -137,10 +151,12 @@ class Joint:
 
     Attributes
     ----------
+    readings
+        All, with their poses at the estimated time offsets.
     estimate
         All sensors.
     whole
-        All readings inside the map.
+        Those inside the map.
     weights
         How far each of them counts, shape (M,).
     problem
@@ -151,6 +167,7 @@ class Joint:
         Whether another round would repeat the last.
     """
 
+    readings: Readings
     estimate: Estimate
     whole: View
     weights: FloatArray
@@ -172,6 +189,7 @@ def settle(
     estimate: Estimate,
     options: OneKeyOptions,
     tell: Progress,
+    trajectory: Trajectory | None,
 ) -> Joint:
     """Solve the joint graph again and again, until the weights are those of its result.
 
@@ -185,19 +203,22 @@ def settle(
         tell("joint graph", round_ / MAX_ROUNDS)
         now = trusted(whole, field_map, estimate, options, round_, last)
         if not now.view.sensors:
-            return Joint(estimate, whole, now.weights, None, ending, settled=False)
+            return Joint(readings, estimate, whole, now.weights, None, ending, settled=False)
         problem = joint_problem(now.view, field_map, estimate, options)
         step = joint_step(problem, estimate, options)
         moved = float(np.abs(step.estimate.t - estimate.t).max())
-        quiet = moved < SETTLED_M and step.estimate.same_noise(estimate)
+        late = float(np.abs(step.estimate.offset - estimate.offset).max())
+        quiet = moved < SETTLED_M and late < SETTLED_S and step.estimate.same_noise(estimate)
         settled = quiet and now.agrees(last)
         estimate, ending, last = step.estimate, step.ending, now
         if settled:
             break
-        if moved > REOBSERVE_M:
+        if late > SETTLED_S and trajectory is not None:
+            readings = with_offsets(readings, trajectory, estimate.offset)
+        if moved > REOBSERVE_M or late > SETTLED_S:
             whole = observe(readings, field_map, estimate, options.min_readings)
     tell("joint graph", 1.0)
     if last is None or not settled:  # the last round's weights are not those of its result
         last = trusted(whole, field_map, estimate, options, MAX_ROUNDS, None)
         problem = joint_problem(last.view, field_map, estimate, options)
-    return Joint(estimate, whole, last.weights, problem, ending, settled)
+    return Joint(readings, estimate, whole, last.weights, problem, ending, settled)

@@ -1,4 +1,4 @@
-"""The joint graph over an uncertain map: ``T(i)``, ``D(i)`` and the map's error ``M(b)``.
+"""The joint graph over an uncertain map: ``T(i)``, ``D(i)``, ``S(i)`` and the map's error ``M(b)``.
 
 Map errors are shared by readings near each other, in one pass or in many, of one sensor or of
 all. As variables of the graph they carry that into the marginals; counted as noise of each
@@ -21,7 +21,6 @@ from l2m_gtsam.graph.calibration import (
     batch_readings,
     prior_graph,
 )
-from l2m_gtsam.graph.compress import linearised
 from l2m_gtsam.graph.elimination import Eliminated, eliminate
 from l2m_gtsam.graph.joint import SensorSolution, with_infinities
 from l2m_gtsam.graph.view import QueryableMap, View
@@ -237,8 +236,7 @@ class UncertainProblem:
                 )
             )
         self._graph.add(map_weights_prior(coverage.sizes, coverage.root_information))
-        held = {s: tests[s].held for s in view.sensors}
-        self._graph.push_back(prior_graph(estimate, held))
+        self._graph.push_back(prior_graph(estimate, {s: tests[s] for s in view.sensors}))
 
     def descend(self, values: gtsam.Values) -> Descent:
         """Take Gauss-Newton steps."""
@@ -279,7 +277,7 @@ class UncertainProblem:
         return self._tests[sensor].free + system.taken(sensor)
 
     def _eliminated(self, values: gtsam.Values) -> Eliminated:
-        linear = linearised(self._graph, values)
+        linear = self._graph.linearize(values)
         return eliminate(linear, self._view.sensors, self._coverage.sizes)
 
     def _residuals(self, values: gtsam.Values) -> FloatArray:

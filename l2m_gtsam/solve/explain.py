@@ -17,6 +17,7 @@ COLUMNS = ("first", "second", "third")
 ALONG = 0.95  # cosine from which a direction is called after the lidar's axis
 # A vehicle within these did not drive: what its poses still tell is their own noise.
 REST_M, REST_DEG = 0.1, 3.0
+A_MOMENT_S, RESOLVED_MM = 0.01, 0.05  # a usual time offset, and what of it is not spelt out
 # Below any sensor's resolution, in uT: what is less is not spelt out.
 RESOLVED_UT = 1e-3
 
@@ -113,6 +114,21 @@ def drive_facts(
     slope = R_lidar_map @ gradient @ R_map_lidar
     moved = movement(R_map_lidar, p_map_lidar)
     return DriveFacts(moved, b_lidar, slope, _not_imitated(slope, b_lidar))
+
+
+def held_offset(test: Determinacy) -> str:
+    """Return why a time offset is held at zero; empty if it is told apart."""
+    if test.offset:
+        return ""
+    shift = 1e3 * A_MOMENT_S * test.imitation
+    if np.linalg.norm(shift) < RESOLVED_MM:
+        return "held at 0: the drive does not show it"
+    # Added zero turns -0.0 into 0.0.
+    place = ", ".join(f"{value + 0.0:.1f}" for value in np.round(shift, 1).tolist())
+    return (
+        f"held at 0: {1e3 * A_MOMENT_S:g} ms look like t moved by ({place}) mm; drive some of it "
+        "the other way round or at another speed"
+    )
 
 
 def explain(test: Determinacy, drive: DriveFacts, options: RankOptions) -> tuple[str, ...]:

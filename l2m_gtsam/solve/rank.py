@@ -1,10 +1,10 @@
 """What the data determine and what they do not: the rank test before any covariance."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from pydantic import Field
-from scipy.linalg import qr
+from scipy.linalg import qr, solve_triangular
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.options import Options
@@ -25,6 +25,9 @@ class RankOptions(Options):
     """Entries of C, without unit."""
     useful_H_ut: float = Field(default=15.0, gt=0)
     """Microtesla."""
+    useful_offset_s: float = Field(default=0.02, gt=0)
+    """Seconds. A time offset that is known less is held where it is, instead of leaving open with
+    it the position along the drive."""
 
     def scale(self) -> FloatArray:
         """Return the largest useful sigma of each parameter, shape (15,)."""
@@ -48,17 +51,51 @@ class Determinacy:
         One name per row of ``directions``: the parameters that take part in it.
     touched
         Parameters that take part in an undetermined direction, shape (15,).
+    offset
+        Whether the time offset is told apart from all of these; if not it is held, and they are
+        judged as if it were known.
+    imitation
+        How fast t would have to move to look like a time offset in m/s, shape (3,).
     """
 
     held: FloatArray
     directions: FloatArray
     names: tuple[str, ...]
     touched: BoolArray
+    offset: bool = False
+    imitation: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def free(self) -> int:
         """Number of directions that the readings determine."""
-        return len(self.touched) - len(self.held)
+        return len(self.touched) - len(self.held) + self.offset
+
+
+def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
+    """Test the rank of a whitened Jacobian with the time offset in it.
+
+    The offset is told apart if its sigma, with all other parameters known no better than is of
+    use, is itself of use. Then the others are tested with it unknown, and else with it known.
+
+    Parameters
+    ----------
+    jacobian
+        Derivatives of whitened residuals by the 15 parameters and the time offset in seconds,
+        shape (M, 16).
+    options
+        The scales.
+    """
+    scaled = jacobian * np.append(options.scale(), options.useful_offset_s)
+    # A step of one of the 15 counts as one standard deviation of what is known without readings.
+    others = np.vstack([scaled, np.eye(15, 16)])
+    triangular = np.asarray(np.linalg.qr(others, mode="r"))
+    if abs(triangular[-1, -1]) < 1.0:
+        like = solve_triangular(triangular[:15, :15], triangular[:15, 15])[:3]
+        imitation = options.useful_t_m / options.useful_offset_s * like
+        return replace(determinacy(jacobian[:, :15], options), imitation=imitation)
+    by_offset = jacobian[:, 15] / np.linalg.norm(jacobian[:, 15])
+    apart = jacobian[:, :15] - np.outer(by_offset, by_offset @ jacobian[:, :15])
+    return replace(determinacy(apart, options), offset=True)
 
 
 def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:

@@ -38,7 +38,7 @@ def levenberg_marquardt(
         Closed form, factors, and the largest number of linearisations.
     """
     distortion = closed_form(readings, field_map, t_start, options)
-    start = Estimate(t_start[None], distortion.vector()[None], np.array([noise]), np.zeros(1))
+    start = Estimate(t_start[None], distortion.vector()[None], np.array([noise]), *np.zeros((2, 1)))
     covariance = reading_covariance(np.full(len(readings), noise), np.zeros((len(readings), 3, 3)))
     graph = reading_graph(batch_readings(readings, field_map), covariance, options.factors)
     end = optimise(graph, start.values([0]), Optimizer.LM, options.joint_iterations)

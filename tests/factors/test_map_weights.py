@@ -16,7 +16,7 @@ from l2m_factors import (
     uncertain_block_factor,
 )
 from l2m_gtsam.data import FloatArray
-from tests.factors.test_reading import as_magnetic, random_values
+from tests.factors.test_reading import as_magnetic, random_values, with_motion
 from tests.worlds import DipoleWorld, dipole_world, drive, random_sensors
 
 TILES = {7: 4, 2: 6}  # weights of each; keys are no positions
@@ -48,8 +48,10 @@ def test_jacobians_match_central_differences(seed: int, tile: int) -> None:
     batch = BatchedReadings(world := dipole_world(seed), some_readings(seed, world))
     rows = np.array([6, 9, 8])  # of the second sensor
     A, W = features(seed, 3, TILES[tile]), whitenings(seed, 3)
-    factor = uncertain_block_factor(batch, rows, tile, A, W)
-    assert_jacobians_match(factor, with_weights(seed, 2), rtol=1e-6, step=1e-4)
+    timed = BatchedReadings(world, with_motion(some_readings(seed, world), seed))
+    for each in (batch, timed):
+        factor = uncertain_block_factor(each, rows, tile, A, W)
+        assert_jacobians_match(factor, with_weights(seed, 2), rtol=1e-6, step=2e-5)
 
 
 def test_the_error_is_that_of_the_map_plus_its_error() -> None:

@@ -1,5 +1,7 @@
 """The magnetic reading factors: derivatives, batching, and the two forms of one mathematics."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -11,11 +13,14 @@ from l2m_factors import (
     BatchedReadings,
     D,
     MagneticReadings,
+    PoseMotion,
+    S,
     T,
     assert_jacobians_match,
     block_factor,
     distortion_prior,
     held_directions,
+    moved,
     reading_factor,
 )
 from l2m_gtsam.data import FloatArray, Readings
@@ -28,6 +33,13 @@ def as_magnetic(readings: Readings) -> MagneticReadings:
     )
 
 
+def with_motion(readings: MagneticReadings, seed: int) -> MagneticReadings:
+    """Return readings of a lidar that turns by up to 1 rad/s and moves by up to 2 m/s."""
+    rng, n = np.random.default_rng(seed), len(readings)
+    twist = np.hstack([rng.uniform(-1, 1, (n, 3)), rng.uniform(-2, 2, (n, 3))])
+    return replace(readings, motion=PoseMotion(twist, rng.uniform(-0.02, 0.02, n)))
+
+
 def random_values(seed: int, sensors: int) -> gtsam.Values:
     rng = np.random.default_rng(seed)
     values = gtsam.Values()
@@ -35,6 +47,7 @@ def random_values(seed: int, sensors: int) -> gtsam.Values:
         values.insert(T(i), rng.uniform(-0.5, 0.5, 3))
         C = Rotation.random(rng=rng).as_matrix() + rng.normal(0, 0.2, (3, 3))
         values.insert(D(i), np.concatenate([C.ravel(), rng.normal(0, 20, 3)]))
+        values.insert(S(i), float(rng.uniform(-0.05, 0.05)))
     return values
 
 
@@ -51,16 +64,19 @@ def test_jacobians_match_central_differences(seed: int) -> None:
     values = random_values(seed, 2)
     noise = gtsam.noiseModel.Gaussian.Covariance(np.diag([0.1, 0.2, 0.3]) + 0.02)
     joint = BatchedReadings(world, readings)
+    timed = BatchedReadings(world, with_motion(readings, seed))
     alone = BatchedReadings(world, readings, fixed_distortion(values, 2))
     whitening = np.broadcast_to(np.linalg.cholesky(np.diag([3.0, 4.0, 5.0]) + 1), (6, 3, 3))
     factors = (
         reading_factor(joint, 1, noise),
         reading_factor(alone, 4, noise),
         block_factor(joint, 0, whitening),
+        reading_factor(timed, 4, noise),
+        block_factor(timed, 1, whitening),
         block_factor(alone, 1, whitening),
     )
     for factor in factors:
-        assert_jacobians_match(factor, values, rtol=1e-6, step=1e-4)
+        assert_jacobians_match(factor, values, rtol=1e-6, step=2e-5)
 
 
 def test_prior_jacobians_match() -> None:
@@ -169,3 +185,26 @@ def test_blocks_equal_readings() -> None:
         np.testing.assert_allclose(a.atPoint3(T(i)), b.atPoint3(T(i)), atol=1e-7)
         np.testing.assert_allclose(a.atVector(D(i)), b.atVector(D(i)), atol=1e-6)
         assert np.linalg.norm(a.atPoint3(T(i)) - sensors[i].t_lidar_mag) < 0.02
+
+
+def test_a_pose_moves_as_its_twist_says() -> None:
+    """Half a second of a quarter turn a second to the left while driving 2 m/s ahead."""
+    R = Rotation.from_euler("z", 90, degrees=True).as_matrix()[None]
+    twist = np.array([[0, 0, np.pi / 2, 2.0, 0, 0]])
+    motion = PoseMotion(twist, np.array([0.25]))
+    R_later, p_later = moved(R, np.array([[5.0, 1.0, 0.5]]), motion, np.array([0.75]))
+    # Rounding; the lidar looks along y, its line in the map is straight.
+    np.testing.assert_allclose(p_later, [[5.0, 2.0, 0.5]], atol=1e-12)
+    expected = Rotation.from_euler("z", 135, degrees=True).as_matrix()
+    np.testing.assert_allclose(R_later[0], expected, atol=1e-12)
+    # Seen from the lidar, which has turned on, that line now points backwards to the right.
+    later = motion.after(np.array([0.75])).twist_lidar[0]
+    half = np.sqrt(2.0)
+    np.testing.assert_allclose(later, [0, 0, np.pi / 2, half, -half, 0], atol=1e-12)
+
+
+def test_without_motion_time_offsets_are_no_variables() -> None:
+    world = dipole_world(1)
+    readings = as_magnetic(drive(1, random_sensors(1, 1), world, count=2))
+    assert BatchedReadings(world, readings).keys_of(0) == [T(0), D(0)]
+    assert BatchedReadings(world, with_motion(readings, 1)).keys_of(0) == [T(0), D(0), S(0)]

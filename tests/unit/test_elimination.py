@@ -1,23 +1,26 @@
 """Block elimination of sensors and map weights against dense algebra."""
 
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 
-from l2m_factors import D, M, T
+from l2m_factors import D, M, S, T
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.compress import JACOBIAN
-from l2m_gtsam.graph.elimination import Eliminated, eliminate
+from l2m_gtsam.graph.elimination import Eliminated, Rows, eliminate
+
+JACOBIAN: Any = gtsam.JacobianFactor  # its stub lists one to three variables, each by itself
 
 SENSORS, SIZES = [0, 2], {4: 3, 7: 5}
 ROWS = 40
-ORDER = [T(0), D(0), T(2), D(2), M(4), M(7)]
-WIDTH = {T(0): 3, D(0): 12, T(2): 3, D(2): 12, M(4): 3, M(7): 5}
+ORDER = [T(0), D(0), S(0), T(2), D(2), S(2), M(4), M(7)]
+WIDTH = {T(0): 3, D(0): 12, S(0): 1, T(2): 3, D(2): 12, S(2): 1, M(4): 3, M(7): 5}
 START = dict(zip(ORDER, np.cumsum([0, *WIDTH.values()]), strict=False))
 
 
 def dense(terms: dict[int, FloatArray]) -> FloatArray:
-    """Return a factor's rows over all 38 numbers."""
+    """Return a factor's rows over all 40 numbers."""
     rows = np.zeros((len(next(iter(terms.values()))), sum(WIDTH.values())))
     for key, A in terms.items():
         rows[:, START[key] : START[key] + WIDTH[key]] = A
@@ -40,6 +43,8 @@ class Problem:
                     for key in (T(sensor), D(sensor), M(tile))
                 }
                 self._add(terms, rng.normal(size=ROWS), blocks, values, sensor)
+            late = {key: rng.normal(size=(ROWS, WIDTH[key])) for key in (T(sensor), S(sensor))}
+            self._add(late, rng.normal(size=ROWS), blocks, values, sensor)
         for tile, size in SIZES.items():
             self._add({M(tile): np.eye(size)}, np.zeros(size), blocks, values, -1)
         self.A, self.b = np.concatenate(blocks), np.concatenate(values)
@@ -77,7 +82,7 @@ def test_steps_and_covariances_are_those_of_dense_algebra(
     """Random rows are well conditioned: to 1e-10."""
     covariance = np.linalg.inv(problem.A.T @ problem.A)
     step = covariance @ problem.A.T @ problem.b
-    own = slice(START[T(sensor)], START[T(sensor)] + 15)
+    own = slice(START[T(sensor)], START[T(sensor)] + 16)
     np.testing.assert_allclose(solved.step(sensor), step[own], atol=1e-10)
     np.testing.assert_allclose(solved.covariance(sensor), covariance[own, own], atol=1e-10)
     length = np.sqrt(step[own] @ np.linalg.solve(covariance[own, own], step[own]))
@@ -88,10 +93,10 @@ def test_steps_and_covariances_are_those_of_dense_algebra(
 def test_a_fit_takes_the_trace_of_the_hat_matrix(
     problem: Problem, solved: Eliminated, sensor: int
 ) -> None:
-    """Fifteen of a sensor's readings for itself, the rest for the weights."""
+    """Sixteen of a sensor's readings for itself, the rest for the weights."""
     rows = problem.A[problem.row_owner == sensor]
     hat = rows @ np.linalg.solve(problem.A.T @ problem.A, rows.T)
-    assert 15 + solved.taken(sensor) == pytest.approx(np.trace(hat), rel=1e-10)
+    assert 16 + solved.taken(sensor) == pytest.approx(np.trace(hat), rel=1e-10)
 
 
 def test_all_readings_and_the_prior_take_as_much_as_there_are_numbers(
@@ -99,5 +104,19 @@ def test_all_readings_and_the_prior_take_as_much_as_there_are_numbers(
 ) -> None:
     prior = problem.A[problem.row_owner == -1]
     hat = prior @ np.linalg.solve(problem.A.T @ problem.A, prior.T)
-    taken = sum(15 + solved.taken(sensor) for sensor in SENSORS)
+    taken = sum(16 + solved.taken(sensor) for sensor in SENSORS)
     assert taken + np.trace(hat) == pytest.approx(sum(WIDTH.values()))
+
+
+def test_many_rows_become_few_without_loss() -> None:
+    """|X x + E beta - b|^2 at random points, to rounding; QR of two blocks of columns and b."""
+    rng = np.random.default_rng(3)
+    X, E, b = rng.normal(size=(90, 16)), rng.normal(size=(90, 5)), rng.normal(size=90)
+    rows = Rows(X, E, b, np.arange(5))
+    few = rows.fewer()
+    assert few.X.shape == (22, 16)
+    for x, beta in zip(rng.normal(size=(10, 16)), rng.normal(size=(10, 5)), strict=True):
+        before = np.sum((rows.X @ x + rows.E @ beta - rows.b) ** 2)
+        after = np.sum((few.X @ x + few.E @ beta - few.b) ** 2)
+        assert after == pytest.approx(before, rel=1e-11)
+    assert few.fewer() is few

@@ -20,7 +20,7 @@ def drive() -> Motion:
     """A straight line with one heading, the lidar mounted with a tilt."""
     R = Rotation.from_euler("ZYX", [30, 2, -1], degrees=True).as_matrix()
     p = np.column_stack([np.linspace(0, 4, 300), np.linspace(0, 2, 300), np.full(300, 0.8)])
-    return Motion("drive", np.broadcast_to(R, (300, 3, 3)), p)
+    return Motion("drive", np.broadcast_to(R, (300, 3, 3)), p, np.linspace(0, 5, 300))
 
 
 def named(word: str) -> Motion:
@@ -97,3 +97,23 @@ def test_the_strongest_place_lies_inside_the_map() -> None:
     np.testing.assert_array_equal(strongest(places, sample), places[3])
     nowhere = FieldSample(places, gradient, places, np.zeros_like(inside))
     assert strongest(places, nowhere) is None
+
+
+def test_velocities_are_those_of_the_poses() -> None:
+    """4.47 m in 5 s along the lidar's line; turning on the spot at the rate that is asked for."""
+    straight = named("once more").twist
+    np.testing.assert_allclose(straight[:, :3], 0, atol=1e-9)
+    speed = np.linalg.norm(straight[:, 3:], axis=1)
+    np.testing.assert_allclose(speed, np.hypot(4, 2) / 5, rtol=1e-9)
+    spot = named("on the spot").twist
+    np.testing.assert_allclose(spot[:, 3:], 0, atol=1e-9)
+    rate = np.linalg.norm(spot[:, :3], axis=1)
+    np.testing.assert_allclose(rate, OPTIONS.turn_rad_s, rtol=1e-9)
+
+
+def test_going_back_is_the_opposite_velocity_in_the_map() -> None:
+    """The vehicle is turned about, so that the lidar sees the same velocity."""
+    ahead, back = named("once more"), named("other way round")
+    for each, sign in ((ahead, 1), (back, -1)):
+        way = np.einsum("nij,nj->ni", each.R, each.twist[:, 3:])
+        np.testing.assert_allclose(way, sign * np.tile([0.8, 0.4, 0.0], (len(way), 1)), atol=1e-9)
