@@ -27,15 +27,12 @@ from l2m_gtsam.results import CalibrationResult, DrivePlan
 from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.bag import has_fields, read_recording, read_trajectory
-from l2m_gtsam.storage.calibration_file import (
-    read_known_sensors,
-    write_calibration,
-    write_known_sensors,
-)
+from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.cloud import read_cloud, write_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
+from l2m_gtsam.storage.known_sensors import read_known_sensors, write_known_sensors
 from l2m_gtsam.storage.map_file import load_map, save_map
 
 Progress = Callable[[str, float], None]

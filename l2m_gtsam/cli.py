@@ -153,7 +153,7 @@ def calibrate(
     from l2m_gtsam.batch import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
     from l2m_gtsam.config import load_config, with_uncertainty
     from l2m_gtsam.qa.tables import calibration_table, disagreement_note
-    from l2m_gtsam.storage.calibration_file import UNCERTAINTY
+    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with _progress() as progress:
@@ -187,7 +187,7 @@ def plan(
     from l2m_gtsam.batch import plan_bag
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.plan_tables import advice, motion_table, plan_table
-    from l2m_gtsam.storage.calibration_file import UNCERTAINTY
+    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen, places = load_config(config), [_place(text) for text in at or []]
     with _progress() as progress:
