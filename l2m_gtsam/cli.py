@@ -17,7 +17,7 @@ from l2m_gtsam.errors import L2MError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from l2m_gtsam.batch import Progress
+    from l2m_gtsam.progress import Progress
 
 app = typer.Typer(
     name="l2m",
@@ -96,7 +96,7 @@ def options(
 @app.command()
 def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
     """Say what is in a bag and what would be used of it, and why."""
-    from l2m_gtsam.batch import inspect_file
+    from l2m_gtsam.batch.drives import inspect_file
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import bag_table
 
@@ -117,7 +117,7 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a warehouse, a mapping drive and a calibration drive, and write them as bags."""
-    from l2m_gtsam.batch import simulate_bags
+    from l2m_gtsam.batch.simulation import simulate_bags
     from l2m_gtsam.errors import ConfigError
     from l2m_gtsam.simulate.bag_writer import BagKind
     from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -150,10 +150,10 @@ def calibrate(
     ] = None,
 ) -> None:
     """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
-    from l2m_gtsam.batch import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
+    from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
     from l2m_gtsam.config import load_config, with_uncertainty
     from l2m_gtsam.qa.tables import calibration_table, disagreement_note
-    from l2m_gtsam.storage.calibration_file import UNCERTAINTY
+    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with _progress() as progress:
@@ -184,10 +184,10 @@ def plan(
     From poses and map alone: the bag needs no readings. Sensors of the bag are assumed where
     `calibration.start` puts them, else at the lidar, aligned with it and without distortion.
     """
-    from l2m_gtsam.batch import plan_bag
+    from l2m_gtsam.batch.drives import plan_bag
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.plan_tables import advice, motion_table, plan_table
-    from l2m_gtsam.storage.calibration_file import UNCERTAINTY
+    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen, places = load_config(config), [_place(text) for text in at or []]
     with _progress() as progress:
@@ -225,7 +225,7 @@ def map_build(
     structure: StructureOption = None,
 ) -> None:
     """Build a map from one or several bags of a calibrated mapping suite."""
-    from l2m_gtsam.batch import build_map_file
+    from l2m_gtsam.batch.maps import build_map_file
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import map_table
 
@@ -248,7 +248,7 @@ def map_update(
 
     Where there are new readings, the scales of a harmonic map's tiles follow them.
     """
-    from l2m_gtsam.batch import update_map_file
+    from l2m_gtsam.batch.maps import update_map_file
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import map_table
 
@@ -267,7 +267,7 @@ def map_compare(
     structure: StructureOption = None,
 ) -> None:
     """Say which kind of map predicts places best that it has not seen."""
-    from l2m_gtsam.batch import compare_map_kinds
+    from l2m_gtsam.batch.maps import compare_map_kinds
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.comparison import comparison_table
 
@@ -279,7 +279,7 @@ def map_compare(
 @map_app.command("info")
 def map_info(map_path: MapArgument) -> None:
     """Say what a map is made of and what it covers."""
-    from l2m_gtsam.batch import describe_map_file
+    from l2m_gtsam.batch.maps import describe_map_file
     from l2m_gtsam.qa.tables import map_table
 
     with _progress() as progress:
@@ -297,7 +297,7 @@ def map_plot(
     ] = None,
 ) -> None:
     """Draw strength and uncertainty of a map at one height."""
-    from l2m_gtsam.batch import plot_map_file
+    from l2m_gtsam.batch.maps import plot_map_file
 
     with _progress() as progress:
         plot_map_file(map_path, out, height, progress)

@@ -3,18 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from l2m_gtsam.batch import (
-    OVERVIEW_FILE,
-    STRUCTURE_FILE,
-    SUITE_FILE,
-    Progress,
-    bag_name,
-    build_map_file,
-    calibrate_bag,
-    simulate_bags,
-)
+from l2m_gtsam.batch.drives import OVERVIEW_FILE, calibrate_bag
+from l2m_gtsam.batch.maps import build_map_file
+from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, bag_name, simulate_bags
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions

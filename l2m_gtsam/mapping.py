@@ -1,6 +1,6 @@
 """Recordings of a mapping suite -> map. Pure: no files, no terminal."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -11,9 +11,8 @@ from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
+from l2m_gtsam.progress import Progress
 from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise
-
-Progress = Callable[[str, float], None]
 
 
 def map_recordings(

@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from l2m_gtsam.results import SensorStatus
-from l2m_gtsam.storage.calibration_file import read_calibration, read_known_sensors
+from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.known_sensors import read_known_sensors
 from tests.bags import Entry, ros, write
 from tests.end_to_end.conftest import Demo, complaint, l2m
 

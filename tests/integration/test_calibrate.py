@@ -23,12 +23,8 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.qa.tables import disagreement_note
 from l2m_gtsam.results import CalibrationResult, SensorStatus
-from l2m_gtsam.storage.calibration_file import (
-    read_calibration,
-    read_known_sensors,
-    write_calibration,
-    write_known_sensors,
-)
+from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
+from l2m_gtsam.storage.known_sensors import read_known_sensors, write_known_sensors
 from l2m_gtsam.storage.yaml_file import read_yaml
 from tests.worlds import DipoleWorld, dipole_world, random_sensors
 

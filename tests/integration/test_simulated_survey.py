@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2m_gtsam.batch import STRUCTURE_FILE, SUITE_FILE, build_map_file, simulate_bags
+from l2m_gtsam.batch.maps import build_map_file
+from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, simulate_bags
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.bag_writer import BagKind

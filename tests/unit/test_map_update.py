@@ -5,7 +5,7 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.bilinear import BilinearMap
+from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map, map_from_state
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters as HarmonicPrior
 from l2m_gtsam.maps.hyperparameters import Hyperparameters

@@ -1,0 +1,114 @@
+"""Drives: inspected, calibrated and planned."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from l2m_gtsam.batch.opening import SavedMap, read_drive
+from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.calibrate import calibrate
+from l2m_gtsam.config import Config
+from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.plan import assumed_recording, plan
+from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.qa.figures import calibration_figure, save_figure
+from l2m_gtsam.results import CalibrationResult, DrivePlan
+from l2m_gtsam.storage.bag import has_fields, read_trajectory
+from l2m_gtsam.storage.calibration_file import write_calibration
+from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.inspect import BagReport, inspect_bag
+
+CALIBRATION_FILE = "calibration.yaml"
+OVERVIEW_FILE = "overview.png"
+
+
+def inspect_file(bag: Path, config: Config, progress: Progress) -> BagReport:
+    """Return what is in a bag and what would be used of it."""
+    return inspect_bag(bag, config.bag, counter(f"reading {bag.name}", progress))
+
+
+def calibrate_bag(
+    bag: Path,
+    map_path: Path,
+    config: Config,
+    out: Path,
+    progress: Progress,
+    truth: tuple[KnownSensor, ...] = (),
+) -> CalibrationResult:
+    """Calibrate all magnetometers of a bag and write `calibration.yaml` and a picture.
+
+    Parameters
+    ----------
+    bag
+        A drive through the mapped place.
+    map_path
+        Map file.
+    config
+        Configuration.
+    out
+        Folder for the results, made if it is missing.
+    progress
+        Called with a stage and the fraction of it that is done.
+    truth
+        Sensors as they are, if that is known, to be drawn beside the estimate.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line; nothing is written then.
+    """
+    check_outputs(out / CALIBRATION_FILE, out / OVERVIEW_FILE)
+    saved, recording = SavedMap.read(map_path), read_drive(bag, config, progress)
+    field_map, source = saved.open(progress, [recording]), source_file(map_path)
+    result = calibrate(recording, field_map, config.calibration, source, progress)
+    result = replace(result, options=config.model_dump(mode="json"))
+    figure = calibration_figure(field_map, recording.trajectory, result, truth)
+    ensure_folder(out)
+    write_calibration(out / CALIBRATION_FILE, result)
+    save_figure(figure, out / OVERVIEW_FILE)
+    return result
+
+
+def plan_bag(
+    bag: Path,
+    map_path: Path,
+    config: Config,
+    at: Sequence[tuple[float, float, float]],
+    progress: Progress,
+) -> DrivePlan:
+    """Say what a drive will determine of its magnetometers, from poses and map alone.
+
+    Parameters
+    ----------
+    bag
+        A drive through the mapped place.
+    map_path
+        Map file.
+    config
+        Configuration; `calibration.start` says where the bag's sensors are assumed.
+    at
+        Places of sensors in the lidar frame in metres that are assumed instead of the bag's own; a
+        bag without magnetometers has one at the lidar if none is given.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    saved, calibration = SavedMap.read(map_path), config.calibration
+    if at or not has_fields(bag):
+        names = {_named(place): place for place in at or [(0.0, 0.0, 0.0)]}
+        trajectory, source = read_trajectory(bag, config.bag), source_file(bag)
+        recording = assumed_recording(trajectory, source, tuple(names), config.plan.rate_hz)
+        calibration = calibration.model_copy(update={"start": names})
+    else:
+        recording = read_drive(bag, config, progress)
+    field_map = saved.open(progress, [recording])
+    return plan(recording, field_map, calibration, config.plan, progress)
+
+
+def _named(place: tuple[float, float, float]) -> str:
+    """Return the name of a sensor that is only assumed."""
+    return f"at {place[0]:g},{place[1]:g},{place[2]:g}"

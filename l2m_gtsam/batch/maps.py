@@ -1,0 +1,195 @@
+"""Map files: built, updated, compared, described and drawn."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from l2m_gtsam.batch.opening import SavedMap
+from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.batch.survey import read_survey
+from l2m_gtsam.config import Config
+from l2m_gtsam.data import Recording
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.mapping import compare_recordings, map_recordings, update_map
+from l2m_gtsam.maps.build import refuse_structure
+from l2m_gtsam.maps.compare import MapComparison
+from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.qa.figures import map_figure, save_figure
+from l2m_gtsam.qa.tables import MapDescription
+from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.map_file import save_map
+
+
+@dataclass(frozen=True)
+class BuiltMap:
+    """A map and what its file says of it."""
+
+    field_map: FieldMap
+    description: MapDescription
+
+
+def build_map_file(
+    bags: Sequence[Path],
+    out: Path,
+    config: Config,
+    suite: Path | None,
+    progress: Progress,
+    structure: str | None = None,
+) -> BuiltMap:
+    """Build a map from mapping bags and write it.
+
+    Parameters
+    ----------
+    bags
+        One or several mapping bags.
+    out
+        Map file to write (`.npz`).
+    config
+        Configuration.
+    suite
+        File with the mapping suite's calibrations; ideal sensors at the lidar's origin if absent.
+    progress
+        Called with a stage and the fraction of it that is done.
+    structure
+        What a LiDAR saw: a `.pcd`, `.ply` or `.npz` file in the map frame, else the name of a
+        PointCloud2 topic of the bags.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    check_outputs(out, suffix=".npz")
+    if structure is not None:
+        refuse_structure(config.mapping.model.kind)
+    survey = read_survey(bags, config, suite, structure, progress)
+    progress("building the map", 0.0)
+    field_map = map_recordings(survey.recordings, survey.suite, config.mapping, survey.cloud)
+    progress("building the map", 1.0)
+    provenance = {
+        "bags": [vars(recording.source) for recording in survey.recordings],
+        "suite": None if suite is None else vars(source_file(suite)),
+        "structure": None if survey.structure is None else survey.structure.provenance,
+        "frame": survey.recordings[0].trajectory.frame,
+        "config": config.model_dump(mode="json", include={"bag", "mapping"}),
+        "version": version("l2m-gtsam"),
+    }
+    return _save_map(out, field_map, provenance)
+
+
+def update_map_file(
+    map_path: Path,
+    bags: Sequence[Path],
+    out: Path,
+    config: Config,
+    suite: Path | None,
+    progress: Progress,
+) -> BuiltMap:
+    """Add the readings of more mapping bags to a map, which keeps its kind and its prior.
+
+    Parameters
+    ----------
+    map_path
+        Map file; it stays as it is unless it is also `out`.
+    bags
+        One or several mapping bags that are not in the map yet, in its frame.
+    out
+        Map file to write (`.npz`).
+    config
+        Configuration, of which only what is read and synchronised counts.
+    suite
+        File with the mapping suite's calibrations; ideal sensors at the lidar's origin if absent.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    check_outputs(out, suffix=".npz")
+    saved = SavedMap.read(map_path)
+    known = saved.bags
+    survey = read_survey(bags, config, suite, None, progress)
+    _check_new(map_path, known, survey.recordings)
+    field_map = saved.open(progress, survey.recordings)
+    progress("updating the map", 0.0)
+    updated = update_map(field_map, survey.recordings, survey.suite, config.mapping)
+    progress("updating the map", 1.0)
+    added = [vars(recording.source) for recording in survey.recordings]
+    update = {
+        "bags": added,
+        "suite": None if suite is None else vars(source_file(suite)),
+        "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
+        "version": version("l2m-gtsam"),
+    }
+    provenance = {
+        **saved.state.provenance,
+        **updated.to_state().provenance,
+        "bags": [*known, *added],
+        "updates": [*saved.updates, update],
+        "frame": survey.recordings[0].trajectory.frame,
+    }
+    return _save_map(out, updated, provenance)
+
+
+def compare_map_kinds(
+    bags: Sequence[Path],
+    config: Config,
+    suite: Path | None,
+    structure: str | None,
+    progress: Progress,
+) -> MapComparison:
+    """Compare the kinds of maps that mapping bags could become, on held-out places.
+
+    Parameters
+    ----------
+    bags, config, suite, structure, progress
+        As in ``build_map_file``; the structure only serves the kind that can use it.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    if structure is not None:
+        refuse_structure(*config.mapping.compare.kinds)
+    survey = read_survey(bags, config, suite, structure, progress)
+    return compare_recordings(
+        survey.recordings, survey.suite, config.mapping, survey.cloud, progress
+    )
+
+
+def describe_map_file(path: Path, progress: Progress) -> MapDescription:
+    """Return what a map file holds and where it came from."""
+    saved = SavedMap.read(path)
+    return MapDescription(saved.open(progress).summary, saved.state.provenance)
+
+
+def plot_map_file(path: Path, out: Path, height: float | None, progress: Progress) -> None:
+    """Draw a map at a height in metres (the middle of its readings if None) as a picture."""
+    check_outputs(out, suffix=".png")
+    field_map = SavedMap.read(path).open(progress)
+    ensure_folder(out.parent)
+    save_figure(map_figure(field_map, height), out)
+
+
+def _save_map(out: Path, field_map: FieldMap, provenance: dict[str, Any]) -> BuiltMap:
+    """Write a map with where it came from, besides what it says of itself."""
+    state = field_map.to_state()
+    state = replace(state, provenance={**state.provenance, **provenance})
+    ensure_folder(out.parent)
+    save_map(out, state)
+    return BuiltMap(field_map, MapDescription(field_map.summary, state.provenance))
+
+
+def _check_new(
+    map_path: Path, known: Sequence[dict[str, Any]], recordings: Sequence[Recording]
+) -> None:
+    """Raise a MapError for a recording that a map has: twice, it would count as two witnesses."""
+    digests = [bag.get("sha256") for bag in known]
+    if twice := [each.source.path for each in recordings if each.source.sha256 in digests]:
+        raise MapError(f"{map_path} was made from {twice[0]} already; give bags that are new")

@@ -1,0 +1,90 @@
+"""Drives and maps from their files, in one frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from l2m_gtsam.config import Config
+from l2m_gtsam.data import MapState, Recording
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.storage.bag import read_recording
+from l2m_gtsam.storage.map_file import load_map
+
+
+def read_drive(bag: Path, config: Config, progress: Progress) -> Recording:
+    """Return what a bag recorded, as far as the configuration reads it."""
+    return read_recording(bag, config.bag, counter(f"reading {bag.name}", progress))
+
+
+@dataclass(frozen=True)
+class SavedMap:
+    """A map file that was read; its map is made when the drives that go with it are known.
+
+    Attributes
+    ----------
+    path
+        The file.
+    state
+        What it holds.
+    """
+
+    path: Path
+    state: MapState
+
+    @classmethod
+    def read(cls, path: Path) -> "SavedMap":
+        """Read a map file; a MapError if it is missing or not sound."""
+        return cls(path, load_map(path))
+
+    @property
+    def bags(self) -> list[dict[str, Any]]:
+        """What the file says of the bags that it was made from; it may have been tampered with."""
+        bags = self._list_of("bags")
+        if not all(isinstance(bag, dict) for bag in bags):
+            raise MapError(f"{self.path}: its list of bags is damaged; build the map again")
+        return bags
+
+    @property
+    def updates(self) -> list[Any]:
+        """What the file says of the updates that it went through."""
+        return self._list_of("updates")
+
+    def open(self, progress: Progress, drives: Sequence[Recording] = ()) -> FieldMap:
+        """Return the map, ready to be asked.
+
+        Parameters
+        ----------
+        progress
+            Called with a stage and the fraction of it that is done.
+        drives
+            What it is going to be used with.
+
+        Raises
+        ------
+        MapError
+            A drive is said to be in another frame, or the map is not sound.
+        """
+        for drive in drives:
+            self._check_frame(drive)
+        progress("loading the map", 0.0)
+        field_map = map_from_state(self.state)
+        progress("loading the map", 1.0)
+        return field_map
+
+    def _check_frame(self, drive: Recording) -> None:
+        frame = self.state.provenance.get("frame")
+        if frame not in (None, drive.trajectory.frame):
+            msg = (
+                f"{self.path} is in frame {frame!r}, the poses of {drive.source.path} are in "
+                f"{drive.trajectory.frame!r}; if both mean the same, say so with "
+                f"`bag.frame: {frame}`"
+            )
+            raise MapError(msg)
+
+    def _list_of(self, name: str) -> list[Any]:
+        entries = self.state.provenance.get(name)
+        return entries if isinstance(entries, list) else []

@@ -1,0 +1,1 @@
+"""The paper's baseline map: averages on a grid."""

@@ -1,0 +1,160 @@
+"""Values on the nodes of a box, and the field between them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import QhullError, cKDTree
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.bilinear.cells import Cells
+from l2m_gtsam.maps.bilinear.options import BilinearOptions
+
+MOST_NODES = 5_000_000  # their values take 120 MB
+FEWEST_IN_PLANE = 3  # averages that span a triangle
+
+
+@dataclass(frozen=True)
+class Knots:
+    """The two nodes around each point along one axis.
+
+    Attributes
+    ----------
+    node
+        Their indices, shape (N, 2).
+    weight
+        Their shares, which add up to one, shape (N, 2).
+    slope
+        Derivatives of the shares in 1/m, shape (N, 2): zero where the point was clamped.
+    """
+
+    node: IntArray
+    weight: FloatArray
+    slope: FloatArray
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Values on the nodes of a box.
+
+    Attributes
+    ----------
+    axes
+        Coordinates of the nodes along x, y and z in metres, ascending, two at least.
+    values
+        Field at the nodes in microtesla, shape (X, Y, Z, 3).
+    """
+
+    axes: tuple[FloatArray, FloatArray, FloatArray]
+    values: FloatArray
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and its exact gradient (N, 3, 3) in uT/m.
+
+        Points outside of the box, in metres, shape (N, 3), take the value of its nearest point.
+        """
+        x, y, z = (knots(axis, at) for axis, at in zip(self.axes, points.T, strict=True))
+        corners = self.values[
+            x.node[:, :, None, None], y.node[:, None, :, None], z.node[:, None, None, :]
+        ]
+        field = contracted(corners, x.weight, y.weight, z.weight)
+        gradient = [
+            contracted(corners, x.slope, y.weight, z.weight),
+            contracted(corners, x.weight, y.slope, z.weight),
+            contracted(corners, x.weight, y.weight, z.slope),
+        ]
+        return field, np.stack(gradient, axis=2)
+
+
+def knots(axis: FloatArray, at: FloatArray) -> Knots:
+    """Return the nodes of an axis, shape (K,), around coordinates, shape (N,), both in metres."""
+    low = np.clip(np.searchsorted(axis, at, side="right") - 1, 0, len(axis) - 2)
+    step = axis[low + 1] - axis[low]
+    share = (np.clip(at, axis[0], axis[-1]) - axis[low]) / step
+    slope = np.where((at < axis[0]) | (at > axis[-1]), 0.0, 1 / step)
+    return Knots(
+        np.column_stack([low, low + 1]),
+        np.column_stack([1 - share, share]),
+        np.column_stack([-slope, slope]),
+    )
+
+
+def contracted(
+    corners: FloatArray, along_x: FloatArray, along_y: FloatArray, along_z: FloatArray
+) -> FloatArray:
+    """Return the sum over the corners, shape (N, 2, 2, 2, 3), times weights (N, 2) per axis."""
+    plane = np.einsum("nabci,nc->nabi", corners, along_z)
+    line = np.einsum("nabi,nb->nai", plane, along_y)
+    return np.asarray(np.einsum("nai,na->ni", line, along_x))
+
+
+def lattice_over(cells: Cells, options: BilinearOptions) -> Lattice:
+    """Return values on the nodes of a box around the averages.
+
+    Raises
+    ------
+    MapError
+        If there would be too many nodes.
+    """
+    first = np.floor(cells.points[:, :2].min(axis=0) / options.spacing)
+    counts = np.floor(cells.points[:, :2].max(axis=0) / options.spacing) - first + 2
+    heights = cells.heights
+    nodes = float(counts.prod()) * len(heights)
+    if nodes > MOST_NODES:
+        raise MapError(
+            f"the map's grid has {nodes:.3g} nodes of {options.spacing:g} m, at most "
+            f"{MOST_NODES:,} are allowed; a larger spacing is needed, or are the positions not in "
+            "metres?"
+        )
+    x, y = (
+        options.spacing * (low + np.arange(int(count)))
+        for low, count in zip(first, counts, strict=True)
+    )
+    plane = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    layers = [layer_values(cells, layer, plane, options) for layer in range(len(heights))]
+    if len(layers) == 1:  # a second one like it: the field is the same at all heights
+        heights, layers = heights + np.arange(2), layers * 2
+    return Lattice((x, y, heights), np.stack(layers, axis=1).reshape(len(x), len(y), -1, 3))
+
+
+def layer_values(
+    cells: Cells, layer: int, plane: FloatArray, options: BilinearOptions
+) -> FloatArray:
+    """Return the field at the nodes of one layer in microtesla, shape (K, 3).
+
+    Parameters
+    ----------
+    cells
+        Averages of all layers.
+    layer
+        Which one.
+    plane
+        Nodes in x and y in metres, shape (K, 2).
+    options
+        How far averages reach.
+    """
+    own = cells.layer == layer
+    centre, field = cells.points[own, :2], cells.field[own]
+    _, nearest = cKDTree(cells.points).query(
+        np.column_stack([plane, np.full(len(plane), cells.heights[layer])])
+    )
+    values = cells.field[nearest]
+    away, _ = cKDTree(centre).query(plane)
+    # A cell's diagonal more, so that every node around a point inside is among them.
+    near = away <= options.reach + np.sqrt(2) * options.spacing
+    linear = triangulated(centre, field, plane[near])
+    values[near] = np.where(np.isnan(linear), values[near], linear)
+    return values
+
+
+def triangulated(at: FloatArray, field: FloatArray, plane: FloatArray) -> FloatArray:
+    """Return field (M, 3) at (M, 2) interpolated at the plane's points, NaN outside, (K, 3)."""
+    nothing = np.full((len(plane), 3), np.nan)
+    if len(at) < FEWEST_IN_PLANE:
+        return nothing
+    middle = at.mean(axis=0)  # far from the origin the triangulation would lose digits
+    try:
+        return np.asarray(LinearNDInterpolator(at - middle, field)(plane - middle))
+    except QhullError:  # all on one line
+        return nothing
