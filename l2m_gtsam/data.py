@@ -52,6 +52,10 @@ class Trajectory:
         Name of the reference frame ("map").
     child_frame
         Name of the body frame ("lidar").
+    covariance
+        Covariance of each pose's error, shape (N, 6, 6), or None where it is unknown. The error
+        is a right perturbation in GTSAM's order, ``T_true = T @ Exp(error)``: a rotation in
+        radians, then a translation in metres, both along the axes of the body.
     """
 
     stamp_ns: IntArray
@@ -59,6 +63,7 @@ class Trajectory:
     p: FloatArray
     frame: str
     child_frame: str
+    covariance: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.stamp_ns)

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FieldSeries, FloatArray, IntArray, Recording, Trajectory
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.options import Options
+from l2m_gtsam.pose_covariance import to_ros
 from l2m_gtsam.simulate.sensors import NoiseOptions
 
 NANOSECONDS = 1_000_000_000
@@ -47,7 +48,8 @@ class BagOptions(Options):
     latency_spread: Annotated[float, Field(ge=0)] = 0.001
     """Mean of the random time that is added to it in seconds (exponential)."""
     noise: NoiseOptions = NoiseOptions()
-    """Standard deviations that the messages' covariances state."""
+    """Of it, the standard deviation that the readings' covariances state; poses bring their
+    own."""
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the latencies."""
 
@@ -195,9 +197,7 @@ def _odometry(dialect: _Dialect, trajectory: Trajectory, options: BagOptions) ->
     """Return the poses as odometry whose twist is unknown (all zero)."""
     quaternions = Rotation.from_matrix(trajectory.R).as_quat()
     stamps = trajectory.stamp_ns.tolist()
-    # REP-103 order: x, y, z, then rotations about x, y, z.
-    sigmas = np.repeat([options.noise.position, np.deg2rad(options.noise.rotation)], 3)
-    covariance = np.diag(sigmas**2).ravel()
+    covariance = _stated(trajectory)
     none = dialect.vector(np.zeros(3))
     twist = dialect.make("geometry_msgs/msg/Twist", linear=none, angular=none)
     twist_with_covariance = dialect.make(
@@ -217,12 +217,19 @@ def _odometry(dialect: _Dialect, trajectory: Trajectory, options: BagOptions) ->
             header=dialect.header(index, stamps[index], trajectory.frame),
             child_frame_id=trajectory.child_frame,
             pose=dialect.make(
-                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance
+                "geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance[index]
             ),
             twist=twist_with_covariance,
         )
 
     return _Channel(options.odometry_topic, ODOMETRY, trajectory.stamp_ns, message)
+
+
+def _stated(trajectory: Trajectory) -> FloatArray:
+    """Return the covariances as messages hold them, all zero where unknown, shape (N, 36)."""
+    if trajectory.covariance is None:
+        return np.broadcast_to(np.zeros(36), (len(trajectory), 36))
+    return to_ros(trajectory.covariance, trajectory.R).reshape(-1, 36)
 
 
 def _magnetic_field(dialect: _Dialect, series: FieldSeries, noise: NoiseOptions) -> _Channel:

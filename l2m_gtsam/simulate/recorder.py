@@ -10,6 +10,7 @@ from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Traj
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.simulate.drive import Motion
 from l2m_gtsam.simulate.sensors import (
+    NANOSECONDS,
     NoiseOptions,
     SamplingOptions,
     measured_poses,
@@ -59,7 +60,8 @@ def record(
 ) -> SimulatedDrive:
     """Return what a vehicle records on its drive through a world.
 
-    Every source has its own clock phase and jitter; stamps are the true times of measurement.
+    Every source has its own clock phase and jitter; stamps are the true times of measurement,
+    those of readings less ``SamplingOptions.clock_offset``.
 
     Parameters
     ----------
@@ -102,7 +104,8 @@ def _record_sensor(
             "clearance between route and racks, or place the sensor nearer to the lidar"
         )
     field = read_field(world, poses, sensor, vehicle.noise, rng)
-    return FieldSeries(sensor.sensor, f"/{sensor.sensor}", sensor.sensor, poses.stamp_ns, field)
+    stamp_ns = poses.stamp_ns - round(sampling.clock_offset * NANOSECONDS)
+    return FieldSeries(sensor.sensor, f"/{sensor.sensor}", sensor.sensor, stamp_ns, field)
 
 
 def _digest(trajectory: Trajectory, series: list[FieldSeries]) -> str:

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import numpy as np
 from pydantic import Field
+from scipy.linalg import solve_banded
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, Trajectory
@@ -23,6 +24,9 @@ class NoiseOptions(Options):
     """Standard deviation of a pose's position per axis in metres."""
     rotation: Annotated[float, Field(ge=0)] = 0.05
     """Standard deviation of a pose's rotation per axis in degrees."""
+    pose_correlation: Annotated[float, Field(ge=0)] = 0.0
+    """How long the errors of poses last in seconds: the correlation of two of them falls to 1/e
+    over this time. 0 gives every pose an error of its own."""
 
 
 class ArrayOptions(Options):
@@ -66,6 +70,9 @@ class SamplingOptions(Options):
     """Readings per second of each magnetometer."""
     jitter: Annotated[float, Field(ge=0, lt=0.5)] = 0.1
     """Largest deviation of a stamp from its regular time, as a share of the interval."""
+    clock_offset: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    """How far the magnetometers' clocks are behind the poses' clock in seconds: a reading was
+    taken at its stamp plus this."""
 
 
 def random_array(options: ArrayOptions, rng: np.random.Generator) -> tuple[KnownSensor, ...]:
@@ -158,11 +165,53 @@ def sensor_points(poses: Trajectory, sensor: KnownSensor) -> FloatArray:
 
 
 def measured_poses(poses: Trajectory, noise: NoiseOptions, rng: np.random.Generator) -> Trajectory:
-    """Return poses as odometry would report them: true ones with white noise."""
-    turn = rng.normal(0.0, np.deg2rad(noise.rotation), (len(poses), 3))
-    shift = rng.normal(0.0, noise.position, (len(poses), 3))
+    """Return poses as odometry would report them, and their covariances.
+
+    Parameters
+    ----------
+    poses
+        True poses.
+    noise
+        Errors of the rotation about the lidar's axes and of the position along the map's axes.
+    rng
+        Source of randomness.
+    """
+    sigmas = np.deg2rad(noise.rotation), noise.position
+    white = [rng.normal(0.0, sigma, (len(poses), 3)) for sigma in sigmas]
+    turn, shift = (lasting(part, poses.stamp_ns, noise.pose_correlation) for part in white)
     R = poses.R @ Rotation.from_rotvec(turn).as_matrix()
-    return Trajectory(poses.stamp_ns, R, poses.p + shift, poses.frame, poses.child_frame)
+    # The same along all axes, and so the same in every frame.
+    covariance = np.tile(np.diag(np.repeat(sigmas, 3) ** 2), (len(poses), 1, 1))
+    return Trajectory(
+        poses.stamp_ns, R, poses.p + shift, poses.frame, poses.child_frame, covariance
+    )
+
+
+def lasting(white: FloatArray, stamp_ns: IntArray, correlation: float) -> FloatArray:
+    """Return noise that lasts: a stationary Ornstein-Uhlenbeck process at irregular times.
+
+    Parameters
+    ----------
+    white
+        Independent values, shape (N, K); the process has their variance.
+    stamp_ns
+        Times in nanoseconds, ascending, shape (N,).
+    correlation
+        Time in seconds over which the correlation falls to 1/e; 0 returns ``white``.
+
+    Returns
+    -------
+    Shape (N, K).
+    """
+    if correlation == 0:
+        return white
+    lapse = np.diff(stamp_ns) / (NANOSECONDS * correlation)
+    fresh = np.ones(len(white))
+    fresh[1:] = np.sqrt(-np.expm1(-2 * lapse))
+    # x[k] - exp(-lapse[k]) x[k - 1] = fresh[k] white[k], all k at once
+    bands = np.ones((2, len(white)))
+    bands[1, :-1] = -np.exp(-lapse)
+    return np.asarray(solve_banded((1, 0), bands, fresh[:, None] * white))
 
 
 def _random_places(options: ArrayOptions, rng: np.random.Generator) -> FloatArray:

@@ -9,6 +9,7 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import FieldSeries, IntArray, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
+from l2m_gtsam.pose_covariance import moved
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.messages import (
@@ -147,7 +148,8 @@ def _add_pose(buffers: Buffers, message: Message, options: BagOptions) -> None:
     if ends not in buffers.poses:
         buffers.poses[ends] = PoseBuffer(*ends)
     buffer = buffers.poses[ends]
-    buffer.add(_stamp(message, content, options), pose.position, pose.orientation)
+    stamp = _stamp(message, content, options)
+    buffer.add(stamp, pose.position, pose.orientation, pose.covariance)
 
 
 def _add_transforms(buffers: Buffers, message: Message, options: BagOptions) -> None:
@@ -172,12 +174,13 @@ def _trajectory(path: Path, buffers: Buffers, options: BagOptions) -> Trajectory
     except ValueError as error:
         raise BagError(f"{path}: poses: {error}") from error
     _check_stamps(path, "poses", tracked.stamp_ns)
-    fixed = options.tracked_to_lidar.rigid()
+    fixed, covariance = options.tracked_to_lidar.rigid(), tracked.covariance
     return replace(
         tracked,
         R=tracked.R @ fixed.R,
         p=tracked.R @ fixed.t + tracked.p,
         frame=options.frame or tracked.frame,
+        covariance=None if covariance is None else moved(covariance, fixed),
     )
 
 
@@ -189,8 +192,7 @@ def _single(path: Path, buffers: Buffers) -> Trajectory:
         ends = ", ".join(f"{parent} > {child}" for parent, child in sorted(buffers.poses)[:10])
         raise BagError(f"{path}: the topic of the poses must track one body, it tracks: {ends}")
     (buffer,) = buffers.poses.values()
-    link = buffer.link()
-    return Trajectory(link.stamp_ns, link.R, link.p, link.parent, link.child)
+    return buffer.trajectory()
 
 
 def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:

@@ -10,6 +10,7 @@ from rosbags.interfaces import Connection
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
+from l2m_gtsam.storage.covariances import CovarianceBuffer
 from l2m_gtsam.storage.messages import (
     FIELD_TYPE,
     POSE_TYPES,
@@ -79,6 +80,7 @@ class _Collected:
     stamps: StampBuffer = field(default_factory=StampBuffer)
     frames: set[str] = field(default_factory=set)
     readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
+    covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
 
 
 def inspect_bag(path: Path, options: BagOptions, progress: Progress | None = None) -> BagReport:
@@ -176,6 +178,8 @@ def _collect(into: _Collected, content: Any, msgtype: str, record_ns: int) -> No
         into.frames.add(stamped.header.frame_id)
     if msgtype == FIELD_TYPE:
         into.readings.add(record_ns, content.magnetic_field)
+    if msgtype in POSE_TYPES and (pose := POSE_TYPES[msgtype](content)).covariance is not None:
+        into.covariances.add(pose.covariance)
 
 
 def _report(
@@ -188,6 +192,8 @@ def _report(
 ) -> TopicReport:
     msgtype = connections[0].msgtype
     found = found or _Collected()
+    if use and len(found.covariances.row):
+        use = f"{use}, {found.covariances.account()}"
     header, record = found.stamps.header(), found.stamps.record()
     gaps = np.diff(np.unique(header)).astype(np.float64) * 1e-9
     count = sum(c.msgcount for c in connections)

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray, Trajectory
+from l2m_gtsam.pose_covariance import from_ros
+from l2m_gtsam.storage.covariances import CovarianceBuffer
 from l2m_gtsam.storage.tf import Link
 
 FIELD_TYPE = "sensor_msgs/msg/MagneticField"
@@ -18,21 +20,22 @@ TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")
 
 @dataclass(frozen=True)
 class RawPose:
-    """A pose as it stands in a message."""
+    """A pose as it stands in a message; types without a covariance have None for it."""
 
     position: Any
     orientation: Any
     child_frame: str
+    covariance: Any = None
 
 
 # Types that carry poses, in the order of preference when a bag has several.
 POSE_TYPES: dict[str, Callable[[Any], RawPose]] = {
     "nav_msgs/msg/Odometry": lambda m: RawPose(
-        m.pose.pose.position, m.pose.pose.orientation, m.child_frame_id
+        m.pose.pose.position, m.pose.pose.orientation, m.child_frame_id, m.pose.covariance
     ),
     "geometry_msgs/msg/PoseStamped": lambda m: RawPose(m.pose.position, m.pose.orientation, ""),
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: RawPose(
-        m.pose.pose.position, m.pose.pose.orientation, ""
+        m.pose.pose.position, m.pose.pose.orientation, "", m.pose.covariance
     ),
     "geometry_msgs/msg/TransformStamped": lambda m: RawPose(
         m.transform.translation, m.transform.rotation, m.child_frame_id
@@ -99,12 +102,27 @@ class PoseBuffer:
     static: bool = False
     stamp_ns: "array[int]" = field(default_factory=lambda: array("q"))
     values: "array[float]" = field(default_factory=lambda: array("d"))
+    covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
 
-    def add(self, stamp_ns: int, position: Any, orientation: Any) -> None:
+    def add(self, stamp_ns: int, position: Any, orientation: Any, covariance: Any = None) -> None:
         """Append one pose."""
         p, q = position, orientation
         self.stamp_ns.append(stamp_ns)
         self.values.extend((p.x, p.y, p.z, q.x, q.y, q.z, q.w))
+        self.covariances.add(covariance)
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses of ``link`` with their covariances, if all of them have a usable one.
+
+        Raises
+        ------
+        ValueError
+            As in ``link``.
+        """
+        link = self.link()
+        stated = self.covariances.at(self._used())
+        covariance = None if stated is None else from_ros(stated, link.R)
+        return Trajectory(link.stamp_ns, link.R, link.p, link.parent, link.child, covariance)
 
     def link(self) -> Link:
         """Return the finite poses in order of time, the first of each stamp.
@@ -114,13 +132,8 @@ class PoseBuffer:
         ValueError
             An orientation has no direction (all zero), or no pose is finite.
         """
-        rows = np.array(self.values, dtype=np.float64).reshape(-1, 7)
-        stamps = np.array(self.stamp_ns, dtype=np.int64)
-        finite = np.isfinite(rows).all(axis=1)
-        if not finite.any():
-            raise ValueError("no pose is finite")
-        stamps, first = np.unique(stamps[finite], return_index=True)
-        rows = rows[finite][first]
+        used = self._used()
+        stamps, rows = np.array(self.stamp_ns, dtype=np.int64)[used], self._rows()[used]
         length = np.linalg.norm(rows[:, 3:], axis=1)
         if np.any(length < 1e-6):
             raise ValueError("an orientation is all zero, it must be a unit quaternion")
@@ -128,3 +141,15 @@ class PoseBuffer:
         if self.static:  # the last one published holds, whenever
             return Link(self.frame, self.child_frame, stamps[:0], R[-1:], rows[-1:, :3])
         return Link(self.frame, self.child_frame, stamps, R, rows[:, :3])
+
+    def _used(self) -> IntArray:
+        """Return the indices of the finite poses in order of time, the first of each stamp."""
+        finite = np.flatnonzero(np.isfinite(self._rows()).all(axis=1))
+        if not len(finite):
+            raise ValueError("no pose is finite")
+        _, first = np.unique(np.array(self.stamp_ns, dtype=np.int64)[finite], return_index=True)
+        return finite[first]
+
+    def _rows(self) -> FloatArray:
+        """Return positions and quaternions as they were written, shape (N, 7)."""
+        return np.array(self.values, dtype=np.float64).reshape(-1, 7)

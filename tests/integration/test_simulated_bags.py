@@ -1,6 +1,6 @@
 """Simulated recordings, written as bags of three kinds, read back through rosbags."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
@@ -20,6 +20,8 @@ from l2m_gtsam.simulate.recorder import SimulatedDrive
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
+from l2m_gtsam.storage.bag import read_trajectory
+from l2m_gtsam.storage.bag_options import BagOptions as ReadOptions
 
 KINDS = list(BagKind)
 
@@ -91,8 +93,7 @@ def test_readings_come_back(tmp_path: Path, drive: SimulatedDrive, kind: BagKind
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_poses_come_back(tmp_path: Path, drive: SimulatedDrive, kind: BagKind) -> None:
-    noise = NoiseOptions(position=0.004, rotation=0.2)
-    write_bag(bag_path(tmp_path, kind), kind, drive.recording, BagOptions(noise=noise))
+    write_bag(bag_path(tmp_path, kind), kind, drive.recording)
     messages = read_topics(bag_path(tmp_path, kind))["/odometry"]
     trajectory = drive.recording.trajectory
     np.testing.assert_array_equal(stamps(messages), trajectory.stamp_ns)
@@ -103,9 +104,38 @@ def test_poses_come_back(tmp_path: Path, drive: SimulatedDrive, kind: BagKind) -
     np.testing.assert_allclose(R, trajectory.R, rtol=0, atol=1e-14)
     first = messages[0].content
     assert (first.header.frame_id, first.child_frame_id) == ("map", "lidar")
-    sigmas = np.sqrt(np.diag(first.pose.covariance.reshape(6, 6)))
-    # Rounding of a square and its root.
-    np.testing.assert_allclose(sigmas, [0.004] * 3 + [np.deg2rad(0.2)] * 3, rtol=1e-12)
+    covariance = first.pose.covariance.reshape(6, 6)
+    # The default noise, alike along all axes; rounding of a square and of two rotations.
+    sigmas = [NoiseOptions().position] * 3 + [np.deg2rad(NoiseOptions().rotation)] * 3
+    np.testing.assert_allclose(covariance, np.diag(np.square(sigmas)), rtol=1e-12, atol=1e-20)
+
+
+def uneven(trajectory: Trajectory) -> Trajectory:
+    """Poses whose errors differ along all axes, are correlated and grow."""
+    root = np.tril(np.random.default_rng(7).normal(size=(6, 6)))
+    scale = np.array([1e-3] * 3 + [5e-3] * 3)
+    growth = np.linspace(1, 2, len(trajectory))[:, None, None]
+    return replace(trajectory, covariance=growth * (root @ root.T) * np.outer(scale, scale))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_covariances_come_back(tmp_path: Path, drive: SimulatedDrive, kind: BagKind) -> None:
+    path = bag_path(tmp_path, kind)
+    trajectory = uneven(drive.recording.trajectory)
+    write_bag(path, kind, replace(drive.recording, trajectory=trajectory))
+    found = read_trajectory(path, ReadOptions())
+    assert found.covariance is not None
+    assert trajectory.covariance is not None
+    # Rotated there and back: a few roundings of entries up to 2e-4 (m^2).
+    np.testing.assert_allclose(found.covariance, trajectory.covariance, rtol=0, atol=1e-17)
+
+
+def test_unknown_covariances_are_written_as_zero(tmp_path: Path, drive: SimulatedDrive) -> None:
+    trajectory = replace(drive.recording.trajectory, covariance=None)
+    write_bag(tmp_path / "drive", BagKind.MCAP, replace(drive.recording, trajectory=trajectory))
+    for message in read_topics(tmp_path / "drive")["/odometry"]:
+        assert not message.content.pose.covariance.any()
+    assert read_trajectory(tmp_path / "drive", ReadOptions()).covariance is None
 
 
 @pytest.mark.parametrize("kind", KINDS)

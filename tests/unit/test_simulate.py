@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.recorder import SimulatedDrive
@@ -18,6 +19,8 @@ from l2m_gtsam.simulate.sensors import (
     NoiseOptions,
     SamplingOptions,
     SuiteOptions,
+    lasting,
+    measured_poses,
     random_array,
     sample_stamps,
 )
@@ -119,6 +122,74 @@ def test_pose_noise_is_as_stated(scenario: Scenario) -> None:
     within = 4 / np.sqrt(2 * shift.size)
     assert shift.std() == pytest.approx(noise.position, rel=within)
     assert np.rad2deg(angles.std()) == pytest.approx(noise.rotation, rel=within)
+
+
+def still(stamp_ns: IntArray) -> Trajectory:
+    """Return poses of a vehicle that stands turned by 0.5 rad at (1, 2, 3) m."""
+    count = len(stamp_ns)
+    R = Rotation.from_rotvec(np.tile([0.0, 0.0, 0.5], (count, 1))).as_matrix()
+    return Trajectory(stamp_ns, R, np.tile([1.0, 2.0, 3.0], (count, 1)), "map", "lidar")
+
+
+def test_without_correlation_a_seed_gives_the_poses_that_it_always_gave() -> None:
+    noise, true = NoiseOptions(), still(np.arange(50) * 10_000_000)
+    found = measured_poses(true, noise, np.random.default_rng(5))
+    again = np.random.default_rng(5)
+    turn = again.normal(0.0, np.deg2rad(noise.rotation), (50, 3))
+    shift = again.normal(0.0, noise.position, (50, 3))
+    R = true.R @ Rotation.from_rotvec(turn).as_matrix()
+    assert found.R.tobytes() == R.tobytes()
+    assert found.p.tobytes() == (true.p + shift).tobytes()
+
+
+def test_stated_covariances_are_those_of_the_errors() -> None:
+    """Errors as documented, ``T_true = T @ Exp(error)``, whitened by what is stated."""
+    true = still(np.arange(4000) * 10_000_000)
+    for correlation in (0.0, 0.05):
+        noise = NoiseOptions(position=0.02, rotation=0.5, pose_correlation=correlation)
+        found = measured_poses(true, noise, np.random.default_rng(6))
+        back = found.R.swapaxes(1, 2)
+        turn = Rotation.from_matrix(back @ true.R).as_rotvec()
+        shift = np.einsum("nij,nj->ni", back, true.p - found.p)
+        assert found.covariance is not None
+        error = np.hstack([turn, shift])
+        spread = np.einsum("ni,nij,nj->n", error, np.linalg.inv(found.covariance), error)
+        # A mean of chi-square of 6, whose variance is 12, over 4000 poses; correlated squares
+        # count 1 / tanh(0.01 / 0.05) = 5.1 times. Five standard deviations.
+        within = 5 * np.sqrt(12 / 4000 * (5.1 if correlation else 1.0))
+        assert spread.mean() == pytest.approx(6.0, abs=within)
+
+
+def test_lasting_noise_is_the_recursion_step_by_step() -> None:
+    rng = np.random.default_rng(8)
+    stamps = np.cumsum(rng.integers(1_000, 900_000_000, 60))
+    white = rng.normal(size=(60, 3))
+    slow = [white[0]]
+    for k in range(1, 60):
+        keep = np.exp(-(stamps[k] - stamps[k - 1]) * 1e-9 / 0.4)
+        slow.append(keep * slow[-1] + np.sqrt(1 - keep**2) * white[k])
+    # Rounding of values around 1; 1 - keep^2 loses six digits of sixteen in the shortest step.
+    np.testing.assert_allclose(lasting(white, stamps, 0.4), slow, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(lasting(white, stamps, 0.0), white)
+
+
+def test_lasting_noise_is_stationary_with_the_stated_correlation() -> None:
+    """All of it is linear in the white noise: its covariance in closed form."""
+    stamps = np.cumsum(np.random.default_rng(9).integers(1_000_000, 900_000_000, 40))
+    response = lasting(np.eye(40), stamps, 0.3)
+    apart = np.abs(stamps[:, None] - stamps) * 1e-9
+    # Rounding of sums of forty products.
+    np.testing.assert_allclose(response @ response.T, np.exp(-apart / 0.3), rtol=0, atol=1e-13)
+
+
+def test_a_clock_that_is_behind_stamps_early(scenario: Scenario) -> None:
+    sampling = SamplingOptions(field_rate=10.0, pose_rate=10.0, clock_offset=0.025)
+    options = ScenarioOptions(seed=3, **{**SMALL, "calibration_sampling": sampling})
+    late, plain = simulate(options).calibration, scenario.calibration
+    np.testing.assert_array_equal(late.recording.trajectory.p, plain.recording.trajectory.p)
+    for ours, theirs in zip(late.recording.series, plain.recording.series, strict=True):
+        np.testing.assert_array_equal(ours.stamp_ns + 25_000_000, theirs.stamp_ns)
+        np.testing.assert_array_equal(ours.field, theirs.field)
 
 
 def test_distortion_is_positive_times_the_mounting_rotation() -> None:

@@ -1,0 +1,54 @@
+"""Covariances of poses: from the order and axes of ROS to those of GTSAM, and to another body.
+
+ROS has the order (x, y, z, rx, ry, rz) and the axes of the header's frame: the position is wrong
+by a vector given there, and the body is turned about its own origin by a rotation vector given
+there, ``p_true = p + dp`` and ``R_true = Exp(dr) @ R``. A right perturbation (w, v) of GTSAM has
+the order (rotation, translation) and the axes of the body, ``R_true = R @ Exp(w)`` and, to first
+order, ``p_true = p + R @ v``. Hence ``w = R.T @ dr`` and ``v = R.T @ dp``.
+"""
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, RigidTransform
+
+
+def from_ros(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Return covariances of right perturbations, as in ``Trajectory``.
+
+    Parameters
+    ----------
+    covariance
+        As in ROS messages, rad and m, shape (N, 6, 6).
+    R
+        Rotations from body to header frame, shape (N, 3, 3).
+    """
+    return _exchanged(covariance, R.swapaxes(1, 2))
+
+
+def to_ros(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Return covariances as in ROS messages, shape (N, 6, 6); undoes ``from_ros``."""
+    return _exchanged(covariance, R)
+
+
+def moved(covariance: FloatArray, T_body_other: RigidTransform) -> FloatArray:
+    """Return the covariances of another body that is fixed to the first.
+
+    Parameters
+    ----------
+    covariance
+        Covariances of right perturbations of the first body's poses, shape (N, 6, 6).
+    T_body_other
+        The other body in the first one's frame.
+    """
+    # T Exp(error) T_body_other = T T_body_other Exp(adjoint @ error)
+    R, t = T_body_other.R, T_body_other.t
+    lever = np.cross(np.eye(3), t)  # the matrix [t]x
+    adjoint = np.block([[R.T, np.zeros((3, 3))], [-R.T @ lever, R.T]])
+    return np.asarray(adjoint @ covariance @ adjoint.T)
+
+
+def _exchanged(covariance: FloatArray, turn: FloatArray) -> FloatArray:
+    """Turn each of the four blocks by ``turn``, shape (N, 3, 3), and exchange the halves."""
+    blocks = covariance.reshape(-1, 2, 3, 2, 3).swapaxes(2, 3)[:, ::-1, ::-1]
+    by = turn[:, None, None]
+    return np.asarray((by @ blocks @ by.swapaxes(3, 4)).swapaxes(2, 3).reshape(-1, 6, 6))
