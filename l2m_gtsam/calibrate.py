@@ -23,6 +23,7 @@ from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.prepare import prepare
 from l2m_gtsam.results import (
     CalibrationResult,
     FoundStart,
@@ -33,7 +34,7 @@ from l2m_gtsam.results import (
 from l2m_gtsam.solve.disagreement import disagreements
 from l2m_gtsam.solve.explain import Movement, movement
 from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
-from l2m_gtsam.sync import stuck_sensors, synchronise
+from l2m_gtsam.sync import stuck_sensors
 
 # A Newton step of a tenth of a standard deviation would still be worth taking.
 CONVERGED_SIGMAS = 0.1
@@ -77,14 +78,12 @@ def calibrate(
     CalibrationError
         No sensor can be solved: the map does not cover the drive, or nothing was read.
     """
-    synchronised = synchronise(recording, options.sync, options.solve.largest_offset_s)
+    synchronised = prepare(recording, options)
     stuck = stuck_sensors(synchronised.readings)
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     found = _starts(alive, solver_map, options, progress)
     t_start = _start_places(alive.sensors, found, options)
-    if not options.solve.largest_offset_s:
-        alive = replace(alive, motion=None)
     poses = recording.trajectory
     solution = solve_one_key(alive, solver_map, t_start, options.solve, progress, poses)
     told = explained(alive, solver_map, t_start, solution, options.solve)
@@ -259,7 +258,7 @@ def _solved(
         t_lidar_mag=solution.estimate.t[found.sensor],
         distortion=distortion,
         R_lidar_mag=np.ascontiguousarray(rotation.R_mag_lidar.T),
-        covariance=found.covariance[:15, :15],
+        covariance=found.covariance,
         rotation_covariance=rotation.covariance,
         noise=float(solution.estimate.noise[found.sensor]),
         residuals=found.figures,
@@ -271,11 +270,12 @@ def _solved(
 
 
 def _time_offset(told: Explained, solution: OneKeySolution) -> TimeOffset:
-    covariance = told.solution.covariance
+    found = told.solution
     return TimeOffset(
-        seconds=float(solution.estimate.offset[told.solution.sensor]),
-        sigma=float(np.sqrt(covariance[15, 15])),
-        cross_covariance=covariance[:15, 15],
+        # Added zero turns -0.0 into 0.0.
+        seconds=float(solution.estimate.offset[found.sensor]) + 0.0,
+        sigma=found.offset_sigma,
+        cross_covariance=found.offset_covariance,
         held=told.held,
     )
 
@@ -289,7 +289,7 @@ def _verdict(
     if abs(solution.estimate.offset[found.sensor]) >= options.largest_offset_s > 0:
         return SensorStatus.NOT_CONVERGED, (
             f"its clock seems to be off by {options.largest_offset_s:g} s or more: correct its "
-            "stamps, or raise `calibration.solve.largest_offset_s`"
+            f"stamps, or raise `calibration.solve.largest_offset_s`{because}"
         )
     if not solution.settled:
         return SensorStatus.NOT_CONVERGED, (

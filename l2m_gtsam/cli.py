@@ -152,7 +152,7 @@ def calibrate(
     """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
     from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
     from l2m_gtsam.config import load_config, with_uncertainty
-    from l2m_gtsam.qa.tables import calibration_table, disagreement_note
+    from l2m_gtsam.qa.tables import calibration_table, disagreement_note, held_clocks_note
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
@@ -162,6 +162,8 @@ def calibrate(
     typer.echo(UNCERTAINTY[result.uncertainty])
     _warn(result.doubts)
     _warn([disagreement_note(each) for each in result.disagreements])
+    if held := held_clocks_note(result):
+        typer.echo(held)
     typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
 
 
@@ -186,13 +188,15 @@ def plan(
     """
     from l2m_gtsam.batch.drives import plan_bag
     from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.plan_tables import advice, motion_table, plan_table
+    from l2m_gtsam.qa.plan_tables import advice, held_plan_note, motion_table, plan_table
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen, places = load_config(config), [_place(text) for text in at or []]
     with _progress() as progress:
         found = plan_bag(bag, map_path, chosen, places, progress)
     _print(plan_table(found))
+    if held := held_plan_note(found):
+        typer.echo(held)
     _print(motion_table(found))
     typer.echo(advice(found))
     typer.echo(UNCERTAINTY[found.uncertainty])

@@ -151,6 +151,9 @@ class Readings:
         Measured field in the sensor's frame in microtesla, finite, shape (N, 3).
     motion
         How the lidar moves there, if that is known: without it no time offset can be.
+    pose_root
+        Square roots L of the covariances of the poses' errors, ``true = measured Exp(L u)``, in the
+        lidar frame, rotation (rad) before translation (m), shape (N, 6, 6); absent for exact poses.
     """
 
     sensors: tuple[str, ...]
@@ -160,6 +163,7 @@ class Readings:
     p_map_lidar: FloatArray
     field: FloatArray
     motion: PoseMotion | None = None
+    pose_root: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.sensor)
@@ -173,6 +177,7 @@ class Readings:
             self.p_map_lidar[rows],
             self.field[rows],
             None if self.motion is None else self.motion[rows],
+            None if self.pose_root is None else self.pose_root[rows],
         )
 
     def select(self, keep: BoolArray) -> "Readings":

@@ -24,13 +24,14 @@ from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.motion import Motion, extra_motions, loop, places_around, strongest
+from l2m_gtsam.prepare import prepare
 from l2m_gtsam.results import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
 from l2m_gtsam.solve.rotation import polar_rotation
-from l2m_gtsam.sync import synchronise
 
 NANOSECONDS = 1e9
+BREAK_NS = 60_000_000_000  # between a drive and a motion that is added to it
 UNKNOWN = np.diag(np.full(len(PARAMETERS), np.inf))
 NOISE_FACT = "noise of a reading (uT)"  # of the summary of maps that learn it
 
@@ -63,7 +64,7 @@ class Task:
     def worst(self, readings: Readings) -> Worst:
         """Return what would be known least of a sensor by itself."""
         solved = self.forecast(readings).solved
-        covariance = solved[0].covariance[:15, :15] if solved else UNKNOWN
+        covariance = solved[0].covariance if solved else UNKNOWN
         return worst(readings.sensors[0], covariance, self.options.solve.rank)
 
     def of(self, sensor: int) -> "Task":
@@ -102,10 +103,8 @@ def plan(
         The map does not cover the drive, or a place is given for an unknown sensor.
     """
     tell = progress or (lambda stage, fraction: None)
-    synchronised = synchronise(recording, options.sync, options.solve.largest_offset_s)
+    synchronised = prepare(recording, options)
     readings = synchronised.readings
-    if not options.solve.largest_offset_s:
-        readings = replace(readings, motion=None)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     noise = _noise(field_map, options, planning)
     task = Task(solver_map, _places(readings.sensors, options), noise, options)
@@ -161,7 +160,8 @@ def only(readings: Readings, sensor: int) -> Readings:
 
 def with_motion(readings: Readings, motion: Motion) -> Readings:
     """Return the readings of a drive to which a motion is added: one per sensor and pose."""
-    S, K, moving = len(readings.sensors), len(motion.p), None
+    S, K, moving, roots = len(readings.sensors), len(motion.p), None, readings.pose_root
+    later = BREAK_NS + np.round(NANOSECONDS * motion.seconds).astype(np.int64)
     if readings.motion is not None:
         twist = np.concatenate([readings.motion.twist_lidar, np.tile(motion.twist, (S, 1))])
         moving = PoseMotion(twist, np.zeros(len(twist)))
@@ -169,11 +169,12 @@ def with_motion(readings: Readings, motion: Motion) -> Readings:
     joined = Readings(
         readings.sensors,
         sensor,
-        np.concatenate([readings.stamp_ns, np.zeros(S * K, dtype=np.int64)]),
+        np.concatenate([readings.stamp_ns, np.tile(readings.stamp_ns.max() + later, S)]),
         np.concatenate([readings.R_map_lidar, np.tile(motion.R, (S, 1, 1))]),
         np.concatenate([readings.p_map_lidar, np.tile(motion.p, (S, 1))]),
         np.concatenate([readings.field, np.zeros((S * K, 3))]),
         moving,
+        None if roots is None else np.concatenate([roots, np.tile(roots[:1], (S * K, 1, 1))]),
     )
     return joined[np.argsort(sensor, kind="stable")]
 
@@ -235,7 +236,7 @@ def _sensor_plans(
         if index in solved:
             covariance, words = _foretold(solved[index], found, task)
             held = held_offset(solved[index].determinacy)
-            late = float(np.sqrt(covariance[15, 15]))
+            late = solved[index].offset_sigma
         else:
             covariance = UNKNOWN
             words = (_too_few(counts, inside, moved, task.options.solve.min_readings),)
@@ -245,7 +246,7 @@ def _sensor_plans(
                 t_lidar_mag=task.t[index],
                 readings=inside,
                 outside_map=int(outside[index]),
-                covariance=covariance[:15, :15],
+                covariance=covariance,
                 rotation_covariance=polar_rotation(np.eye(3), covariance[3:12, 3:12]).covariance,
                 undetermined=words,
                 offset_sigma=late,

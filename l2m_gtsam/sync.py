@@ -38,7 +38,7 @@ class SyncOptions(Options):
 # Readings that vary less than this are stuck: a moving magnetometer's noise alone is larger.
 STUCK_UT = 1e-3
 # Velocities are taken over this time: between two poses their noise would be a large part.
-TWIST_S = 0.2
+TWIST_S = 0.1
 
 
 def synchronise(

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, Readings
+from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, Readings, Trajectory
 from tests.steel import HALF_AREA, SteelHall
 
 CLEARANCE_M = 0.4  # of every reading to posts and racks, horizontally
@@ -52,15 +52,29 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class CalibrationDrive:
-    """A drive with readings of sensors whose truth is known."""
+    """A drive with readings of sensors whose truth is known.
+
+    Attributes
+    ----------
+    readings
+        With the poses that are known.
+    sensors
+        The truth.
+    trajectory
+        All poses that are known.
+    offset
+        Time offsets of the sensors in seconds, shape (S,).
+    """
 
     readings: Readings
     sensors: tuple[KnownSensor, ...]
+    trajectory: Trajectory
+    offset: FloatArray
 
     def truth(self) -> FloatArray:
-        """Return t, C row by row and H of every sensor, shape (S, 15)."""
+        """Return t, C row by row, H and time offset of every sensor, shape (S, 16)."""
         rows = [np.concatenate([s.t_lidar_mag, s.distortion.vector()]) for s in self.sensors]
-        return np.stack(rows)
+        return np.column_stack([np.stack(rows), self.offset])
 
 
 @dataclass(frozen=True)
@@ -135,7 +149,9 @@ def calibration_drive(
         path.p[row],
         field,
     )
-    return CalibrationDrive(readings, mounted)
+    stamps = STEP_NS * np.arange(len(path.p))
+    trajectory = Trajectory(stamps, path.R, path.p, "map", "lidar")
+    return CalibrationDrive(readings, mounted, trajectory, np.zeros(sensors))
 
 
 def _pass(

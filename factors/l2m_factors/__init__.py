@@ -2,12 +2,18 @@
 
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.field_map import FieldMap
-from l2m_factors.keys import D, M, S, T
-from l2m_factors.map_weights import map_weights_prior, uncertain_block_factor
+from l2m_factors.keys import D, M, P, S, T
 from l2m_factors.motion import PoseMotion, moved
 from l2m_factors.priors import distortion_prior, held_directions
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
+from l2m_factors.shared_errors import (
+    SharedError,
+    map_weights_prior,
+    pose_errors_prior,
+    shared_error,
+    uncertain_block_factor,
+)
 
 __all__ = [
     "BatchedReadings",
@@ -15,9 +21,11 @@ __all__ = [
     "FieldMap",
     "M",
     "MagneticReadings",
+    "P",
     "PoseMotion",
     "ReadingResiduals",
     "S",
+    "SharedError",
     "T",
     "assert_jacobians_match",
     "block_factor",
@@ -25,7 +33,9 @@ __all__ = [
     "held_directions",
     "map_weights_prior",
     "moved",
+    "pose_errors_prior",
     "reading_factor",
     "reading_residuals",
+    "shared_error",
     "uncertain_block_factor",
 ]

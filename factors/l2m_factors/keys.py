@@ -21,3 +21,8 @@ def S(sensor: int) -> int:
 def M(tile: int) -> int:
     """Return the key of the map's error in this tile: Vector of its modes, unit variance each."""
     return int(gtsam.symbol("M", tile))
+
+
+def P(knot: int) -> int:
+    """Return the key of the lidar's pose error at this knot: Vector 6, unit variance each."""
+    return int(gtsam.symbol("P", knot))

@@ -13,6 +13,7 @@ from l2m_gtsam.graph.calibration import Estimate, FactorForm, batch_readings, re
 from l2m_gtsam.graph.optimise import Optimizer, optimise
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.options import Options
+from l2m_gtsam.pose_noise import PoseNoiseOptions
 from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.closed_form import (
     ClosedFormOptions,
@@ -64,6 +65,9 @@ class OneKeyOptions(Options):
     largest_offset_s: float = Field(default=0.25, ge=0, le=10)
     """How far a sensor's clock may be off the lidar's, seconds. The time offset is part of the
     solve where the drive tells it from the position; 0 takes all clocks for one."""
+    pose_noise: PoseNoiseOptions = PoseNoiseOptions()
+    """How wrong the lidar's poses are. With `uncertainty: independent` each reading has a pose
+    error of its own."""
     robust: RobustOptions = RobustOptions()
     """What becomes of readings that the map and one distortion cannot explain."""
     rank: RankOptions = RankOptions()

@@ -2,16 +2,16 @@ r"""Solving the linear graph of sensors and map weights, block by block.
 
 Each sensor's sixteen parameters are eliminated by QR ``X = Q R`` of the rows ``X x + E beta = b``
 that touch it, which does not mind directions of very different strength. What remains speaks of
-the map's weights alone; their prior has unit variance, so that a Cholesky factor of their
-information is safe:
+the shared weights alone, those of the map's error and of the poses'; their prior has unit variance,
+so that a Cholesky factor of their information is safe:
 
 .. math::
     R_s \delta_s + S_s \beta = d_s, \quad S_s = Q_s^T E_s, \quad
     \Lambda = \Lambda_0 + \sum_s (E_s^T E_s - S_s^T S_s), \quad
     \mathrm{cov}(\delta_s) = R_s^{-1} (I + S_s \Lambda^{-1} S_s^T) R_s^{-T}
 
-A reading touches the weights of one tile, so that ``E^T E`` is made of small blocks. GTSAM's own
-sequential QR gives the same, but fills in and knows nothing of BLAS: it is far slower.
+A reading touches the weights of one tile and two knots, so that ``E^T E`` is made of small blocks.
+GTSAM's own sequential QR gives the same, but fills in and knows nothing of BLAS: it is far slower.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from l2m_factors import D, M, S, T
+from l2m_factors import D, S, T
 from l2m_gtsam.data import FloatArray, IntArray
 
 SENSOR = 16  # parameters of a sensor: t, C row by row, H, time offset
@@ -39,7 +39,7 @@ class Block:
 
 @dataclass(frozen=True)
 class SensorRows:
-    """Conditional of one sensor given the map's weights: ``R x + S beta = d``.
+    """Conditional of one sensor given the shared weights: ``R x + S beta = d``.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Eliminated:
     sensors
         Conditional of each sensor.
     factor
-        Cholesky factor of the information of the map's weights, lower triangular, shape (K, K).
+        Cholesky factor of the information of the shared weights, lower triangular, shape (K, K).
     beta
         Their step, shape (K,).
     """
@@ -90,7 +90,7 @@ class Eliminated:
 
     @cached_property
     def covariance_of_weights(self) -> FloatArray:
-        """Covariance of the map's weights, shape (K, K)."""
+        """Covariance of the shared weights, shape (K, K)."""
         return np.asarray(cho_solve((self.factor, True), np.eye(len(self.factor))))
 
     def taken(self, sensor: int) -> float:
@@ -113,14 +113,14 @@ class Eliminated:
         return np.asarray(np.eye(SENSOR) + half.T @ half)
 
     def stepped(self, values: gtsam.Values, sizes: dict[int, int]) -> gtsam.Values:
-        """Return values moved by the step; ``sizes`` are those of the tiles' weights."""
+        """Return values moved by the step; ``sizes`` are those of the shared weights, by key."""
         delta = gtsam.VectorValues()
         for sensor in self.sensors:
             step = self.step(sensor)
-            for key, at in PLACES.items():
-                delta.insert(key(sensor), step[at])
-        for tile, columns in tile_columns(sizes).items():
-            delta.insert(M(tile), self.beta[columns])
+            for variable, at in PLACES.items():
+                delta.insert(variable(sensor), step[at])
+        for key, columns in weight_columns(sizes).items():
+            delta.insert(key, self.beta[columns])
         return values.retract(delta)
 
 
@@ -164,11 +164,11 @@ def eliminate(
     Parameters
     ----------
     linear
-        Factors on ``T(i)``, ``D(i)``, ``S(i)`` and ``M(b)``.
+        Factors on ``T(i)``, ``D(i)``, ``S(i)`` and shared weights.
     sensors
         Sensors of the graph.
     sizes
-        Number of weights of each tile.
+        Number of shared weights of each key.
     """
     grouped, count = rows_by_sensor(linear, sensors, sizes), sum(sizes.values())
     information, pull = np.zeros((count, count)), np.zeros(count)
@@ -198,9 +198,9 @@ def rows_by_sensor(
     linear: gtsam.GaussianFactorGraph, sensors: list[int], sizes: dict[int, int]
 ) -> dict[int, list[Rows]]:
     """Return the rows of each sensor, and under -1 those of the weights alone."""
-    tiles = tile_columns(sizes)
     place = {key(s): (s, at) for key, at in PLACES.items() for s in sensors}
-    weights = {M(tile): np.arange(at.start, at.stop) for tile, at in tiles.items()}
+    columns_of = weight_columns(sizes).items()
+    weights = {key: np.arange(at.start, at.stop) for key, at in columns_of}
     found: dict[int, list[Rows]] = {sensor: [] for sensor in [*sensors, -1]}
     for index in range(linear.size()):
         factor, sensor, start = linear.at(index), -1, 0
@@ -220,9 +220,9 @@ def rows_by_sensor(
     return found
 
 
-def tile_columns(sizes: dict[int, int]) -> dict[int, slice]:
-    """Return the columns of each tile's weights among all of them."""
+def weight_columns(sizes: dict[int, int]) -> dict[int, slice]:
+    """Return the columns of each key's weights among all of them."""
     ends = np.cumsum(list(sizes.values())).tolist()
     return {
-        tile: slice(end - size, end) for (tile, size), end in zip(sizes.items(), ends, strict=True)
+        key: slice(end - size, end) for (key, size), end in zip(sizes.items(), ends, strict=True)
     }

@@ -70,8 +70,8 @@ def explained(
         if (after.touched & ~before.touched).any():
             words += undetermined(after, own, solution.estimate.t[s], field_map, options.rank)
         open_ = replace(before, offset=after.offset)
-        covariance = with_infinities(found.covariance, open_)
-        told[s] = Explained(replace(found, covariance=covariance), words, held_offset(after))
+        covariance = with_infinities(found.joint_covariance, open_)
+        told[s] = Explained(replace(found, joint_covariance=covariance), words, held_offset(after))
     return told
 
 

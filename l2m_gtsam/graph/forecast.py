@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_factors import M
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions, fit_distortions, start_estimate
 from l2m_gtsam.graph.calibration import Estimate
+from l2m_gtsam.graph.coverage import UncertainMap, cover
 from l2m_gtsam.graph.joint import SensorSolution, joint_problem, sensor_solutions
-from l2m_gtsam.graph.uncertain import UncertainMap, UncertainProblem, cover
+from l2m_gtsam.graph.uncertain import UncertainProblem, starting_values
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
@@ -68,7 +68,8 @@ def forecast(
     problem = joint_problem(view, field_map, ideal.estimate, options)
     if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
         tests = problem.determinacies
-        solved = _uncertain(view, field_map, field_map, ideal.estimate, tests)
+        lasts = options.pose_noise.correlation_s
+        solved = _uncertain(view, field_map, field_map, ideal.estimate, tests, lasts)
         return Forecast(view, solved, Uncertainty.FULL)
     return Forecast(view, sensor_solutions(problem, ideal.estimate), Uncertainty.INDEPENDENT)
 
@@ -122,10 +123,9 @@ def _uncertain(
     errors: UncertainMap,
     ideal: Estimate,
     tests: dict[int, Determinacy],
+    correlation_s: float,
 ) -> tuple[SensorSolution, ...]:
     """Return the solutions with the map's error, of which nothing is known yet, in the graph."""
-    coverage = cover(view, errors, ideal)
-    values = ideal.values(view.sensors)
-    for tile, size in coverage.sizes.items():
-        values.insert(M(tile), np.zeros(size))
+    coverage = cover(view, errors, ideal, correlation_s)
+    values = starting_values(ideal, view.sensors, coverage)
     return UncertainProblem(view, field_map, coverage, ideal, tests).solutions(values)

@@ -18,6 +18,7 @@ from l2m_gtsam.graph.calibration import (
     whitened_jacobian,
 )
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
+from l2m_gtsam.graph.pose_errors import error_of_poses
 from l2m_gtsam.graph.view import QueryableMap, View
 from l2m_gtsam.results import ResidualFigures
 from l2m_gtsam.solve.figures import residual_figures
@@ -42,7 +43,7 @@ class SensorSolution:
     ----------
     sensor
         Index of the sensor.
-    covariance
+    joint_covariance
         Of (t, C row by row, H, time offset) in m, uT and s; undetermined parameters have infinite
         variance and no correlation, shape (16, 16).
     figures
@@ -54,10 +55,25 @@ class SensorSolution:
     """
 
     sensor: int
-    covariance: FloatArray
+    joint_covariance: FloatArray
     figures: ResidualFigures
     determinacy: Determinacy
     remaining_sigmas: float
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of (t, C row by row, H) alone, shape (15, 15)."""
+        return self.joint_covariance[:-1, :-1]
+
+    @property
+    def offset_covariance(self) -> FloatArray:
+        """Of (t, C row by row, H) with the time offset, shape (15,)."""
+        return self.joint_covariance[:-1, -1]
+
+    @property
+    def offset_sigma(self) -> float:
+        """Standard deviation of the time offset in seconds."""
+        return float(np.sqrt(self.joint_covariance[-1, -1]))
 
 
 @dataclass(frozen=True)
@@ -70,8 +86,8 @@ class JointProblem:
         The readings used.
     batch
         The same, as the factors evaluate them.
-    map_share
-        Covariance that the map contributes to each residual in uT^2, shape (N, 3, 3).
+    share
+        Covariance that map and poses contribute to each residual in uT^2, shape (N, 3, 3).
     covariance
         Covariance of each residual in uT^2, shape (N, 3, 3).
     determinacies
@@ -82,7 +98,7 @@ class JointProblem:
 
     view: View
     batch: BatchedReadings
-    map_share: FloatArray
+    share: FloatArray
     covariance: FloatArray
     determinacies: dict[int, Determinacy]
     graph: gtsam.NonlinearFactorGraph
@@ -100,8 +116,10 @@ def joint_problem(
     view: View, field_map: QueryableMap, estimate: Estimate, options: OneKeyOptions
 ) -> JointProblem:
     """Build the joint graph at an estimate: rank test first, undetermined directions held."""
-    sensor = view.readings.sensor
-    share = map_covariance(estimate.C()[sensor], view.readings.R_map_lidar, view.map_variance)
+    sensor, C = view.readings.sensor, estimate.C()[view.readings.sensor]
+    share = map_covariance(C, view.readings.R_map_lidar, view.map_variance)
+    by_pose = C @ error_of_poses(view.readings, field_map, estimate)
+    share += by_pose @ by_pose.transpose(0, 2, 1)
     covariance = reading_covariance(estimate.noise[sensor], share, view.trust)
     batch = batch_readings(view.readings, field_map)
     values, W = estimate.values(view.sensors), whitening(covariance)
@@ -129,7 +147,7 @@ def joint_step(problem: JointProblem, estimate: Estimate, options: OneKeyOptions
 def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
     """Return the most likely noise of each sensor in uT, shape (S,)."""
     noise, values = estimate.noise.copy(), estimate.values(problem.view.sensors)
-    variance = np.trace(problem.map_share, axis1=1, axis2=2) / 3
+    variance = np.trace(problem.share, axis1=1, axis2=2) / 3
     for s in problem.view.sensors:
         rows, taken = problem.batch.rows_of(s), problem.determinacies[s].free
         rows = rows[problem.view.trust[rows] > HALF]
@@ -152,7 +170,7 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         solutions.append(
             SensorSolution(
                 sensor=s,
-                covariance=with_infinities(covariances[s], test),
+                joint_covariance=with_infinities(covariances[s], test),
                 figures=residual_figures(residual, W[rows], test.free),
                 determinacy=test,
                 remaining_sigmas=float(np.sqrt(gradient @ covariances[s] @ gradient)),

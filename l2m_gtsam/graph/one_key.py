@@ -22,6 +22,7 @@ from l2m_gtsam.graph.alternation import (
     start_estimate,
 )
 from l2m_gtsam.graph.calibration import Estimate
+from l2m_gtsam.graph.coverage import UncertainMap
 from l2m_gtsam.graph.joint import (
     JointProblem,
     SensorSolution,
@@ -31,7 +32,7 @@ from l2m_gtsam.graph.joint import (
 )
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.trust import NOTHING, Trusted, plausible, trusted
-from l2m_gtsam.graph.uncertain import UncertainMap, solve_uncertain
+from l2m_gtsam.graph.uncertain import solve_uncertain
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.sync import with_offsets

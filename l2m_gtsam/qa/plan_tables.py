@@ -26,6 +26,7 @@ def plan_table(plan: DrivePlan) -> Table:
         "± C by column",
         "± H (uT)",
         "± rotation (deg)",
+        "± clock (ms)",
         "readings",
         "outside map",
     ):
@@ -34,6 +35,16 @@ def plan_table(plan: DrivePlan) -> Table:
     for sensor in plan.sensors:
         table.add_row(*_sensor_row(sensor))
     return table
+
+
+def held_plan_note(plan: DrivePlan) -> str:
+    """Return of which sensors time offsets will be taken as zero and why; else nothing."""
+    held = {sensor.sensor: sensor.offset_held for sensor in plan.sensors if sensor.offset_held}
+    if not held:
+        return ""
+    first, reason = next(iter(held.items()))
+    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
+    return f"time offset of {first}{more} will be {reason}"
 
 
 def motion_table(plan: DrivePlan) -> Table:
@@ -82,6 +93,7 @@ def _sensor_row(sensor: SensorPlan) -> tuple[str, ...]:
         _sigmas(sigma[3:12].reshape(3, 3).max(axis=0)),
         _sigmas(sigma[12:]),
         _sigmas(np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))),
+        _sigmas(np.array([1e3 * sensor.offset_sigma])),
         f"{sensor.readings:,}",
         f"{sensor.outside_map:,}",
         escape(". ".join(sensor.undetermined)),

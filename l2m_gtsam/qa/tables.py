@@ -15,6 +15,7 @@ from l2m_gtsam.results import (
     Return,
     SensorCalibration,
     SensorStatus,
+    TimeOffset,
 )
 from l2m_gtsam.storage.inspect import BagReport, TopicReport
 
@@ -29,6 +30,7 @@ def calibration_table(result: CalibrationResult) -> Table:
         "H (uT)",
         "|C - R| max",
         "rotation (deg)",
+        "clock (ms)",
         "|residual| rms (uT)",
         "readings used",
         "outside map",
@@ -156,7 +158,7 @@ def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
     status = _status(sensor)
     if sensor.residuals is None:
         counts = (f"{sensor.outside_map:,}", f"{sensor.rejected:,}")
-        return (escape(sensor.sensor), *("-",) * 7, *counts, status)
+        return (escape(sensor.sensor), *("-",) * 8, *counts, status)
     distortion, R = sensor.distortion, sensor.R_lidar_mag.T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
     return (
@@ -166,12 +168,34 @@ def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
         _vector(distortion.H, 2),
         f"{np.abs(distortion.C - R).max():.3f}",
         f"{angle:.2f}",
+        _clock(sensor.time_offset),
         f"{sensor.residuals.rms:.3f}",
         f"{sensor.residuals.readings:,}",
         f"{sensor.outside_map:,}",
         f"{sensor.rejected:,}",
         status,
     )
+
+
+def _clock(offset: TimeOffset | None) -> str:
+    """Return a time offset in milliseconds with its sigma; a dash where it is held at zero."""
+    if offset is None or not offset.estimated:
+        return "-"
+    return f"{1e3 * offset.seconds:.2f} ± {1e3 * offset.sigma:.2f}"
+
+
+def held_clocks_note(result: CalibrationResult) -> str:
+    """Return which sensors' time offsets are taken as zero and why, as a sentence; else nothing."""
+    held = {
+        sensor.sensor: sensor.time_offset.held
+        for sensor in result.sensors
+        if sensor.time_offset is not None and not sensor.time_offset.estimated
+    }
+    if not held:
+        return ""
+    first, reason = next(iter(held.items()))
+    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
+    return f"time offset of {first}{more} {reason}"
 
 
 def _truth_row(known: KnownSensor, sensor: SensorCalibration) -> tuple[str, ...]:

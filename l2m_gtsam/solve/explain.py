@@ -17,7 +17,8 @@ COLUMNS = ("first", "second", "third")
 ALONG = 0.95  # cosine from which a direction is called after the lidar's axis
 # A vehicle within these did not drive: what its poses still tell is their own noise.
 REST_M, REST_DEG = 0.1, 3.0
-A_MOMENT_S, RESOLVED_MM = 0.01, 0.05  # a usual time offset, and what of it is not spelt out
+A_MOMENT_S = 0.01  # a usual time offset
+RESOLVED_MM, RESOLVED_DEG = 0.05, 0.005  # what is not spelt out
 # Below any sensor's resolution, in uT: what is less is not spelt out.
 RESOLVED_UT = 1e-3
 
@@ -120,14 +121,16 @@ def held_offset(test: Determinacy) -> str:
     """Return why a time offset is held at zero; empty if it is told apart."""
     if test.offset:
         return ""
-    shift = 1e3 * A_MOMENT_S * test.imitation
-    if np.linalg.norm(shift) < RESOLVED_MM:
-        return "held at 0: the drive does not show it"
+    C = A_MOMENT_S * test.imitation[3:].reshape(3, 3)
+    shift = 1e3 * A_MOMENT_S * test.imitation[:3]
+    turn = np.degrees(np.linalg.norm(C - C.T) / np.sqrt(8))
+    if np.linalg.norm(shift) < RESOLVED_MM and turn < RESOLVED_DEG:
+        return "held at 0: nothing in this drive shows it"
     # Added zero turns -0.0 into 0.0.
     place = ", ".join(f"{value + 0.0:.1f}" for value in np.round(shift, 1).tolist())
     return (
-        f"held at 0: {1e3 * A_MOMENT_S:g} ms look like t moved by ({place}) mm; drive some of it "
-        "the other way round or at another speed"
+        f"held at 0: {1e3 * A_MOMENT_S:g} ms look like t moved by ({place}) mm and the sensor "
+        f"turned by {turn:.2f} deg; drive at another speed or the other way round, too"
     )
 
 

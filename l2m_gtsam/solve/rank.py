@@ -55,7 +55,8 @@ class Determinacy:
         Whether the time offset is told apart from all of these; if not it is held, and they are
         judged as if it were known.
     imitation
-        How fast t would have to move to look like a time offset in m/s, shape (3,).
+        How t and C row by row would have to change to look like a time offset that is not told
+        apart, per second of it, shape (12,).
     """
 
     held: FloatArray
@@ -63,7 +64,7 @@ class Determinacy:
     names: tuple[str, ...]
     touched: BoolArray
     offset: bool = False
-    imitation: FloatArray = field(default_factory=lambda: np.zeros(3))
+    imitation: FloatArray = field(default_factory=lambda: np.zeros(12))
 
     @property
     def free(self) -> int:
@@ -90,8 +91,8 @@ def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy
     others = np.vstack([scaled, np.eye(15, 16)])
     triangular = np.asarray(np.linalg.qr(others, mode="r"))
     if abs(triangular[-1, -1]) < 1.0:
-        like = solve_triangular(triangular[:15, :15], triangular[:15, 15])[:3]
-        imitation = options.useful_t_m / options.useful_offset_s * like
+        like = solve_triangular(triangular[:15, :15], triangular[:15, 15])
+        imitation = (options.scale() * like / options.useful_offset_s)[:12]
         return replace(determinacy(jacobian[:, :15], options), imitation=imitation)
     by_offset = jacobian[:, 15] / np.linalg.norm(jacobian[:, 15])
     apart = jacobian[:, :15] - np.outer(by_offset, by_offset @ jacobian[:, :15])

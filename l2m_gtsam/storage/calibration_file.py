@@ -15,6 +15,7 @@ from l2m_gtsam.results import (
     Return,
     SensorCalibration,
     SensorStatus,
+    TimeOffset,
     Uncertainty,
 )
 from l2m_gtsam.storage.calibration_legend import MODEL, UNCERTAINTY
@@ -56,6 +57,13 @@ class _Start(Lenient):
     runner_up: Vector | None
 
 
+class _TimeOffset(Lenient):
+    seconds: float
+    sigma: float
+    cross_covariance: Row15
+    held: str
+
+
 class _Sensor(Lenient):
     status: SensorStatus
     message: str
@@ -72,6 +80,8 @@ class _Sensor(Lenient):
     outside_map: int
     start: _Start | None = None
     rejected: int = 0
+    # Files of the first version do not speak of it.
+    time_offset: _TimeOffset | None = None
 
 
 class _Disagreement(Lenient):
@@ -168,7 +178,21 @@ def _sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
         "outside_map": sensor.outside_map,
         "rejected": sensor.rejected,
         "start": _start_entry(sensor.start),
+        "time_offset": _time_offset_entry(sensor),
         "covariance": sensor.covariance.tolist(),
+    }
+
+
+def _time_offset_entry(sensor: SensorCalibration) -> dict[str, Any] | None:
+    offset = sensor.time_offset
+    if offset is None:
+        return None
+    return {
+        "seconds": offset.seconds,
+        "sigma": offset.sigma,
+        "correlation_with_t": sensor.offset_correlation.tolist(),
+        "held": offset.held,
+        "cross_covariance": offset.cross_covariance.tolist(),
     }
 
 
@@ -215,6 +239,12 @@ def _start(entry: _Start | None) -> FoundStart | None:
     return FoundStart(np.array(entry.t_lidar_mag), entry.margin, other)
 
 
+def _time_offset(entry: _TimeOffset | None) -> TimeOffset | None:
+    if entry is None:
+        return None
+    return TimeOffset(**{**dict(entry), "cross_covariance": np.array(entry.cross_covariance)})
+
+
 def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
     figures = entry.residuals
     return SensorCalibration(
@@ -235,4 +265,5 @@ def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
         outside_map=entry.outside_map,
         start=_start(entry.start),
         rejected=entry.rejected,
+        time_offset=_time_offset(entry.time_offset),
     )

@@ -25,6 +25,10 @@ MODEL = {
     ),
     "rotation_covariance": "of the error e in the mag frame: true = exp(e) @ R_mag_lidar",
     "covariance_order": "t_x t_y t_z C_xx C_xy C_xz C_yx C_yy C_yz C_zx C_zy C_zz H_x H_y H_z",
+    "time_offset": (
+        "a reading's pose is that at stamp + seconds; cross_covariance with the parameters in "
+        "covariance_order; held says why it is not estimated but taken as 0"
+    ),
     "disagreements": (
         "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
         "ns, the lidar's way from p_from to p_to in m in the map, median residual (size) in uT"

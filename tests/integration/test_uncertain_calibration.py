@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
+from l2m_gtsam.graph.coverage import UncertainMap
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.graph.uncertain import UncertainMap
 from l2m_gtsam.graph.view import observe
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap

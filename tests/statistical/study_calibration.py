@@ -7,9 +7,9 @@ from typing import Self
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.one_key import solve_one_key
+from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from tests.statistical.figures import (
     Band,
     chi_square_band,
@@ -24,6 +24,7 @@ from tests.steel_drives import CalibrationDrive, calibration_drive, survey
 
 START_M = 0.05  # each axis of a start is at most this far from the truth
 BLOCKS = {"t": slice(0, 3), "C, H": slice(3, 15), "all": slice(0, 15)}
+OFFSET = slice(15, 16)
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class Solved:
     sensor
         Its index in the readings.
     vector
-        t in metres, C row by row, H in uT, shape (15,).
+        t in metres, C row by row, H in uT, time offset in seconds, shape (16,).
     covariance
-        Of the same, shape (15, 15); infinite for what is undetermined.
+        Of the same, shape (16, 16); infinite for what is undetermined.
     """
 
     sensor: int
@@ -45,17 +46,37 @@ class Solved:
     covariance: FloatArray
 
 
-Calibrate = Callable[[Readings, StudiedMap, FloatArray], Sequence[Solved]]
-"""From readings of S sensors, a map and starts (S, 3); sensors not solved are left out."""
+Calibrate = Callable[[CalibrationDrive, StudiedMap, FloatArray], Sequence[Solved]]
+"""From a drive of S sensors, a map and starts (S, 3); sensors not solved are left out."""
 
 
-def independent(readings: Readings, field_map: StudiedMap, t_start: FloatArray) -> Sequence[Solved]:
+def independent(
+    drive: CalibrationDrive, field_map: StudiedMap, t_start: FloatArray
+) -> Sequence[Solved]:
     """Calibrate as if the map's errors were independent between readings."""
-    solution = solve_one_key(readings, field_map, t_start, OneKeyOptions())
+    return solved_by(solve_one_key(drive.readings, field_map, t_start, OneKeyOptions()))
+
+
+def solved_by(solution: OneKeySolution) -> Sequence[Solved]:
+    """Return what a solve says of its sensors."""
+    estimate = solution.estimate
     return [
-        Solved(found.sensor, solution.estimate.vector(found.sensor), found.covariance)
+        Solved(
+            found.sensor,
+            np.append(estimate.vector(found.sensor), estimate.offset[found.sensor]),
+            found.joint_covariance,
+        )
         for found in solution.solved
     ]
+
+
+Trouble = Callable[[CalibrationDrive, int], CalibrationDrive]
+"""What goes wrong on a drive, from a seed."""
+
+
+def untroubled(drive: CalibrationDrive, _: int) -> CalibrationDrive:
+    """Return the drive as it is."""
+    return drive
 
 
 @dataclass(frozen=True)
@@ -93,6 +114,8 @@ class CalibrationConditions:
         Of each survey.
     seed
         Of the first world.
+    trouble
+        What goes wrong on every drive.
     """
 
     surveys: int = 20
@@ -105,6 +128,7 @@ class CalibrationConditions:
     strength: float = MILD
     survey_readings: int = 1500
     seed: int = 100
+    trouble: Trouble = untroubled
 
 
 @dataclass(frozen=True)
@@ -114,9 +138,9 @@ class Outcomes:
     Attributes
     ----------
     error
-        Estimate minus truth of (t, C, H), shape (N, 15).
+        Estimate minus truth of (t, C, H, time offset), shape (N, 16).
     covariance
-        As the calibrations say, shape (N, 15, 15).
+        As the calibrations say, shape (N, 16, 16).
     survey
         Number of the survey of each, shape (N,).
     """
@@ -135,8 +159,8 @@ class Outcomes:
         )
 
     def determined(self) -> "Outcomes":
-        """Return those of which all fifteen parameters have a finite variance."""
-        keep = np.isfinite(self.covariance).all(axis=(1, 2))
+        """Return those of which t, C and H have a finite variance."""
+        keep = np.isfinite(self.covariance[:, :15, :15]).all(axis=(1, 2))
         return Outcomes(self.error[keep], self.covariance[keep], self.survey[keep])
 
 
@@ -195,7 +219,8 @@ class CalibrationRow:
     error, sigma
         Of t along x, y, z in metres, root mean square, shape (3,); sigmas of the determined.
     honesty
-        Of t, (C, H) and all fifteen by name, over the determined; empty with too few.
+        Of t, (C, H) and all fifteen by name, over the determined; empty with too few. Of the time
+        offset, too, where all of these know it.
     """
 
     case: str
@@ -243,7 +268,7 @@ def calibration_study(
 
 
 def honesty(outcomes: Outcomes, block: slice) -> Honesty:
-    """Return whether the covariances of a block of the fifteen parameters are true.
+    """Return whether the covariances of a block of the parameters are true.
 
     Raises
     ------
@@ -281,7 +306,7 @@ def _outcomes(
         for number, drive in enumerate(_drives(hall, conditions, seed, span, noise)):
             start = _start(drive, seed, number)
             for method, calibrate in case.methods.items():
-                solved = calibrate(drive.readings, field_map, start)
+                solved = calibrate(drive, field_map, start)
                 parts[method].append(_compared(solved, drive, seed))
     return {method: Outcomes.joined(part) for method, part in parts.items()}
 
@@ -295,14 +320,9 @@ def _drives(
 ) -> Iterator[CalibrationDrive]:
     """Yield the drives on one survey."""
     for number in range(conditions.drives):
-        yield calibration_drive(
-            hall,
-            1000 * seed + number,  # no two drives of a study are alike
-            span,
-            noise,
-            conditions.sensors,
-            conditions.readings,
-        )
+        own = 1000 * seed + number  # no two drives of a study are alike
+        drive = calibration_drive(hall, own, span, noise, conditions.sensors, conditions.readings)
+        yield conditions.trouble(drive, own)
 
 
 def _start(drive: CalibrationDrive, seed: int, number: int) -> FloatArray:
@@ -317,8 +337,8 @@ def _compared(solved: Sequence[Solved], drive: CalibrationDrive, seed: int) -> O
     truth = drive.truth()
     error = [found.vector - truth[found.sensor] for found in solved]
     return Outcomes(
-        np.reshape(error, (-1, 15)),
-        np.reshape([found.covariance for found in solved], (-1, 15, 15)),
+        np.reshape(error, (-1, 16)),
+        np.reshape([found.covariance for found in solved], (-1, 16, 16)),
         np.full(len(solved), seed),
     )
 
@@ -334,7 +354,9 @@ def _row(
     """Return the figures of a method under one condition."""
     determined = outcomes.determined()
     enough = len(np.unique(determined.survey)) > 1
-    variances = np.diagonal(determined.covariance, axis1=1, axis2=2)[:, :3]
+    variances = np.diagonal(determined.covariance, axis1=1, axis2=2)
+    timed = {"offset": OFFSET} if np.isfinite(variances).all() else {}
+    blocks = BLOCKS | timed
     return CalibrationRow(
         case,
         method,
@@ -344,6 +366,6 @@ def _row(
         len(outcomes.error),
         len(determined.error),
         error=np.sqrt(np.mean(outcomes.error[:, :3] ** 2, axis=0)),
-        sigma=np.sqrt(np.mean(variances, axis=0)) if enough else np.full(3, np.nan),
-        honesty={name: honesty(determined, at) for name, at in BLOCKS.items()} if enough else {},
+        sigma=np.sqrt(np.mean(variances[:, :3], axis=0)) if enough else np.full(3, np.nan),
+        honesty={name: honesty(determined, at) for name, at in blocks.items()} if enough else {},
     )

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FieldSample, FloatArray, Readings
+from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.simulate.world import SteelWorld
 from tests.statistical import study_calibration
@@ -26,6 +26,7 @@ from tests.statistical.study_maps import (
     map_study,
 )
 from tests.steel import MILD, CloudVariant, SteelHall, steel_hall
+from tests.steel_drives import CalibrationDrive
 from tests.worlds import DipoleWorld, dipole_world
 
 Exact = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
@@ -83,11 +84,13 @@ def steel_of(scene: Scene, sigma: float, told: float) -> TrueMap:
     return TrueMap(lambda p: (scene.hall.world.field(p), np.zeros((len(p), 3, 3))), sigma, told)
 
 
-def doubtless(readings: Readings, field_map: StudiedMap, t_start: FloatArray) -> Sequence[Solved]:
+def doubtless(
+    drive: CalibrationDrive, field_map: StudiedMap, t_start: FloatArray
+) -> Sequence[Solved]:
     """Calibrate, and halve every sigma."""
     return [
         replace(found, covariance=found.covariance / 4)
-        for found in independent(readings, field_map, t_start)
+        for found in independent(drive, field_map, t_start)
     ]
 
 

@@ -12,7 +12,7 @@ from l2m_gtsam.graph.elimination import Eliminated, Rows, eliminate
 
 JACOBIAN: Any = gtsam.JacobianFactor  # its stub lists one to three variables, each by itself
 
-SENSORS, SIZES = [0, 2], {4: 3, 7: 5}
+SENSORS, SIZES = [0, 2], {M(4): 3, M(7): 5}
 ROWS = 40
 ORDER = [T(0), D(0), S(0), T(2), D(2), S(2), M(4), M(7)]
 WIDTH = {T(0): 3, D(0): 12, S(0): 1, T(2): 3, D(2): 12, S(2): 1, M(4): 3, M(7): 5}
@@ -39,14 +39,13 @@ class Problem:
         for sensor in SENSORS:
             for tile in SIZES:
                 terms = {
-                    key: rng.normal(size=(ROWS, WIDTH[key]))
-                    for key in (T(sensor), D(sensor), M(tile))
+                    key: rng.normal(size=(ROWS, WIDTH[key])) for key in (T(sensor), D(sensor), tile)
                 }
                 self._add(terms, rng.normal(size=ROWS), blocks, values, sensor)
             late = {key: rng.normal(size=(ROWS, WIDTH[key])) for key in (T(sensor), S(sensor))}
             self._add(late, rng.normal(size=ROWS), blocks, values, sensor)
         for tile, size in SIZES.items():
-            self._add({M(tile): np.eye(size)}, np.zeros(size), blocks, values, -1)
+            self._add({tile: np.eye(size)}, np.zeros(size), blocks, values, -1)
         self.A, self.b = np.concatenate(blocks), np.concatenate(values)
         self.row_owner = np.concatenate(self.owner)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from l2m_factors.field_map import FieldMap as PluginFieldMap
-from l2m_gtsam.graph.uncertain import UncertainMap
+from l2m_gtsam.graph.coverage import UncertainMap
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions

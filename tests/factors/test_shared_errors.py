@@ -1,18 +1,22 @@
-"""Readings over an uncertain map: derivatives, and the certain map as a special case."""
+"""Readings that share errors of map and poses: derivatives, and none as a special case."""
 
 import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import block_diag
 
 from l2m_factors import (
     BatchedReadings,
     M,
     MagneticReadings,
+    P,
+    SharedError,
     assert_jacobians_match,
     block_factor,
     map_weights_prior,
+    pose_errors_prior,
     uncertain_block_factor,
 )
 from l2m_gtsam.data import FloatArray
@@ -41,6 +45,10 @@ def whitenings(seed: int, count: int) -> FloatArray:
     return np.random.default_rng(seed + 3).normal(size=(count, 3, 3)) + 3 * np.eye(3)
 
 
+def in_tile(tile: int, A: FloatArray) -> list[SharedError]:
+    return [SharedError(M(tile), A)]
+
+
 @settings(max_examples=20)
 @given(seed=st.integers(0, 10_000), tile=st.sampled_from(sorted(TILES)))
 def test_jacobians_match_central_differences(seed: int, tile: int) -> None:
@@ -49,36 +57,43 @@ def test_jacobians_match_central_differences(seed: int, tile: int) -> None:
     rows = np.array([6, 9, 8])  # of the second sensor
     A, W = features(seed, 3, TILES[tile]), whitenings(seed, 3)
     timed = BatchedReadings(world, with_motion(some_readings(seed, world), seed))
-    for each in (batch, timed):
-        factor = uncertain_block_factor(each, rows, tile, A, W)
-        assert_jacobians_match(factor, with_weights(seed, 2), rtol=1e-6, step=2e-5)
+    values, errors = with_weights(seed, 2), in_tile(tile, A)
+    values.insert(P(3), np.random.default_rng(seed).normal(size=6))
+    poses = [*errors, SharedError(P(3), features(seed + 9, 3, 6))]
+    dense = np.random.default_rng(seed).normal(size=(9, 9)) + 3 * np.eye(9)
+    for factor in (
+        uncertain_block_factor(batch, rows, errors, W),
+        uncertain_block_factor(timed, rows, errors, W),
+        uncertain_block_factor(timed, rows, poses, dense),
+    ):
+        assert_jacobians_match(factor, values, rtol=1e-6, step=2e-5)
 
 
 def test_the_error_is_that_of_the_map_plus_its_error() -> None:
-    """e = C R^T (B + A beta) + H - z, whitened, reading by reading."""
+    """e = C (R^T B + F gamma) + H - z, whitened, reading by reading."""
     world = dipole_world(1)
     readings, values = some_readings(1, world), with_weights(1, 2)
     rows, A, W = np.array([2, 0]), features(1, 2, 6), whitenings(1, 2)
-    factor = uncertain_block_factor(BatchedReadings(world, readings), rows, 2, A, W)
+    factor = uncertain_block_factor(BatchedReadings(world, readings), rows, in_tile(2, A), W)
     _, b = factor.linearize(values).jacobian()
     C, H = (part := values.atVector(gtsam.symbol("D", 0)))[:9].reshape(3, 3), part[9:]
     t, beta = values.atPoint3(gtsam.symbol("T", 0)), values.atVector(M(2))
     expected = []
     for k, row in enumerate(rows):
         R, p = readings.R_map_lidar[row], readings.p_map_lidar[row]
-        field = world.field_and_gradient((R @ t + p)[None])[0][0] + A[k] @ beta
-        expected.append(W[k] @ (C @ R.T @ field + H - readings.field[row]))
+        field = R.T @ world.field_and_gradient((R @ t + p)[None])[0][0] + A[k] @ beta
+        expected.append(W[k] @ (C @ field + H - readings.field[row]))
     # Sums of some 100 uT in another order.
     np.testing.assert_allclose(-b, np.concatenate(expected), rtol=0, atol=1e-10)
 
 
 def test_without_an_error_the_map_is_certain() -> None:
-    """Weights of zero: the same error, and the same derivatives by T and D."""
+    """Weights of zero: the same error, and the same derivatives by T and D, in either whitening."""
     world = dipole_world(2)
     batch, values = BatchedReadings(world, some_readings(2, world)), with_weights(2, 2)
     values.update(M(7), np.zeros(4))
     W, rows = whitenings(2, 10), np.arange(5, 10)
-    ours = uncertain_block_factor(batch, rows, 7, features(2, 5, 4), W[rows])
+    ours = uncertain_block_factor(batch, rows, in_tile(7, features(2, 5, 4)), W[rows])
     plain = block_factor(batch, 1, W)
     assert ours.error(values) == pytest.approx(plain.error(values), rel=1e-12)
     A, b = ours.linearize(values).jacobian()
@@ -96,9 +111,34 @@ def test_weights_are_shared_by_the_sensors_of_a_tile() -> None:
         whitenings(3, 3),
     )
     first, second = (
-        uncertain_block_factor(batch, np.arange(start, start + 3), 2, A, W) for start in (0, 5)
+        uncertain_block_factor(batch, np.arange(start, start + 3), in_tile(2, A), W)
+        for start in (0, 5)
     )
     assert set(first.keys()) & set(second.keys()) == {M(2)}
+
+
+def test_one_matrix_for_all_readings_is_as_good_as_one_for_each() -> None:
+    world = dipole_world(2)
+    batch, values = BatchedReadings(world, some_readings(2, world)), with_weights(2, 2)
+    W, rows, errors = whitenings(2, 3), np.arange(5, 8), in_tile(7, features(2, 3, 4))
+    each = uncertain_block_factor(batch, rows, errors, W).linearize(values)
+    whole = uncertain_block_factor(batch, rows, errors, block_diag(*W)).linearize(values)
+    for one, other in zip(each.jacobian(), whole.jacobian(), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
+
+
+def test_the_prior_of_pose_errors_is_a_chain_of_unit_variance() -> None:
+    """Covariance of knots i and k: the product of the correlations between them; rounding."""
+    likes, graph, values = (0.5, 0.9), pose_errors_prior((0.5, 0.9)), gtsam.Values()
+    for knot in range(3):
+        values.insert(P(knot), np.random.default_rng(knot).normal(size=6))
+    for index in range(graph.size()):
+        assert_jacobians_match(graph.at(index), values)
+    marginals = gtsam.Marginals(graph, values)
+    joint = marginals.jointMarginalCovariance([P(0), P(1), P(2)])
+    for i, k, like in ((0, 0, 1), (1, 1, 1), (2, 2, 1), (0, 1, 0.5), (1, 2, 0.9), (0, 2, 0.45)):
+        np.testing.assert_allclose(joint.at(P(i), P(k)), like * np.eye(6), atol=1e-12)
+    assert graph.size() == len(likes) + 1
 
 
 @settings(max_examples=10)

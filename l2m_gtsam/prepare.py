@@ -1,0 +1,32 @@
+"""A recording as a solve takes it: readings with all that is known of their poses."""
+
+from dataclasses import replace
+
+from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.data import Recording, Synchronised
+from l2m_gtsam.pose_noise import pose_roots
+from l2m_gtsam.solve.explain import movement
+from l2m_gtsam.sync import synchronise
+
+
+def prepare(recording: Recording, options: CalibrationOptions) -> Synchronised:
+    """Return the readings that take part, their poses, how these move and how wrong they are.
+
+    Of a vehicle that stands still, velocities are the noise of its poses: they are left out, as
+    they are where clocks are known to agree.
+
+    Raises
+    ------
+    SyncError
+        Readings and poses do not overlap.
+    """
+    largest, poses = options.solve.largest_offset_s, recording.trajectory
+    synchronised = synchronise(recording, options.sync, largest)
+    readings = synchronised.readings
+    still = movement(poses.R, poses.p).at_rest
+    readings = replace(
+        readings,
+        motion=None if still or not largest else readings.motion,
+        pose_root=pose_roots(poses, readings.stamp_ns, options.solve.pose_noise),
+    )
+    return replace(synchronised, readings=readings)
