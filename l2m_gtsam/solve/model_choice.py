@@ -120,7 +120,7 @@ def reason_of(choice: Choice, trials: list[Trial]) -> str:
         return why
     next_ = max(simpler, key=lambda trial: trial.fit.parameters)
     above = next_.above(choice.least)
-    return f"{why}; {next_.model} is {_told(best, next_)}, its BIC {above:.2g} above the least"
+    return f"{why}; {next_.model} is {_told(best, next_)}, its BIC {above:.0f} above the least"
 
 
 def _told(best: Trial, trial: Trial) -> str:

@@ -1,9 +1,10 @@
 r"""Which model of a magnetometer its readings ask for: held-out segments and the BIC.
 
 Readings next to each other share the errors of the map. What is left of them is correlated, and a
-regressor that varies as slowly finds some of it to explain, whatever it is: the likelihood of N
-independent readings gains in proportion to N, the penalty of the BIC only with log N, so that the
-largest model would always win. Two remedies are taken together.
+regressor that varies as slowly finds some of it to explain, whatever it is, again in every
+neighbour: the likelihood of N independent readings gains in proportion to the rate of reading, the
+penalty of the BIC only with its logarithm, so that the largest model would win. Two remedies are
+taken together.
 
 1. *Held out.* The drive is cut into segments; each is predicted by fits to the others. The score is
    the mean logarithm of the density of a reading; differences between models vary over the

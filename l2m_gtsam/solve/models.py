@@ -6,8 +6,8 @@ The largest is linear in its coefficients,
     z = C b + H + \sum_k q_k h_k + E \, db/dt + \text{noise},
 
 with numbers q_k that were recorded along the drive (a current, a speed) and the eddy currents of
-Tolles and Lawson in the last term. Smaller ones leave terms out or restrict C. E = tau C is a clock
-that is off by tau: the last term holds a time offset, too.
+Tolles and Lawson in the last term. Smaller ones leave terms out or restrict C. A clock that is off
+by tau gives E = tau C: the last term holds a time offset, too.
 """
 
 from dataclasses import dataclass
