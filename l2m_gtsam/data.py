@@ -96,6 +96,31 @@ class FieldSeries:
 
 
 @dataclass(frozen=True)
+class ScalarSeries:
+    """A number that was recorded along a drive: a motor's current, a speed, a duty cycle.
+
+    Attributes
+    ----------
+    name
+        What it is called, unique within a recording.
+    topic
+        Where it came from.
+    stamp_ns
+        Times in nanoseconds, strictly increasing, shape (M,).
+    value
+        Finite, in the unit of the topic times the scale that was asked for, shape (M,).
+    """
+
+    name: str
+    topic: str
+    stamp_ns: IntArray
+    value: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+
+@dataclass(frozen=True)
 class SourceFile:
     """Where data came from: a file or folder and the SHA-256 of its content."""
 

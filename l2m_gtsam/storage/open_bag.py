@@ -158,7 +158,10 @@ def _default_typestore(is_ros1: bool) -> Typestore:
 def _typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typestore:
     """Return the bag's own definition of a type, or ROS's where it has none as text."""
     if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
-        return _default_typestore(is_ros1)
+        store = _default_typestore(is_ros1)
+        if msgtype not in store.types:
+            raise ValueError("the bag holds none and ROS knows none; an mcap file would carry it")
+        return store
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(definition.data, msgtype))
     store.get_msgdef(msgtype)

@@ -1,0 +1,79 @@
+"""Numbers that go along with a drive, brought to the times of the readings."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, ScalarSeries
+from l2m_gtsam.options import Options
+
+
+class ResampleOptions(Options):
+    """How numbers get from their own times to those of the readings."""
+
+    max_gap_s: float = Field(default=0.5, gt=0)
+    """Between two samples further apart than this a number is not known; it is never
+    extrapolated."""
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """Numbers at the times of readings.
+
+    Attributes
+    ----------
+    names
+        One for each of K numbers.
+    values
+        In the units of their series, shape (N, K); 0 where one is not known.
+    known
+        Whether all of them are known at a reading, shape (N,).
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    known: BoolArray
+
+
+def resampled(
+    series: Sequence[ScalarSeries], stamp_ns: IntArray, options: ResampleOptions
+) -> Resampled:
+    """Interpolate numbers along the line between two samples.
+
+    Parameters
+    ----------
+    series
+        K series.
+    stamp_ns
+        Times of the readings in nanoseconds, in any order, shape (N,).
+    options
+        How far apart samples may be.
+    """
+    values = np.zeros((len(stamp_ns), len(series)))
+    known = np.ones(len(stamp_ns), dtype=np.bool_)
+    for k, each in enumerate(series):
+        near = _is_near(each.stamp_ns, stamp_ns, options.max_gap_s)
+        values[near, k] = _interpolated(each, stamp_ns[near])
+        known &= near
+    return Resampled(tuple(each.name for each in series), values, known)
+
+
+def _interpolated(series: ScalarSeries, stamp_ns: IntArray) -> FloatArray:
+    if not len(stamp_ns):
+        return np.empty(0)
+    # Seconds since 1970 in double precision would keep tenths of a microsecond only.
+    start = series.stamp_ns[0]
+    at_s, sample_s = (stamp_ns - start) * 1e-9, (series.stamp_ns - start) * 1e-9
+    return np.asarray(np.interp(at_s, sample_s, series.value))
+
+
+def _is_near(sample_ns: IntArray, stamp_ns: IntArray, max_gap_s: float) -> BoolArray:
+    """Return which times lie on a sample, or between two that are near each other, shape (N,)."""
+    if not len(sample_ns):
+        return np.zeros(len(stamp_ns), dtype=np.bool_)
+    after = np.searchsorted(sample_ns, stamp_ns)
+    on_sample = sample_ns[np.minimum(after, len(sample_ns) - 1)] == stamp_ns
+    gap_s = np.concatenate([[np.inf], np.diff(sample_ns) * 1e-9, [np.inf]])[after]
+    return np.asarray(on_sample | (gap_s <= max_gap_s))

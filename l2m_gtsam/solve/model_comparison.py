@@ -1,0 +1,255 @@
+r"""Which model of a magnetometer its readings ask for: held-out segments and the BIC.
+
+Readings next to each other share the errors of the map. What is left of them is correlated, and a
+regressor that varies as slowly finds some of it to explain, whatever it is, again in every
+neighbour: the likelihood of N independent readings gains in proportion to the rate of reading, the
+penalty of the BIC only with its logarithm, so that the largest model would win. Two remedies are
+taken together.
+
+1. *Held out.* The drive is cut into segments; each is predicted by fits to the others. The score is
+   the mean logarithm of the density of a reading; differences between models vary over the
+   segments, which gives their standard error.
+2. *BIC for correlated residuals.* What is left of readings k apart has the correlation rho_k. The
+   penalty counts each parameter as often as the variance of its estimate exceeds that with
+   independent residuals (X. Gao, P. X.-K. Song, "Composite likelihood Bayesian information
+   criteria", 2010): many times where its regressor varies as slowly as the map's errors, once where
+   it is quick. Differences are divided by that factor to read as odds.
+
+``model_choice`` says how the two decide.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.options import Options
+from l2m_gtsam.solve.model_choice import Choice, HeldOut, Trial, choose, reason_of, standard_error
+from l2m_gtsam.solve.model_fits import Fit, Spread, compress, fit_model, inflation, spread_of
+from l2m_gtsam.solve.models import Coefficients, Model, Samples
+
+PER_COLUMN = 4  # readings, at the least
+PER_SEGMENT = 4
+
+
+class ModelOptions(Options):
+    """How models of a magnetometer are compared."""
+
+    segments: int = Field(default=8, ge=3, le=50)
+    """Parts of the drive, of equally many readings, of which each is held out once."""
+    strong: float = Field(default=10.0, gt=0)
+    """A BIC so far above the least rejects a model: odds of 150 to 1 (R. E. Kass, A. E. Raftery,
+    "Bayes factors", 1995)."""
+
+
+@dataclass(frozen=True)
+class ModelFit:
+    """One model and how it does.
+
+    Attributes
+    ----------
+    model
+        Which.
+    parameters
+        Number of those that the readings determine.
+    coefficients, sigma
+        And their standard deviations, with the correlation of residuals taken into account;
+        infinite for what the readings do not determine, zero for what the model fixes.
+    rms
+        Of what is left of the readings it was fitted to, per axis in uT.
+    held_out_rms
+        Of what is left of held-out readings, per axis in uT.
+    held_out_score
+        Mean logarithm of the density of a held-out reading in 1/uT^3.
+    score_error
+        Standard error of that over the segments.
+    behind, behind_error
+        By how much the score is less than the best among the models that the BIC admits, and the
+        standard error of this difference.
+    bic
+        For correlated residuals.
+    bic_above
+        How much more than the least it is, divided by how often the parameters that make the
+        difference count.
+    """
+
+    model: Model
+    parameters: int
+    coefficients: Coefficients
+    sigma: Coefficients
+    rms: float
+    held_out_rms: float
+    held_out_score: float
+    score_error: float
+    behind: float
+    behind_error: float
+    bic: float
+    bic_above: float
+
+
+@dataclass(frozen=True)
+class ModelComparison:
+    """Nested models on the readings of one sensor.
+
+    Attributes
+    ----------
+    fits
+        One per model, from few parameters to many.
+    regressors
+        Names of the recorded numbers.
+    readings
+        That were used.
+    independent
+        As how many independent ones they count.
+    segments
+        Parts of the drive that were held out.
+    recommended
+        The simplest adequate model.
+    reason
+        A sentence why.
+    """
+
+    fits: tuple[ModelFit, ...]
+    regressors: tuple[str, ...]
+    readings: int
+    independent: float
+    segments: int
+    recommended: Model
+    reason: str
+
+    def __getitem__(self, model: Model) -> ModelFit:
+        return next(each for each in self.fits if each.model is model)
+
+
+def compare_models(samples: Samples, options: ModelOptions) -> ModelComparison:
+    """Compare nested models on the readings of one sensor.
+
+    Parameters
+    ----------
+    samples
+        Readings in order of time.
+    options
+        How.
+
+    Raises
+    ------
+    CalibrationError
+        There are too few readings, or numbers or weights that make no sense.
+    """
+    check_samples(samples, options)
+    models = [model for model in Model if samples.names or not model.has_regressors]
+    whole = compress(samples)
+    fits = {model: fit_model(model, whole) for model in models}
+    left = fits[models[-1]].coefficients.residual(samples)
+    correlation = correlation_of(np.sqrt(samples.weights)[:, None] * left)
+    root = inflation(whole, correlation)
+    held_out = predicted(samples, options.segments, models)
+    trials = [
+        trial_of(samples, model, fit, spread_of(fit, whole, root), held_out[model])
+        for model, fit in fits.items()
+    ]
+    choice = choose(trials, options.strong)
+    return ModelComparison(
+        fits=tuple(_figures(trial, choice) for trial in trials),
+        regressors=samples.names,
+        readings=len(samples),
+        independent=len(samples) / float(2 * correlation.sum() - 1),
+        segments=options.segments,
+        recommended=choice.chosen.model,
+        reason=reason_of(choice, trials),
+    )
+
+
+def trial_of(samples: Samples, model: Model, fit: Fit, spread: Spread, held_out: HeldOut) -> Trial:
+    """Return a model with its rms and its BIC."""
+    values = samples.z.size
+    bic = values * np.log(fit.squares / values) + spread.freedom * np.log(values)
+    rms = _rms(fit.coefficients.residual(samples))
+    return Trial(model, fit, spread, rms, held_out, float(bic))
+
+
+def check_samples(samples: Samples, options: ModelOptions) -> None:
+    """Refuse what no model can be fitted to.
+
+    Raises
+    ------
+    CalibrationError
+        One line that says what is wrong.
+    """
+    parts = {"readings": samples.z, "predicted fields": samples.b, "rates": samples.db_dt}
+    parts |= {f"regressor {name!r}": samples.q[:, k] for k, name in enumerate(samples.names)}
+    for what, values in parts.items():
+        if not np.isfinite(values).all():
+            raise CalibrationError(f"models: {what}: some are not finite; leave these readings out")
+    if not (np.isfinite(samples.weights) & (samples.weights > 0)).all():
+        raise CalibrationError("models: every reading needs a finite weight above 0")
+    columns = samples.columns().shape[1]
+    needed = max(PER_COLUMN * (1 + columns), PER_SEGMENT * options.segments)
+    if len(samples) < needed:
+        raise CalibrationError(
+            f"models: {len(samples)} readings cannot tell models of {columns} columns apart in "
+            f"{options.segments} segments, at least {needed} are needed"
+        )
+
+
+def correlation_of(residual: FloatArray) -> FloatArray:
+    """Return the correlation of residuals no, one, two, ... readings apart, shape (N,).
+
+    It is zero from the first that is not positive: after that there is only noise in them.
+
+    Parameters
+    ----------
+    residual
+        Weighted, in order of time, shape (N, 3).
+    """
+    N = len(residual)
+    power = np.abs(np.fft.rfft(residual, 2 * N, axis=0)) ** 2
+    covariance = np.fft.irfft(power, 2 * N, axis=0)[:N].sum(axis=1)
+    covariance[np.cumsum(covariance <= 0) > 0] = 0.0
+    covariance[0] = max(covariance[0], np.finfo(float).tiny)
+    return np.asarray(covariance / covariance[0])
+
+
+def predicted(samples: Samples, segments: int, models: list[Model]) -> dict[Model, HeldOut]:
+    """Return how each model, fitted to the other segments, predicts each segment."""
+    segment = np.arange(len(samples)) * segments // len(samples)
+    residual = {model: np.empty_like(samples.z) for model in models}
+    scores = {model: np.empty(segments) for model in models}
+    for k in range(segments):
+        others, held_out = compress(samples[segment != k]), samples[segment == k]
+        for model in models:
+            fit = fit_model(model, others)
+            e = fit.coefficients.residual(held_out)
+            residual[model][segment == k] = e
+            scores[model][k] = np.mean(_log_density(e, fit.variance / held_out.weights))
+    return {model: HeldOut(_rms(residual[model]), scores[model]) for model in models}
+
+
+def _log_density(residual: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return it for residuals in uT, shape (N, 3), of variances per axis in uT^2, shape (N,)."""
+    squares = np.sum(residual**2, axis=1) / variance
+    return np.asarray(-0.5 * (squares + 3 * np.log(2 * np.pi * variance)))
+
+
+def _figures(trial: Trial, choice: Choice) -> ModelFit:
+    behind, error = choice.best.lead(trial)
+    return ModelFit(
+        model=trial.model,
+        parameters=trial.fit.parameters,
+        coefficients=trial.fit.coefficients,
+        sigma=trial.spread.sigma,
+        rms=trial.rms,
+        held_out_rms=trial.held_out.rms,
+        held_out_score=float(trial.held_out.scores.mean()),
+        score_error=standard_error(trial.held_out.scores),
+        behind=behind,
+        behind_error=error,
+        bic=trial.bic,
+        bic_above=trial.above(choice.least),
+    )
+
+
+def _rms(residual: FloatArray) -> float:
+    return float(np.sqrt(np.mean(residual**2)))

@@ -1,0 +1,117 @@
+r"""Models of what a magnetometer reads, from a rotation and an offset to motors and eddy currents.
+
+The largest is linear in its coefficients,
+
+.. math::
+    z = C b + H + \sum_k q_k h_k + E \, db/dt + \text{noise},
+
+with numbers q_k that were recorded along the drive (a current, a speed) and the eddy currents of
+Tolles and Lawson in the last term. Smaller ones leave terms out or restrict C. A clock that is off
+by tau gives E = tau C: the last term holds a time offset, too.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Self
+
+import numpy as np
+
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+
+
+class Model(StrEnum):
+    """What a magnetometer's readings are made of, from few parameters to many."""
+
+    OFFSET = "offset"
+    SCALE = "scale"
+    FULL = "full"
+    REGRESSORS = "full + regressors"
+    EDDY = "full + eddy"
+    ALL = "full + regressors + eddy"
+
+    @property
+    def has_regressors(self) -> bool:
+        """Whether recorded numbers take part."""
+        return self in (Model.REGRESSORS, Model.ALL)
+
+    @property
+    def has_eddy(self) -> bool:
+        """Whether the field's rate of change takes part."""
+        return self in (Model.EDDY, Model.ALL)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Readings of one sensor in order of time, and what could explain them.
+
+    Attributes
+    ----------
+    z
+        Readings in uT, shape (N, 3).
+    b
+        Field in the lidar frame at the sensor that the map predicts, uT, shape (N, 3).
+    db_dt
+        Its rate of change along the drive in uT/s, shape (N, 3).
+    q
+        Recorded numbers at the readings, each in its own unit, shape (N, K).
+    weights
+        One over the variance of each reading in 1/uT^2, shape (N,).
+    names
+        Of the K numbers.
+    """
+
+    z: FloatArray
+    b: FloatArray
+    db_dt: FloatArray
+    q: FloatArray
+    weights: FloatArray
+    names: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> "Samples":
+        return Samples(
+            self.z[rows],
+            self.b[rows],
+            self.db_dt[rows],
+            self.q[rows],
+            self.weights[rows],
+            self.names,
+        )
+
+    def columns(self) -> FloatArray:
+        """Return b, q and db/dt side by side, shape (N, 3 + K + 3)."""
+        return np.hstack([self.b, self.q, self.db_dt])
+
+
+@dataclass(frozen=True)
+class Coefficients:
+    """What multiplies what, or a standard deviation of each.
+
+    Attributes
+    ----------
+    C
+        Distortion matrix, shape (3, 3).
+    H
+        Offset in uT, with all recorded numbers at zero, shape (3,).
+    h
+        Field of each recorded number in the sensor's frame, uT per unit of it, shape (K, 3).
+    E
+        Of the eddy currents in seconds, shape (3, 3).
+    """
+
+    C: FloatArray
+    H: FloatArray
+    h: FloatArray
+    E: FloatArray
+
+    @classmethod
+    def of_columns(cls, X: FloatArray, H: FloatArray) -> Self:
+        """Return the coefficients of b, q and db/dt, shape (3 + K + 3, 3), and H."""
+        return cls(X[:3].T, H, X[3:-3], X[-3:].T)
+
+    def residual(self, samples: Samples) -> FloatArray:
+        """Return what is left of readings in uT, shape (N, 3)."""
+        explained = samples.b @ self.C.T + samples.q @ self.h + samples.db_dt @ self.E.T
+        return np.asarray(samples.z - explained - self.H)
