@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FieldSample, FloatArray, Readings
-from l2m_gtsam.graph.global_start import Basin, StartOptions, distinct, find_starts
+from l2m_gtsam.graph.descent import Basin
+from l2m_gtsam.graph.global_start import StartOptions, distinct, find_starts
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.results import FoundStart
 from tests.worlds import DipoleWorld, dipole_world, drive, random_sensors
