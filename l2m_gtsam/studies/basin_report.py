@@ -34,8 +34,8 @@ def sensors(table: BasinTable) -> str:
     """Return how many distortions never failed: trials that are independent."""
     small, medium = sizes(table.options)
     return (
-        f"One-key, every start of a distortion within {small}: {counted(table.all_small)} "
-        f"distortions; within {medium}: {counted(table.all_medium)}."
+        f"Distortions of which one-key brought every start within {small}: "
+        f"{counted(table.all_small)}; within {medium}: {counted(table.all_medium)}."
     )
 
 
