@@ -24,6 +24,7 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("basin_out"),
     distortions: Annotated[int, typer.Option(min=1, help="Random sensors.")] = 20,
     starts: Annotated[int, typer.Option(min=1, help="Starts of each sensor in each ring.")] = 100,
+    lm_starts: Annotated[int, typer.Option(min=1, help="Of them, those that LM gets.")] = 20,
     rings: Annotated[int, typer.Option(min=1, help="Rings of 0.25 m.")] = 12,
     seed: Annotated[int, typer.Option(min=0, help="Of drives, sensors and starts.")] = 1,
     processes: Annotated[int, typer.Option(min=1, help="How many compute.")] = 1,
@@ -39,7 +40,9 @@ def main(
         place = f"distortion {cell.distortion}, ring {cell.ring}"
         typer.echo(f"{monotonic() - begin:8.1f} s {share:7.1%}: {place}", err=True)
 
-    options = BasinOptions(distortions=distortions, starts=starts, rings=rings, seed=seed)
+    options = BasinOptions(
+        distortions=distortions, starts=starts, lm_starts=lm_starts, rings=rings, seed=seed
+    )
     typer.echo(basin_markdown(run_basin(options, out, processes, tell)))
 
 

@@ -7,38 +7,28 @@ followed to their minima on the map itself.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from pydantic import Field
 from scipy.ndimage import minimum_filter
 
-from l2m_gtsam.data import BoolArray, FloatArray, Readings
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
+from l2m_gtsam.graph.descent import Basin, Terrain, descend
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.field_map import Surveyed
 from l2m_gtsam.maps.nearest import NearestReadings
 from l2m_gtsam.options import Options
 from l2m_gtsam.results import FoundStart
-from l2m_gtsam.solve.profile import (
-    Linearisation,
-    Prediction,
-    Snapshots,
-    linearised,
-    misfits,
-    snapshots_of,
-)
-from l2m_gtsam.solve.robust import RobustOptions, consistent
+from l2m_gtsam.solve.profile import Prediction, Snapshots, misfits, snapshots_of
 from l2m_gtsam.threads import in_threads
 
 BATCH = 256  # candidates at a time
 FIRST = 10  # poses that tell whether a candidate lies in the map at all
-STEPS = 30  # of Gauss-Newton; four to eight are usual
-SETTLED = 1e-3  # metres: the solve itself goes on from there
 STRIDE = 1.9  # steps of the grid: places nearer to a better one are not followed
 TINY = np.finfo(float).tiny
-# A whitened residual this long is an outlier; from a start that is only near most are long.
-LARGEST = RobustOptions().largest
-FEWEST = 12  # readings inside: as many components as a distortion has parameters, three times
+
+Node = tuple[int, int, int, int]
+"""A sensor, and a place in steps of the lattice."""
 
 
 class StartOptions(Options):
@@ -69,22 +59,6 @@ class StartOptions(Options):
     square), the start is ambiguous."""
 
 
-@dataclass(frozen=True)
-class Basin:
-    """A place that explains a sensor's readings better than those around it.
-
-    Attributes
-    ----------
-    t
-        In the lidar frame in metres, shape (3,).
-    rms
-        What it leaves of the readings that it explains best, per axis in uT.
-    """
-
-    t: FloatArray
-    rms: float
-
-
 def find_starts(
     readings: Readings, field_map: QueryableMap, centre: FloatArray, options: StartOptions
 ) -> list[FoundStart | None]:
@@ -101,34 +75,73 @@ def find_starts(
     options
         How wide and how fine to look.
     """
+    return find_starts_around(readings, field_map, centre[None], options)[0]
+
+
+def find_starts_around(
+    readings: Readings, field_map: QueryableMap, centres: FloatArray, options: StartOptions
+) -> list[list[FoundStart | None]]:
+    """Return for each of several centres what ``find_starts`` does, looking at a place once.
+
+    Parameters
+    ----------
+    readings
+        Of all sensors.
+    field_map
+        The magnetic map.
+    centres
+        In the lidar frame in metres, shape (N, 3); the box about all of them is in memory.
+    options
+        How wide and how fine to look around each.
+    """
     together = snapshots_of(readings, options.poses)
-    found = starts_of(together, field_map, centre, options)
+    found = starts_of(together, field_map, centres, options)
     for sensor in np.flatnonzero(~together.shared()).tolist():
         # A sensor that reads at other times than the rest is looked for by itself.
         rows = np.arange(len(readings))[readings.rows_of(sensor)]
         if len(rows):
             alone = snapshots_of(readings[rows], options.poses)
-            found[sensor] = starts_of(alone, field_map, centre, options)[sensor]
+            for each, own in zip(found, starts_of(alone, field_map, centres, options), strict=True):
+                each[sensor] = own[sensor]
     return found
 
 
 def starts_of(
-    snapshots: Snapshots, field_map: QueryableMap, centre: FloatArray, options: StartOptions
-) -> list[FoundStart | None]:
-    """Return where each sensor is from readings at common poses; see ``find_starts``."""
-    grid = Candidates.around(centre, options)
+    snapshots: Snapshots, field_map: QueryableMap, centres: FloatArray, options: StartOptions
+) -> list[list[FoundStart | None]]:
+    """Return where each sensor is, by centre, from readings at common poses."""
     coarse = coarse_prediction(field_map, options)
-    left = look(snapshots, coarse, grid, options)
-    hopes = [hopes_of(grid, left[..., sensor], options) for sensor in range(left.shape[-1])]
-    ends = descend(snapshots, fine_prediction(field_map, coarse), field_map, hopes, options)
-    return [
-        found_start(distinct(basins, options.apart), each)
-        for basins, each in zip(ends, hopes, strict=True)
+    balls = [Candidates.around(centre, options) for centre in centres]
+    union = Candidates.union(balls)
+    left = look(snapshots, coarse, union, options)
+    hopes = [
+        hopes_of(ball, np.where(ball.within, part, np.inf), sensor, options)
+        for ball in balls
+        for sensor, part in enumerate(np.moveaxis(left[ball.slices_of(union)], -1, 0))
     ]
+    fine = fine_prediction(field_map, coarse)
+    good = 1 - options.outliers
+    followed = follow(Terrain(snapshots, fine, field_map, options.step, good), hopes, options.step)
+    found = [found_start(each, followed, options) for each in hopes]
+    sensors = left.shape[-1]
+    return [found[row : row + sensors] for row in range(0, len(found), sensors)]
 
 
-def found_start(basins: tuple[Basin, ...], hopes: "Hopes") -> FoundStart | None:
-    """Return the best of a sensor's basins, best first, beside the second best."""
+def follow(terrain: Terrain, hopes: list["Hopes"], step: float) -> dict[Node, Basin]:
+    """Return the minimum that each node of any hopes leads to, of those that lead anywhere."""
+    nodes = sorted({node for each in hopes for node in each.nodes})
+    sensors = np.array([node[0] for node in nodes], dtype=np.int64)
+    t = step * np.array([node[1:] for node in nodes]).reshape(-1, 3)
+    ends = descend(terrain, sensors, t)
+    return {node: end for node, end in zip(nodes, ends, strict=True) if end is not None}
+
+
+def found_start(
+    hopes: "Hopes", followed: dict[Node, Basin], options: StartOptions
+) -> FoundStart | None:
+    """Return the best of the basins that a sensor's hopes led to, beside the second best."""
+    reached = [followed[node] for node in hopes.nodes if node in followed]
+    basins = distinct(reached, options.apart)
     if not basins:
         return None
     best, margin, runner_up = basins[0], hopes.margin, hopes.runner_up
@@ -163,46 +176,74 @@ def fine_prediction(field_map: QueryableMap, coarse: Prediction) -> Prediction:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Places on a cubic grid, of which those within a ball are looked at.
+    """Places on a cubic lattice, of which those within some balls are looked at.
+
+    They are the lidar frame's multiples of a step: searches around different centres look at the
+    same places.
 
     Attributes
     ----------
-    t
-        All nodes in the lidar frame in metres, shape (n, n, n, 3).
+    step
+        Metres.
+    lowest
+        The first node in steps, shape (3,).
     within
-        Those in the ball, shape (n, n, n).
+        Which nodes of a box are in a ball, shape (nx, ny, nz).
     """
 
-    t: FloatArray
+    step: float
+    lowest: IntArray
     within: BoolArray
 
     @classmethod
     def around(cls, centre: FloatArray, options: StartOptions) -> "Candidates":
-        """Return the candidates about a middle."""
-        half = int(np.ceil(options.search_radius / options.step))
-        axis = options.step * np.arange(-half, half + 1)
-        offset = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
-        within = np.linalg.norm(offset, axis=-1) <= options.search_radius
-        return cls(centre + offset, within)
+        """Return the candidates in the ball about a centre in metres, shape (3,)."""
+        radius, step = options.search_radius, options.step
+        lowest = np.floor((centre - radius) / step).astype(np.int64)
+        highest = np.ceil((centre + radius) / step).astype(np.int64)
+        box = cls(step, lowest, np.ones(highest - lowest + 1, dtype=np.bool_))
+        away = np.linalg.norm(box.t(np.argwhere(box.within)) - centre, axis=1)
+        return replace(box, within=(away <= radius).reshape(box.within.shape))
+
+    @classmethod
+    def union(cls, balls: Sequence["Candidates"]) -> "Candidates":
+        """Return the candidates in any of some balls of one step."""
+        lowest = np.min([ball.lowest for ball in balls], axis=0)
+        ends = [ball.lowest + ball.within.shape for ball in balls]
+        whole = cls(balls[0].step, lowest, np.zeros(np.max(ends, axis=0) - lowest, dtype=np.bool_))
+        for ball in balls:
+            whole.within[ball.slices_of(whole)] |= ball.within
+        return whole
+
+    def slices_of(self, whole: "Candidates") -> tuple[slice, slice, slice]:
+        """Return where the box lies in a larger one."""
+        x, y, z = (self.lowest - whole.lowest).tolist()
+        nx, ny, nz = self.within.shape
+        return slice(x, x + nx), slice(y, y + ny), slice(z, z + nz)
+
+    def t(self, nodes: IntArray) -> FloatArray:
+        """Return nodes of the box, shape (N, 3), in the lidar frame in metres."""
+        return np.asarray(self.step * (self.lowest + nodes))
 
 
 def look(
     snapshots: Snapshots, predict: Prediction, grid: Candidates, options: StartOptions
 ) -> FloatArray:
-    """Return the misfits in uT of all nodes and sensors, shape (n, n, n, S).
+    """Return the misfits in uT of all nodes and sensors, shape (nx, ny, nz, S).
 
     They are infinite where too few readings would lie in the map.
     """
     left = np.full((*grid.within.shape, snapshots.field.shape[1]), np.inf)
-    nodes = np.argwhere(grid.within)
-    _, inside = predict(snapshots.thinned(FIRST).places(grid.t[tuple(nodes.T)]).reshape(-1, 3))
-    often = inside.reshape(len(nodes), -1).mean(axis=1) >= 0.5 * options.least_known
-    nodes = nodes[often]
+    nodes, first = np.argwhere(grid.within), snapshots.thinned(FIRST)
 
     def write(start: int) -> None:
-        at = tuple(nodes[start : start + BATCH].T)
-        part = misfits(snapshots, predict, grid.t[at], 1 - options.outliers)
-        left[at] = np.where(part.known >= options.least_known, part.rms, np.inf)
+        at = nodes[start : start + BATCH]
+        _, inside = predict(first.places(grid.t(at)).reshape(-1, 3))
+        often = inside.reshape(len(at), -1).mean(axis=1) >= 0.5 * options.least_known
+        if often.any():
+            at = at[often]
+            part = misfits(snapshots, predict, grid.t(at), 1 - options.outliers)
+            left[tuple(at.T)] = np.where(part.known >= options.least_known, part.rms, np.inf)
 
     in_threads(write, range(0, len(nodes), BATCH))
     return left
@@ -214,8 +255,8 @@ class Hopes:
 
     Attributes
     ----------
-    t
-        In the lidar frame in metres, shape (B, 3).
+    nodes
+        The sensor and the place in steps of the lattice.
     margin
         How many times more (root mean square) the best place that is not followed leaves on the
         grid than the best of all; infinite if there is none.
@@ -223,158 +264,43 @@ class Hopes:
         That place in metres, shape (3,), if there is one.
     """
 
-    t: FloatArray
+    nodes: tuple[Node, ...]
     margin: float
     runner_up: FloatArray | None
 
 
-def hopes_of(grid: Candidates, left: FloatArray, options: StartOptions) -> Hopes:
-    """Return the places on the grid that could, seen finely, lead to the best.
+def hopes_of(grid: Candidates, left: FloatArray, sensor: int, options: StartOptions) -> Hopes:
+    """Return the places of a ball that could, seen finely, lead to the best.
 
     Beside minima these are nodes some steps from better ones: the coarse map knows little of
-    heights, and its minimum may lie over or under the true one.
+    heights, and its minimum may lie over or under the true one. ``left`` is the sensor's misfits
+    in uT, infinite outside of the ball, shape (nx, ny, nz).
     """
     nodes = np.argwhere(np.isfinite(left))
     value = left[tuple(nodes.T)]
     order = np.argsort(value, kind="stable")
-    places, ratio = grid.t[tuple(nodes[order].T)], value[order]
+    nodes, ratio = nodes[order], value[order]
+    places, apart = grid.t(nodes), STRIDE * options.step
     ratio = ratio / max(ratio.min(initial=np.inf), TINY)
-    picked = spread_out(places[ratio <= options.follow], STRIDE * options.step, options.basins)
-    lowest = (left == minimum_filter(left, size=3))[tuple(nodes[order].T)]
-    away = np.linalg.norm(places[:, None] - picked, axis=2).min(axis=1, initial=np.inf)
-    rest = np.flatnonzero(lowest & (away >= STRIDE * options.step))
+    picked = spread_out(places[ratio <= options.follow], apart, options.basins)
+    chosen = tuple((sensor, *node) for node in (grid.lowest + nodes[picked]).tolist())
+    lowest = (left == minimum_filter(left, size=3))[tuple(nodes.T)]
+    away = np.linalg.norm(places[:, None] - places[picked], axis=2).min(axis=1, initial=np.inf)
+    rest = np.flatnonzero(lowest & (away >= apart))
     if not len(rest):
-        return Hopes(picked, float("inf"), None)
-    return Hopes(picked, float(ratio[rest[0]]), places[rest[0]])
+        return Hopes(chosen, float("inf"), None)
+    return Hopes(chosen, float(ratio[rest[0]]), places[rest[0]])
 
 
-def spread_out(places: FloatArray, apart: float, most: int) -> FloatArray:
-    """Return at most so many places, the first ones that keep a distance from those before."""
-    picked: list[FloatArray] = []
-    for place in places:
-        if len(picked) == most:
-            break
-        if all(np.linalg.norm(place - other) >= apart for other in picked):
-            picked.append(place)
-    return np.array(picked).reshape(-1, 3)
-
-
-def descend(
-    snapshots: Snapshots,
-    predict: Prediction,
-    field_map: QueryableMap,
-    hopes: list[Hopes],
-    options: StartOptions,
-) -> list[list[Basin]]:
-    """Return the minima that the places of each sensor lead to.
-
-    Gauss-Newton, all places in step: the map is asked once for all of them. Those about which too
-    little is known lead nowhere.
-    """
-    descents = [
-        Descent.begin(snapshots, sensor, t) for sensor, each in enumerate(hopes) for t in each.t
-    ]
-    if not descents:
-        return [[] for _ in hopes]
-    told = predict(np.concatenate([each.places for each in descents]))
-    fields, inside = (split(part, descents) for part in told)
-    descents = [each.starting(*at) for each, *at in zip(descents, fields, inside, strict=True)]
-    active = descents = [each for each in descents if len(each.z) >= FEWEST]
-    for _ in range(STEPS):
-        if not active:
-            break
-        asked = field_map.field_and_gradient(np.concatenate([each.places for each in active]))
-        answers = zip(*(split(part, active) for part in asked), strict=True)
-        for each, (field, gradient) in zip(active, answers, strict=True):
-            each.go_on(linearised(field, gradient, each.R, each.z), options.step)
-        active = [each for each in active if np.linalg.norm(each.step) > SETTLED]
-    rms = at_ends(snapshots, predict, descents, 1 - options.outliers)
-    return [
-        [Basin(d.t, left) for d, left in zip(descents, rms, strict=True) if d.sensor == s]
-        for s in range(len(hopes))
-    ]
-
-
-def at_ends(
-    snapshots: Snapshots, predict: Prediction, descents: list["Descent"], good: float
-) -> list[float]:
-    """Return what each descent's end leaves of its sensor's readings in uT."""
-    if not descents:
-        return []
-    ends = misfits(snapshots, predict, np.stack([each.t for each in descents]), good)
-    return [float(ends.rms[row, each.sensor]) for row, each in enumerate(descents)]
-
-
-@dataclass
-class Descent:
-    """The way of one sensor from a place to a minimum of its cost.
-
-    Attributes
-    ----------
-    sensor
-        Index of the sensor.
-    R, p, z
-        Poses of the lidar in the map and readings in uT, shapes (K, 3, 3), (K, 3) and (K, 3).
-    trial, step
-        Where the cost is asked next, and how far that is from ``t``, shape (3,), metres.
-    t, least
-        The best place so far, shape (3,), and its cost in uT^2.
-    """
-
-    sensor: int
-    R: FloatArray
-    p: FloatArray
-    z: FloatArray
-    trial: FloatArray
-    step: FloatArray
-    t: FloatArray
-    least: float = float("inf")
-
-    @classmethod
-    def begin(cls, snapshots: Snapshots, sensor: int, t: FloatArray) -> "Descent":
-        """Return a descent from a place in metres, shape (3,)."""
-        has = np.isfinite(snapshots.field[:, sensor]).all(axis=1)
-        return cls(
-            sensor,
-            snapshots.R_map_lidar[has],
-            snapshots.p_map_lidar[has],
-            snapshots.field[has, sensor],
-            trial=t,
-            step=np.full(3, np.inf),
-            t=t,
-        )
-
-    def starting(self, field: FloatArray, inside: BoolArray) -> "Descent":
-        """Return the same on readings inside the map that are no outliers seen from here.
-
-        ``field`` in uT, shape (K, 3), is that of the map at ``places``.
-        """
-        rows = np.flatnonzero(inside)
-        b = np.einsum("kji,kj->ki", self.R[rows], field[rows])
-        if len(rows) >= FEWEST:
-            rows = rows[consistent(b, self.z[rows], np.zeros(len(rows)), LARGEST)]
-        return replace(self, R=self.R[rows], p=self.p[rows], z=self.z[rows])
-
-    @property
-    def places(self) -> FloatArray:
-        """Where the readings would have been taken in the map, metres, shape (K, 3)."""
-        return np.asarray(self.R @ self.trial + self.p)
-
-    def go_on(self, seen: Linearisation, longest: float) -> None:
-        """Take the Gauss-Newton step, or a quarter of the last one where that led uphill."""
-        cost = float(seen.residual @ seen.residual)
-        if cost < self.least:
-            self.t, self.least = self.trial, cost
-            step = seen.step()
-            self.step = step * min(1.0, longest / max(float(np.linalg.norm(step)), TINY))
-        else:
-            self.step = 0.25 * self.step
-        self.trial = self.t + self.step
-
-
-def split(values: Any, descents: Sequence[Descent]) -> list[Any]:
-    """Return the rows of each descent."""
-    return np.split(values, np.cumsum([len(each.z) for each in descents])[:-1])
+def spread_out(places: FloatArray, apart: float, most: int) -> list[int]:
+    """Return at most so many rows, the first ones that keep a distance from those before."""
+    picked: list[int] = []
+    free = np.ones(len(places), dtype=np.bool_)
+    while len(picked) < most and free.any():
+        row = int(np.argmax(free))
+        picked.append(row)
+        free &= np.linalg.norm(places - places[row], axis=1) >= apart
+    return picked
 
 
 def distinct(basins: list[Basin], apart: float) -> tuple[Basin, ...]:

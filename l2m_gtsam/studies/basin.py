@@ -6,8 +6,13 @@ truth. Two methods get the same readings, map and starts. *One-key* looks for a 
 around the given one and solves from there: the given start is all that it is told. *LM* is
 Levenberg-Marquardt over t, C and H from the given start itself.
 
-A cell of the study, one distortion and one ring, is a function of the options alone: cells may be
-computed in any order and anywhere.
+The starts of one distortion share a drive, and the lattice on which one-key looks: what differs
+between them is which of its nodes lie in the ball. Starts whose balls hold the same best nodes
+find the same place and end in the same result, which is then computed once. Starts are therefore
+no independent trials of one-key; distortions, each with a drive and noise of its own, are.
+
+A cell of the study, one distortion and one ring, is a function of the options alone, up to
+rounding: cells may be computed in any order and anywhere.
 """
 
 from collections.abc import Sequence
@@ -16,16 +21,15 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import BoolArray, FloatArray, Readings
+from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.global_start import StartOptions, find_starts
+from l2m_gtsam.graph.global_start import StartOptions, find_starts_around
 from l2m_gtsam.graph.one_key import solve_one_key
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.options import Options
 from l2m_gtsam.results import FoundStart, Uncertainty
 from l2m_gtsam.studies.levenberg_marquardt import levenberg_marquardt
 from l2m_gtsam.studies.share import Share
-from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive
+from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, mapped_site, random_drive
 
 DRIVE, STARTS = 1, 2  # streams of randomness
 
@@ -39,6 +43,9 @@ class BasinOptions(Options):
     """Sensors of random place and distortion, each on its own drive."""
     starts: int = Field(default=100, ge=1)
     """Of each sensor in each ring."""
+    lm_starts: int = Field(default=20, ge=1)
+    """The baseline runs from so many of them, the first: its rate needs fewer trials, and far out
+    it takes seconds per start."""
     rings: int = Field(default=12, ge=1)
     """Rings of initial offsets, from the truth outwards."""
     width: float = Field(default=0.25, gt=0)
@@ -77,7 +84,7 @@ class Cell:
     t_one_key
         Where one-key ended, NaN where it ended without a result, shape (N, 3).
     t_lm
-        Where Levenberg-Marquardt ended, shape (N, 3).
+        Where Levenberg-Marquardt ended from the first L of the starts, shape (L, 3).
     """
 
     distortion: int
@@ -123,37 +130,68 @@ class RingRow:
 
 @dataclass(frozen=True)
 class BasinTable:
-    """The study's outcome, one row per ring from the truth outwards."""
+    """The study's outcome.
+
+    Attributes
+    ----------
+    options
+        The study.
+    rows
+        One per ring from the truth outwards.
+    all_small, all_medium
+        Distortions of which one-key brought every start within a small or medium error.
+    """
 
     options: BasinOptions
     rows: tuple[RingRow, ...]
+    all_small: Share
+    all_medium: Share
 
 
-def cell(options: BasinOptions, distortion: int, ring: int) -> Cell:
-    """Calibrate one sensor from all starts of one ring."""
+@dataclass(frozen=True)
+class Found:
+    """What the search found from N given starts; see ``Cell``.
+
+    Attributes
+    ----------
+    t
+        Shape (N, 3).
+    margin
+        Shape (N,).
+    ambiguous
+        Shape (N,).
+    """
+
+    t: FloatArray
+    margin: FloatArray
+    ambiguous: BoolArray
+
+
+def cells_of(options: BasinOptions, distortion: int, rings: Sequence[int]) -> list[Cell]:
+    """Calibrate one sensor from all starts of some rings."""
     site = mapped_site(options.site)
     rng = np.random.default_rng([options.seed, distortion, 0, DRIVE])
     drive = random_drive(site, options.site, rng)
-    readings, t_true = drive.readings, drive.sensor.t_lidar_mag
-    t_start = random_starts(options, t_true, distortion, ring)
-    found = [find_starts(readings, site.field_map, t, options.search)[0] for t in t_start]
-    t_found = np.array([np.full(3, np.nan) if each is None else each.t_lidar_mag for each in found])
-    return Cell(
-        distortion=distortion,
-        ring=ring,
-        t_true=t_true,
-        t_start=t_start,
-        t_found=t_found,
-        margin=np.array([np.inf if each is None else each.margin for each in found]),
-        ambiguous=np.array([is_ambiguous(each, options.search) for each in found]),
-        t_one_key=one_key(readings, site.field_map, t_found, options.solve),
-        t_lm=plain_lm(readings, site.field_map, t_start, options),
-    )
-
-
-def is_ambiguous(found: FoundStart | None, options: StartOptions) -> bool:
-    """Return whether a start was found that another place rivals."""
-    return found is not None and found.ambiguous(options.clear)
+    t_true = drive.sensor.t_lidar_mag
+    t_start = np.concatenate([random_starts(options, t_true, distortion, ring) for ring in rings])
+    found = search(site, drive, t_start, options.search)
+    t_one_key = one_key(site, drive, found.t, options.solve)
+    cells = []
+    for index, ring in enumerate(rings):
+        rows = slice(index * options.starts, (index + 1) * options.starts)
+        cell = Cell(
+            distortion=distortion,
+            ring=ring,
+            t_true=t_true,
+            t_start=t_start[rows],
+            t_found=found.t[rows],
+            margin=found.margin[rows],
+            ambiguous=found.ambiguous[rows],
+            t_one_key=t_one_key[rows],
+            t_lm=plain_lm(site, drive, t_start[rows][: options.lm_starts], options),
+        )
+        cells.append(cell)
+    return cells
 
 
 def random_starts(
@@ -167,51 +205,59 @@ def random_starts(
     return np.asarray(t_true + offset * direction)
 
 
+def search(site: Site, drive: SiteDrive, t_start: FloatArray, options: StartOptions) -> Found:
+    """Return what one-key finds around each given start, shape (N, 3)."""
+    each = find_starts_around(drive.readings, site.field_map, t_start, options)
+    found = [starts[0] for starts in each]
+    nowhere = FoundStart(np.full(3, np.nan), np.inf, None)
+    return Found(
+        np.array([(start or nowhere).t_lidar_mag for start in found]),
+        np.array([(start or nowhere).margin for start in found]),
+        np.array([start is not None and start.ambiguous(options.clear) for start in found]),
+    )
+
+
 def one_key(
-    readings: Readings, field_map: QueryableMap, t_found: FloatArray, options: OneKeyOptions
+    site: Site, drive: SiteDrive, t_found: FloatArray, options: OneKeyOptions
 ) -> FloatArray:
     """Return where the one-key solve ends from each start that was found, shape (N, 3).
 
-    As many sensors with the same readings are solved in one graph, as those of a vehicle are; the
-    map is then asked once for all of them. None shares a variable with another.
+    Each by itself, as for a vehicle with one sensor; from the same place it ends in the same.
     """
-    ends = np.full_like(t_found, np.nan)
-    rows = np.flatnonzero(np.isfinite(t_found).all(axis=1))
-    if len(rows):
-        solution = solve_one_key(repeated(readings, len(rows)), field_map, t_found[rows], options)
-        solved = [each.sensor for each in solution.solved]
-        ends[rows[solved]] = solution.estimate.t[solved]
-    return ends
-
-
-def repeated(readings: Readings, count: int) -> Readings:
-    """Return the readings of one sensor as those of so many."""
-    rows = np.tile(np.arange(len(readings)), count)
-    return Readings(
-        sensors=tuple(f"{readings.sensors[0]}_{index}" for index in range(count)),
-        sensor=np.repeat(np.arange(count), len(readings)),
-        stamp_ns=readings.stamp_ns[rows],
-        R_map_lidar=readings.R_map_lidar[rows],
-        p_map_lidar=readings.p_map_lidar[rows],
-        field=readings.field[rows],
-    )
+    distinct, which = np.unique(t_found, axis=0, return_inverse=True)
+    ends = np.full_like(distinct, np.nan)
+    for row in np.flatnonzero(np.isfinite(distinct).all(axis=1)):
+        solution = solve_one_key(drive.readings, site.field_map, distinct[row][None], options)
+        if solution.solved:
+            ends[row] = solution.estimate.t[0]
+    return ends[which.ravel()]
 
 
 def plain_lm(
-    readings: Readings, field_map: QueryableMap, t_start: FloatArray, options: BasinOptions
+    site: Site, drive: SiteDrive, t_start: FloatArray, options: BasinOptions
 ) -> FloatArray:
     """Return where Levenberg-Marquardt ends from each start, shape (N, 3): each by itself."""
     noise = options.site.scenario.noise.field
-    return np.array(
-        [levenberg_marquardt(readings, field_map, t, noise, options.solve) for t in t_start]
-    )
+    ends = [
+        levenberg_marquardt(drive.readings, site.field_map, t, noise, options.solve)
+        for t in t_start
+    ]
+    return np.array(ends)
 
 
 def basin_table(options: BasinOptions, cells: Sequence[Cell]) -> BasinTable:
     """Return the counts of all cells; rings without any are left out."""
     rings = sorted({each.ring for each in cells})
     rows = [ring_row(options, [each for each in cells if each.ring == ring]) for ring in rings]
-    return BasinTable(options, tuple(rows))
+    worst: dict[int, float] = {}
+    for each in cells:
+        # NaN, no result, is as bad as can be.
+        error = float(np.nan_to_num(each.error(each.t_one_key), nan=np.inf).max())
+        worst[each.distortion] = max(error, worst.get(each.distortion, 0.0))
+    errors = np.array(list(worst.values()))
+    return BasinTable(
+        options, tuple(rows), within(errors, options.small), within(errors, options.medium)
+    )
 
 
 def ring_row(options: BasinOptions, cells: Sequence[Cell]) -> RingRow:

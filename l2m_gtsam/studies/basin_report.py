@@ -23,17 +23,40 @@ def basin_markdown(table: BasinTable) -> str:
     """Return the table of a study with 95 % intervals, and under it what was counted."""
     small, medium = sizes(table.options)
     head = (
-        f"| initial offset (m) | starts | one-key within {small} | within {medium} "
+        f"| initial offset (m) | starts | one-key within {small} | within {medium} | LM starts "
         f"| LM within {small} | within {medium} | ambiguous | wrong, not ambiguous |"
     )
-    note = (
-        "Each start is calibrated by both methods, with "
+    rows = [table_line(row) for row in table.rows]
+    return "\n".join([head, "|---" * 9 + "|", *rows, "", sensors(table), "", note(table), ""])
+
+
+def sensors(table: BasinTable) -> str:
+    """Return how many distortions never failed: trials that are independent."""
+    small, medium = sizes(table.options)
+    return (
+        f"Distortions of which one-key brought every start within {small}: "
+        f"{counted(table.all_small)}; within {medium}: {counted(table.all_medium)}."
+    )
+
+
+def counted(share: Share) -> str:
+    """Return a share as counts, with its interval."""
+    low, high = share.interval
+    return f"{share.successes} of {share.trials} ({100 * low:.1f}-{100 * high:.1f} %)"
+
+
+def note(table: BasinTable) -> str:
+    """Return what was counted."""
+    small, _ = sizes(table.options)
+    return (
+        f"Both methods calibrate from the same starts, LM from the first {table.options.lm_starts} "
+        "of each distortion and ring, with "
         f"{table.options.site.scenario.noise.field:g} uT of noise. In brackets Wilson's 95 % "
-        "intervals, which take the starts for independent; those of one distortion share a drive. "
+        "intervals, those of starts as if they were independent. They are not: the starts of one "
+        "distortion share a drive and the lattice of the search, and differ for one-key in which "
+        "nodes lie in the ball around them; more independent is the count of distortions. "
         f"Wrong: not within {small}. Ambiguous: marked so by one-key, right or wrong."
     )
-    rows = [table_line(row) for row in table.rows]
-    return "\n".join([head, "|---" * 8 + "|", *rows, "", note, ""])
 
 
 def sizes(options: BasinOptions) -> tuple[str, str]:
@@ -47,7 +70,9 @@ def table_line(row: RingRow) -> str:
     cells = [
         f"{row.inner:.2f}-{row.outer:.2f}",
         f"{row.one_key_small.trials:,}",
-        *(said(share) for share in shares),
+        *(said(share) for share in shares[:2]),
+        f"{row.lm_small.trials:,}",
+        *(said(share) for share in shares[2:]),
         str(row.ambiguous),
         str(row.unwarned),
     ]

@@ -1,26 +1,23 @@
 """A basin study from start to files, on as many processes as wanted, going on where it stopped."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 
 from l2m_gtsam.qa.figures import save_figure
 from l2m_gtsam.storage.atomic import atomic_path
-from l2m_gtsam.studies.basin import BasinOptions, BasinTable, Cell, basin_table, cell
+from l2m_gtsam.studies.basin import BasinOptions, BasinTable, Cell, basin_table, cells_of
 from l2m_gtsam.studies.basin_file import BasinStudy, cells_to_keep, write_study
 from l2m_gtsam.studies.basin_report import basin_figure, basin_markdown
 
 STUDY_FILE, TABLE_FILE, FIGURE_FILE = "basin.json", "basin.md", "basin.png"
 
-Place = tuple[int, int]
-
 
 def run_basin(
     options: BasinOptions, out: Path, processes: int, tell: Callable[[Cell, float], None]
 ) -> BasinTable:
-    """Compute all cells that a folder does not hold yet, writing after each what there is.
+    """Compute all cells that a folder does not hold yet, writing after each distortion.
 
     Parameters
     ----------
@@ -31,7 +28,7 @@ def run_basin(
     processes
         How many compute; with one it is this one.
     tell
-        Called with each new cell and the share of all that is there.
+        Called with each new cell and the share of all cells that is there.
 
     Raises
     ------
@@ -40,24 +37,29 @@ def run_basin(
     """
     out.mkdir(parents=True, exist_ok=True)
     cells = list(cells_to_keep(out / STUDY_FILE, options))
-    every = list(product(range(options.distortions), range(options.rings)))
     there = {(each.distortion, each.ring) for each in cells}
-    for new in computed(options, [place for place in every if place not in there], processes):
-        cells.append(new)
-        cells.sort(key=lambda each: (each.distortion, each.ring))
+    missing = {
+        distortion: [ring for ring in range(options.rings) if (distortion, ring) not in there]
+        for distortion in range(options.distortions)
+    }
+    for new in computed(options, {d: rings for d, rings in missing.items() if rings}, processes):
+        cells = sorted([*cells, *new], key=lambda each: (each.distortion, each.ring))
         write_results(out, options, cells)
-        tell(new, len(cells) / len(every))
+        for each in new:
+            tell(each, len(cells) / (options.distortions * options.rings))
     return write_results(out, options, cells)
 
 
-def computed(options: BasinOptions, places: Sequence[Place], processes: int) -> Iterator[Cell]:
-    """Yield the cells at these places, as they get ready."""
+def computed(
+    options: BasinOptions, missing: Mapping[int, Sequence[int]], processes: int
+) -> Iterator[list[Cell]]:
+    """Yield the cells of these rings of each distortion, as they get ready."""
     if processes == 1:
-        yield from (cell(options, *place) for place in places)
+        yield from (cells_of(options, *each) for each in missing.items())
         return
     # Forks of a process that has threads may wait for ever.
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        waiting = [pool.submit(cell, options, *place) for place in places]
+        waiting = [pool.submit(cells_of, options, *each) for each in missing.items()]
         yield from (ready.result() for ready in as_completed(waiting))
 
 

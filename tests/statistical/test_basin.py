@@ -10,16 +10,18 @@ from scipy.stats import binomtest
 
 from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.graph.global_start import find_starts
+from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
-from l2m_gtsam.studies.basin import BasinOptions, Cell, basin_table, cell
+from l2m_gtsam.studies.basin import DRIVE, BasinOptions, Cell, basin_table, cells_of
 from l2m_gtsam.studies.basin_file import BasinStudy, read_study, write_study
 from l2m_gtsam.studies.basin_report import basin_markdown
 from l2m_gtsam.studies.basin_run import FIGURE_FILE, STUDY_FILE, TABLE_FILE, run_basin
 from l2m_gtsam.studies.share import Share
-from l2m_gtsam.studies.site import SiteOptions
+from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive
 from tests.quick_maps import quick
 
 HALL = ScenarioOptions(
@@ -31,12 +33,12 @@ HALL = ScenarioOptions(
     calibration_sampling=SamplingOptions(field_rate=3.0),
 )
 SITE = SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("harmonic")))
-TINY = BasinOptions(distortions=1, starts=2, rings=2, width=1.5, site=SITE)
+TINY = BasinOptions(distortions=1, starts=3, lm_starts=2, rings=2, width=1.5, site=SITE)
 
 
 @lru_cache
 def tiny_cells() -> tuple[Cell, ...]:
-    return tuple(cell(TINY, 0, ring) for ring in range(TINY.rings))
+    return tuple(cells_of(TINY, 0, range(TINY.rings)))
 
 
 def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
@@ -52,7 +54,7 @@ def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
         margin=np.full(count, np.inf),
         ambiguous=np.arange(count) == 0,
         t_one_key=np.array(errors)[:, None] * np.array([1.0, 0.0, 0.0]),
-        t_lm=t_start,
+        t_lm=t_start[: TINY.lm_starts],
     )
 
 
@@ -60,7 +62,9 @@ def test_one_key_finds_the_sensor_from_every_start() -> None:
     table = basin_table(TINY, tiny_cells())
     assert [(row.inner, row.outer) for row in table.rows] == [(0.0, 1.5), (1.5, 3.0)]
     for row in table.rows:
-        assert row.one_key_medium == Share(2, 2)
+        assert row.one_key_medium == Share(3, 3)
+        assert row.lm_medium.trials == 2
+    assert table.all_medium == Share(1, 1)
 
 
 def test_starts_lie_in_their_ring() -> None:
@@ -69,10 +73,24 @@ def test_starts_lie_in_their_ring() -> None:
         assert ((offset >= each.ring) & (offset < each.ring + 1)).all()
 
 
-def test_a_cell_repeats_itself() -> None:
-    again = cell(TINY, 0, 0)
-    for name, value in vars(tiny_cells()[0]).items():
-        np.testing.assert_array_equal(getattr(again, name), value)
+def test_a_cell_repeats_itself_also_without_the_others() -> None:
+    (again,) = cells_of(TINY, 0, [1])
+    for name, value in vars(tiny_cells()[1]).items():
+        # Descents go in step with those of other starts: sums over other batches round otherwise.
+        np.testing.assert_allclose(getattr(again, name), value, rtol=1e-9, atol=1e-9)
+
+
+def test_a_start_is_solved_as_the_product_does() -> None:
+    site = mapped_site(SITE)
+    rng = np.random.default_rng([TINY.seed, 0, 0, DRIVE])
+    readings = random_drive(site, SITE, rng).readings
+    for each in tiny_cells():
+        found = find_starts(readings, site.field_map, each.t_start[2], TINY.search)[0]
+        assert found is not None
+        solution = solve_one_key(readings, site.field_map, found.t_lidar_mag[None], TINY.solve)
+        # Rounding, as above; the solve ends where its steps are far below a micrometre.
+        np.testing.assert_allclose(each.t_found[2], found.t_lidar_mag, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(each.t_one_key[2], solution.estimate.t[0], rtol=0, atol=1e-6)
 
 
 def test_all_cells_of_a_distortion_share_its_sensor_and_no_two_their_starts() -> None:
@@ -85,9 +103,20 @@ def test_the_table_counts_what_cells_hold() -> None:
     cells = [made_up(0, 0, [0.01, 0.03, np.nan]), made_up(1, 0, [0.06, 0.02])]
     (row,) = basin_table(TINY, cells).rows
     assert (row.one_key_small, row.one_key_medium) == (Share(2, 5), Share(3, 5))
-    assert (row.lm_small, row.lm_medium) == (Share(0, 5), Share(0, 5))
+    assert (row.lm_small, row.lm_medium) == (Share(0, 4), Share(0, 4))
     # Ambiguous are the first of both cells; of the others 3 cm and the missing one are wrong.
     assert (row.ambiguous, row.unwarned) == (2, 2)
+
+
+def test_a_distortion_counts_where_every_start_of_every_ring_succeeded() -> None:
+    good, fair, bad, none = [0.01, 0.02], [0.01, 0.04], [0.06, 0.01], [np.nan, 0.01]
+    outcomes = [(good, good), (good, fair), (bad, good), (good, none)]
+    cells = [
+        made_up(d, ring, e) for d, rings in enumerate(outcomes) for ring, e in enumerate(rings)
+    ]
+    table = basin_table(TINY, cells)
+    assert (table.all_small, table.all_medium) == (Share(1, 4), Share(2, 4))
+    assert "1 of 4" in basin_markdown(table)
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 20), (7, 20), (1995, 2000), (2000, 2000)])
@@ -97,7 +126,7 @@ def test_intervals_are_wilsons(successes: int, trials: int) -> None:
 
 
 def test_a_study_comes_back_from_its_file(tmp_path: Path) -> None:
-    lost = replace(tiny_cells()[0], t_one_key=np.full((2, 3), np.nan), margin=np.full(2, np.inf))
+    lost = replace(tiny_cells()[0], t_one_key=np.full((3, 3), np.nan), margin=np.full(3, np.inf))
     study = BasinStudy(TINY, (lost, tiny_cells()[1]))
     write_study(tmp_path / STUDY_FILE, study)
     back = read_study(tmp_path / STUDY_FILE)
@@ -132,4 +161,5 @@ def test_the_global_start_forgives_any_guess_within_three_metres(tmp_path: Path)
     for row in table.rows:
         assert row.one_key_small.trials == 2000
         assert row.one_key_small.rate >= 0.995, str(row)
+        assert row.lm_small.trials == 400
     assert table.rows[-1].lm_medium.rate < 0.5

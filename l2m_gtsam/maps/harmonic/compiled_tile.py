@@ -13,6 +13,7 @@ from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
 from l2m_gtsam.maps.harmonic.potential_grid import Box, Lattice, PotentialGrid, potential_grid
+from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import WAVE_NUMBERS
 
@@ -95,21 +96,24 @@ class CompiledTile:
     Attributes
     ----------
     tile
-        The exact one; it answers where the grid does not reach.
+        The exact one.
     grid
         The smooth part of the potential in the tile's frame.
     near
         What the grid leaves out.
+    terms
+        All of the exact tile; they answer where the grid does not reach.
     """
 
     tile: Tile
     grid: PotentialGrid
     near: NearSources
+    terms: TermSum
 
     @property
     def nbytes(self) -> int:
         """Memory in bytes."""
-        return self.grid.coefficients.nbytes + self.near.nbytes
+        return self.grid.coefficients.nbytes + self.near.nbytes + self.terms.nbytes
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
@@ -117,12 +121,12 @@ class CompiledTile:
         local = self.tile.clipped(frame.localise(points))
         field, gradient = self.grid.field_and_gradient(local)
         self.near.add_to(local, field, gradient)
+        missing = np.flatnonzero(np.isnan(field[:, 0]))
+        if len(missing):
+            field[missing], gradient[missing] = self.terms.field_and_gradient(local[missing])
         R = frame.R_map_tile
         if not np.array_equal(R, np.eye(3)):
             field, gradient = field @ R.T, turned(gradient, R)
-        missing = np.flatnonzero(np.isnan(field[:, 0]))
-        if len(missing):
-            field[missing], gradient[missing] = self.tile.field_and_gradient(points[missing])
         return field, gradient
 
 
@@ -231,4 +235,5 @@ def with_grid(
     readings = frame.localise(places.readings)
     grid = potential_grid(potential, readings, places.reach, spacing, places.box(frame))
     upper = grid.lower + spacing * np.array(grid.coefficients.shape)
-    return CompiledTile(tile, grid, near_sources(sources, grid.lower, upper, radius))
+    near = near_sources(sources, grid.lower, upper, radius)
+    return CompiledTile(tile, grid, near, TermSum.of(tile, sources))
