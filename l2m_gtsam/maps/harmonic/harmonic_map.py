@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.harmonic.blend import Blend
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
@@ -32,14 +33,13 @@ class Answer:
 
     Attributes
     ----------
-    field, gradient
-        Of all these points, shapes (N, 3) and (N, 3, 3).
+    said
+        Field and gradient of all these points, shapes (N, 3) and (N, 3, 3).
     own, variance
         Which of the points lie in the tile's core, shape (N,), and the variance there, (K, 3).
     """
 
-    field: FloatArray
-    gradient: FloatArray
+    said: tuple[FloatArray, FloatArray]
     own: BoolArray
     variance: FloatArray
 
@@ -179,22 +179,19 @@ class HarmonicMap:
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
         points = checked_points(points)
-        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
-        variance = np.empty_like(points)
+        blend, variance = Blend.of(len(points)), np.empty_like(points)
         visits, owner = self.learnt.tiling.visits(points), self.learnt.tiling.grid.block_of(points)
 
         def answer(visit: Visit) -> Answer:
             # All that a tile is asked at once: it may not stay in memory.
             tile, at = self.tiles[visit.tile], points[visit.rows]
             own = owner[visit.rows] == visit.tile
-            return Answer(*tile.field_and_gradient(at), own, tile.variance(at[own]))
+            return Answer(tile.field_and_gradient(at), own, tile.variance(at[own]))
 
         for visit, found in zip(visits, in_threads(answer, visits), strict=True):
-            at, share = visit.rows, visit.share
-            field[at] += share[:, None] * found.field
-            gradient[at] += share[:, None, None] * found.gradient
-            variance[at[found.own]] = found.variance
-        return self._sample(points, field, gradient, variance)
+            blend.add(visit.rows, visit.share, found.said)
+            variance[visit.rows[found.own]] = found.variance
+        return self._sample(points, blend, variance)
 
     def compile(self) -> CompiledMap:
         """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster."""
@@ -202,18 +199,16 @@ class HarmonicMap:
 
     def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
         """Return what is known at points with this field and gradient; see ``query``."""
-        return self._sample(points, field, gradient, self.variance(points))
+        return self._sample(points, Blend(field, gradient), self.variance(points))
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
-        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        blend = Blend.of(len(points))
         for visit in self.learnt.tiling.visits(points):
-            at, share = visit.rows, visit.share
-            b, g = self.tiles[visit.tile].field_and_gradient(points[at])
-            field[at] += share[:, None] * b
-            gradient[at] += share[:, None, None] * g
-        return field, gradient
+            said = self.tiles[visit.tile].field_and_gradient(points[visit.rows])
+            blend.add(visit.rows, visit.share, said)
+        return blend.field, blend.gradient
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis, also outside; see ``FieldMap``."""
@@ -261,12 +256,10 @@ class HarmonicMap:
         covariance[np.diag_indices_from(covariance)] += np.maximum(rest, 0.0)
         return np.asarray(covariance.reshape(count, 3, count, 3))
 
-    def _sample(
-        self, points: FloatArray, field: FloatArray, gradient: FloatArray, variance: FloatArray
-    ) -> FieldSample:
+    def _sample(self, points: FloatArray, blend: Blend, variance: FloatArray) -> FieldSample:
         away, _ = self.learnt.readings.tree.query(points, distance_upper_bound=self.options.reach)
         inside = np.isfinite(away) & (variance.sum(axis=1) <= self.learnt.most_variance)
-        return masked(FieldSample(field, gradient, variance, inside))
+        return masked(FieldSample(blend.field, blend.gradient, variance, inside))
 
 
 def described(learnt: Learnt) -> str:
