@@ -8,14 +8,8 @@ from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.potential_grid import (
-    DEGREE,
-    HALF_TAPS,
-    Box,
-    Lattice,
-    PotentialGrid,
-    potential_grid,
-)
+from l2m_gtsam.maps.harmonic.potential_grid import Box, Lattice, PotentialGrid, potential_grid
+from l2m_gtsam.maps.harmonic.spline import DEGREE, HALF_TAPS
 
 FIELD_TOLERANCE = 0.005  # uT, what the solvers are promised
 GRADIENT_TOLERANCE = 0.02  # uT/m, what the solvers are promised

@@ -6,10 +6,10 @@ from threading import Lock
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary
+from l2m_gtsam.maps.harmonic.blend import Blend
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
@@ -186,13 +186,13 @@ class CompiledMap:
 
     def _said(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what the tiles say at points."""
-        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        blend = Blend.of(len(points))
         for visit in self.exact.learnt.tiling.visits(points):
             tile = self.tiles.tile(visit.tile)
             for start in range(0, len(visit.rows), AT_ONCE):
                 rows, share = visit.rows[start : start + AT_ONCE], visit.share[start:]
-                add_shares(rows, share, *tile.field_and_gradient(points[rows]), field, gradient)
-        return field, gradient
+                blend.add(rows, share, tile.field_and_gradient(points[rows]))
+        return blend.field, blend.gradient
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis, also outside; see ``FieldMap``."""
@@ -220,20 +220,3 @@ def by_place(points: FloatArray) -> IntArray:
     # Numbers of 16 bits are sorted in linear time; where they run over, places take turns.
     numbers = (across * (along.max() + 1) + along) % 2**16
     return np.argsort(numbers.astype(np.uint16), kind="stable")
-
-
-@njit(cache=True, nogil=True)
-def add_shares(
-    rows: IntArray,
-    share: FloatArray,
-    part_field: FloatArray,
-    part_gradient: FloatArray,
-    field: FloatArray,
-    gradient: FloatArray,
-) -> None:
-    """Add what one tile says, times its share, to the rows of field and gradient."""
-    for n in range(len(rows)):
-        for i in range(3):
-            field[rows[n], i] += share[n] * part_field[n, i]
-            for j in range(3):
-                gradient[rows[n], i, j] += share[n] * part_gradient[n, i, j]

@@ -7,23 +7,22 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.harmonic.blend import Blend
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
-from l2m_gtsam.maps.harmonic.explanation import Explanation
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
+from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.visits import Visit
-from l2m_gtsam.maps.survey import narrow
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
 from l2m_gtsam.threads import in_threads
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out
-LOCAL = "its own, about those of the map"
 
 
 @dataclass(frozen=True)
@@ -32,14 +31,13 @@ class Answer:
 
     Attributes
     ----------
-    field, gradient
-        Of all these points, shapes (N, 3) and (N, 3, 3).
+    said
+        Field and gradient of all these points, shapes (N, 3) and (N, 3, 3).
     own, variance
         Which of the points lie in the tile's core, shape (N,), and the variance there, (K, 3).
     """
 
-    field: FloatArray
-    gradient: FloatArray
+    said: tuple[FloatArray, FloatArray]
     own: BoolArray
     variance: FloatArray
 
@@ -148,28 +146,7 @@ class HarmonicMap:
     @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
-        learnt, points = self.learnt, self.learnt.readings.points
-        h = learnt.hyperparameters
-        return MapSummary(
-            kind=KIND,
-            readings=learnt.origin.readings,
-            rows=len(points),
-            lower=points.min(axis=0),
-            upper=points.max(axis=0),
-            facts={
-                "noise of a reading (uT)": h.noise,
-                "floor": f"{h.floor_scale:.3g} uT, sources {h.floor_depth:.2f} m below",
-                "ceiling": f"{h.ceiling_scale:.3g} uT, sources {h.ceiling_depth:.2f} m above",
-                "scales of a tile": LOCAL if learnt.local.spread else "those of the map",
-                "hyperparameters": learnt.origin.learning.described,
-                "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
-                "sources": described(learnt),
-                "field": judged(learnt.origin.explanation),
-                "tiles": len(self.tiles),
-                "tile (m)": float(learnt.tiling.grid.size),
-            },
-            doubts=doubts(learnt),
-        )
+        return summary_of(KIND, self.learnt)
 
     @property
     def kind(self) -> str:
@@ -179,22 +156,19 @@ class HarmonicMap:
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
         points = checked_points(points)
-        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
-        variance = np.empty_like(points)
+        blend, variance = Blend.of(len(points)), np.empty_like(points)
         visits, owner = self.learnt.tiling.visits(points), self.learnt.tiling.grid.block_of(points)
 
         def answer(visit: Visit) -> Answer:
             # All that a tile is asked at once: it may not stay in memory.
             tile, at = self.tiles[visit.tile], points[visit.rows]
             own = owner[visit.rows] == visit.tile
-            return Answer(*tile.field_and_gradient(at), own, tile.variance(at[own]))
+            return Answer(tile.field_and_gradient(at), own, tile.variance(at[own]))
 
         for visit, found in zip(visits, in_threads(answer, visits), strict=True):
-            at, share = visit.rows, visit.share
-            field[at] += share[:, None] * found.field
-            gradient[at] += share[:, None, None] * found.gradient
-            variance[at[found.own]] = found.variance
-        return self._sample(points, field, gradient, variance)
+            blend.add(visit.rows, visit.share, found.said)
+            variance[visit.rows[found.own]] = found.variance
+        return self._sample(points, blend, variance)
 
     def compile(self) -> CompiledMap:
         """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster."""
@@ -202,18 +176,16 @@ class HarmonicMap:
 
     def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
         """Return what is known at points with this field and gradient; see ``query``."""
-        return self._sample(points, field, gradient, self.variance(points))
+        return self._sample(points, Blend(field, gradient), self.variance(points))
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
-        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        blend = Blend.of(len(points))
         for visit in self.learnt.tiling.visits(points):
-            at, share = visit.rows, visit.share
-            b, g = self.tiles[visit.tile].field_and_gradient(points[at])
-            field[at] += share[:, None] * b
-            gradient[at] += share[:, None, None] * g
-        return field, gradient
+            said = self.tiles[visit.tile].field_and_gradient(points[visit.rows])
+            blend.add(visit.rows, visit.share, said)
+        return blend.field, blend.gradient
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis, also outside; see ``FieldMap``."""
@@ -261,51 +233,7 @@ class HarmonicMap:
         covariance[np.diag_indices_from(covariance)] += np.maximum(rest, 0.0)
         return np.asarray(covariance.reshape(count, 3, count, 3))
 
-    def _sample(
-        self, points: FloatArray, field: FloatArray, gradient: FloatArray, variance: FloatArray
-    ) -> FieldSample:
+    def _sample(self, points: FloatArray, blend: Blend, variance: FloatArray) -> FieldSample:
         away, _ = self.learnt.readings.tree.query(points, distance_upper_bound=self.options.reach)
         inside = np.isfinite(away) & (variance.sum(axis=1) <= self.learnt.most_variance)
-        return masked(FieldSample(field, gradient, variance, inside))
-
-
-def described(learnt: Learnt) -> str:
-    """Return where the sources came from, in a few words."""
-    shown, given = int(np.count_nonzero(learnt.strengths)), len(learnt.strengths)
-    if learnt.origin.searched:
-        return (
-            f"{shown} found without a point cloud: sigmas are less sure; --structure tells where "
-            "steel stands"
-        )
-    if not given:
-        return "floor and ceiling only"
-    return f"the readings show {shown} of {given} structures"
-
-
-def doubts(learnt: Learnt) -> tuple[str, ...]:
-    """Return what speaks against the map, a sentence each."""
-    origin, parts = learnt.origin, learnt.tiling.parts
-    found = [each for each in (*origin.survey, narrow(learnt.readings.points)) if each]
-    if origin.explanation.reasons:
-        found.append(judged(origin.explanation))
-    if not origin.explanation.judged:
-        found.append("there are too few places to say whether the map explains the field")
-    if origin.searched:
-        found.append(
-            "sources were searched for, for want of a point cloud of the structure: sigmas are "
-            "less sure"
-        )
-    if parts > 1:
-        found.append(
-            f"the survey lies in {parts} separate parts; between them nothing is known of the field"
-        )
-    return tuple(found)
-
-
-def judged(explanation: Explanation) -> str:
-    """Return whether the map explains its readings, in a few words."""
-    if explanation.reasons:
-        return f"the map does not explain the field: {'; '.join(explanation.reasons)}"
-    if not explanation.judged:
-        return "too few places to hold any out"
-    return f"explained: errors at held-out places are {explanation.spread:.2f} times their sigmas"
+        return masked(FieldSample(blend.field, blend.gradient, variance, inside))
