@@ -3,7 +3,7 @@
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.solve.model_comparison import ModelComparison, ModelFit
+from l2m_gtsam.model_results import ModelComparison, ModelFigures
 
 HEADINGS = (
     "parameters",
@@ -38,7 +38,7 @@ def model_table(sensor: str, comparison: ModelComparison) -> Table:
     return table
 
 
-def _row(fit: ModelFit) -> tuple[str, ...]:
+def _row(fit: ModelFigures) -> tuple[str, ...]:
     return (
         fit.model.value,
         str(fit.parameters),
