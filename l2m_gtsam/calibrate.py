@@ -19,7 +19,8 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import OneKeyOptions, Progress
 from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
-from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.graph.moving_solve import MovingProblem, MovingSolution, solve_moving
+from l2m_gtsam.graph.one_key import OneKeySolution
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
@@ -46,6 +47,7 @@ ONE_POINT = 11.3
 # With more of its readings rejected than this, what a sensor's others agree on may be chance.
 MOST_REJECTED = 0.4
 
+UNSOLVED = "the sensor is not solved"
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 
 
@@ -84,11 +86,21 @@ def calibrate(
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     found = _starts(alive, solver_map, options, progress)
     t_start = _start_places(alive.sensors, found, options)
-    poses = recording.trajectory
-    solution = solve_one_key(alive, solver_map, t_start, options.solve, progress, poses)
-    told = explained(alive, solver_map, t_start, solution, options.solve)
+    problem = MovingProblem(
+        readings=alive,
+        names=tuple(each.name for each in recording.scalars),
+        field_map=solver_map,
+        options=options.solve,
+        models=options.models,
+        progress=progress,
+        trajectory=recording.trajectory,
+    )
+    outcome = solve_moving(problem, t_start)
+    solution = outcome.solution
+    told = explained(outcome.readings, solver_map, t_start, solution, options.solve)
     moved = movement(recording.trajectory.R, recording.trajectory.p)
     sensors = _assess(synchronised, alive, solution, told, moved, options)
+    sensors = tuple(_with_models(index, each, outcome) for index, each in enumerate(sensors))
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
     sensors = tuple(_with_neighbours(sensor, sensors) for sensor in sensors)
     if not solution.solved:
@@ -144,6 +156,18 @@ def _start_places(
             options.start.get(name, at_lidar) if each is None else each.t_lidar_mag
             for name, each in zip(sensors, found, strict=True)
         ]
+    )
+
+
+def _with_models(
+    index: int, sensor: SensorCalibration, outcome: MovingSolution
+) -> SensorCalibration:
+    """Return the same with its models and what recorded numbers add to its readings."""
+    return replace(
+        sensor,
+        models=outcome.compared.get(index),
+        not_compared=outcome.not_compared.get(index, "" if index in outcome.compared else UNSOLVED),
+        moving=outcome.moving.get(index, ()),
     )
 
 
@@ -336,11 +360,13 @@ def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -
     if counts.kept >= needed:
         return "the sensor reports one constant value: it is stuck"
     reason = f"{moved.rest}: " if moved.at_rest else ""
+    without = counts.without_regressor
+    numbers = f", {without} without a recorded number" if without else ""
     return (
         f"{reason}{usable} usable readings of {counts.received} received "
         f"({counts.not_finite} not finite, {counts.repeated} repeated, "
         f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
-        f"{counts.thinned} at a place already read), at least {needed} are needed"
+        f"{counts.thinned} at a place already read{numbers}), at least {needed} are needed"
     )
 
 

@@ -92,11 +92,14 @@ class MovingField:
 
     Attributes
     ----------
+    name
+        Of the number.
     h
         In the sensor's frame in uT per unit of the number, shape (3,).
     sigma
         Its standard deviations, shape (3,).
     """
 
+    name: str
     h: FloatArray
     sigma: FloatArray

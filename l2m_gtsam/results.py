@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from l2m_gtsam.data import Distortion, FloatArray, SourceFile, SyncCounts
+from l2m_gtsam.model_results import ModelComparison, MovingField
 
 
 class SensorStatus(StrEnum):
@@ -180,6 +181,13 @@ class SensorCalibration:
         Readings inside the map that did not count: no distortion explains them beside the others.
     time_offset
         Of the sensor's clock; absent where nothing was solved.
+    models
+        Models of the readings side by side; absent where they are not compared.
+    not_compared
+        Why they are not.
+    moving
+        What recorded numbers add to the readings; H is the offset where they are zero. Empty for a
+        sensor to which no model with them is recommended.
     """
 
     sensor: str
@@ -198,6 +206,9 @@ class SensorCalibration:
     start: FoundStart | None = None
     rejected: int = 0
     time_offset: TimeOffset | None = None
+    models: ModelComparison | None = None
+    not_compared: str = ""
+    moving: tuple[MovingField, ...] = ()
 
     @property
     def offset_correlation(self) -> FloatArray:

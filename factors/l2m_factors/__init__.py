@@ -2,11 +2,11 @@
 
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.field_map import FieldMap
-from l2m_factors.keys import D, M, P, S, T
+from l2m_factors.keys import D, M, P, Q, S, T
 from l2m_factors.motion import PoseMotion, moved
 from l2m_factors.priors import distortion_prior, held_directions
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
-from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
+from l2m_factors.residual import MagneticReadings, ReadingResiduals, field_rate, reading_residuals
 from l2m_factors.shared_errors import (
     SharedError,
     map_weights_prior,
@@ -23,6 +23,7 @@ __all__ = [
     "MagneticReadings",
     "P",
     "PoseMotion",
+    "Q",
     "ReadingResiduals",
     "S",
     "SharedError",
@@ -30,6 +31,7 @@ __all__ = [
     "assert_jacobians_match",
     "block_factor",
     "distortion_prior",
+    "field_rate",
     "held_directions",
     "map_weights_prior",
     "moved",

@@ -1,7 +1,7 @@
 """What the readings of a view share: the map's error in each tile, the poses' at each knot."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -10,6 +10,7 @@ from scipy.linalg import solve_triangular
 from l2m_factors import M, P
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.graph.calibration import Estimate
+from l2m_gtsam.graph.moving_fields import MovingFields
 from l2m_gtsam.graph.pose_errors import PoseKnots, pose_seconds
 from l2m_gtsam.graph.view import View
 
@@ -87,6 +88,8 @@ class Coverage:
         Where pose errors are variables; absent where poses are taken for exact.
     seconds
         When each pose was taken, as the knots count, shape (N,).
+    moving
+        The sensors that feel recorded numbers.
     """
 
     groups: tuple[Group, ...]
@@ -95,14 +98,14 @@ class Coverage:
     root_information: FloatArray
     knots: PoseKnots | None
     seconds: FloatArray
+    moving: MovingFields = field(default_factory=MovingFields)
 
     @property
     def sizes(self) -> dict[int, int]:
         """Number of weights of each key of the graph."""
         knots = 0 if self.knots is None else len(self.knots.seconds)
-        return {M(tile): size for tile, size in self.tiles.items()} | {
-            P(knot): POSE for knot in range(knots)
-        }
+        tiles = {M(tile): size for tile, size in self.tiles.items()}
+        return tiles | {P(knot): POSE for knot in range(knots)} | self.moving.sizes
 
 
 def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: float) -> Coverage:

@@ -17,6 +17,7 @@ from l2m_gtsam.graph.calibration import (
     variables,
     whitened_jacobian,
 )
+from l2m_gtsam.graph.moving_fields import Correction
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.pose_errors import error_of_poses
 from l2m_gtsam.graph.view import QueryableMap, View
@@ -52,6 +53,9 @@ class SensorSolution:
         What the data determine.
     remaining_sigmas
         Length of the Newton step that remains, in standard deviations.
+    moving
+        What recorded numbers add to the readings, beyond what was taken off them; absent where it
+        is no variable of the graph.
     """
 
     sensor: int
@@ -59,6 +63,7 @@ class SensorSolution:
     figures: ResidualFigures
     determinacy: Determinacy
     remaining_sigmas: float
+    moving: Correction | None = None
 
     @property
     def covariance(self) -> FloatArray:
