@@ -21,7 +21,7 @@ def model_samples(
     Parameters
     ----------
     readings
-        Of one sensor, at least one, all inside the map, in order of time.
+        Of one sensor, at least one, in order of time; those outside the map do not count.
     field_map
         The map.
     estimate
@@ -29,18 +29,20 @@ def model_samples(
     names
         Of the readings' recorded numbers.
     """
-    sensor, R = int(readings.sensor[0]), readings.R_map_lidar
+    sensor = int(readings.sensor[0])
     t, noise = estimate.t[sensor], estimate.noise[sensor]
-    sample = field_map.query(R @ t + readings.p_map_lidar)
-    R_lidar_map = R.transpose(0, 2, 1)
-    b = np.einsum("nij,nj->ni", R_lidar_map, sample.field)
+    sample = field_map.query(readings.R_map_lidar @ t + readings.p_map_lidar)
+    inside = sample.inside
+    readings, R_lidar_map = readings.select(inside), readings.R_map_lidar[inside].transpose(0, 2, 1)
+    b = np.einsum("nij,nj->ni", R_lidar_map, sample.field[inside])
+    slope = R_lidar_map @ sample.gradient[inside] @ readings.R_map_lidar
     q = np.empty((len(b), 0)) if readings.regressors is None else readings.regressors
     return Samples(
         z=readings.field,
         b=b,
-        db_dt=_rates(readings, b, R_lidar_map @ sample.gradient @ R, t),
+        db_dt=_rates(readings, b, slope, t),
         q=q,
-        weights=1 / (noise**2 + sample.variance.mean(axis=1)),
+        weights=1 / (noise**2 + sample.variance[inside].mean(axis=1)),
         names=names,
     )
 
