@@ -61,7 +61,7 @@ class MovingDrive:
     def error(self, sensor: int, found: FloatArray) -> FloatArray:
         """Return the error of (t, C row by row, H), shape (15,)."""
         known = self.sensors[sensor]
-        return found - np.concatenate([known.t_lidar_mag, known.distortion.vector()])
+        return np.asarray(found - np.concatenate([known.t_lidar_mag, known.distortion.vector()]))
 
 
 def surveyed(seed: int) -> HarmonicMap:
@@ -95,7 +95,8 @@ def moving_drive(
     count
         Number N of readings of each sensor.
     """
-    rng, seconds = np.random.default_rng([seed, 1]), np.arange(count) * STEP_NS * 1e-9
+    rng = np.random.default_rng([seed, 1])
+    seconds: FloatArray = np.arange(count, dtype=float) * (STEP_NS * 1e-9)
     amperes = current(seed, seconds) if amperes is None else amperes
     trajectory = _trajectory(rng, seconds)
     small = tuple(

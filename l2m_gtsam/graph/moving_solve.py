@@ -170,19 +170,23 @@ def solve_moving(problem: MovingProblem, t_start: FloatArray) -> MovingSolution:
         Where to start each sensor in the lidar frame in metres, shape (S, 3).
     """
     last = problem.solved(t_start, {})
-    found = last.found()
+    found, given_up = last.found(), set[int]()
     for _ in range(ROUNDS):
         if last.settled(found):
             break
         last = problem.solved(_places(last.solution, t_start), found)
-        # A sensor that the numbers do not help in the end is solved without them, for good.
-        found = {s: each for s, each in last.found().items() if s in found}
+        # A sensor that the numbers turn out not to help is solved without them, for good.
+        given_up |= found.keys() - last.found().keys()
+        found = {s: each for s, each in last.found().items() if s not in given_up}
     return MovingSolution(
         solution=last.solution,
         readings=last.given,
         compared=last.compared,
         not_compared=last.not_compared,
-        moving={s: _named(problem.names, each) for s, each in found.items() if s in last.fields},
+        moving={
+            sensor: _named(problem.names, found.get(sensor, taken_off))
+            for sensor, taken_off in last.fields.items()
+        },
     )
 
 
