@@ -49,6 +49,28 @@ class UncertainMap(Protocol):
         ...
 
 
+class NothingShared:
+    """A map whose errors are independent: one tile with one weight that no reading feels."""
+
+    covariance = np.eye(1)
+
+    def errors_over(self, points: FloatArray, /) -> "NothingShared":
+        """Return the same for any places."""
+        return self
+
+    def sizes(self) -> dict[int, int]:
+        """Return the weight of the tile."""
+        return {0: 1}
+
+    def owner(self, points: FloatArray, /) -> IntArray:
+        """Return the tile for each point, shape (N,)."""
+        return np.zeros(len(points), dtype=np.int64)
+
+    def features(self, points: FloatArray, tile: int, /) -> FloatArray:
+        """Return that it does nothing, shape (N, 3, 1)."""
+        return np.zeros((len(points), 3, 1))
+
+
 @dataclass(frozen=True)
 class Group:
     """Readings of one sensor in one tile and, where poses are uncertain, between two knots.

@@ -130,17 +130,16 @@ def test_readings_that_were_rejected_count_again() -> None:
 
 
 def test_a_map_without_known_errors_and_a_motor() -> None:
-    """The exact field; sigmas do not count h, so that errors are some of them."""
+    """The exact field: sigmas count h, which is found beside t, C and H."""
     drive = moving_drive(1, (STRONG,))
-    recording = drive.recording
     silent, told = (
-        calibrate(each, WORLD, options(drive, Uncertainty.INDEPENDENT)).sensors[0]
-        for each in (drive.silent, recording)
+        calibrate(each, WORLD, options(drive, Uncertainty.INDEPENDENT))
+        for each in (drive.silent, drive.recording)
     )
-    known = drive.sensors[0].t_lidar_mag
-    assert np.linalg.norm(silent.t_lidar_mag - known) > 0.05
-    assert np.linalg.norm(told.t_lidar_mag - known) < 0.015
-    (motor,) = told.moving
+    assert told.uncertainty is Uncertainty.INDEPENDENT
+    assert nees(drive, silent)[0] > 1000
+    assert nees(drive, told)[0] < 44  # 15 degrees of freedom: one in ten thousand
+    (motor,) = told.sensors[0].moving
     assert np.abs((motor.h - drive.h[0]) / motor.sigma).max() < 4
 
 
