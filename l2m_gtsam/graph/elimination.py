@@ -150,7 +150,7 @@ class Rows:
         X, E, b = np.split(R, [SENSOR, width], axis=1)
         return Rows(X, E, b.ravel(), self.columns)
 
-    @property
+    @cached_property
     def block(self) -> Block:
         """What the rows would say of the weights if the sensor's parameters were known."""
         return Block(self.columns, self.E.T @ self.E)

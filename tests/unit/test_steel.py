@@ -165,7 +165,7 @@ def test_survey_noise_is_as_stated(hall: SteelHall, surveyed: Survey) -> None:
 def test_readings_of_a_drive_are_those_of_its_sensors(hall: SteelHall, seed: int) -> None:
     """Noiseless readings, undone, are the world's field where the poses put the sensor."""
     d = calibration_drive(hall, seed, (0.4, 1.0), noise=0.0, sensors=3, count=220)
-    assert d.truth().shape == (3, 15)
+    assert d.truth().shape == (3, 16)
     for index, sensor in enumerate(d.sensors):
         rows = d.readings.rows_of(index)
         R, p = d.readings.R_map_lidar[rows], d.readings.p_map_lidar[rows]
