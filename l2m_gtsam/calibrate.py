@@ -19,6 +19,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import OneKeyOptions, Progress
 from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
+from l2m_gtsam.graph.named_priors import priors_of
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
@@ -76,16 +77,18 @@ def calibrate(
     SyncError
         Readings and poses do not overlap.
     CalibrationError
-        No sensor can be solved: the map does not cover the drive, or nothing was read.
+        No sensor can be solved: the map does not cover the drive, or nothing was read. Or a start
+        or prior names no sensor of the recording.
     """
     synchronised = prepare(recording, options)
     stuck = stuck_sensors(synchronised.readings)
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    priors = priors_of(options.priors, alive.sensors)
     found = _starts(alive, solver_map, options, progress)
     t_start = _start_places(alive.sensors, found, options)
     poses = recording.trajectory
-    solution = solve_one_key(alive, solver_map, t_start, options.solve, progress, poses)
+    solution = solve_one_key(alive, solver_map, t_start, options.solve, progress, poses, priors)
     told = explained(alive, solver_map, t_start, solution, options.solve)
     moved = movement(recording.trajectory.R, recording.trajectory.p)
     sensors = _assess(synchronised, alive, solution, told, moved, options)
@@ -266,6 +269,7 @@ def _solved(
         sync=counts,
         outside_map=outside,
         time_offset=_time_offset(told, solution),
+        from_priors=told.from_priors,
     )
 
 
@@ -302,7 +306,8 @@ def _verdict(
         )
     if words:
         return SensorStatus.UNDETERMINED, open_
-    return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings"
+    known = f"; from priors: {', '.join(told.from_priors)}" if told.from_priors else ""
+    return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings{known}"
 
 
 def _unsolved(

@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field, ValidationError
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions
+from l2m_gtsam.graph.prior_options import PriorOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
@@ -42,6 +43,8 @@ class CalibrationOptions(Options):
     it is not given."""
     search: StartOptions = StartOptions()
     """How starts are looked for."""
+    priors: PriorOptions = PriorOptions()
+    """What is known of sensors beforehand: places, rotations, the geometry of arrays."""
     solve: OneKeyOptions = OneKeyOptions()
     """The one-key solve."""
 
@@ -121,6 +124,8 @@ def _explain(path: Path, error: ValidationError) -> str:
 def _accepted(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """Return the keys of the options at a location."""
     for part in location:
+        if str(part) not in model.model_fields:  # a name or a place in a list of options
+            continue
         inner: Any = model.model_fields[str(part)].annotation
         candidates = [inner, *getattr(inner, "__args__", ())]
         nested = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]

@@ -180,6 +180,9 @@ class SensorCalibration:
         Readings inside the map that did not count: no distortion explains them beside the others.
     time_offset
         Of the sensor's clock; absent where nothing was solved.
+    from_priors
+        What the readings leave open and only priors determine: phrases with the parameters by name
+        and what was known beforehand.
     """
 
     sensor: str
@@ -198,6 +201,7 @@ class SensorCalibration:
     start: FoundStart | None = None
     rejected: int = 0
     time_offset: TimeOffset | None = None
+    from_priors: tuple[str, ...] = ()
 
     @property
     def offset_correlation(self) -> FloatArray:
@@ -287,6 +291,8 @@ class SensorPlan:
         Of the time offset in seconds, infinite where it will be held.
     offset_held
         Why it will be held at zero; empty where it will be estimated.
+    from_priors
+        What the readings will leave open and only priors determine, as of a calibration.
     """
 
     sensor: str
@@ -298,6 +304,7 @@ class SensorPlan:
     undetermined: tuple[str, ...]
     offset_sigma: float = float("inf")
     offset_held: str = ""
+    from_priors: tuple[str, ...] = ()
 
     @property
     def sigma(self) -> FloatArray:

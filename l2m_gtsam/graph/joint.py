@@ -17,6 +17,7 @@ from l2m_gtsam.graph.calibration import (
     variables,
     whitened_jacobian,
 )
+from l2m_gtsam.graph.determined import determinacies
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.pose_errors import error_of_poses
 from l2m_gtsam.graph.view import QueryableMap, View
@@ -29,7 +30,7 @@ from l2m_gtsam.solve.noise import (
     reading_covariance,
     whitening,
 )
-from l2m_gtsam.solve.rank import Determinacy, timed_determinacy
+from l2m_gtsam.solve.rank import Determinacy
 
 # Of each round; two rounds at least are made, and each step shortens what remains fourfold.
 POLISHING_STEPS = 2
@@ -93,7 +94,7 @@ class JointProblem:
     determinacies
         Rank test of each sensor.
     graph
-        Readings, ridge, and a hold on what the data cannot determine.
+        Readings, priors, ridge, and a hold on what these cannot determine.
     """
 
     view: View
@@ -124,7 +125,7 @@ def joint_problem(
     batch = batch_readings(view.readings, field_map)
     values, W = estimate.values(view.sensors), whitening(covariance)
     jacobians = {s: whitened_jacobian(batch, W, values, s) for s in view.sensors}
-    tests = {s: timed_determinacy(J, options.rank) for s, J in jacobians.items()}
+    tests = determinacies(jacobians, estimate.priors, values, options.rank)
     graph = reading_graph(batch, covariance, options.factors)
     graph.push_back(prior_graph(estimate, tests))
     return JointProblem(view, batch, share, covariance, tests, graph)

@@ -1,0 +1,144 @@
+"""What readings and priors determine together, and what only the priors do.
+
+A sensor that baselines connect to others is tested with all of these unknown: they are eliminated
+from the rows of the cluster, and what remains speaks of the one sensor alone.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from scipy.linalg import block_diag
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_of, rows_in
+from l2m_gtsam.graph.priors import HOLD_S, Prior, Priors
+from l2m_gtsam.solve.rank import PARAMETERS, Determinacy, RankOptions, timed_determinacy
+
+# Of the largest sigma of use: what is known of other sensors at least. It is as good as nothing.
+LOOSE = 1e3
+TIME_OFFSET = "time offset"
+
+
+def determinacies(
+    jacobians: Mapping[int, FloatArray],
+    priors: Priors,
+    values: gtsam.Values,
+    options: RankOptions,
+) -> dict[int, Determinacy]:
+    """Test the rank of every sensor.
+
+    Parameters
+    ----------
+    jacobians
+        Derivatives of each sensor's whitened residuals by (t, C row by row, H, offset), (M, 16).
+    priors
+        What is known beforehand.
+    values
+        Where priors are linearised: ``T(i)`` and ``D(i)``.
+    options
+        The scales of the test.
+    """
+    alone = {sensor: timed_determinacy(J, options) for sensor, J in jacobians.items()}
+    few = {sensor: np.asarray(np.linalg.qr(J, mode="r")) for sensor, J in jacobians.items()}
+    held = frozenset(sensor for sensor, test in alone.items() if not test.offset)
+    linear, tests = priors.graph(jacobians).linearize(values), dict(alone)
+    for sensors in clusters_of(linear, list(jacobians)):
+        known = Priors(priors.among(sensors))
+        if known.each:
+            cluster = Cluster(sensors, few, held, values, options)
+            tests |= {each: with_priors(each, cluster, known, alone[each]) for each in sensors}
+    return tests
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Sensors that priors connect, or one alone.
+
+    Attributes
+    ----------
+    sensors
+        Which.
+    jacobians
+        Rows on each sensor that say what its readings do, shape (M, 16).
+    held
+        Sensors whose readings do not tell their time offset: in the graph it is held.
+    values
+        Where priors are linearised.
+    options
+        The scales of the test.
+    """
+
+    sensors: tuple[int, ...]
+    jacobians: Mapping[int, FloatArray]
+    held: frozenset[int]
+    values: gtsam.Values
+    options: RankOptions
+
+    def test(self, sensor: int, priors: Priors) -> Determinacy:
+        """Test one sensor with all others of the cluster unknown."""
+        return timed_determinacy(self.rows_of(sensor, priors), self.options)
+
+    def rows_of(self, sensor: int, priors: Priors) -> FloatArray:
+        """Return rows on one sensor that say what all do when the others are unknown, (M, 16)."""
+        others = [other for other in self.sensors if other != sensor]
+        rows = [self._of_readings(), *map(self._of_prior, priors.each), *map(self._loose, others)]
+        at = [rows_in(self.sensors, each) for each in (*others, sensor)]
+        columns = np.concatenate([np.arange(each.start, each.stop) for each in at])
+        triangular = np.asarray(np.linalg.qr(np.concatenate(rows)[:, columns], mode="r"))
+        first = SENSOR * len(others)
+        return triangular[first:, first:]
+
+    def _of_readings(self) -> FloatArray:
+        return np.asarray(block_diag(*(self.jacobians[sensor] for sensor in self.sensors)))
+
+    def _of_prior(self, prior: Prior) -> FloatArray:
+        factor, columns = prior.factor().linearize(self.values), columns_of(self.sensors)
+        jacobian, _ = factor.jacobian()
+        rows, start = np.zeros((len(jacobian), SENSOR * len(self.sensors))), 0
+        for at in (columns[key] for key in list(factor.keys())):
+            rows[:, at] = jacobian[:, start : start + at.stop - at.start]
+            start += at.stop - at.start
+        return rows
+
+    def _loose(self, other: int) -> FloatArray:
+        """Return rows that keep another sensor's parameters finite and its offset where held."""
+        scale = np.append(self.options.scale(), self.options.useful_offset_s)
+        strength = 1 / (LOOSE * scale)
+        if other in self.held:
+            strength[-1] = 1 / HOLD_S
+        rows = np.zeros((SENSOR, SENSOR * len(self.sensors)))
+        rows[:, rows_in(self.sensors, other)] = np.diag(strength)
+        return rows
+
+
+def with_priors(sensor: int, cluster: Cluster, priors: Priors, alone: Determinacy) -> Determinacy:
+    """Return the rank test of a sensor with its cluster, and which priors decide what.
+
+    Parameters
+    ----------
+    sensor
+        The one that is tested.
+    cluster
+        Its cluster.
+    priors
+        What is known of the cluster.
+    alone
+        The test of its readings alone.
+    """
+    every = cluster.test(sensor, priors)
+    gained = _open(alone) - _open(every)
+    kinds = list(dict.fromkeys(prior.kind for prior in priors.each))
+    without = {kind: _open(cluster.test(sensor, priors.without(kind))) for kind in kinds if gained}
+    reasons = {}
+    for name in (each for each in (*PARAMETERS, TIME_OFFSET) if each in gained):
+        needed = [kind for kind in kinds if name in without[kind]]
+        reasons[name] = " and ".join(needed) or " or ".join(kinds)
+    return replace(every, borrowed=reasons, lent=every.free - alone.free)
+
+
+def _open(test: Determinacy) -> set[str]:
+    """Return the parameters that a test leaves open."""
+    open_ = {PARAMETERS[index] for index in np.flatnonzero(test.touched)}
+    return open_ if test.offset else open_ | {TIME_OFFSET}
