@@ -17,6 +17,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import OneKeyOptions, Progress
+from l2m_gtsam.graph.contradictions import Contradiction
 from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.named_priors import priors_of
@@ -92,6 +93,10 @@ def calibrate(
     told = explained(alive, solver_map, t_start, solution, options.solve)
     moved = movement(recording.trajectory.R, recording.trajectory.p)
     sensors = _assess(synchronised, alive, solution, told, moved, options)
+    missed = {alive.sensors[each.sensor]: each.contradictions for each in solution.solved}
+    sensors = tuple(
+        _with_contradictions(each, missed.get(each.sensor, ()), alive.sensors) for each in sensors
+    )
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
     sensors = tuple(_with_neighbours(sensor, sensors) for sensor in sensors)
     if not solution.solved:
@@ -165,6 +170,22 @@ def _with_start(
         f"{start.margin:.2f} times as much; give `calibration.start` or drive more varied ways"
     )
     return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
+
+
+def _with_contradictions(
+    sensor: SensorCalibration, missed: tuple[Contradiction, ...], names: tuple[str, ...]
+) -> SensorCalibration:
+    """Return the same with a word on what was known beforehand and the readings speak against."""
+    if not missed or sensor.status is not SensorStatus.SOLVED:
+        return sensor
+    worst = max(missed, key=lambda each: each.sigmas)
+    others = [names[each] for each in worst.sensors if names[each] != sensor.sensor]
+    where = f" with {others[0]}" if others else ""
+    msg = (
+        f"its {worst.kind}{where} contradicts the readings by {worst.sigmas:.1f} sigmas: correct "
+        "`calibration.priors`, or give it a larger sigma"
+    )
+    return replace(sensor, status=SensorStatus.CONTRADICTED, message=msg)
 
 
 def _with_neighbours(

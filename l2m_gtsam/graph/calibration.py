@@ -22,7 +22,7 @@ from l2m_factors import (
     reading_factor,
 )
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.clusters import clusters_of, columns_of, rows_in, sensors_in
+from l2m_gtsam.graph.clusters import clusters_of, columns_among, columns_of, sensors_in
 from l2m_gtsam.graph.priors import HOLD_S, NO_PRIORS, Priors
 from l2m_gtsam.solve.noise import whitening
 from l2m_gtsam.solve.rank import Determinacy
@@ -185,32 +185,39 @@ def variables(sensor: int) -> tuple[int, int, int]:
     return T(sensor), D(sensor), S(sensor)
 
 
-def sensor_covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, sensors: list[int]
-) -> dict[int, FloatArray]:
-    """Return the marginal covariance of (t, C row by row, H, offset) of each sensor, (16, 16).
+class Covariances:
+    """Marginal covariances of a linear graph of sensors.
 
     Where one direction is thousands of times better known than another, GTSAM's marginals, which
     are made by Cholesky, call the system indeterminate; QR of the same factors still has it.
+
+    Parameters
+    ----------
+    graph, values
+        The graph and where it is linearised.
     """
-    linear = graph.linearize(values)
-    try:
-        marginals = gtsam.Marginals(linear, values)
-    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException has no Python type
-        if "ndetermina" not in str(error):
-            raise
-        return {sensor: _covariance_by_qr(linear, sensor) for sensor in sensors}
-    return {sensor: _marginal_covariance(marginals, sensor) for sensor in sensors}
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        self._linear = graph.linearize(values)
+        self._marginals: gtsam.Marginals | None = None
+        try:
+            self._marginals = gtsam.Marginals(self._linear, values)
+        except RuntimeError as error:  # GTSAM's exception has no Python type
+            if "ndetermina" not in str(error):
+                raise
+
+    def among(self, sensors: tuple[int, ...]) -> FloatArray:
+        """Return that of all parameters of sensors that factors connect, (16 n, 16 n)."""
+        if self._marginals is None:
+            return covariance_by_qr(self._linear, sensors)
+        keys = list(columns_of(sensors))
+        joint = self._marginals.jointMarginalCovariance(keys)
+        return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
 
 
-def _marginal_covariance(marginals: gtsam.Marginals, sensor: int) -> FloatArray:
-    keys = variables(sensor)
-    joint = marginals.jointMarginalCovariance(list(keys))
-    return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
-
-
-def _covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensor: int) -> FloatArray:
-    cluster = next(each for each in clusters_of(linear, sensors_in(linear)) if sensor in each)
+def covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensors: tuple[int, ...]) -> FloatArray:
+    """Return the marginal covariance of sensors that factors connect, by QR, (16 n, 16 n)."""
+    cluster = next(each for each in clusters_of(linear, sensors_in(linear)) if sensors[0] in each)
     ordering = gtsam.Ordering()
     for key in columns_of(cluster):
         ordering.push_back(key)
@@ -222,5 +229,5 @@ def _covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensor: int) -> FloatAr
     scale = 1 / np.linalg.norm(jacobian, axis=0)
     triangular = np.asarray(np.linalg.qr(jacobian * scale, mode="r"))
     root = scale[:, None] * solve_triangular(triangular, np.eye(len(scale)))
-    at = rows_in(cluster, sensor)
+    at = columns_among(cluster, sensors)
     return np.asarray(root[at] @ root[at].T)

@@ -6,6 +6,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from l2m_factors import D, S, T
+from l2m_gtsam.data import IntArray
 
 SENSOR = 16  # parameters of a sensor: t, C row by row, H, time offset
 PLACES = {T: slice(0, 3), D: slice(3, 15), S: slice(15, 16)}
@@ -49,3 +50,9 @@ def rows_in(cluster: tuple[int, ...], sensor: int) -> slice:
     """Return where a sensor's parameters stand among those of its cluster."""
     start = SENSOR * cluster.index(sensor)
     return slice(start, start + SENSOR)
+
+
+def columns_among(cluster: tuple[int, ...], sensors: tuple[int, ...]) -> IntArray:
+    """Return where the parameters of some sensors stand among those of their cluster."""
+    at = [rows_in(cluster, sensor) for sensor in sensors]
+    return np.concatenate([np.arange(each.start, each.stop) for each in at])

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_of, rows_in
-from l2m_gtsam.graph.priors import HOLD_S, Prior, Priors
+from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_among, rows_in
+from l2m_gtsam.graph.priors import HOLD_S, Prior, Priors, prior_rows
 from l2m_gtsam.solve.rank import PARAMETERS, Determinacy, RankOptions, timed_determinacy
 
 # Of the largest sigma of use: what is known of other sensors at least. It is as good as nothing.
@@ -84,8 +84,7 @@ class Cluster:
         """Return rows on one sensor that say what all do when the others are unknown, (M, 16)."""
         others = [other for other in self.sensors if other != sensor]
         rows = [self._of_readings(), *map(self._of_prior, priors.each), *map(self._loose, others)]
-        at = [rows_in(self.sensors, each) for each in (*others, sensor)]
-        columns = np.concatenate([np.arange(each.start, each.stop) for each in at])
+        columns = columns_among(self.sensors, (*others, sensor))
         triangular = np.asarray(np.linalg.qr(np.concatenate(rows)[:, columns], mode="r"))
         first = SENSOR * len(others)
         return triangular[first:, first:]
@@ -94,13 +93,7 @@ class Cluster:
         return np.asarray(block_diag(*(self.jacobians[sensor] for sensor in self.sensors)))
 
     def _of_prior(self, prior: Prior) -> FloatArray:
-        factor, columns = prior.factor().linearize(self.values), columns_of(self.sensors)
-        jacobian, _ = factor.jacobian()
-        rows, start = np.zeros((len(jacobian), SENSOR * len(self.sensors))), 0
-        for at in (columns[key] for key in list(factor.keys())):
-            rows[:, at] = jacobian[:, start : start + at.stop - at.start]
-            start += at.stop - at.start
-        return rows
+        return prior_rows(prior, self.values, self.sensors)[0]
 
     def _loose(self, other: int) -> FloatArray:
         """Return rows that keep another sensor's parameters finite and its offset where held."""

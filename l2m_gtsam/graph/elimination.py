@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_of, rows_in
+from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_among, columns_of, rows_in
 
 NONE = np.empty(0, dtype=np.int64)
 SHARED = -1  # of rows that are no one sensor's
@@ -97,13 +97,14 @@ class Eliminated:
 
     def covariance(self, sensor: int) -> FloatArray:
         """Return the marginal covariance of (t, C row by row, H, offset), shape (16, 16)."""
-        cluster, at = self._of[sensor], rows_in(self._of[sensor].sensors, sensor)
-        return self.joint_covariance(cluster)[at, at]
+        return self.among((sensor,))
 
-    def joint_covariance(self, cluster: ClusterRows) -> FloatArray:
-        """Return the marginal covariance of the parameters of a cluster, shape (16 n, 16 n)."""
-        R = cluster.R
-        return np.asarray(solve_triangular(R, solve_triangular(R, self._spread(cluster)).T))
+    def among(self, sensors: tuple[int, ...]) -> FloatArray:
+        """Return the covariance of all parameters of sensors of one cluster, (16 n, 16 n)."""
+        cluster = self._of[sensors[0]]
+        R, at = cluster.R, columns_among(cluster.sensors, sensors)
+        whole = solve_triangular(R, solve_triangular(R, self._spread(cluster)).T)
+        return np.asarray(whole[np.ix_(at, at)])
 
     def step(self, sensor: int) -> FloatArray:
         """Return the step of a sensor's parameters, shape (16,)."""

@@ -9,14 +9,15 @@ from l2m_factors import BatchedReadings
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import (
+    Covariances,
     Estimate,
     batch_readings,
     prior_graph,
     reading_graph,
-    sensor_covariances,
     variables,
     whitened_jacobian,
 )
+from l2m_gtsam.graph.contradictions import Contradiction, contradictions
 from l2m_gtsam.graph.determined import determinacies
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.pose_errors import error_of_poses
@@ -53,6 +54,8 @@ class SensorSolution:
         What the data determine.
     remaining_sigmas
         Length of the Newton step that remains, in standard deviations.
+    contradictions
+        What was known of the sensor beforehand and the readings speak against.
     """
 
     sensor: int
@@ -60,6 +63,7 @@ class SensorSolution:
     figures: ResidualFigures
     determinacy: Determinacy
     remaining_sigmas: float
+    contradictions: tuple[Contradiction, ...] = ()
 
     @property
     def covariance(self) -> FloatArray:
@@ -160,21 +164,24 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
 def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
     """Return covariance and figures of every sensor at the optimum of its own weights."""
     values = estimate.values(problem.view.sensors)
-    covariances = sensor_covariances(problem.graph, values, problem.view.sensors)
+    covariances = Covariances(problem.graph, values)
+    missed = contradictions(estimate.priors.among(problem.view.sensors), values, covariances.among)
     gradients = problem.graph.linearize(values).gradientAtZero()
     W = whitening(problem.covariance)
     solutions = []
     for s in problem.view.sensors:
         rows, test = problem.batch.rows_of(s), problem.determinacies[s]
         residual = problem.batch.residuals(values, s).residual[rows]
+        covariance = covariances.among((s,))
         gradient = np.concatenate([gradients.at(key) for key in variables(s)])
         solutions.append(
             SensorSolution(
                 sensor=s,
-                joint_covariance=with_infinities(covariances[s], test),
+                joint_covariance=with_infinities(covariance, test),
                 figures=residual_figures(residual, W[rows], test.free),
                 determinacy=test,
-                remaining_sigmas=float(np.sqrt(gradient @ covariances[s] @ gradient)),
+                remaining_sigmas=float(np.sqrt(gradient @ covariance @ gradient)),
+                contradictions=tuple(each for each in missed if s in each.sensors),
             )
         )
     return tuple(solutions)

@@ -76,9 +76,8 @@ def planar(plane: PlanarMount, sensors: tuple[str, ...]) -> list[Difference]:
     """
     named = sorted({s for name in plane.sensors for s in matching(name, sensors, "planar")})
     if len(named) < 2:
-        msg = (
-            f"calibration.priors.planar: {', '.join(plane.sensors)} is one sensor, two make a plane"
-        )
+        only = ", ".join(plane.sensors)
+        msg = f"calibration.priors.planar: {only} is one sensor; a plane takes two or more"
         raise CalibrationError(msg)
     sigma = np.array([np.inf, np.inf, plane.sigma_m * np.sqrt(len(named))])
     pairs = combinations(named, 2)
@@ -98,7 +97,7 @@ def between(baseline: Baseline, sensors: tuple[str, ...]) -> Prior:
     if baseline.distance is not None:
         return Distance((first, second), baseline.distance, baseline.sigma_m)
     vector = np.array(baseline.vector, dtype=float)
-    return Difference((first, second), vector, np.full(3, baseline.sigma_m), "baselines")
+    return Difference((first, second), vector, np.full(3, baseline.sigma_m), "baseline")
 
 
 def one(name: str, sensors: tuple[str, ...]) -> int:

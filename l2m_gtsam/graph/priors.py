@@ -8,6 +8,7 @@ import numpy as np
 
 from l2m_factors import T, distance_prior, rotation_prior
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.clusters import SENSOR, columns_of
 
 AXES = "xyz"
 HOLD_S = 1e-6  # a time offset that is held: far below what any clock of a vehicle resolves
@@ -72,7 +73,7 @@ class Distance:
     sensors: tuple[int, ...]
     metres: float
     sigma: float
-    kind: str = "baselines"
+    kind: str = "baseline"
 
     def factor(self) -> gtsam.NonlinearFactor:
         """Return it as a factor."""
@@ -143,6 +144,19 @@ class Priors:
 
 
 NO_PRIORS = Priors()
+
+
+def prior_rows(
+    prior: Prior, values: gtsam.Values, sensors: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return white rows over the parameters of sensors, (M, 16 n), and what is missed, (M,)."""
+    factor, columns = prior.factor().linearize(values), columns_of(sensors)
+    jacobian, b = factor.jacobian()
+    rows, start = np.zeros((len(b), SENSOR * len(sensors))), 0
+    for at in (columns[key] for key in list(factor.keys())):
+        rows[:, at] = jacobian[:, start : start + at.stop - at.start]
+        start += at.stop - at.start
+    return rows, np.asarray(b)
 
 
 def _graph(priors: tuple[Prior, ...]) -> gtsam.NonlinearFactorGraph:
