@@ -22,6 +22,7 @@ from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.named_priors import priors_of
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.graph.priors import Priors
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
@@ -86,7 +87,7 @@ def calibrate(
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     priors = priors_of(options.priors, alive.sensors)
-    found = _starts(alive, solver_map, options, progress)
+    found = _starts(alive, solver_map, options, priors, progress)
     t_start = _start_places(alive.sensors, found, options)
     poses = recording.trajectory
     solution = solve_one_key(alive, solver_map, t_start, options.solve, progress, poses, priors)
@@ -119,6 +120,7 @@ def _starts(
     readings: Readings,
     field_map: QueryableMap,
     options: CalibrationOptions,
+    priors: Priors,
     progress: Progress | None,
 ) -> list[FoundStart | None]:
     """Look for the start of each sensor; none where it is given or none is found.
@@ -136,7 +138,7 @@ def _starts(
         return [None] * len(readings.sensors)
     tell = progress or (lambda stage, fraction: None)
     tell("global start", 0.0)
-    found = find_starts(readings, field_map, np.zeros(3), options.search)
+    found = find_starts(readings, field_map, np.zeros(3), options.search, priors)
     tell("global start", 1.0)
     names = zip(readings.sensors, found, strict=True)
     return [None if name in options.start else each for name, each in names]

@@ -3,7 +3,7 @@
 Frames and units are those of ``data``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -68,6 +68,11 @@ class FoundStart:
     t_lidar_mag: FloatArray
     margin: float
     runner_up: FloatArray | None
+
+    def moved(self, by: FloatArray) -> "FoundStart":
+        """Return the same for a place that is elsewhere by a vector in metres, shape (3,)."""
+        other = None if self.runner_up is None else self.runner_up + by
+        return replace(self, t_lidar_mag=self.t_lidar_mag + by, runner_up=other)
 
     def ambiguous(self, clear: float) -> bool:
         """Return whether the second best place leaves less than so many times as much."""

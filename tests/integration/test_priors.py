@@ -197,7 +197,7 @@ def test_a_distance_sharpens_what_two_places_leave() -> None:
 def test_a_wrong_height_is_named_where_readings_speak_against_it(world: World) -> None:
     """Ten sigmas off: a strong field says so; a uniform one cannot, and the mark stays."""
     truth, priors = drawn(2)
-    told = T + [0.0, 0.0, 10 * HEIGHT_SIGMA]
+    told = T + np.array([0.0, 0.0, 10 * HEIGHT_SIGMA])
     priors["position"] = {
         "mag_0": {axis: [value, HEIGHT_SIGMA] for axis, value in zip("xyz", told, strict=True)}
     }
