@@ -23,6 +23,7 @@ from l2m_gtsam.graph.forecast import Forecast, forecast
 from l2m_gtsam.graph.joint import SensorSolution
 from l2m_gtsam.graph.named_priors import priors_of
 from l2m_gtsam.graph.priors import Priors
+from l2m_gtsam.graph.rigid import placed
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.motion import Motion, extra_motions, loop, places_around, strongest
@@ -94,8 +95,8 @@ def plan(
     field_map
         The magnetic map, in the frame of the recording's poses.
     options
-        How it would be calibrated; sensors are assumed where ``start`` puts them, else at the
-        lidar, without distortion.
+        How it would be calibrated; sensors are assumed where ``start`` puts them, else where they
+        were measured, else at the lidar, without distortion.
     planning
         What is assumed and tried.
     progress
@@ -114,7 +115,7 @@ def plan(
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     noise = _noise(field_map, options, planning)
     priors = priors_of(options.priors, readings.sensors)
-    task = Task(solver_map, _places(readings.sensors, options), noise, options, priors)
+    task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)
     tell("what the drive tells", 0.0)
     found = task.forecast(readings)
     tell("what the drive tells", 1.0)
@@ -207,13 +208,15 @@ def _noise(field_map: QueryableMap, options: CalibrationOptions, planning: PlanO
     return planning.noise_ut
 
 
-def _places(sensors: tuple[str, ...], options: CalibrationOptions) -> FloatArray:
+def _places(sensors: tuple[str, ...], options: CalibrationOptions, priors: Priors) -> FloatArray:
     """Return where sensors are assumed in metres, shape (S, 3)."""
     if unknown := sorted(set(options.start) - set(sensors)):
         msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
         raise CalibrationError(msg)
     at_lidar = (0.0, 0.0, 0.0)
-    return np.array([options.start.get(name, at_lidar) for name in sensors])
+    t = np.array([options.start.get(name, at_lidar) for name in sensors])
+    given = [index for index, name in enumerate(sensors) if name in options.start]
+    return placed(t, given, priors)
 
 
 def _motions(

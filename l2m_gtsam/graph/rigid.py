@@ -77,6 +77,33 @@ def reached(start: int, links: dict[int, list[tuple[int, FloatArray]]]) -> dict[
     return places
 
 
+def placed(t: FloatArray, given: Collection[int], priors: Priors) -> FloatArray:
+    """Return places in metres, shape (S, 3), that agree with what is known.
+
+    Parameters
+    ----------
+    t
+        Places to begin with, shape (S, 3).
+    given
+        Sensors that stay there; the others go where they were measured or where vectors put them.
+    priors
+        What is known.
+    """
+    t = t.copy()
+    measured = [each for each in priors.each if isinstance(each, Coordinate)]
+    for each in measured:
+        if each.sensors[0] not in given:
+            t[each.sensors[0], each.axis] = each.value
+    for group in rigid_groups(priors, range(len(t))):
+        told = [sum(each.sensors[0] == sensor for each in measured) for sensor in group.sensors]
+        first = max(range(len(told)), key=lambda row: (group.sensors[row] in given, told[row]))
+        base = t[group.sensors[first]] - group.offset[first]
+        for sensor, offset in zip(group.sensors, group.offset, strict=True):
+            if sensor not in given:
+                t[sensor] = base + offset
+    return t
+
+
 def bounded(left: FloatArray, nodes: Sequence[FloatArray], bounds: Bounds) -> FloatArray:
     """Return misfits (nx, ny, nz, S), infinite where a sensor cannot be.
 
