@@ -299,8 +299,7 @@ def _solved(
 def _time_offset(told: Explained, solution: OneKeySolution) -> TimeOffset:
     found = told.solution
     return TimeOffset(
-        # Added zero turns -0.0 into 0.0.
-        seconds=float(solution.estimate.offset[found.sensor]) + 0.0,
+        seconds=0.0 if told.held else float(solution.estimate.offset[found.sensor]),
         sigma=found.offset_sigma,
         cross_covariance=found.offset_covariance,
         held=told.held,

@@ -9,7 +9,8 @@ Levenberg-Marquardt over t, C and H from the given start itself.
 The starts of one distortion share a drive, and the lattice on which one-key looks: what differs
 between them is which of its nodes lie in the ball. Starts whose balls hold the same best nodes
 find the same place and end in the same result, which is then computed once. Starts are therefore
-no independent trials of one-key; distortions, each with a drive and noise of its own, are.
+no independent trials of one-key; distortions, each with a drive and noise of its own, are, given
+the site and its map, which all of them share.
 
 A cell of the study, one distortion and one ring, is a function of the options alone, up to
 rounding: cells may be computed in any order and anywhere.

@@ -54,7 +54,8 @@ def note(table: BasinTable) -> str:
         f"{table.options.site.scenario.noise.field:g} uT of noise. In brackets Wilson's 95 % "
         "intervals, those of starts as if they were independent. They are not: the starts of one "
         "distortion share a drive and the lattice of the search, and differ for one-key in which "
-        "nodes lie in the ball around them; more independent is the count of distortions. "
+        "nodes lie in the ball around them; more independent is the count of distortions, which "
+        "share the site and its map. "
         f"Wrong: not within {small}. Ambiguous: marked so by one-key, right or wrong."
     )
 
@@ -99,12 +100,18 @@ def basin_figure(table: BasinTable) -> Figure:
         (f"one-key, within {medium}", ONE_KEY | WIDE, left, [row.one_key_medium for row in rows]),
         (f"one-key, within {small}", ONE_KEY | NEAR, left, [row.one_key_small for row in rows]),
     ):
-        draw_rates(axes, at, shares, label=name, **style)
+        draw_rates(axes, at, shares, label=f"{name} ({trials(shares)} starts a ring)", **style)
     axes.set(xlabel="initial offset (m)", ylabel="success rate (%)", ylim=(-3, 103))
     axes.set_xlim(0, max(row.outer for row in rows))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower left")
     return figure
+
+
+def trials(shares: Sequence[Share]) -> str:
+    """Return how many trials each share is of, or the least and the most."""
+    least, most = (end(share.trials for share in shares) for end in (min, max))
+    return f"{most:,}" if least == most else f"{least:,} to {most:,}"
 
 
 def draw_rates(axes: Axes, offset: FloatArray, shares: Sequence[Share], **style: Any) -> None:

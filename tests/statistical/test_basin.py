@@ -18,7 +18,7 @@ from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
 from l2m_gtsam.studies.basin import DRIVE, BasinOptions, Cell, basin_table, cells_of
 from l2m_gtsam.studies.basin_file import BasinStudy, read_study, write_study
-from l2m_gtsam.studies.basin_report import basin_markdown
+from l2m_gtsam.studies.basin_report import basin_figure, basin_markdown
 from l2m_gtsam.studies.basin_run import FIGURE_FILE, STUDY_FILE, TABLE_FILE, run_basin
 from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive
@@ -117,6 +117,17 @@ def test_a_distortion_counts_where_every_start_of_every_ring_succeeded() -> None
     table = basin_table(TINY, cells)
     assert (table.all_small, table.all_medium) == (Share(1, 4), Share(2, 4))
     assert "1 of 4" in basin_markdown(table)
+
+
+def test_table_and_figure_say_how_many_starts_each_method_got() -> None:
+    cells = [made_up(0, 0, [0.01, 0.01, 0.01]), made_up(1, 0, [0.01, 0.01])]
+    table = basin_table(TINY, cells)
+    line = basin_markdown(table).splitlines()[2].split(" | ")
+    assert (line[1], line[4]) == ("5", "4")
+    (axes,) = basin_figure(table).axes
+    _, legend = axes.get_legend_handles_labels()
+    assert "LM, within 2 cm (4 starts a ring)" in legend
+    assert "one-key, within 2 cm (5 starts a ring)" in legend
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 20), (7, 20), (1995, 2000), (2000, 2000)])

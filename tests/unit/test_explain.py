@@ -1,11 +1,13 @@
 """Sentences about what is open, from rank tests and drives made for them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.solve.explain import DriveFacts, drive_facts, explain, movement
+from l2m_gtsam.solve.explain import DriveFacts, drive_facts, explain, held_offset, movement
 from l2m_gtsam.solve.rank import RankOptions, determinacy
 
 RANK = RankOptions()
@@ -112,3 +114,18 @@ def test_movement_is_measured() -> None:
     assert moved.heights == pytest.approx(0.2)
     assert moved.tilt == pytest.approx(4)
     assert not moved.at_rest
+
+
+def test_a_held_offset_says_what_imitates_it() -> None:
+    """Half a metre per second and a tenth of a radian about z, for ten milliseconds."""
+    imitation = np.zeros(12)
+    imitation[0], imitation[4], imitation[6] = 0.5, 0.1, -0.1
+    test = replace(determinacy(rich(), RANK), imitation=imitation)
+    assert held_offset(test) == (
+        "held at 0: 10 ms look like t moved by (5.0, 0.0, 0.0) mm and the sensor turned by 0.06 "
+        "deg; drive at another speed or the other way round, too"
+    )
+    assert held_offset(replace(test, imitation=np.zeros(12))).endswith(
+        "nothing in this drive shows it"
+    )
+    assert held_offset(replace(test, offset=True)) == ""

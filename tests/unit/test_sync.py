@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FieldSeries, Recording, SourceFile, Trajectory
 from l2m_gtsam.errors import SyncError
-from l2m_gtsam.sync import SyncOptions, synchronise
+from l2m_gtsam.sync import SyncOptions, synchronise, with_offsets
 
 KEEP_ALL = SyncOptions(thin_distance_m=0, thin_angle_deg=0)
 
@@ -103,3 +103,41 @@ def test_other_clocks_are_named_in_one_line() -> None:
     with pytest.raises(SyncError, match=r"drive.bag: .*1700000000.000.*900.000") as error:
         synchronise(recording(poses, series(np.arange(0, 9, 0.5))), KEEP_ALL)
     assert "\n" not in str(error.value)
+
+
+def test_readings_need_poses_as_far_around_as_their_clock_may_be_off() -> None:
+    """Poses from 0 to 2.9 s and from 5 to 7.9 s; half a second at each of the four ends is lost."""
+    poses = turning_drive(np.concatenate([np.arange(0, 3, 0.1), np.arange(5, 8, 0.1)]))
+    stamps = np.array([0.2, 0.6, 2.3, 2.6, 4.0, 5.2, 5.6, 7.3, 7.6])
+    result = synchronise(recording(poses, series(stamps)), KEEP_ALL, 0.5)
+    counts = result.counts[0]
+    assert (counts.outside_trajectory, counts.in_pose_gap, counts.kept) == (2, 3, 4)
+    kept = 1e-9 * (result.readings.stamp_ns - result.readings.stamp_ns[0])
+    np.testing.assert_allclose(kept, [0, 1.7, 5.0, 6.7], atol=1e-6)
+
+
+def test_other_offsets_are_other_poses() -> None:
+    """The pose at stamp + offset, sensor by sensor, with the velocities of the drive."""
+    poses = turning_drive(np.arange(0, 10, 0.1))
+    stamps = np.sort(np.random.default_rng(3).uniform(1, 8.9, 50))
+    sensors = series(stamps), series(stamps, name="late")
+    readings = synchronise(recording(poses, *sensors), KEEP_ALL, 0.5).readings
+    moved = with_offsets(readings, poses, np.array([0.0, 0.3]))
+    expected = turning_drive(np.concatenate([stamps, stamps + 0.3]))
+    np.testing.assert_allclose(moved.p_map_lidar, expected.p, atol=2e-9)
+    np.testing.assert_allclose(moved.R_map_lidar, expected.R, atol=2e-9)
+    assert moved.motion is not None
+    np.testing.assert_array_equal(moved.motion.offset, np.repeat([0.0, 0.3], 50))
+    v = np.einsum("nji,j->ni", expected.R, [1.0, 0, 0])
+    # The chord over a tenth of a second, seen from its middle.
+    np.testing.assert_allclose(moved.motion.twist_lidar[:, :3], [[0, 0, 0.5]] * 100, atol=1e-7)
+    np.testing.assert_allclose(moved.motion.twist_lidar[:, 3:], v, atol=1e-7)
+
+
+def test_beyond_its_poses_a_lidar_stands_still() -> None:
+    poses = turning_drive(np.arange(0, 2, 0.1))
+    readings = synchronise(recording(poses, series(np.array([0.5, 1.5]))), KEEP_ALL).readings
+    moved = with_offsets(readings, poses, np.array([3.0]))
+    np.testing.assert_allclose(moved.p_map_lidar, np.tile(poses.p[-1], (2, 1)))
+    assert moved.motion is not None
+    np.testing.assert_array_equal(moved.motion.twist_lidar, 0)
