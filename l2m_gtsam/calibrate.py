@@ -178,7 +178,7 @@ def _with_contradictions(
     sensor: SensorCalibration, missed: tuple[Contradiction, ...], names: tuple[str, ...]
 ) -> SensorCalibration:
     """Return the same with a word on what was known beforehand and the readings speak against."""
-    if not missed or sensor.status is not SensorStatus.SOLVED:
+    if not missed:
         return sensor
     worst = max(missed, key=lambda each: each.sigmas)
     others = [names[each] for each in worst.sensors if names[each] != sensor.sensor]
@@ -187,6 +187,8 @@ def _with_contradictions(
         f"its {worst.kind}{where} contradicts the readings by {worst.sigmas:.1f} sigmas: correct "
         "`calibration.priors`, or give it a larger sigma"
     )
+    if sensor.status is not SensorStatus.SOLVED:
+        return replace(sensor, message=f"{sensor.message}; {msg}")
     return replace(sensor, status=SensorStatus.CONTRADICTED, message=msg)
 
 
