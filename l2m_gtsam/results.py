@@ -186,8 +186,8 @@ class SensorCalibration:
     time_offset
         Of the sensor's clock; absent where nothing was solved.
     from_priors
-        What the readings leave open and only priors determine: phrases with the parameters by name
-        and what was known beforehand.
+        What the readings leave open and only priors determine, or mostly: phrases with the
+        parameters by name and what was known beforehand.
     """
 
     sensor: str

@@ -4,12 +4,12 @@ A sensor that baselines connect to others is tested with all of these unknown: t
 from the rows of the cluster, and what remains speaks of the one sensor alone.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_among, rows_in
@@ -19,6 +19,9 @@ from l2m_gtsam.solve.rank import PARAMETERS, Determinacy, RankOptions, timed_det
 # Of the largest sigma of use: what is known of other sensors at least. It is as good as nothing.
 LOOSE = 1e3
 TIME_OFFSET = "time offset"
+# A value is mostly a prior's if its sigma was so many times larger without: three quarters of what
+# is known of it is not from the readings.
+MOSTLY = 2.0
 
 
 def determinacies(
@@ -48,7 +51,7 @@ def determinacies(
         known = Priors(priors.among(sensors))
         if known.each:
             cluster = Cluster(sensors, few, held, values, options)
-            tests |= {each: with_priors(each, cluster, known, alone[each]) for each in sensors}
+            tests |= {each: with_priors(each, cluster, known) for each in sensors}
     return tests
 
 
@@ -76,10 +79,6 @@ class Cluster:
     values: gtsam.Values
     options: RankOptions
 
-    def test(self, sensor: int, priors: Priors) -> Determinacy:
-        """Test one sensor with all others of the cluster unknown."""
-        return timed_determinacy(self.rows_of(sensor, priors), self.options)
-
     def rows_of(self, sensor: int, priors: Priors) -> FloatArray:
         """Return rows on one sensor that say what all do when the others are unknown, (M, 16)."""
         others = [other for other in self.sensors if other != sensor]
@@ -106,7 +105,7 @@ class Cluster:
         return rows
 
 
-def with_priors(sensor: int, cluster: Cluster, priors: Priors, alone: Determinacy) -> Determinacy:
+def with_priors(sensor: int, cluster: Cluster, priors: Priors) -> Determinacy:
     """Return the rank test of a sensor with its cluster, and which priors decide what.
 
     Parameters
@@ -117,21 +116,67 @@ def with_priors(sensor: int, cluster: Cluster, priors: Priors, alone: Determinac
         Its cluster.
     priors
         What is known of the cluster.
-    alone
-        The test of its readings alone.
     """
-    every = cluster.test(sensor, priors)
-    gained = _open(alone) - _open(every)
-    kinds = list(dict.fromkeys(prior.kind for prior in priors.each))
-    without = {kind: _open(cluster.test(sensor, priors.without(kind))) for kind in kinds if gained}
+    scales = cluster.options
+    every = Known.of(cluster.rows_of(sensor, priors), scales)
+    before = Known.of(cluster.jacobians[sensor], scales)
+    opened, weaker = before.open - every.open, before.weaker_than(every)
+    kinds = list(dict.fromkeys(p.kind for p in priors.each)) if opened | weaker else []
+    without = {
+        kind: Known.of(cluster.rows_of(sensor, priors.without(kind)), scales) for kind in kinds
+    }
+    open_by = {kind: each.open for kind, each in without.items()}
+    weaker_by = {kind: each.open | each.weaker_than(every) for kind, each in without.items()}
+    return replace(
+        every.test,
+        borrowed=_reasons(opened, open_by),
+        leaning=_reasons(weaker, weaker_by),
+        lent=every.test.free - before.test.free,
+    )
+
+
+def _reasons(names: Collection[str], missed: Mapping[str, Collection[str]]) -> dict[str, str]:
+    """Return by name the kinds of prior without any one of which it is missed, or all of them."""
     reasons = {}
-    for name in (each for each in (*PARAMETERS, TIME_OFFSET) if each in gained):
-        needed = [kind for kind in kinds if name in without[kind]]
-        reasons[name] = " and ".join(needed) or " or ".join(kinds)
-    return replace(every, borrowed=reasons, lent=every.free - alone.free)
+    for name in (each for each in (*PARAMETERS, TIME_OFFSET) if each in names):
+        needed = [kind for kind, without in missed.items() if name in without]
+        reasons[name] = " and ".join(needed) or " or ".join(missed)
+    return reasons
 
 
-def _open(test: Determinacy) -> set[str]:
-    """Return the parameters that a test leaves open."""
-    open_ = {PARAMETERS[index] for index in np.flatnonzero(test.touched)}
-    return open_ if test.offset else open_ | {TIME_OFFSET}
+@dataclass(frozen=True)
+class Known:
+    """What rows on one sensor say of it.
+
+    Attributes
+    ----------
+    test
+        The rank test.
+    open
+        Names of the parameters that it leaves open.
+    sigma
+        Of the 15 parameters, where they are not, shape (15,).
+    """
+
+    test: Determinacy
+    open: frozenset[str]
+    sigma: FloatArray
+
+    @classmethod
+    def of(cls, rows: FloatArray, options: RankOptions) -> "Known":
+        """Test white rows, shape (M, 16)."""
+        test = timed_determinacy(rows, options)
+        open_ = {PARAMETERS[index] for index in np.flatnonzero(test.touched)}
+        held = np.zeros((len(test.held) + 1, SENSOR))
+        held[:-1, :-1] = test.held
+        held[-1, -1] = 0.0 if test.offset else 1 / HOLD_S
+        scale = np.append(options.scale(), options.useful_offset_s)
+        triangular = np.asarray(np.linalg.qr(np.concatenate([rows, held]) * scale, mode="r"))
+        root = scale[:, None] * solve_triangular(triangular, np.eye(SENSOR))
+        sigma = np.linalg.norm(root, axis=1)[:-1]
+        return cls(test, frozenset(open_ if test.offset else open_ | {TIME_OFFSET}), sigma)
+
+    def weaker_than(self, other: "Known") -> frozenset[str]:
+        """Return what both determine, but this one far less."""
+        far = np.flatnonzero(self.sigma > MOSTLY * other.sigma)
+        return frozenset(PARAMETERS[index] for index in far) - self.open - other.open

@@ -82,10 +82,11 @@ def explained(
 
 
 def from_priors(*tests: Determinacy) -> tuple[str, ...]:
-    """Return which parameters are known from priors alone, by any of some tests of one sensor."""
+    """Return which parameters priors alone determine, or mostly, by any of a sensor's tests."""
     touched = np.any([test.touched for test in tests], axis=0)
-    open_ = [PARAMETERS[index] for index in np.flatnonzero(touched)]
-    whys = {name: why for test in tests for name, why in test.borrowed.items()}
+    open_ = {PARAMETERS[index] for index in np.flatnonzero(touched)}
+    whys = {name: f"mostly {why}" for test in tests for name, why in test.leaning.items()}
+    whys |= {name: why for test in tests for name, why in test.borrowed.items()}
     names = [name for name in (*PARAMETERS, TIME_OFFSET) if name in whys and name not in open_]
     groups = {whys[name]: [each for each in names if whys[each] == whys[name]] for name in names}
     return tuple(f"{', '.join(group)} ({why})" for why, group in groups.items())

@@ -60,6 +60,8 @@ class Determinacy:
     borrowed
         By name the parameters that the readings leave open and priors do not, with what is known
         beforehand that decides.
+    leaning
+        The same for parameters that the readings determine, but priors far better.
     lent
         Number of directions that priors determine and the readings do not.
     """
@@ -71,6 +73,7 @@ class Determinacy:
     offset: bool = False
     imitation: FloatArray = field(default_factory=lambda: np.zeros(12))
     borrowed: dict[str, str] = field(default_factory=dict)
+    leaning: dict[str, str] = field(default_factory=dict)
     lent: int = 0
 
     @property

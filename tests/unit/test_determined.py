@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from l2m_factors import D, T
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.determined import LOOSE, Cluster, determinacies
+from l2m_gtsam.graph.determined import LOOSE, Cluster, Known, determinacies
 from l2m_gtsam.graph.priors import NO_PRIORS, Coordinate, Difference, Mount, Priors
 from l2m_gtsam.solve.rank import RankOptions, timed_determinacy
 
@@ -117,3 +117,22 @@ def test_a_mount_lends_a_column_of_c() -> None:
     jacobians = {0: readings(0, silent=5)}
     (test,) = determinacies(jacobians, Priors((mount,)), values(1), OPTIONS).values()
     assert test.borrowed == {"C_xz": "nominal rotation"}
+
+
+def test_what_is_mostly_a_priors_leans_on_it() -> None:
+    """A ruler twice as good as the readings, and one half as good."""
+    jacobians = {0: readings(0)}
+    alone = Known.of(jacobians[0], OPTIONS).sigma[2]
+    for sigma, leans in ((alone / 2, True), (2 * alone, False)):
+        known = Priors((Coordinate((0,), 2, 0.0, sigma),))
+        (test,) = determinacies(jacobians, known, values(1), OPTIONS).values()
+        assert test.borrowed == {}
+        # Half of the readings' sigma: sqrt(5) times as much is known; twice: sqrt(5/4) times.
+        assert test.leaning == ({"t_z": "measured height"} if leans else {})
+        assert test.free == 16
+
+
+def test_sigmas_are_those_of_the_normal_equations() -> None:
+    J = readings(3)
+    expected = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))[:15]
+    np.testing.assert_allclose(Known.of(J, OPTIONS).sigma, expected, rtol=1e-9)
