@@ -20,8 +20,9 @@ from l2m_gtsam.graph.alternation import OneKeyOptions, Progress
 from l2m_gtsam.graph.contradictions import Contradiction
 from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
+from l2m_gtsam.graph.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.graph.named_priors import priors_of
-from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.graph.one_key import OneKeySolution
 from l2m_gtsam.graph.priors import Priors
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
@@ -49,6 +50,7 @@ ONE_POINT = 11.3
 # With more of its readings rejected than this, what a sensor's others agree on may be chance.
 MOST_REJECTED = 0.4
 
+UNSOLVED = "the sensor is not solved"
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 
 
@@ -89,11 +91,22 @@ def calibrate(
     priors = priors_of(options.priors, alive.sensors)
     found = _starts(alive, solver_map, options, priors, progress)
     t_start = _start_places(alive.sensors, found, options)
-    poses = recording.trajectory
-    solution = solve_one_key(alive, solver_map, t_start, options.solve, progress, poses, priors)
-    told = explained(alive, solver_map, t_start, solution, options.solve)
+    problem = MovingProblem(
+        readings=alive,
+        names=tuple(each.name for each in recording.scalars),
+        field_map=solver_map,
+        options=options.solve,
+        models=options.models,
+        progress=progress,
+        trajectory=recording.trajectory,
+        priors=priors,
+    )
+    outcome = solve_moving(problem, t_start)
+    solution = outcome.solution
+    told = explained(outcome.readings, solver_map, t_start, solution, options.solve)
     moved = movement(recording.trajectory.R, recording.trajectory.p)
     sensors = _assess(synchronised, alive, solution, told, moved, options)
+    sensors = tuple(_with_models(index, each, outcome) for index, each in enumerate(sensors))
     missed = {alive.sensors[each.sensor]: each.contradictions for each in solution.solved}
     sensors = tuple(
         _with_contradictions(each, missed.get(each.sensor, ()), alive.sensors) for each in sensors
@@ -154,6 +167,18 @@ def _start_places(
             options.start.get(name, at_lidar) if each is None else each.t_lidar_mag
             for name, each in zip(sensors, found, strict=True)
         ]
+    )
+
+
+def _with_models(
+    index: int, sensor: SensorCalibration, outcome: MovingSolution
+) -> SensorCalibration:
+    """Return the same with its models and what recorded numbers add to its readings."""
+    return replace(
+        sensor,
+        models=outcome.compared.get(index),
+        not_compared=outcome.not_compared.get(index, "" if index in outcome.compared else UNSOLVED),
+        moving=outcome.moving.get(index, ()),
     )
 
 
@@ -365,11 +390,13 @@ def _why_silent(usable: int, counts: SyncCounts, moved: Movement, needed: int) -
     if counts.kept >= needed:
         return "the sensor reports one constant value: it is stuck"
     reason = f"{moved.rest}: " if moved.at_rest else ""
+    without = counts.without_regressor
+    numbers = f", {without} without a recorded number" if without else ""
     return (
         f"{reason}{usable} usable readings of {counts.received} received "
         f"({counts.not_finite} not finite, {counts.repeated} repeated, "
         f"{counts.outside_trajectory} without a pose, {counts.in_pose_gap} in a gap between poses, "
-        f"{counts.thinned} at a place already read), at least {needed} are needed"
+        f"{counts.thinned} at a place already read{numbers}), at least {needed} are needed"
     )
 
 

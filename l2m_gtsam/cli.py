@@ -148,10 +148,14 @@ def calibrate(
             "use independent."
         ),
     ] = None,
+    models: Annotated[
+        bool, typer.Option("--models", help="Show how models of each sensor compare.")
+    ] = False,
 ) -> None:
     """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
     from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
     from l2m_gtsam.config import load_config, with_uncertainty
+    from l2m_gtsam.qa.model_table import model_note, model_tables
     from l2m_gtsam.qa.tables import calibration_table, disagreement_note, held_clocks_note
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
@@ -164,6 +168,10 @@ def calibrate(
     _warn([disagreement_note(each) for each in result.disagreements])
     if held := held_clocks_note(result):
         typer.echo(held)
+    for table in model_tables(result) if models else ():
+        _print(table)
+    for note in filter(None, map(model_note, result.sensors)):
+        typer.echo(note)
     typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
 
 

@@ -1,7 +1,7 @@
 """One configuration composed of the options beside each algorithm, read from YAML."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 
@@ -13,7 +13,9 @@ from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
 from l2m_gtsam.options import Options
+from l2m_gtsam.regressors import ResampleOptions
 from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.solve.model_comparison import ModelOptions
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
@@ -47,6 +49,10 @@ class CalibrationOptions(Options):
     """What is known of sensors beforehand: places, rotations, the geometry of arrays."""
     solve: OneKeyOptions = OneKeyOptions()
     """The one-key solve."""
+    models: ModelOptions = ModelOptions()
+    """How models of each sensor are compared after the solve."""
+    regressors: ResampleOptions = ResampleOptions()
+    """How the numbers of `bag.regressors` get to the times of the readings."""
 
 
 class PlanOptions(Options):
@@ -123,10 +129,13 @@ def _explain(path: Path, error: ValidationError) -> str:
 
 def _accepted(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     """Return the keys of the options at a location."""
-    for part in location:
-        if str(part) not in model.model_fields:  # a name or a place in a list of options
+    parts = iter(location)
+    for part in parts:
+        if str(part) not in model.model_fields:  # a place in a list of options
             continue
         inner: Any = model.model_fields[str(part)].annotation
+        if get_origin(inner) is dict:
+            next(parts, None)  # a name that the user gave
         candidates = [inner, *getattr(inner, "__args__", ())]
         nested = [c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel)]
         if not nested:

@@ -130,11 +130,12 @@ class SourceFile:
 
 @dataclass(frozen=True)
 class Recording:
-    """One drive: the lidar's poses in the map and the readings of every magnetometer."""
+    """One drive: the lidar's poses in the map, the readings of every magnetometer, and numbers."""
 
     trajectory: Trajectory
     series: tuple[FieldSeries, ...]
     source: SourceFile
+    scalars: tuple[ScalarSeries, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -179,6 +180,9 @@ class Readings:
     pose_root
         Square roots L of the covariances of the poses' errors, ``true = measured Exp(L u)``, in the
         lidar frame, rotation (rad) before translation (m), shape (N, 6, 6); absent for exact poses.
+    regressors
+        Recorded numbers whose field may be part of the readings, each in its own unit, shape
+        (N, K); zero where a sensor does not feel them, absent where none were recorded.
     """
 
     sensors: tuple[str, ...]
@@ -189,6 +193,7 @@ class Readings:
     field: FloatArray
     motion: PoseMotion | None = None
     pose_root: FloatArray | None = None
+    regressors: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.sensor)
@@ -203,6 +208,7 @@ class Readings:
             self.field[rows],
             None if self.motion is None else self.motion[rows],
             None if self.pose_root is None else self.pose_root[rows],
+            None if self.regressors is None else self.regressors[rows],
         )
 
     def select(self, keep: BoolArray) -> "Readings":
@@ -226,6 +232,7 @@ class SyncCounts:
     in_pose_gap: int
     thinned: int
     kept: int
+    without_regressor: int = 0
 
 
 @dataclass(frozen=True)

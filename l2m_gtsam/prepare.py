@@ -5,6 +5,7 @@ from dataclasses import replace
 from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import Recording, Synchronised
 from l2m_gtsam.pose_noise import pose_roots
+from l2m_gtsam.regressors import with_regressors
 from l2m_gtsam.solve.explain import movement
 from l2m_gtsam.sync import synchronise
 
@@ -18,10 +19,11 @@ def prepare(recording: Recording, options: CalibrationOptions) -> Synchronised:
     Raises
     ------
     SyncError
-        Readings and poses do not overlap.
+        Readings and poses or recorded numbers do not overlap, or a number never changes.
     """
     largest, poses = options.solve.largest_offset_s, recording.trajectory
     synchronised = synchronise(recording, options.sync, largest)
+    synchronised = with_regressors(synchronised, recording.scalars, options.regressors)
     readings = synchronised.readings
     still = movement(poses.R, poses.p).at_rest
     readings = replace(

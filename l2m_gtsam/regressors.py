@@ -1,13 +1,22 @@
 """Numbers that go along with a drive, brought to the times of the readings."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray, ScalarSeries
+from l2m_gtsam.data import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    ScalarSeries,
+    Synchronised,
+)
+from l2m_gtsam.errors import SyncError
 from l2m_gtsam.options import Options
+
+STILL = 1e-9  # of its size: a number that varies less follows from rounding
 
 
 class ResampleOptions(Options):
@@ -77,3 +86,65 @@ def _is_near(sample_ns: IntArray, stamp_ns: IntArray, max_gap_s: float) -> BoolA
     on_sample = sample_ns[np.minimum(after, len(sample_ns) - 1)] == stamp_ns
     gap_s = np.concatenate([[np.inf], np.diff(sample_ns) * 1e-9, [np.inf]])[after]
     return np.asarray(on_sample | (gap_s <= max_gap_s))
+
+
+def with_regressors(
+    synchronised: Synchronised, series: Sequence[ScalarSeries], options: ResampleOptions
+) -> Synchronised:
+    """Return the readings at which all numbers are known, with them; all readings for no numbers.
+
+    Parameters
+    ----------
+    synchronised
+        Readings and their account.
+    series
+        K series.
+    options
+        How far apart samples may be.
+
+    Raises
+    ------
+    SyncError
+        No reading is left, or a number never changes.
+    """
+    if not series:
+        return synchronised
+    readings = synchronised.readings
+    found = resampled(series, readings.stamp_ns, options)
+    if not found.known.any():
+        raise SyncError(_none_known(readings.stamp_ns, series, options))
+    _check_changes(found)
+    dropped = np.bincount(readings.sensor[~found.known], minlength=len(readings.sensors))
+    counts = tuple(
+        replace(count, kept=count.kept - int(without), without_regressor=int(without))
+        for count, without in zip(synchronised.counts, dropped, strict=True)
+    )
+    readings = replace(readings, regressors=found.values)
+    return Synchronised(readings.select(found.known), counts)
+
+
+def _check_changes(found: Resampled) -> None:
+    """Raise a SyncError for a number that is the same at all readings."""
+    for name, values in zip(found.names, found.values[found.known].T, strict=True):
+        if np.ptp(values) <= STILL * np.abs(values).max():
+            raise SyncError(
+                f"regressor {name!r}: it is {values[0]:g} at all readings, which nothing tells "
+                "from the offset H; leave it out of `bag.regressors`"
+            )
+
+
+def _none_known(
+    stamp_ns: IntArray, series: Sequence[ScalarSeries], options: ResampleOptions
+) -> str:
+    spans = ", ".join(
+        f"{each.name!r} from {each.stamp_ns[0] * 1e-9:.3f} to {each.stamp_ns[-1] * 1e-9:.3f} s"
+        for each in series
+        if len(each)
+    )
+    first, last = stamp_ns.min() * 1e-9, stamp_ns.max() * 1e-9
+    return (
+        f"no reading has all recorded numbers: readings run from {first:.3f} to {last:.3f} s, "
+        f"{spans}, and samples may be "
+        f"{options.max_gap_s:g} s apart at most (`calibration.regressors.max_gap_s`); if clocks "
+        "differ, try `bag.stamps: record`"
+    )

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from l2m_gtsam.data import Distortion, FloatArray, SourceFile, SyncCounts
+from l2m_gtsam.model_results import ModelComparison, MovingField
 
 
 class SensorStatus(StrEnum):
@@ -188,6 +189,13 @@ class SensorCalibration:
     from_priors
         What the readings leave open and only priors determine, or mostly: phrases with the
         parameters by name and what was known beforehand.
+    models
+        Models of the readings side by side; absent where they are not compared.
+    not_compared
+        Why they are not.
+    moving
+        What recorded numbers add to the readings; H is the offset where they are zero. Empty for a
+        sensor to which no model with them is recommended.
     """
 
     sensor: str
@@ -207,6 +215,9 @@ class SensorCalibration:
     rejected: int = 0
     time_offset: TimeOffset | None = None
     from_priors: tuple[str, ...] = ()
+    models: ModelComparison | None = None
+    not_compared: str = ""
+    moving: tuple[MovingField, ...] = ()
 
     @property
     def offset_correlation(self) -> FloatArray:

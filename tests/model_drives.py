@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.solve.models import Coefficients, Model, Samples
+from l2m_gtsam.models import Coefficients, Model, Samples
 
 STEP = 0.1  # seconds between readings
 NOISE = 0.2  # uT

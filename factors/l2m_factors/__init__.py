@@ -2,7 +2,7 @@
 
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.field_map import FieldMap
-from l2m_factors.keys import D, M, P, S, T
+from l2m_factors.keys import D, M, P, Q, S, T
 from l2m_factors.motion import PoseMotion, moved
 from l2m_factors.priors import (
     distance_prior,
@@ -11,7 +11,7 @@ from l2m_factors.priors import (
     rotation_prior,
 )
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
-from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
+from l2m_factors.residual import MagneticReadings, ReadingResiduals, field_rate, reading_residuals
 from l2m_factors.shared_errors import (
     SharedError,
     map_weights_prior,
@@ -28,6 +28,7 @@ __all__ = [
     "MagneticReadings",
     "P",
     "PoseMotion",
+    "Q",
     "ReadingResiduals",
     "S",
     "SharedError",
@@ -36,6 +37,7 @@ __all__ = [
     "block_factor",
     "distance_prior",
     "distortion_prior",
+    "field_rate",
     "held_directions",
     "map_weights_prior",
     "moved",

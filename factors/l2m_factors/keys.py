@@ -26,3 +26,11 @@ def M(tile: int) -> int:
 def P(knot: int) -> int:
     """Return the key of the lidar's pose error at this knot: Vector 6, unit variance each."""
     return int(gtsam.symbol("P", knot))
+
+
+def Q(sensor: int) -> int:
+    """Return the key of what recorded numbers add to this sensor's field: Vector 3K, unit variance.
+
+    Three for each of K numbers, along the axes of the lidar.
+    """
+    return int(gtsam.symbol("Q", sensor))

@@ -5,8 +5,9 @@ r"""Magnetic readings whose prediction is uncertain, in ways that readings share
     \partial e / \partial \gamma = C F
 
 ``gamma`` are weights that many readings have in common, with a prior: of the map's error in one
-tile, ``M(b)``, with ``F = R^T A``; of the lidar's pose error at a knot of the drive, ``P(k)``.
-F is given per reading, at the place where the graph is linearised; it changes over decimetres.
+tile, ``M(b)``, with ``F = R^T A``; of the lidar's pose error at a knot of the drive, ``P(k)``; of
+the field that recorded numbers add at a sensor, ``Q(i)``. F is given per reading, at the place
+where the graph is linearised; it changes over decimetres.
 """
 
 from collections.abc import Mapping, Sequence

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from l2m_gtsam.batch.opening import SavedMap, read_drive
+from l2m_gtsam.batch.opening import SavedMap, read_drive, read_drive_and_numbers
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import Config
@@ -58,7 +58,8 @@ def calibrate_bag(
         Whatever is wrong with the input, in one line; nothing is written then.
     """
     check_outputs(out / CALIBRATION_FILE, out / OVERVIEW_FILE)
-    saved, recording = SavedMap.read(map_path), read_drive(bag, config, progress)
+    saved = SavedMap.read(map_path)
+    recording = read_drive_and_numbers(bag, config, progress)
     field_map, source = saved.open(progress, [recording]), source_file(map_path)
     result = calibrate(recording, field_map, config.calibration, source, progress)
     result = replace(result, options=config.model_dump(mode="json"))

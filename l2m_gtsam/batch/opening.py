@@ -1,7 +1,7 @@
 """Drives and maps from their files, in one frame."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +13,19 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.map_file import load_map
+from l2m_gtsam.storage.regressors import read_scalars
 
 
 def read_drive(bag: Path, config: Config, progress: Progress) -> Recording:
     """Return what a bag recorded, as far as the configuration reads it."""
     return read_recording(bag, config.bag, counter(f"reading {bag.name}", progress))
+
+
+def read_drive_and_numbers(bag: Path, config: Config, progress: Progress) -> Recording:
+    """Return what a bag recorded with the numbers that the configuration names."""
+    told = counter(f"reading numbers of {bag.name}", progress)
+    scalars = read_scalars(bag, config.bag.regressors, config.bag.stamps, told)
+    return replace(read_drive(bag, config, progress), scalars=scalars)
 
 
 @dataclass(frozen=True)

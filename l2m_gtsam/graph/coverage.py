@@ -1,7 +1,7 @@
 """What the readings of a view share: the map's error in each tile, the poses' at each knot."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -10,6 +10,7 @@ from scipy.linalg import solve_triangular
 from l2m_factors import M, P
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.graph.calibration import Estimate
+from l2m_gtsam.graph.moving_fields import MovingFields
 from l2m_gtsam.graph.pose_errors import PoseKnots, pose_seconds
 from l2m_gtsam.graph.view import View
 
@@ -46,6 +47,28 @@ class UncertainMap(Protocol):
     def errors_over(self, points: FloatArray, /) -> MapErrors:
         """Return the map's error over places, shape (N, 3), in metres."""
         ...
+
+
+class NothingShared:
+    """A map whose errors are independent: one tile with one weight that no reading feels."""
+
+    covariance = np.eye(1)
+
+    def errors_over(self, points: FloatArray, /) -> "NothingShared":
+        """Return the same for any places."""
+        return self
+
+    def sizes(self) -> dict[int, int]:
+        """Return the weight of the tile."""
+        return {0: 1}
+
+    def owner(self, points: FloatArray, /) -> IntArray:
+        """Return the tile for each point, shape (N,)."""
+        return np.zeros(len(points), dtype=np.int64)
+
+    def features(self, points: FloatArray, tile: int, /) -> FloatArray:
+        """Return that it does nothing, shape (N, 3, 1)."""
+        return np.zeros((len(points), 3, 1))
 
 
 @dataclass(frozen=True)
@@ -87,6 +110,8 @@ class Coverage:
         Where pose errors are variables; absent where poses are taken for exact.
     seconds
         When each pose was taken, as the knots count, shape (N,).
+    moving
+        The sensors that feel recorded numbers.
     """
 
     groups: tuple[Group, ...]
@@ -95,14 +120,14 @@ class Coverage:
     root_information: FloatArray
     knots: PoseKnots | None
     seconds: FloatArray
+    moving: MovingFields = field(default_factory=MovingFields)
 
     @property
     def sizes(self) -> dict[int, int]:
         """Number of weights of each key of the graph."""
         knots = 0 if self.knots is None else len(self.knots.seconds)
-        return {M(tile): size for tile, size in self.tiles.items()} | {
-            P(knot): POSE for knot in range(knots)
-        }
+        tiles = {M(tile): size for tile, size in self.tiles.items()}
+        return tiles | {P(knot): POSE for knot in range(knots)} | self.moving.sizes
 
 
 def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: float) -> Coverage:

@@ -91,15 +91,19 @@ def group_noise(
     share = map_covariance(C, readings.R_map_lidar, coverage.rest)
     own = reading_covariance(estimate.noise[readings.sensor], share, view.trust)
     R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
-    by_map = [
-        SharedError(M(group.tile), R_lidar_map[group.rows] @ group.features)
+    q = readings.regressors
+    shared = [
+        (
+            SharedError(M(group.tile), R_lidar_map[group.rows] @ group.features),
+            *coverage.moving.errors(group.sensor, None if q is None else q[group.rows]),
+        )
         for group in coverage.groups
     ]
     pose = pose_share(readings, field_map, coverage, estimate)
     if pose is None:
         W = whitening(own)
         return GroupNoise(
-            errors=tuple((each,) for each in by_map),
+            errors=tuple(shared),
             whitenings=tuple(W[group.rows] for group in coverage.groups),
             alone=W,
             rest=_mean_variance(share),
@@ -109,9 +113,9 @@ def group_noise(
         bridge, n = pose.bridge(group), len(group.rows)
         whitenings.append(_inverse_root(bridge + block_diag(*own[group.rows])))
         left[group.rows] = bridge.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-    shared = zip(by_map, coverage.groups, strict=True)
+    pairs = zip(shared, coverage.groups, strict=True)
     return GroupNoise(
-        errors=tuple((each, *pose.errors(group)) for each, group in shared),
+        errors=tuple((*each, *pose.errors(group)) for each, group in pairs),
         whitenings=tuple(whitenings),
         alone=whitening(own + left),
         rest=_mean_variance(share + left),

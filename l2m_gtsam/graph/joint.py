@@ -19,6 +19,7 @@ from l2m_gtsam.graph.calibration import (
 )
 from l2m_gtsam.graph.contradictions import Contradiction, contradictions
 from l2m_gtsam.graph.determined import determinacies
+from l2m_gtsam.graph.moving_fields import Correction
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.pose_errors import error_of_poses
 from l2m_gtsam.graph.view import QueryableMap, View
@@ -56,6 +57,9 @@ class SensorSolution:
         Length of the Newton step that remains, in standard deviations.
     contradictions
         What was known of the sensor beforehand and the readings speak against.
+    moving
+        What recorded numbers add to the readings, beyond what was taken off them; absent where it
+        is no variable of the graph.
     """
 
     sensor: int
@@ -64,6 +68,7 @@ class SensorSolution:
     determinacy: Determinacy
     remaining_sigmas: float
     contradictions: tuple[Contradiction, ...] = ()
+    moving: Correction | None = None
 
     @property
     def covariance(self) -> FloatArray:

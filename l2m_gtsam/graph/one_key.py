@@ -22,7 +22,7 @@ from l2m_gtsam.graph.alternation import (
     start_estimate,
 )
 from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.coverage import UncertainMap
+from l2m_gtsam.graph.coverage import NothingShared, UncertainMap
 from l2m_gtsam.graph.joint import (
     JointProblem,
     SensorSolution,
@@ -137,18 +137,32 @@ def solve_one_key(
     if joint.problem is None:
         return outcome
     view, tests = joint.problem.view, joint.problem.determinacies
-    if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
-        tell("map uncertainty", 0.0)
-        full = solve_uncertain(view, field_map, field_map, joint.estimate, tests, options)
-        tell("map uncertainty", 1.0)
-        return replace(
-            outcome,
-            estimate=full.estimate,
-            solved=full.solved,
-            settled=joint.settled and full.settled,
-            uncertainty=Uncertainty.FULL,
-        )
-    return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
+    errors = shared_errors(field_map, view.readings, options.uncertainty)
+    if errors is None:
+        return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
+    tell("map uncertainty", 0.0)
+    full = solve_uncertain(view, field_map, errors, joint.estimate, tests, options)
+    tell("map uncertainty", 1.0)
+    unshared = isinstance(errors, NothingShared)
+    return replace(
+        outcome,
+        estimate=full.estimate,
+        solved=full.solved,
+        settled=joint.settled and full.settled,
+        uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
+    )
+
+
+def shared_errors(
+    field_map: QueryableMap, readings: Readings, uncertainty: Uncertainty
+) -> UncertainMap | None:
+    """Return the errors that are variables beside the sensors; none if nothing is shared.
+
+    Fields of recorded numbers are shared whatever is known of the map.
+    """
+    if uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
+        return field_map
+    return None if readings.regressors is None else NothingShared()
 
 
 @dataclass(frozen=True)

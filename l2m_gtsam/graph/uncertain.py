@@ -1,9 +1,10 @@
 """The joint graph over an uncertain map: ``T(i)``, ``D(i)``, ``S(i)``, and errors that are shared.
 
 The map's errors, ``M(b)``, are shared by readings near each other, in one pass or in many, of one
-sensor or of all; those of the lidar's poses, ``P(k)``, by readings near each other in time. As
-variables of the graph they carry that into the marginals; counted as noise of each reading they
-would average out as they do not in truth.
+sensor or of all; those of the lidar's poses, ``P(k)``, by readings near each other in time; fields
+that recorded numbers add, ``Q(i)``, by all readings of a sensor. As variables of the graph they
+carry that into the marginals; counted as noise of each reading they would average out as they do
+not in truth.
 """
 
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ import numpy as np
 
 from l2m_factors import (
     D,
+    Q,
     map_weights_prior,
     pose_errors_prior,
     shared_error,
@@ -24,9 +26,10 @@ from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate, batch_readings, prior_graph
 from l2m_gtsam.graph.contradictions import contradictions
 from l2m_gtsam.graph.coverage import Coverage, UncertainMap, cover
-from l2m_gtsam.graph.elimination import Eliminated, eliminate
+from l2m_gtsam.graph.elimination import Eliminated, eliminate, weight_columns
 from l2m_gtsam.graph.group_noise import group_noise
 from l2m_gtsam.graph.joint import SensorSolution, with_infinities
+from l2m_gtsam.graph.moving_fields import Correction, moving_fields
 from l2m_gtsam.graph.view import QueryableMap, View
 from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.noise import HALF, estimate_noise
@@ -80,6 +83,8 @@ def solve_uncertain(
         How to solve.
     """
     coverage = cover(view, errors, near, options.pose_noise.correlation_s)
+    moving = moving_fields(view.readings, options.moving_field_ut)
+    coverage = replace(coverage, moving=moving)
     values = starting_values(near, view.sensors, coverage)
     estimate, settled = near, False
     for _ in range(MAX_ROUNDS):
@@ -146,6 +151,7 @@ class UncertainProblem:
         self._graph.add(map_weights_prior(coverage.tiles, coverage.root_information))
         if coverage.knots is not None:
             self._graph.push_back(pose_errors_prior(coverage.knots.correlation.tolist()))
+        self._graph.push_back(coverage.moving.prior())
         self._graph.push_back(prior_graph(estimate, {s: tests[s] for s in view.sensors}))
 
     def descend(self, values: gtsam.Values) -> Descent:
@@ -180,9 +186,22 @@ class UncertainProblem:
                     determinacy=self._tests[s],
                     remaining_sigmas=system.sigmas(s),
                     contradictions=tuple(each for each in missed if s in each.sensors),
+                    moving=self._correction(s, system, values),
                 )
             )
         return tuple(solutions)
+
+    def _correction(
+        self, sensor: int, system: Eliminated, values: gtsam.Values
+    ) -> Correction | None:
+        """Return what recorded numbers still add to a sensor's readings; none if it feels none."""
+        moving, key = self._coverage.moving, Q(sensor)
+        if sensor not in moving.scales:
+            return None
+        own = weight_columns(self._coverage.sizes)[key]
+        covariance = system.covariance_of_weights[own, own]
+        C = values.atVector(D(sensor))[:9].reshape(3, 3)
+        return moving.correction(sensor, values.atVector(key), covariance, C)
 
     def _taken(self, system: Eliminated, sensor: int) -> float:
         """Return the degrees of freedom that the fit took of a sensor's readings."""

@@ -3,7 +3,9 @@
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.solve.model_comparison import ModelComparison, ModelFit
+from l2m_gtsam.model_results import ModelComparison, ModelFigures, MovingField
+from l2m_gtsam.models import Model
+from l2m_gtsam.results import CalibrationResult, SensorCalibration
 
 HEADINGS = (
     "parameters",
@@ -38,7 +40,7 @@ def model_table(sensor: str, comparison: ModelComparison) -> Table:
     return table
 
 
-def _row(fit: ModelFit) -> tuple[str, ...]:
+def _row(fit: ModelFigures) -> tuple[str, ...]:
     return (
         fit.model.value,
         str(fit.parameters),
@@ -48,3 +50,23 @@ def _row(fit: ModelFit) -> tuple[str, ...]:
         f"{fit.behind:.3f} ± {fit.behind_error:.3f}",
         f"{fit.bic_above:.1f}",
     )
+
+
+def model_tables(result: CalibrationResult) -> list[Table]:
+    """Return the models of every sensor of which they are compared."""
+    compared = ((each.sensor, each.models) for each in result.sensors)
+    return [model_table(sensor, models) for sensor, models in compared if models is not None]
+
+
+def model_note(sensor: SensorCalibration) -> str:
+    """Return which model its readings ask for and what moves in it; nothing for the usual one."""
+    models = sensor.models
+    if models is None or models.recommended is Model.FULL:
+        return ""
+    moving = "".join(f"; {_moving(each)}" for each in sensor.moving)
+    return f"model of {sensor.sensor}: {models.recommended} ({models.reason}){moving}"
+
+
+def _moving(found: MovingField) -> str:
+    each = zip(found.h.tolist(), found.sigma.tolist(), strict=True)
+    return f"{found.name}: " + ", ".join(f"{h:.3g} ± {sigma:.1g}" for h, sigma in each) + " uT each"

@@ -18,17 +18,16 @@ taken together.
 ``model_choice`` says how the two decide.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.model_results import ModelComparison, ModelFigures
+from l2m_gtsam.models import Model, Samples
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.model_choice import Choice, HeldOut, Trial, choose, reason_of, standard_error
 from l2m_gtsam.solve.model_fits import Fit, Spread, compress, fit_model, inflation, spread_of
-from l2m_gtsam.solve.models import Coefficients, Model, Samples
 
 PER_COLUMN = 4  # readings, at the least
 PER_SEGMENT = 4
@@ -42,85 +41,6 @@ class ModelOptions(Options):
     strong: float = Field(default=10.0, gt=0)
     """A BIC so far above the least rejects a model: odds of 150 to 1 (R. E. Kass, A. E. Raftery,
     "Bayes factors", 1995)."""
-
-
-@dataclass(frozen=True)
-class ModelFit:
-    """One model and how it does.
-
-    Attributes
-    ----------
-    model
-        Which.
-    parameters
-        Number of those that the readings determine.
-    coefficients, sigma
-        And their standard deviations, with the correlation of residuals taken into account;
-        infinite for what the readings do not determine, zero for what the model fixes.
-    rms
-        Of what is left of the readings it was fitted to, per axis in uT.
-    held_out_rms
-        Of what is left of held-out readings, per axis in uT.
-    held_out_score
-        Mean logarithm of the density of a held-out reading in 1/uT^3.
-    score_error
-        Standard error of that over the segments.
-    behind, behind_error
-        By how much the score is less than the best among the models that the BIC admits, and the
-        standard error of this difference.
-    bic
-        For correlated residuals.
-    bic_above
-        How much more than the least it is, divided by how often the parameters that make the
-        difference count.
-    """
-
-    model: Model
-    parameters: int
-    coefficients: Coefficients
-    sigma: Coefficients
-    rms: float
-    held_out_rms: float
-    held_out_score: float
-    score_error: float
-    behind: float
-    behind_error: float
-    bic: float
-    bic_above: float
-
-
-@dataclass(frozen=True)
-class ModelComparison:
-    """Nested models on the readings of one sensor.
-
-    Attributes
-    ----------
-    fits
-        One per model, from few parameters to many.
-    regressors
-        Names of the recorded numbers.
-    readings
-        That were used.
-    independent
-        As how many independent ones they count.
-    segments
-        Parts of the drive that were held out.
-    recommended
-        The simplest adequate model.
-    reason
-        A sentence why.
-    """
-
-    fits: tuple[ModelFit, ...]
-    regressors: tuple[str, ...]
-    readings: int
-    independent: float
-    segments: int
-    recommended: Model
-    reason: str
-
-    def __getitem__(self, model: Model) -> ModelFit:
-        return next(each for each in self.fits if each.model is model)
 
 
 def compare_models(samples: Samples, options: ModelOptions) -> ModelComparison:
@@ -139,7 +59,7 @@ def compare_models(samples: Samples, options: ModelOptions) -> ModelComparison:
         There are too few readings, or numbers or weights that make no sense.
     """
     check_samples(samples, options)
-    models = [model for model in Model if samples.names or not model.has_regressors]
+    models = models_for(samples)
     whole = compress(samples)
     fits = {model: fit_model(model, whole) for model in models}
     left = fits[models[-1]].coefficients.residual(samples)
@@ -159,7 +79,19 @@ def compare_models(samples: Samples, options: ModelOptions) -> ModelComparison:
         segments=options.segments,
         recommended=choice.chosen.model,
         reason=reason_of(choice, trials),
+        coefficients=choice.chosen.fit.coefficients,
+        sigma=choice.chosen.spread.sigma,
     )
+
+
+def models_for(samples: Samples) -> list[Model]:
+    """Return the models that there are numbers and rates for, from few parameters to many."""
+    regressors, rates = bool(samples.names), bool(samples.db_dt.any())
+    return [
+        model
+        for model in Model
+        if (regressors or not model.has_regressors) and (rates or not model.has_eddy)
+    ]
 
 
 def trial_of(samples: Samples, model: Model, fit: Fit, spread: Spread, held_out: HeldOut) -> Trial:
@@ -233,13 +165,11 @@ def _log_density(residual: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(-0.5 * (squares + 3 * np.log(2 * np.pi * variance)))
 
 
-def _figures(trial: Trial, choice: Choice) -> ModelFit:
+def _figures(trial: Trial, choice: Choice) -> ModelFigures:
     behind, error = choice.best.lead(trial)
-    return ModelFit(
+    return ModelFigures(
         model=trial.model,
         parameters=trial.fit.parameters,
-        coefficients=trial.fit.coefficients,
-        sigma=trial.spread.sigma,
         rms=trial.rms,
         held_out_rms=trial.held_out.rms,
         held_out_score=float(trial.held_out.scores.mean()),

@@ -125,7 +125,7 @@ def median_noise(residual: FloatArray, map_variance: FloatArray) -> float:
 
 
 def consistent(
-    b_lidar: FloatArray, field: FloatArray, map_variance: FloatArray, largest: float
+    columns: FloatArray, field: FloatArray, map_variance: FloatArray, largest: float
 ) -> BoolArray:
     """Return which readings one distortion explains, up to noise that half of them show, (N,).
 
@@ -134,8 +134,9 @@ def consistent(
 
     Parameters
     ----------
-    b_lidar
-        Predicted field in the lidar frame in uT, shape (N, 3).
+    columns
+        Predicted field in the lidar frame in uT, and what else explains readings, of about the
+        same size, shape (N, P).
     field
         Readings in uT, shape (N, 3).
     map_variance
@@ -143,7 +144,7 @@ def consistent(
     largest
         Largest squared length of a whitened residual that passes for noise.
     """
-    regressors = np.column_stack([np.ones(len(b_lidar)), b_lidar - b_lidar.mean(axis=0)])
+    regressors = np.column_stack([np.ones(len(columns)), columns - columns.mean(axis=0)])
     e = deviations(regressors, field, np.ones(len(field)))
     for _ in range(FIRST_ROUNDS):
         length = np.linalg.norm(e, axis=1)

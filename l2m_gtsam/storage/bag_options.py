@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.options import Options
+from l2m_gtsam.storage.regressor_options import RegressorName, RegressorTopic
 from l2m_gtsam.storage.units import Unit
 
 
@@ -77,6 +78,10 @@ class BagOptions(Options):
     units: Unit = Unit.AUTO
     """Unit of the readings: `auto` takes tesla, as ROS prescribes, and refuses a strength that
     does not fit; or `tesla`, `millitesla`, `microtesla`, `nanotesla`, `gauss`, `milligauss`."""
+
+    regressors: dict[RegressorName, RegressorTopic] = Field(default_factory=dict)
+    """Numbers that `l2m calibrate` reads beside the readings, by names of your choice: motor
+    currents, speeds, duty cycles. What follows them is told from the map's field."""
 
     @model_validator(mode="after")
     def _one_source_of_poses(self) -> "BagOptions":

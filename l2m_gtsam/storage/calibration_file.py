@@ -20,6 +20,14 @@ from l2m_gtsam.results import (
 )
 from l2m_gtsam.storage.calibration_legend import MODEL, UNCERTAINTY
 from l2m_gtsam.storage.file_model import Lenient, Matrix, Vector, read_model
+from l2m_gtsam.storage.model_entry import (
+    ModelsEntry,
+    MovingEntry,
+    models_entry,
+    models_of,
+    moving_entry,
+    moving_of,
+)
 from l2m_gtsam.storage.transform_entry import transform_entry
 from l2m_gtsam.storage.yaml_file import write_yaml
 
@@ -49,6 +57,7 @@ class _Counts(Lenient):
     in_pose_gap: int
     thinned: int
     kept: int
+    without_regressor: int = 0
 
 
 class _Start(Lenient):
@@ -83,6 +92,9 @@ class _Sensor(Lenient):
     rejected: int = 0
     # Files of the first version do not speak of it.
     time_offset: _TimeOffset | None = None
+    models: ModelsEntry | None = None
+    not_compared: str = ""
+    moving: dict[str, MovingEntry] = Field(default_factory=dict)
 
 
 class _Disagreement(Lenient):
@@ -181,6 +193,9 @@ def _sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
         "rejected": sensor.rejected,
         "start": _start_entry(sensor.start),
         "time_offset": _time_offset_entry(sensor),
+        "moving": moving_entry(sensor.moving),
+        "models": None if sensor.models is None else models_entry(sensor.models),
+        "not_compared": sensor.not_compared,
         "covariance": sensor.covariance.tolist(),
     }
 
@@ -269,4 +284,7 @@ def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
         start=_start(entry.start),
         rejected=entry.rejected,
         time_offset=_time_offset(entry.time_offset),
+        models=None if entry.models is None else models_of(entry.models),
+        not_compared=entry.not_compared,
+        moving=moving_of(entry.moving),
     )

@@ -29,6 +29,15 @@ MODEL = {
         "a reading's pose is that at stamp + seconds; cross_covariance with the parameters in "
         "covariance_order; held says why it is not estimated but taken as 0"
     ),
+    "moving": (
+        "B_meas = C @ B_lidar + H + sum of number * h (uT per unit of the recorded number); H is "
+        "the offset where all numbers are 0; empty where the readings do not ask for it"
+    ),
+    "models": (
+        "models of the readings, z = C b + H + sum of number * h + E db/dt and parts of it; score: "
+        "mean log density of held-out readings (1/uT^3), behind: the best of them; coefficients "
+        "are those of the recommended model at t_lidar_mag, b counted as exact"
+    ),
     "disagreements": (
         "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
         "ns, the lidar's way from p_from to p_to in m in the map, median residual (size) in uT"

@@ -2,8 +2,8 @@
 
 import pytest
 
+from l2m_gtsam.models import Model
 from l2m_gtsam.solve.model_comparison import ModelOptions, compare_models
-from l2m_gtsam.solve.models import Model
 from tests.model_drives import NOISE, Setting, drawn
 
 SETTINGS = {

@@ -43,6 +43,10 @@ def test_the_effective_configuration_reads_back() -> None:
         ("calibration: {solve: {optimizer: newton}}", r"calibration.solve.optimizer: .*'lm' or"),
         ("calibration: {sync: {max_pose_gap_s: soon}}", r"max_pose_gap_s: .*number.*'soon'"),
         ("[1, 2]", r"the file: "),
+        (
+            "bag: {regressors: {motor: {topic: /m, feild: x}}}",
+            r"unknown key 'bag.regressors.motor.feild'; accepted here: field, scale, topic",
+        ),
         ("bag: {fields: [", r"not valid YAML"),
     ],
 )
@@ -53,6 +57,15 @@ def test_faults_are_one_line_that_names_the_key(tmp_path: Path, content: str, pa
         load_config(path)
     assert str(error.value).startswith(str(path))
     assert "\n" not in str(error.value)
+
+
+def test_the_example_of_moving_distortion_loads(repository: Path, tmp_path: Path) -> None:
+    page = (repository / "docs" / "moving-distortion.md").read_text()
+    path = tmp_path / "c.yaml"
+    path.write_text(page.split("```yaml\n")[1].split("```")[0])
+    regressors = load_config(path).bag.regressors
+    assert regressors["left_wheel"].scale == 0.01
+    assert regressors["turning"].field == "twist.twist.angular.z"
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -11,9 +11,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.models import Coefficients, Model, Samples
 from l2m_gtsam.solve.model_comparison import correlation_of
 from l2m_gtsam.solve.model_fits import Fit, compress, fit_model, inflation, spread_of
-from l2m_gtsam.solve.models import Coefficients, Model, Samples
 from tests.model_drives import NOISE, Setting, coefficients, drawn, field, times
 
 LINEAR = [model for model in Model if model not in (Model.OFFSET, Model.SCALE)]
