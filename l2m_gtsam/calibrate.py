@@ -17,10 +17,13 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import OneKeyOptions, Progress
+from l2m_gtsam.graph.contradictions import Contradiction
 from l2m_gtsam.graph.explanation import Explained, explained
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.moving_solve import MovingProblem, MovingSolution, solve_moving
+from l2m_gtsam.graph.named_priors import priors_of
 from l2m_gtsam.graph.one_key import OneKeySolution
+from l2m_gtsam.graph.priors import Priors
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
@@ -78,13 +81,15 @@ def calibrate(
     SyncError
         Readings and poses do not overlap.
     CalibrationError
-        No sensor can be solved: the map does not cover the drive, or nothing was read.
+        No sensor can be solved: the map does not cover the drive, or nothing was read. Or a start
+        or prior names no sensor of the recording.
     """
     synchronised = prepare(recording, options)
     stuck = stuck_sensors(synchronised.readings)
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
-    found = _starts(alive, solver_map, options, progress)
+    priors = priors_of(options.priors, alive.sensors)
+    found = _starts(alive, solver_map, options, priors, progress)
     t_start = _start_places(alive.sensors, found, options)
     problem = MovingProblem(
         readings=alive,
@@ -94,6 +99,7 @@ def calibrate(
         models=options.models,
         progress=progress,
         trajectory=recording.trajectory,
+        priors=priors,
     )
     outcome = solve_moving(problem, t_start)
     solution = outcome.solution
@@ -101,6 +107,10 @@ def calibrate(
     moved = movement(recording.trajectory.R, recording.trajectory.p)
     sensors = _assess(synchronised, alive, solution, told, moved, options)
     sensors = tuple(_with_models(index, each, outcome) for index, each in enumerate(sensors))
+    missed = {alive.sensors[each.sensor]: each.contradictions for each in solution.solved}
+    sensors = tuple(
+        _with_contradictions(each, missed.get(each.sensor, ()), alive.sensors) for each in sensors
+    )
     sensors = tuple(_with_start(*each, options) for each in zip(sensors, found, strict=True))
     sensors = tuple(_with_neighbours(sensor, sensors) for sensor in sensors)
     if not solution.solved:
@@ -123,6 +133,7 @@ def _starts(
     readings: Readings,
     field_map: QueryableMap,
     options: CalibrationOptions,
+    priors: Priors,
     progress: Progress | None,
 ) -> list[FoundStart | None]:
     """Look for the start of each sensor; none where it is given or none is found.
@@ -140,7 +151,7 @@ def _starts(
         return [None] * len(readings.sensors)
     tell = progress or (lambda stage, fraction: None)
     tell("global start", 0.0)
-    found = find_starts(readings, field_map, np.zeros(3), options.search)
+    found = find_starts(readings, field_map, np.zeros(3), options.search, priors)
     tell("global start", 1.0)
     names = zip(readings.sensors, found, strict=True)
     return [None if name in options.start else each for name, each in names]
@@ -186,6 +197,24 @@ def _with_start(
         f"{start.margin:.2f} times as much; give `calibration.start` or drive more varied ways"
     )
     return replace(sensor, start=start, status=SensorStatus.AMBIGUOUS, message=msg)
+
+
+def _with_contradictions(
+    sensor: SensorCalibration, missed: tuple[Contradiction, ...], names: tuple[str, ...]
+) -> SensorCalibration:
+    """Return the same with a word on what was known beforehand and the readings speak against."""
+    if not missed:
+        return sensor
+    worst = max(missed, key=lambda each: each.sigmas)
+    others = [names[each] for each in worst.sensors if names[each] != sensor.sensor]
+    where = f" with {others[0]}" if others else ""
+    msg = (
+        f"its {worst.kind}{where} contradicts the readings by {worst.sigmas:.1f} sigmas: correct "
+        "`calibration.priors`, or give it a larger sigma"
+    )
+    if sensor.status is not SensorStatus.SOLVED:
+        return replace(sensor, message=f"{sensor.message}; {msg}")
+    return replace(sensor, status=SensorStatus.CONTRADICTED, message=msg)
 
 
 def _with_neighbours(
@@ -290,6 +319,7 @@ def _solved(
         sync=counts,
         outside_map=outside,
         time_offset=_time_offset(told, solution),
+        from_priors=told.from_priors,
     )
 
 
@@ -325,7 +355,8 @@ def _verdict(
         )
     if words:
         return SensorStatus.UNDETERMINED, open_
-    return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings"
+    known = f"; from priors: {', '.join(told.from_priors)}" if told.from_priors else ""
+    return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings{known}"
 
 
 def _unsolved(

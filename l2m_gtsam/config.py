@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field, ValidationError
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions
+from l2m_gtsam.graph.prior_options import PriorOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
@@ -44,6 +45,8 @@ class CalibrationOptions(Options):
     it is not given."""
     search: StartOptions = StartOptions()
     """How starts are looked for."""
+    priors: PriorOptions = PriorOptions()
+    """What is known of sensors beforehand: places, rotations, the geometry of arrays."""
     solve: OneKeyOptions = OneKeyOptions()
     """The one-key solve."""
     models: ModelOptions = ModelOptions()
@@ -128,6 +131,8 @@ def _accepted(model: type[BaseModel], location: tuple[int | str, ...]) -> list[s
     """Return the keys of the options at a location."""
     parts = iter(location)
     for part in parts:
+        if str(part) not in model.model_fields:  # a place in a list of options
+            continue
         inner: Any = model.model_fields[str(part)].annotation
         if get_origin(inner) is dict:
             next(parts, None)  # a name that the user gave

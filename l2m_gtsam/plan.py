@@ -18,9 +18,12 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import Progress
-from l2m_gtsam.graph.explanation import undetermined
+from l2m_gtsam.graph.explanation import from_priors, undetermined
 from l2m_gtsam.graph.forecast import Forecast, forecast
 from l2m_gtsam.graph.joint import SensorSolution
+from l2m_gtsam.graph.named_priors import priors_of
+from l2m_gtsam.graph.priors import Priors
+from l2m_gtsam.graph.rigid import placed
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.motion import Motion, extra_motions, loop, places_around, strongest
@@ -50,16 +53,20 @@ class Task:
         Of the sensors in uT.
     options
         How the solve would go.
+    priors
+        What is known of the sensors beforehand.
     """
 
     field_map: QueryableMap
     t: FloatArray
     noise: float
     options: CalibrationOptions
+    priors: Priors
 
     def forecast(self, readings: Readings) -> Forecast:
         """Return what a solve would say."""
-        return forecast(readings, self.field_map, self.t, self.noise, self.options.solve)
+        options = self.options.solve
+        return forecast(readings, self.field_map, self.t, self.noise, options, self.priors)
 
     def worst(self, readings: Readings) -> Worst:
         """Return what would be known least of a sensor by itself."""
@@ -68,8 +75,8 @@ class Task:
         return worst(readings.sensors[0], covariance, self.options.solve.rank)
 
     def of(self, sensor: int) -> "Task":
-        """Return the task of one sensor by itself."""
-        return replace(self, t=self.t[[sensor]])
+        """Return the task of one sensor by itself: baselines to others are left out."""
+        return replace(self, t=self.t[[sensor]], priors=self.priors.of_one(sensor))
 
 
 def plan(
@@ -88,8 +95,8 @@ def plan(
     field_map
         The magnetic map, in the frame of the recording's poses.
     options
-        How it would be calibrated; sensors are assumed where ``start`` puts them, else at the
-        lidar, without distortion.
+        How it would be calibrated; sensors are assumed where ``start`` puts them, else where they
+        were measured, else at the lidar, without distortion.
     planning
         What is assumed and tried.
     progress
@@ -107,7 +114,8 @@ def plan(
     readings = synchronised.readings
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     noise = _noise(field_map, options, planning)
-    task = Task(solver_map, _places(readings.sensors, options), noise, options)
+    priors = priors_of(options.priors, readings.sensors)
+    task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)
     tell("what the drive tells", 0.0)
     found = task.forecast(readings)
     tell("what the drive tells", 1.0)
@@ -200,13 +208,15 @@ def _noise(field_map: QueryableMap, options: CalibrationOptions, planning: PlanO
     return planning.noise_ut
 
 
-def _places(sensors: tuple[str, ...], options: CalibrationOptions) -> FloatArray:
+def _places(sensors: tuple[str, ...], options: CalibrationOptions, priors: Priors) -> FloatArray:
     """Return where sensors are assumed in metres, shape (S, 3)."""
     if unknown := sorted(set(options.start) - set(sensors)):
         msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
         raise CalibrationError(msg)
     at_lidar = (0.0, 0.0, 0.0)
-    return np.array([options.start.get(name, at_lidar) for name in sensors])
+    t = np.array([options.start.get(name, at_lidar) for name in sensors])
+    given = [index for index, name in enumerate(sensors) if name in options.start]
+    return placed(t, given, priors)
 
 
 def _motions(
@@ -233,9 +243,11 @@ def _sensor_plans(
     for index, counts in enumerate(synchronised.counts):
         inside = counts.kept - int(outside[index])
         held, late = "", float("inf")
+        known: tuple[str, ...] = ()
         if index in solved:
             covariance, words = _foretold(solved[index], found, task)
             held = held_offset(solved[index].determinacy)
+            known = from_priors(solved[index].determinacy)
             late = solved[index].offset_sigma
         else:
             covariance = UNKNOWN
@@ -247,13 +259,20 @@ def _sensor_plans(
                 readings=inside,
                 outside_map=int(outside[index]),
                 covariance=covariance,
-                rotation_covariance=polar_rotation(np.eye(3), covariance[3:12, 3:12]).covariance,
+                rotation_covariance=_of_rotation(index, covariance, task),
                 undetermined=words,
                 offset_sigma=late,
                 offset_held=held,
+                from_priors=known,
             )
         )
     return tuple(plans)
+
+
+def _of_rotation(sensor: int, covariance: FloatArray, task: Task) -> FloatArray:
+    """Return the covariance of an ideal sensor's rotation, shape (3, 3), in rad^2."""
+    R_mag_lidar = task.priors.mounts().get(sensor, np.eye(3))
+    return polar_rotation(R_mag_lidar, covariance[3:12, 3:12]).covariance
 
 
 def _foretold(

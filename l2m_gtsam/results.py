@@ -3,7 +3,7 @@
 Frames and units are those of ``data``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -69,6 +69,11 @@ class FoundStart:
     t_lidar_mag: FloatArray
     margin: float
     runner_up: FloatArray | None
+
+    def moved(self, by: FloatArray) -> "FoundStart":
+        """Return the same for a place that is elsewhere by a vector in metres, shape (3,)."""
+        other = None if self.runner_up is None else self.runner_up + by
+        return replace(self, t_lidar_mag=self.t_lidar_mag + by, runner_up=other)
 
     def ambiguous(self, clear: float) -> bool:
         """Return whether the second best place leaves less than so many times as much."""
@@ -181,6 +186,9 @@ class SensorCalibration:
         Readings inside the map that did not count: no distortion explains them beside the others.
     time_offset
         Of the sensor's clock; absent where nothing was solved.
+    from_priors
+        What the readings leave open and only priors determine, or mostly: phrases with the
+        parameters by name and what was known beforehand.
     models
         Models of the readings side by side; absent where they are not compared.
     not_compared
@@ -206,6 +214,7 @@ class SensorCalibration:
     start: FoundStart | None = None
     rejected: int = 0
     time_offset: TimeOffset | None = None
+    from_priors: tuple[str, ...] = ()
     models: ModelComparison | None = None
     not_compared: str = ""
     moving: tuple[MovingField, ...] = ()
@@ -298,6 +307,8 @@ class SensorPlan:
         Of the time offset in seconds, infinite where it will be held.
     offset_held
         Why it will be held at zero; empty where it will be estimated.
+    from_priors
+        What the readings will leave open and only priors determine, as of a calibration.
     """
 
     sensor: str
@@ -309,6 +320,7 @@ class SensorPlan:
     undetermined: tuple[str, ...]
     offset_sigma: float = float("inf")
     offset_held: str = ""
+    from_priors: tuple[str, ...] = ()
 
     @property
     def sigma(self) -> FloatArray:

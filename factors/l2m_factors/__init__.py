@@ -4,7 +4,12 @@ from l2m_factors.check import assert_jacobians_match
 from l2m_factors.field_map import FieldMap
 from l2m_factors.keys import D, M, P, Q, S, T
 from l2m_factors.motion import PoseMotion, moved
-from l2m_factors.priors import distortion_prior, held_directions
+from l2m_factors.priors import (
+    distance_prior,
+    distortion_prior,
+    held_directions,
+    rotation_prior,
+)
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, field_rate, reading_residuals
 from l2m_factors.shared_errors import (
@@ -30,6 +35,7 @@ __all__ = [
     "T",
     "assert_jacobians_match",
     "block_factor",
+    "distance_prior",
     "distortion_prior",
     "field_rate",
     "held_directions",
@@ -38,6 +44,7 @@ __all__ = [
     "pose_errors_prior",
     "reading_factor",
     "reading_residuals",
+    "rotation_prior",
     "shared_error",
     "uncertain_block_factor",
 ]

@@ -6,6 +6,9 @@ import numpy as np
 from l2m_factors.field_map import FloatArray
 from l2m_factors.keys import D, T
 
+# What a small rotation by each axis adds to the identity, row by row, shape (9, 3).
+TURNS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(0, 2, 1).reshape(3, 9).T
+
 
 def distortion_prior(sensor: int, C0: FloatArray, sigma: float) -> gtsam.CustomFactor:
     """Return the ridge of the closed form as a factor: C near ``C0``, H free.
@@ -22,6 +25,64 @@ def distortion_prior(sensor: int, C0: FloatArray, sigma: float) -> gtsam.CustomF
     sigma
         Standard deviation of each entry of C.
     """
+    return _near(sensor, C0, gtsam.noiseModel.Isotropic.Sigma(9, sigma))
+
+
+def rotation_prior(
+    sensor: int, R_mag_lidar: FloatArray, turn_sigma: float, stretch_sigma: float
+) -> gtsam.CustomFactor:
+    """Return a nominal rotation as a factor: C near it, H free.
+
+    C is taken for ``(I + E + [w]) R_mag_lidar``: a small rotation w of the mount and a stretch E
+    of which all nine entries are independent.
+
+    Parameters
+    ----------
+    sensor
+        Index of the sensor.
+    R_mag_lidar
+        Nominal rotation from the lidar's to the sensor's axes, shape (3, 3).
+    turn_sigma
+        Standard deviation of each component of w in rad.
+    stretch_sigma
+        Standard deviation of each entry of E.
+    """
+    turned = np.kron(np.eye(3), R_mag_lidar.T)  # C - R_mag_lidar from E + [w], row by row
+    own = stretch_sigma**2 * np.eye(9) + turn_sigma**2 * TURNS @ TURNS.T
+    noise = gtsam.noiseModel.Gaussian.Covariance(turned @ own @ turned.T)
+    return _near(sensor, R_mag_lidar, noise)
+
+
+def distance_prior(first: int, second: int, metres: float, sigma: float) -> gtsam.CustomFactor:
+    """Return a measured distance of two sensors as a factor on their positions.
+
+    Unlike GTSAM's range factor it is finite where both are at one point: there no direction tells
+    more than another, and none is taken.
+
+    Parameters
+    ----------
+    first, second
+        Indices of the sensors.
+    metres, sigma
+        The distance and its standard deviation.
+    """
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        apart = values.atPoint3(T(second)) - values.atPoint3(T(first))
+        length = float(np.linalg.norm(apart))
+        if jacobians is not None:
+            along = (apart / max(length, np.finfo(float).tiny))[None]
+            jacobians[0], jacobians[1] = -along, along
+        return np.array([length - metres])
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+    return gtsam.CustomFactor(noise, [T(first), T(second)], error)
+
+
+def _near(sensor: int, C0: FloatArray, noise: gtsam.noiseModel.Base) -> gtsam.CustomFactor:
+    """Return a prior on C row by row."""
     expected = C0.ravel()
     derivative = np.eye(9, 12)
 
@@ -32,7 +93,7 @@ def distortion_prior(sensor: int, C0: FloatArray, sigma: float) -> gtsam.CustomF
             jacobians[0] = derivative
         return np.asarray(values.atVector(D(sensor))[:9] - expected)
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(9, sigma), [D(sensor)], error)
+    return gtsam.CustomFactor(noise, [D(sensor)], error)
 
 
 def held_directions(sensor: int, directions: FloatArray, at: FloatArray) -> gtsam.CustomFactor:

@@ -11,6 +11,7 @@ from l2m_factors import T
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.calibration import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.graph.optimise import Optimizer, optimise
+from l2m_gtsam.graph.priors import NO_PRIORS, Priors
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.options import Options
 from l2m_gtsam.pose_noise import PoseNoiseOptions
@@ -85,13 +86,17 @@ class Alternated:
     steps: int
 
 
-def start_estimate(t_start: FloatArray, options: OneKeyOptions) -> Estimate:
-    """Return ideal sensors at these positions, shape (S, 3), metres."""
+def start_estimate(
+    t_start: FloatArray, options: OneKeyOptions, priors: Priors = NO_PRIORS
+) -> Estimate:
+    """Return ideal sensors at these positions, shape (S, 3), metres, turned as is known."""
     count = len(t_start)
-    ideal = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+    ideal = np.tile(np.concatenate([np.eye(3).ravel(), np.zeros(3)]), (count, 1))
+    for sensor, R_mag_lidar in priors.mounts().items():
+        ideal[sensor, :9] = R_mag_lidar.ravel()
     unknown = options.sensor_noise_ut is None  # then the first closed form replaces it
     noise = np.full(count, 1.0 if unknown else options.sensor_noise_ut)
-    return Estimate(t_start, np.tile(ideal, (count, 1)), noise, np.zeros(count), np.zeros(count))
+    return Estimate(t_start, ideal, noise, np.zeros(count), np.zeros(count), priors)
 
 
 def alternate(
@@ -155,6 +160,7 @@ def move_sensors(
     tie = gtsam.noiseModel.Isotropic.Sigma(3, TIE_M)
     for sensor in view.sensors:
         graph.add(gtsam.PriorFactorPoint3(T(sensor), estimate.t[sensor], tie))
+    graph.push_back(estimate.priors.of_places(view.sensors))
     optimised = optimise(graph, start, options.optimizer, options.graph_iterations)
     return estimate.updated(optimised.values, view.sensors)
 

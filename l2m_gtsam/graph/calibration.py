@@ -22,10 +22,10 @@ from l2m_factors import (
     reading_factor,
 )
 from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.graph.clusters import clusters_of, columns_among, columns_of, sensors_in
+from l2m_gtsam.graph.priors import HOLD_S, NO_PRIORS, Priors
 from l2m_gtsam.solve.noise import whitening
 from l2m_gtsam.solve.rank import Determinacy
-
-HOLD_S = 1e-6  # a time offset that is held: far below what any clock of a vehicle resolves
 
 
 class FactorForm(StrEnum):
@@ -52,6 +52,8 @@ class Estimate:
         shape (S,).
     offset
         Time offsets in seconds, shape (S,): a reading's pose is that at stamp + offset.
+    priors
+        What is known of the sensors beforehand.
     """
 
     t: FloatArray
@@ -59,6 +61,7 @@ class Estimate:
     noise: FloatArray
     ridge: FloatArray
     offset: FloatArray
+    priors: Priors = NO_PRIORS
 
     def C(self) -> FloatArray:
         """Return the distortion matrices, shape (S, 3, 3)."""
@@ -144,19 +147,22 @@ def reading_graph(
 
 
 def prior_graph(estimate: Estimate, tests: Mapping[int, Determinacy]) -> gtsam.NonlinearFactorGraph:
-    """Return the ridge towards an ideal sensor and a hold on what cannot be determined.
+    """Return what is known beforehand, the ridge, and a hold on what cannot be determined.
+
+    The ridge is towards an ideal sensor; a nominal rotation takes its place.
 
     Parameters
     ----------
     estimate
-        Strength of the ridge, and where directions are held; a time offset is held at zero.
+        What is known, strength of the ridge, and where directions are held; a time offset is held
+        at zero.
     tests
         Rank test of each sensor of the graph, which says what is held.
     """
-    graph = gtsam.NonlinearFactorGraph()
+    graph, mounts = estimate.priors.graph(tests), estimate.priors.mounts()
     tight = gtsam.noiseModel.Isotropic.Sigma(1, HOLD_S)
     for sensor, test in tests.items():
-        if estimate.ridge[sensor] > 0:
+        if estimate.ridge[sensor] > 0 and sensor not in mounts:
             sigma = float(estimate.ridge[sensor] ** -0.5)
             graph.add(distortion_prior(sensor, np.eye(3), sigma))
         if len(test.held):
@@ -179,40 +185,49 @@ def variables(sensor: int) -> tuple[int, int, int]:
     return T(sensor), D(sensor), S(sensor)
 
 
-def sensor_covariances(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, sensors: list[int]
-) -> dict[int, FloatArray]:
-    """Return the marginal covariance of (t, C row by row, H, offset) of each sensor, (16, 16).
+class Covariances:
+    """Marginal covariances of a linear graph of sensors.
 
     Where one direction is thousands of times better known than another, GTSAM's marginals, which
     are made by Cholesky, call the system indeterminate; QR of the same factors still has it.
+
+    Parameters
+    ----------
+    graph, values
+        The graph and where it is linearised.
     """
-    linear = graph.linearize(values)
-    try:
-        marginals = gtsam.Marginals(linear, values)
-    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException has no Python type
-        if "ndetermina" not in str(error):
-            raise
-        return {sensor: _covariance_by_qr(linear, sensor) for sensor in sensors}
-    return {sensor: _marginal_covariance(marginals, sensor) for sensor in sensors}
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        self._linear = graph.linearize(values)
+        self._marginals: gtsam.Marginals | None = None
+        try:
+            self._marginals = gtsam.Marginals(self._linear, values)
+        except RuntimeError as error:  # GTSAM's exception has no Python type
+            if "ndetermina" not in str(error):
+                raise
+
+    def among(self, sensors: tuple[int, ...]) -> FloatArray:
+        """Return that of all parameters of sensors that factors connect, (16 n, 16 n)."""
+        if self._marginals is None:
+            return covariance_by_qr(self._linear, sensors)
+        keys = list(columns_of(sensors))
+        joint = self._marginals.jointMarginalCovariance(keys)
+        return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
 
 
-def _marginal_covariance(marginals: gtsam.Marginals, sensor: int) -> FloatArray:
-    keys = variables(sensor)
-    joint = marginals.jointMarginalCovariance(list(keys))
-    return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
-
-
-def _covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensor: int) -> FloatArray:
+def covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensors: tuple[int, ...]) -> FloatArray:
+    """Return the marginal covariance of sensors that factors connect, by QR, (16 n, 16 n)."""
+    cluster = next(each for each in clusters_of(linear, sensors_in(linear)) if sensors[0] in each)
     ordering = gtsam.Ordering()
-    for key in variables(sensor):
+    for key in columns_of(cluster):
         ordering.push_back(key)
     own = gtsam.GaussianFactorGraph()
     for index in range(linear.size()):
-        if set(linear.at(index).keys()) <= set(variables(sensor)):
+        if set(linear.at(index).keys()) <= set(columns_of(cluster)):
             own.push_back(linear.at(index))
     jacobian, _ = own.jacobian(ordering)
     scale = 1 / np.linalg.norm(jacobian, axis=0)
     triangular = np.asarray(np.linalg.qr(jacobian * scale, mode="r"))
     root = scale[:, None] * solve_triangular(triangular, np.eye(len(scale)))
-    return np.asarray(root @ root.T)
+    at = columns_among(cluster, sensors)
+    return np.asarray(root[at] @ root[at].T)

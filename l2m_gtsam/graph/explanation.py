@@ -10,12 +10,13 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.graph.determined import TIME_OFFSET
 from l2m_gtsam.graph.forecast import rank_tests
 from l2m_gtsam.graph.joint import SensorSolution, with_infinities
 from l2m_gtsam.graph.one_key import OneKeySolution
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.solve.explain import drive_facts, explain, held_offset
-from l2m_gtsam.solve.rank import Determinacy, RankOptions
+from l2m_gtsam.solve.rank import PARAMETERS, Determinacy, RankOptions
 
 
 @dataclass(frozen=True)
@@ -30,11 +31,14 @@ class Explained:
         A sentence for each reason, with the parameters by name; none if nothing is open.
     held
         Why the time offset is held at zero; empty if it is not.
+    from_priors
+        What only priors determine, a phrase for each of their kinds.
     """
 
     solution: SensorSolution
     words: tuple[str, ...]
     held: str
+    from_priors: tuple[str, ...]
 
 
 def explained(
@@ -61,7 +65,8 @@ def explained(
     """
     if not solution.solved:
         return {}
-    tests = rank_tests(readings, field_map, t_start, solution.estimate.noise, options)
+    noise, priors = solution.estimate.noise, solution.estimate.priors
+    tests = rank_tests(readings, field_map, t_start, noise, options, priors)
     used, told = solution.readings.select(solution.used), {}
     for found in solution.solved:
         s, after = found.sensor, found.determinacy
@@ -71,8 +76,20 @@ def explained(
             words += undetermined(after, own, solution.estimate.t[s], field_map, options.rank)
         open_ = replace(before, offset=after.offset)
         covariance = with_infinities(found.joint_covariance, open_)
-        told[s] = Explained(replace(found, joint_covariance=covariance), words, held_offset(after))
+        found = replace(found, joint_covariance=covariance)
+        told[s] = Explained(found, words, held_offset(after), from_priors(before, after))
     return told
+
+
+def from_priors(*tests: Determinacy) -> tuple[str, ...]:
+    """Return which parameters priors alone determine, or mostly, by any of a sensor's tests."""
+    touched = np.any([test.touched for test in tests], axis=0)
+    open_ = {PARAMETERS[index] for index in np.flatnonzero(touched)}
+    whys = {name: f"mostly {why}" for test in tests for name, why in test.leaning.items()}
+    whys |= {name: why for test in tests for name, why in test.borrowed.items()}
+    names = [name for name in (*PARAMETERS, TIME_OFFSET) if name in whys and name not in open_]
+    groups = {whys[name]: [each for each in names if whys[each] == whys[name]] for name in names}
+    return tuple(f"{', '.join(group)} ({why})" for why, group in groups.items())
 
 
 def undetermined(

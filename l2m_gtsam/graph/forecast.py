@@ -13,6 +13,7 @@ from l2m_gtsam.graph.alternation import OneKeyOptions, fit_distortions, start_es
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.coverage import UncertainMap, cover
 from l2m_gtsam.graph.joint import SensorSolution, joint_problem, sensor_solutions
+from l2m_gtsam.graph.priors import NO_PRIORS, Priors
 from l2m_gtsam.graph.uncertain import UncertainProblem, starting_values
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.results import Uncertainty
@@ -44,8 +45,9 @@ def forecast(
     t_lidar_mag: FloatArray,
     noise: float,
     options: OneKeyOptions,
+    priors: Priors = NO_PRIORS,
 ) -> Forecast:
-    """Return what a solve would say of sensors at assumed places, with C = I and H = 0.
+    """Return what a solve would say of sensors at assumed places, with C a rotation and H = 0.
 
     Parameters
     ----------
@@ -59,9 +61,11 @@ def forecast(
         Standard deviation of the sensors' noise in uT.
     options
         How the solve would go.
+    priors
+        What is known of the sensors beforehand; without a nominal rotation C = I.
     """
     every = np.full(len(t_lidar_mag), noise)
-    ideal = ideal_estimate(readings, field_map, t_lidar_mag, every, options)
+    ideal = ideal_estimate(readings, field_map, t_lidar_mag, every, options, priors)
     view = ideal.view
     if not view.sensors:
         return Forecast(view, (), options.uncertainty)
@@ -80,6 +84,7 @@ def rank_tests(
     t_lidar_mag: FloatArray,
     noise: FloatArray,
     options: OneKeyOptions,
+    priors: Priors = NO_PRIORS,
 ) -> dict[int, Determinacy]:
     """Return what a drive would determine of ideal sensors; parameters as of ``forecast``.
 
@@ -88,7 +93,7 @@ def rank_tests(
     noise
         Standard deviation of each sensor's noise in uT, shape (S,).
     """
-    ideal = ideal_estimate(readings, field_map, t_lidar_mag, noise, options)
+    ideal = ideal_estimate(readings, field_map, t_lidar_mag, noise, options, priors)
     if not ideal.view.sensors:
         return {}
     return joint_problem(ideal.view, field_map, ideal.estimate, options).determinacies
@@ -108,12 +113,14 @@ def ideal_estimate(
     t_lidar_mag: FloatArray,
     noise: FloatArray,
     options: OneKeyOptions,
+    priors: Priors,
 ) -> Ideal:
-    """Return sensors at places, shape (S, 3), with C = I, H = 0 and the solve's own ridge."""
+    """Return sensors at places, (S, 3), with C a rotation, H = 0 and the solve's own ridge."""
     options = options.model_copy(update={"sensor_noise_ut": float(noise.max())})  # it is given
-    start = replace(start_estimate(t_lidar_mag, options), noise=noise)
+    start = replace(start_estimate(t_lidar_mag, options, priors), noise=noise)
     view = observe(readings, field_map, start, options.min_readings)
-    view = replace(view, readings=replace(view.readings, field=view.b_lidar))
+    field = np.einsum("nij,nj->ni", start.C()[view.readings.sensor], view.b_lidar)
+    view = replace(view, readings=replace(view.readings, field=field))
     return Ideal(replace(start, ridge=fit_distortions(view, start, options).ridge), view)
 
 

@@ -6,14 +6,17 @@ followed to their minima on the map itself.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
 from scipy.ndimage import minimum_filter
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
+from l2m_gtsam.data import BoolArray, FloatArray, Readings
+from l2m_gtsam.graph.candidates import Candidates
 from l2m_gtsam.graph.descent import Basin, Terrain, descend
+from l2m_gtsam.graph.priors import NO_PRIORS, Priors
+from l2m_gtsam.graph.rigid import Bounds, Rigid, bounded, pooled, rigid_groups
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.field_map import Surveyed
 from l2m_gtsam.maps.nearest import NearestReadings
@@ -60,7 +63,11 @@ class StartOptions(Options):
 
 
 def find_starts(
-    readings: Readings, field_map: QueryableMap, centre: FloatArray, options: StartOptions
+    readings: Readings,
+    field_map: QueryableMap,
+    centre: FloatArray,
+    options: StartOptions,
+    priors: Priors = NO_PRIORS,
 ) -> list[FoundStart | None]:
     """Return where each sensor of a drive is; none where no candidate lies in the map.
 
@@ -74,12 +81,19 @@ def find_starts(
         Middle of the search in the lidar frame in metres, shape (3,).
     options
         How wide and how fine to look.
+    priors
+        What is known beforehand: sensors are where coordinates were measured, and those with known
+        vectors between them are looked for together.
     """
-    return find_starts_around(readings, field_map, centre[None], options)[0]
+    return find_starts_around(readings, field_map, centre[None], options, priors)[0]
 
 
 def find_starts_around(
-    readings: Readings, field_map: QueryableMap, centres: FloatArray, options: StartOptions
+    readings: Readings,
+    field_map: QueryableMap,
+    centres: FloatArray,
+    options: StartOptions,
+    priors: Priors = NO_PRIORS,
 ) -> list[list[FoundStart | None]]:
     """Return for each of several centres what ``find_starts`` does, looking at a place once.
 
@@ -93,54 +107,92 @@ def find_starts_around(
         In the lidar frame in metres, shape (N, 3); the box about all of them is in memory.
     options
         How wide and how fine to look around each.
+    priors
+        What is known beforehand.
     """
     together = snapshots_of(readings, options.poses)
-    found = starts_of(together, field_map, centres, options)
+    bounds = Bounds.of(priors, len(readings.sensors))
+    groups = rigid_groups(priors, np.flatnonzero(together.shared()).tolist())
+    found = starts_of(together, field_map, centres, options, bounds, groups)
     for sensor in np.flatnonzero(~together.shared()).tolist():
         # A sensor that reads at other times than the rest is looked for by itself.
         rows = np.arange(len(readings))[readings.rows_of(sensor)]
         if len(rows):
             alone = snapshots_of(readings[rows], options.poses)
-            for each, own in zip(found, starts_of(alone, field_map, centres, options), strict=True):
+            by_itself = starts_of(alone, field_map, centres, options, bounds, [])
+            for each, own in zip(found, by_itself, strict=True):
                 each[sensor] = own[sensor]
     return found
 
 
 def starts_of(
-    snapshots: Snapshots, field_map: QueryableMap, centres: FloatArray, options: StartOptions
+    snapshots: Snapshots,
+    field_map: QueryableMap,
+    centres: FloatArray,
+    options: StartOptions,
+    bounds: Bounds,
+    groups: Sequence[Rigid],
 ) -> list[list[FoundStart | None]]:
     """Return where each sensor is, by centre, from readings at common poses."""
     coarse = coarse_prediction(field_map, options)
-    balls = [Candidates.around(centre, options) for centre in centres]
+    balls = [Candidates.around(centre, options.search_radius, options.step) for centre in centres]
     union = Candidates.union(balls)
     left = look(snapshots, coarse, union, options)
+    left = pooled(bounded(left, union.axes(), bounds), groups, options.step)
     hopes = [
         hopes_of(ball, np.where(ball.within, part, np.inf), sensor, options)
         for ball in balls
         for sensor, part in enumerate(np.moveaxis(left[ball.slices_of(union)], -1, 0))
     ]
     fine = fine_prediction(field_map, coarse)
-    good = 1 - options.outliers
-    followed = follow(Terrain(snapshots, fine, field_map, options.step, good), hopes, options.step)
-    found = [found_start(each, followed, options) for each in hopes]
-    sensors = left.shape[-1]
-    return [found[row : row + sensors] for row in range(0, len(found), sensors)]
+    terrain = Terrain(snapshots, fine, field_map, options.step, 1 - options.outliers)
+    followed = follow(terrain, hopes, options.step, bounds)
+    sensors, starts = left.shape[-1], []
+    for row in range(0, len(hopes), sensors):
+        own = hopes[row : row + sensors]
+        found = [found_start(each, reached(each, followed), options) for each in own]
+        for group in groups:
+            place_group(group, terrain, own, followed, options, found)
+        starts.append(found)
+    return starts
 
 
-def follow(terrain: Terrain, hopes: list["Hopes"], step: float) -> dict[Node, Basin]:
-    """Return the minimum that each node of any hopes leads to, of those that lead anywhere."""
+def follow(
+    terrain: Terrain, hopes: list["Hopes"], step: float, bounds: Bounds
+) -> dict[Node, Basin]:
+    """Return the minimum that each node of any hopes leads to, of those that lead anywhere.
+
+    One beyond the bounds is taken to their edge, and what is left there counts.
+    """
     nodes = sorted({node for each in hopes for node in each.nodes})
     sensors = np.array([node[0] for node in nodes], dtype=np.int64)
     t = step * np.array([node[1:] for node in nodes]).reshape(-1, 3)
     ends = descend(terrain, sensors, t)
-    return {node: end for node, end in zip(nodes, ends, strict=True) if end is not None}
+    return {
+        node: within(end, node[0], terrain, bounds)
+        for node, end in zip(nodes, ends, strict=True)
+        if end is not None
+    }
+
+
+def within(basin: Basin, sensor: int, terrain: Terrain, bounds: Bounds) -> Basin:
+    """Return a sensor's basin, or the nearest place where the sensor can be."""
+    t = np.clip(basin.t, bounds.low[sensor], bounds.high[sensor])
+    if (t == basin.t).all():
+        return basin
+    left = misfits(terrain.snapshots, terrain.predict, t[None], terrain.good).rms
+    return Basin(t, float(left[0, sensor]))
+
+
+def reached(hopes: "Hopes", followed: dict[Node, Basin]) -> list[Basin]:
+    """Return the basins that hopes led to."""
+    return [followed[node] for node in hopes.nodes if node in followed]
 
 
 def found_start(
-    hopes: "Hopes", followed: dict[Node, Basin], options: StartOptions
+    hopes: "Hopes", reached: Sequence[Basin], options: StartOptions
 ) -> FoundStart | None:
     """Return the best of the basins that a sensor's hopes led to, beside the second best."""
-    reached = [followed[node] for node in hopes.nodes if node in followed]
     basins = distinct(reached, options.apart)
     if not basins:
         return None
@@ -148,6 +200,39 @@ def found_start(
     if len(basins) > 1 and (ratio := basins[1].rms / max(best.rms, TINY)) < margin:
         margin, runner_up = ratio, basins[1].t
     return FoundStart(best.t, float(margin), runner_up)
+
+
+def place_group(
+    group: Rigid,
+    terrain: Terrain,
+    hopes: list["Hopes"],
+    followed: dict[Node, Basin],
+    options: StartOptions,
+    found: list[FoundStart | None],
+) -> None:
+    """Replace what was found for each sensor of a group by where the whole group fits best.
+
+    Every minimum of every sensor is a place for the group: a sensor that sees little of the field
+    follows those that see more.
+    """
+    places = [
+        basin.t - offset
+        for sensor, offset in zip(group.sensors, group.offset, strict=True)
+        for basin in reached(hopes[sensor], followed)
+    ]
+    if not places:
+        return
+    left = [
+        misfits(terrain.snapshots, terrain.predict, np.array(places) + offset, terrain.good).rms[
+            :, sensor
+        ]
+        for sensor, offset in zip(group.sensors, group.offset, strict=True)
+    ]
+    mean = np.exp(np.mean(np.log(np.maximum(left, TINY)), axis=0))
+    basins = [Basin(t, float(rms)) for t, rms in zip(places, mean, strict=True)]
+    start = found_start(hopes[group.sensors[0]], basins, options)
+    for sensor, offset in zip(group.sensors, group.offset, strict=True):
+        found[sensor] = None if start is None else start.moved(offset)
 
 
 def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> Prediction:
@@ -172,58 +257,6 @@ def fine_prediction(field_map: QueryableMap, coarse: Prediction) -> Prediction:
         return field, inside
 
     return predict
-
-
-@dataclass(frozen=True)
-class Candidates:
-    """Places on a cubic lattice, of which those within some balls are looked at.
-
-    They are the lidar frame's multiples of a step: searches around different centres look at the
-    same places.
-
-    Attributes
-    ----------
-    step
-        Metres.
-    lowest
-        The first node in steps, shape (3,).
-    within
-        Which nodes of a box are in a ball, shape (nx, ny, nz).
-    """
-
-    step: float
-    lowest: IntArray
-    within: BoolArray
-
-    @classmethod
-    def around(cls, centre: FloatArray, options: StartOptions) -> "Candidates":
-        """Return the candidates in the ball about a centre in metres, shape (3,)."""
-        radius, step = options.search_radius, options.step
-        lowest = np.floor((centre - radius) / step).astype(np.int64)
-        highest = np.ceil((centre + radius) / step).astype(np.int64)
-        box = cls(step, lowest, np.ones(highest - lowest + 1, dtype=np.bool_))
-        away = np.linalg.norm(box.t(np.argwhere(box.within)) - centre, axis=1)
-        return replace(box, within=(away <= radius).reshape(box.within.shape))
-
-    @classmethod
-    def union(cls, balls: Sequence["Candidates"]) -> "Candidates":
-        """Return the candidates in any of some balls of one step."""
-        lowest = np.min([ball.lowest for ball in balls], axis=0)
-        ends = [ball.lowest + ball.within.shape for ball in balls]
-        whole = cls(balls[0].step, lowest, np.zeros(np.max(ends, axis=0) - lowest, dtype=np.bool_))
-        for ball in balls:
-            whole.within[ball.slices_of(whole)] |= ball.within
-        return whole
-
-    def slices_of(self, whole: "Candidates") -> tuple[slice, slice, slice]:
-        """Return where the box lies in a larger one."""
-        x, y, z = (self.lowest - whole.lowest).tolist()
-        nx, ny, nz = self.within.shape
-        return slice(x, x + nx), slice(y, y + ny), slice(z, z + nz)
-
-    def t(self, nodes: IntArray) -> FloatArray:
-        """Return nodes of the box, shape (N, 3), in the lidar frame in metres."""
-        return np.asarray(self.step * (self.lowest + nodes))
 
 
 def look(
@@ -303,7 +336,7 @@ def spread_out(places: FloatArray, apart: float, most: int) -> list[int]:
     return picked
 
 
-def distinct(basins: list[Basin], apart: float) -> tuple[Basin, ...]:
+def distinct(basins: Sequence[Basin], apart: float) -> tuple[Basin, ...]:
     """Return basins that are apart, the best first."""
     kept: list[Basin] = []
     for basin in sorted(basins, key=lambda each: each.rms):

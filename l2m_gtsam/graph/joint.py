@@ -9,14 +9,16 @@ from l2m_factors import BatchedReadings
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import (
+    Covariances,
     Estimate,
     batch_readings,
     prior_graph,
     reading_graph,
-    sensor_covariances,
     variables,
     whitened_jacobian,
 )
+from l2m_gtsam.graph.contradictions import Contradiction, contradictions
+from l2m_gtsam.graph.determined import determinacies
 from l2m_gtsam.graph.moving_fields import Correction
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.pose_errors import error_of_poses
@@ -30,7 +32,7 @@ from l2m_gtsam.solve.noise import (
     reading_covariance,
     whitening,
 )
-from l2m_gtsam.solve.rank import Determinacy, timed_determinacy
+from l2m_gtsam.solve.rank import Determinacy
 
 # Of each round; two rounds at least are made, and each step shortens what remains fourfold.
 POLISHING_STEPS = 2
@@ -53,6 +55,8 @@ class SensorSolution:
         What the data determine.
     remaining_sigmas
         Length of the Newton step that remains, in standard deviations.
+    contradictions
+        What was known of the sensor beforehand and the readings speak against.
     moving
         What recorded numbers add to the readings, beyond what was taken off them; absent where it
         is no variable of the graph.
@@ -63,6 +67,7 @@ class SensorSolution:
     figures: ResidualFigures
     determinacy: Determinacy
     remaining_sigmas: float
+    contradictions: tuple[Contradiction, ...] = ()
     moving: Correction | None = None
 
     @property
@@ -98,7 +103,7 @@ class JointProblem:
     determinacies
         Rank test of each sensor.
     graph
-        Readings, ridge, and a hold on what the data cannot determine.
+        Readings, priors, ridge, and a hold on what these cannot determine.
     """
 
     view: View
@@ -129,7 +134,7 @@ def joint_problem(
     batch = batch_readings(view.readings, field_map)
     values, W = estimate.values(view.sensors), whitening(covariance)
     jacobians = {s: whitened_jacobian(batch, W, values, s) for s in view.sensors}
-    tests = {s: timed_determinacy(J, options.rank) for s, J in jacobians.items()}
+    tests = determinacies(jacobians, estimate.priors, values, options.rank)
     graph = reading_graph(batch, covariance, options.factors)
     graph.push_back(prior_graph(estimate, tests))
     return JointProblem(view, batch, share, covariance, tests, graph)
@@ -164,21 +169,24 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
 def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
     """Return covariance and figures of every sensor at the optimum of its own weights."""
     values = estimate.values(problem.view.sensors)
-    covariances = sensor_covariances(problem.graph, values, problem.view.sensors)
+    covariances = Covariances(problem.graph, values)
+    missed = contradictions(estimate.priors.among(problem.view.sensors), values, covariances.among)
     gradients = problem.graph.linearize(values).gradientAtZero()
     W = whitening(problem.covariance)
     solutions = []
     for s in problem.view.sensors:
         rows, test = problem.batch.rows_of(s), problem.determinacies[s]
         residual = problem.batch.residuals(values, s).residual[rows]
+        covariance = covariances.among((s,))
         gradient = np.concatenate([gradients.at(key) for key in variables(s)])
         solutions.append(
             SensorSolution(
                 sensor=s,
-                joint_covariance=with_infinities(covariances[s], test),
+                joint_covariance=with_infinities(covariance, test),
                 figures=residual_figures(residual, W[rows], test.free),
                 determinacy=test,
-                remaining_sigmas=float(np.sqrt(gradient @ covariances[s] @ gradient)),
+                remaining_sigmas=float(np.sqrt(gradient @ covariance @ gradient)),
+                contradictions=tuple(each for each in missed if s in each.sensors),
             )
         )
     return tuple(solutions)

@@ -16,6 +16,7 @@ from l2m_gtsam.graph.alternation import OneKeyOptions, Progress
 from l2m_gtsam.graph.model_samples import explicable, model_samples
 from l2m_gtsam.graph.moving_fields import Correction
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.graph.priors import NO_PRIORS, Priors
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.model_results import ModelComparison, MovingField
 from l2m_gtsam.solve.model_comparison import ModelOptions, compare_models
@@ -67,6 +68,8 @@ class MovingProblem:
         Called with a stage and the fraction of it that is done.
     trajectory
         The lidar's poses.
+    priors
+        What is known of the sensors beforehand.
     """
 
     readings: Readings
@@ -76,12 +79,19 @@ class MovingProblem:
     models: ModelOptions
     progress: Progress | None
     trajectory: Trajectory | None
+    priors: Priors = NO_PRIORS
 
     def solved(self, t_start: FloatArray, fields: Mapping[int, Correction]) -> "Round":
         """Solve without the fields of the sensors that feel some, and compare models."""
         given = without(self.readings, fields)
         solution = solve_one_key(
-            given, self.field_map, t_start, self.options, self.progress, self.trajectory
+            given,
+            self.field_map,
+            t_start,
+            self.options,
+            self.progress,
+            self.trajectory,
+            self.priors,
         )
         compared, not_compared = self._compared(solution)
         return Round(fields, given, solution, compared, not_compared)

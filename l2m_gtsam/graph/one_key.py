@@ -31,6 +31,7 @@ from l2m_gtsam.graph.joint import (
     sensor_solutions,
 )
 from l2m_gtsam.graph.optimise import Ending
+from l2m_gtsam.graph.priors import NO_PRIORS, Priors
 from l2m_gtsam.graph.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.graph.uncertain import solve_uncertain
 from l2m_gtsam.graph.view import QueryableMap, View, observe
@@ -96,6 +97,7 @@ def solve_one_key(
     options: OneKeyOptions,
     progress: Progress | None = None,
     trajectory: Trajectory | None = None,
+    priors: Priors = NO_PRIORS,
 ) -> OneKeySolution:
     """Calibrate all sensors of a batch of readings.
 
@@ -114,10 +116,13 @@ def solve_one_key(
     trajectory
         The lidar's poses, to take those of the readings anew for other time offsets; without it
         they go on as they move.
+    priors
+        What is known of the sensors beforehand.
     """
     tell = progress or (lambda stage, fraction: None)
     good = readings.select(plausible(readings, field_map, t_start, options.robust))
-    near = alternate(good, field_map, start_estimate(t_start, options), options, tell)
+    start = start_estimate(t_start, options, priors)
+    near = alternate(good, field_map, start, options, tell)
     joint = settle(readings, field_map, near.estimate, options, tell, trajectory)
     outcome = OneKeySolution(
         readings=joint.readings,

@@ -24,6 +24,7 @@ from l2m_factors import (
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate, batch_readings, prior_graph
+from l2m_gtsam.graph.contradictions import contradictions
 from l2m_gtsam.graph.coverage import Coverage, UncertainMap, cover
 from l2m_gtsam.graph.elimination import Eliminated, eliminate, weight_columns
 from l2m_gtsam.graph.group_noise import group_noise
@@ -139,6 +140,7 @@ class UncertainProblem:
         tests: Mapping[int, Determinacy],
     ) -> None:
         self._view, self._coverage, self._tests = view, coverage, tests
+        self._priors = estimate.priors.among(view.sensors)
         self._batch = batch_readings(view.readings, field_map)
         self._noise = group_noise(view, field_map, coverage, estimate)
         self._graph = gtsam.NonlinearFactorGraph()
@@ -172,6 +174,7 @@ class UncertainProblem:
     def solutions(self, values: gtsam.Values) -> tuple[SensorSolution, ...]:
         """Return covariance and figures of every sensor."""
         system, residual = self._eliminated(values), self._residuals(values)
+        missed = contradictions(self._priors, values, system.among)
         solutions = []
         for s in self._view.sensors:
             rows, taken = self._batch.rows_of(s), self._taken(system, s)
@@ -182,6 +185,7 @@ class UncertainProblem:
                     figures=residual_figures(residual[rows], self._noise.alone[rows], taken),
                     determinacy=self._tests[s],
                     remaining_sigmas=system.sigmas(s),
+                    contradictions=tuple(each for each in missed if s in each.sensors),
                     moving=self._correction(s, system, values),
                 )
             )

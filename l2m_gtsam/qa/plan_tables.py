@@ -96,8 +96,12 @@ def _sensor_row(sensor: SensorPlan) -> tuple[str, ...]:
         _sigmas(np.array([1e3 * sensor.offset_sigma])),
         f"{sensor.readings:,}",
         f"{sensor.outside_map:,}",
-        escape(". ".join(sensor.undetermined)),
+        escape(". ".join([*sensor.undetermined, *map(_from_prior, sensor.from_priors)])),
     )
+
+
+def _from_prior(phrase: str) -> str:
+    return f"from priors: {phrase}"
 
 
 def _sigmas(values: FloatArray) -> str:

@@ -223,5 +223,6 @@ def _vector(values: FloatArray, digits: int) -> str:
 def _status(sensor: SensorCalibration) -> str:
     colour = "green" if sensor.status is SensorStatus.SOLVED else "yellow"
     if sensor.status is SensorStatus.SOLVED:
-        return f"[{colour}]{sensor.status.value}[/]"
+        known = f"; from priors: {', '.join(sensor.from_priors)}" if sensor.from_priors else ""
+        return f"[{colour}]{sensor.status.value}[/]{escape(known)}"
     return f"[{colour}]{sensor.status.value}[/]: {escape(sensor.message)}"

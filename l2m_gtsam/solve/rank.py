@@ -57,6 +57,13 @@ class Determinacy:
     imitation
         How t and C row by row would have to change to look like a time offset that is not told
         apart, per second of it, shape (12,).
+    borrowed
+        By name the parameters that the readings leave open and priors do not, with what is known
+        beforehand that decides.
+    leaning
+        The same for parameters that the readings determine, but priors far better.
+    lent
+        Number of directions that priors determine and the readings do not.
     """
 
     held: FloatArray
@@ -65,11 +72,14 @@ class Determinacy:
     touched: BoolArray
     offset: bool = False
     imitation: FloatArray = field(default_factory=lambda: np.zeros(12))
+    borrowed: dict[str, str] = field(default_factory=dict)
+    leaning: dict[str, str] = field(default_factory=dict)
+    lent: int = 0
 
     @property
     def free(self) -> int:
         """Number of directions that the readings determine."""
-        return len(self.touched) - len(self.held) + self.offset
+        return len(self.touched) - len(self.held) + self.offset - self.lent
 
 
 def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:

@@ -85,6 +85,7 @@ class _Sensor(Lenient):
     noise: float
     residuals: _Residuals | None
     undetermined: tuple[str, ...]
+    from_priors: tuple[str, ...] = ()
     readings: _Counts
     outside_map: int
     start: _Start | None = None
@@ -185,6 +186,7 @@ def _sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
         "transforms": transform_entry(RigidTransform(sensor.R_lidar_mag, sensor.t_lidar_mag)),
         "noise": sensor.noise,
         "undetermined": list(sensor.undetermined),
+        "from_priors": list(sensor.from_priors),
         "residuals": _residuals_entry(sensor.residuals),
         "readings": vars(sensor.sync).copy(),
         "outside_map": sensor.outside_map,
@@ -276,6 +278,7 @@ def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
         if figures is None
         else ResidualFigures(**{**dict(figures), "rms_axes": np.array(figures.rms_axes)}),
         undetermined=entry.undetermined,
+        from_priors=entry.from_priors,
         sync=SyncCounts(**dict(entry.readings)),
         outside_map=entry.outside_map,
         start=_start(entry.start),

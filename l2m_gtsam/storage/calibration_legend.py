@@ -42,5 +42,9 @@ MODEL = {
         "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
         "ns, the lidar's way from p_from to p_to in m in the map, median residual (size) in uT"
     ),
+    "from_priors": (
+        "what the readings leave open and only `calibration.priors` determine, or mostly (sigmas "
+        "without them would be more than twice as large): parameters, and what was known of them"
+    ),
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from l2m_gtsam.data import FieldSample, FloatArray, KnownSensor
 from l2m_gtsam.graph import one_key
 from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.calibration import FactorForm, _covariance_by_qr, sensor_covariances
+from l2m_gtsam.graph.calibration import Covariances, FactorForm, covariance_by_qr
 from l2m_gtsam.graph.joint import joint_problem
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.graph.optimise import Optimizer
@@ -180,9 +180,10 @@ def test_both_ways_to_a_covariance_agree() -> None:
     estimate = solve_one_key(readings, world, np.zeros((2, 3)), options).estimate
     problem = joint_problem(observe(readings, world, estimate, 30), world, estimate, options)
     values = estimate.values([0, 1])
-    marginals = sensor_covariances(problem.graph, values, [0, 1])
-    for sensor, covariance in marginals.items():
-        other = _covariance_by_qr(problem.graph.linearize(values), sensor)
+    marginals = Covariances(problem.graph, values)
+    for sensor in (0, 1):
+        covariance = marginals.among((sensor,))
+        other = covariance_by_qr(problem.graph.linearize(values), (sensor,))
         sigma = np.sqrt(np.diag(covariance))
         np.testing.assert_allclose(
             other / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-6

@@ -12,6 +12,7 @@ from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.coverage import UncertainMap
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.graph.priors import Difference, Priors
 from l2m_gtsam.graph.view import observe
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -269,3 +270,51 @@ def test_a_sensor_that_leaves_the_map_on_the_way_is_not_settled() -> None:
     stamps, sensor = np.arange(count) * 50_000_000, np.zeros(count, dtype=np.int64)
     lost = solve_one_key(Readings(("mag",), sensor, stamps, R, p, b), poor, t[None], FULL)
     assert not (lost.solved and lost.settled)
+
+
+def array(sigma: float, off: float) -> Priors:
+    """Return a baseline between both sensors that is wrong by so many metres along x."""
+    vector = SENSORS[1].t_lidar_mag - SENSORS[0].t_lidar_mag + np.array([off, 0.0, 0.0])
+    return Priors((Difference((0, 1), vector, np.full(3, sigma), "baseline"),))
+
+
+def test_a_tight_baseline_makes_two_sensors_one(
+    readings: Readings, field_map: HarmonicMap, full: OneKeySolution
+) -> None:
+    """Known to a micrometre, their places differ by it and have one covariance, a smaller one."""
+    found = solve_one_key(readings, field_map, STARTS, FULL, priors=array(1e-6, 0.0))
+    apart = SENSORS[1].t_lidar_mag - SENSORS[0].t_lidar_mag
+    np.testing.assert_allclose(found.estimate.t[1] - found.estimate.t[0], apart, atol=1e-5)
+    one, other = (each.covariance[:3, :3] for each in found.solved)
+    np.testing.assert_allclose(one, other, atol=1e-3 * np.trace(one))
+    for before in full.solved:
+        # The baseline adds information, so that the difference of covariances is positive.
+        gain = before.covariance[:3, :3] - one
+        assert np.linalg.eigvalsh(gain).min() > -1e-3 * np.trace(one)
+    assert not any(each.contradictions for each in found.solved)
+
+
+@pytest.mark.parametrize("options", [FULL, INDEPENDENT])
+def test_a_wrong_baseline_is_contradicted(
+    readings: Readings, field_map: HarmonicMap, options: OneKeyOptions
+) -> None:
+    """Half a metre off; both ways to a covariance see it."""
+    found = solve_one_key(readings, field_map, STARTS, options, priors=array(0.01, 0.5))
+    assert [each.sensor for each in found.solved] == [0, 1]
+    for each in found.solved:
+        (contradiction,) = each.contradictions
+        assert contradiction.sensors == (0, 1)
+        assert contradiction.sigmas > 4
+
+
+def test_a_baseline_of_no_weight_changes_nothing(
+    readings: Readings, field_map: HarmonicMap, full: OneKeySolution
+) -> None:
+    """Known to ten kilometres it makes a cluster of both and says nothing: to 1e-5 of variances."""
+    loose = solve_one_key(readings, field_map, STARTS, FULL, priors=array(1e4, 0.0))
+    for before, after in zip(full.solved, loose.solved, strict=True):
+        size = np.sqrt(np.outer(*[np.diag(before.covariance)] * 2))
+        np.testing.assert_allclose(
+            after.covariance / size, before.covariance / size, rtol=0, atol=1e-5
+        )
+        assert after.figures.chi2_per_dof == pytest.approx(before.figures.chi2_per_dof, rel=1e-6)

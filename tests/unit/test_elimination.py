@@ -28,9 +28,12 @@ def dense(terms: dict[int, FloatArray]) -> FloatArray:
 
 
 class Problem:
-    """Random readings of two sensors in two tiles, and a prior of unit variance on the weights."""
+    """Random readings of two sensors in two tiles, and a prior of unit variance on the weights.
 
-    def __init__(self) -> None:
+    With a baseline there are rows on both positions, too.
+    """
+
+    def __init__(self, baseline: bool) -> None:
         rng = np.random.default_rng(0)
         self.graph = gtsam.GaussianFactorGraph()
         self.owner: list[IntArray] = []
@@ -46,6 +49,9 @@ class Problem:
             self._add(late, rng.normal(size=ROWS), blocks, values, sensor)
         for tile, size in SIZES.items():
             self._add({tile: np.eye(size)}, np.zeros(size), blocks, values, -1)
+        if baseline:
+            terms = {T(0): -30 * np.eye(3), T(2): 30 * np.eye(3)}
+            self._add(terms, rng.normal(size=3), blocks, values, -1)
         self.A, self.b = np.concatenate(blocks), np.concatenate(values)
         self.row_owner = np.concatenate(self.owner)
 
@@ -64,9 +70,9 @@ class Problem:
         self.owner.append(np.full(len(b), sensor))
 
 
-@pytest.fixture(scope="module")
-def problem() -> Problem:
-    return Problem()
+@pytest.fixture(scope="module", params=[False, True], ids=["apart", "with a baseline"])
+def problem(request: pytest.FixtureRequest) -> Problem:
+    return Problem(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +111,19 @@ def test_all_readings_and_the_prior_take_as_much_as_there_are_numbers(
     hat = prior @ np.linalg.solve(problem.A.T @ problem.A, prior.T)
     taken = sum(16 + solved.taken(sensor) for sensor in SENSORS)
     assert taken + np.trace(hat) == pytest.approx(sum(WIDTH.values()))
+
+
+def test_a_baseline_correlates_sensors() -> None:
+    """The covariance of both, beside dense algebra; without a baseline they are no cluster."""
+    problem = Problem(baseline=True)
+    solved = eliminate(problem.graph, SENSORS, SIZES)
+    assert [each.sensors for each in solved.clusters] == [(0, 2)]
+    covariance = np.linalg.inv(problem.A.T @ problem.A)[:32, :32]
+    np.testing.assert_allclose(solved.among((0, 2)), covariance, atol=1e-10)
+    turned = np.roll(np.roll(covariance, 16, axis=0), 16, axis=1)
+    np.testing.assert_allclose(solved.among((2, 0)), turned, atol=1e-10)
+    apart = eliminate(Problem(baseline=False).graph, SENSORS, SIZES)
+    assert [each.sensors for each in apart.clusters] == [(0,), (2,)]
 
 
 def test_many_rows_become_few_without_loss() -> None:

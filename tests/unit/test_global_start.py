@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_gtsam.data import FieldSample, FloatArray, Readings
+from l2m_gtsam.graph.candidates import Candidates
 from l2m_gtsam.graph.descent import Basin
 from l2m_gtsam.graph.global_start import (
-    Candidates,
     StartOptions,
     distinct,
     find_starts,
@@ -124,7 +124,7 @@ def test_candidates_are_the_multiples_of_the_step_in_the_ball(
     centre: tuple[float, float, float], step: float, radius: float
 ) -> None:
     middle = np.array(centre)
-    ball = Candidates.around(middle, StartOptions(step=step, search_radius=radius))
+    ball = Candidates.around(middle, radius, step)
     axis = np.arange(-np.ceil(2 / step), np.ceil(2 / step) + 1)
     every = step * np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     expected = every[np.linalg.norm(every - middle, axis=1) <= radius]
@@ -132,7 +132,7 @@ def test_candidates_are_the_multiples_of_the_step_in_the_ball(
 
 
 def test_a_union_holds_its_balls_and_nothing_else() -> None:
-    balls = [Candidates.around(centre, SMALL) for centre in CENTRES[:3]]
+    balls = [Candidates.around(centre, SMALL.search_radius, SMALL.step) for centre in CENTRES[:3]]
     union = Candidates.union(balls)
     held = [ball.t(np.argwhere(ball.within)) for ball in balls]
     expected = np.unique(np.concatenate(held), axis=0)
