@@ -15,6 +15,7 @@ import typer
 from l2m_gtsam.errors import L2MError
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from l2m_gtsam.progress import Progress
@@ -342,12 +343,24 @@ def _warn(doubts: Sequence[str]) -> None:
 def _print(table: "Table") -> None:
     """Print a table as wide as its numbers need: a narrow terminal wraps, it cuts no digits."""
     from rich.console import Console
-    from rich.measure import Measurement
 
     console = Console()
-    wide = console.options.update(width=1000)
-    needed = Measurement.get(console, wide, table).minimum
-    Console(width=max(needed, console.width if console.is_terminal else 200)).print(table)
+    wide = console.width if console.is_terminal else 200
+    Console(width=max(_needed(console, table), wide)).print(table)
+
+
+def _needed(console: "Console", table: "Table") -> int:
+    """Return the width of a table whose words, and lines that do not wrap, are whole."""
+    from rich.measure import Measurement
+
+    options, widths = console.options.update(width=1000), []
+    for column in table.columns:
+        cells = (Measurement.get(console, options, cell) for cell in column.cells)
+        words = Measurement.get(console, options, column.header).minimum
+        own = [cell.maximum if column.no_wrap else cell.minimum for cell in cells]
+        widths.append(max([words, *own]))
+    borders = 3 * len(widths) + 1
+    return sum(widths) + borders
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from l2m_gtsam.storage.inspect import BagReport, TopicReport
 def calibration_table(result: CalibrationResult) -> Table:
     """Return one row per sensor: position, sigma, offset, scale, rotation, residual, status."""
     table = Table(title="Calibration: B_meas = C @ B_lidar + H", title_justify="left")
-    table.add_column("sensor")
+    table.add_column("sensor", no_wrap=True)
     for heading in (
         "t_lidar_mag (m)",
         "± (mm)",
