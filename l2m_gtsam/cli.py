@@ -355,10 +355,8 @@ def _needed(console: "Console", table: "Table") -> int:
 
     options, widths = console.options.update(width=1000), []
     for column in table.columns:
-        cells = (Measurement.get(console, options, cell) for cell in column.cells)
-        words = Measurement.get(console, options, column.header).minimum
-        own = [cell.maximum if column.no_wrap else cell.minimum for cell in cells]
-        widths.append(max([words, *own]))
+        cells = (Measurement.get(console, options, cell) for cell in (column.header, *column.cells))
+        widths.append(max(cell.maximum if column.no_wrap else cell.minimum for cell in cells))
     borders = 3 * len(widths) + 1
     return sum(widths) + borders
 
