@@ -20,7 +20,7 @@ def clusters_of(linear: gtsam.GaussianFactorGraph, sensors: list[int]) -> list[t
     owner = {key(sensor): row for row, sensor in enumerate(sensors) for key in PLACES}
     pairs = [(0, 0)]
     for index in range(linear.size()):
-        rows = sorted({owner[key] for key in linear.at(index).keys() if key in owner})  # noqa: SIM118
+        rows = sorted({owner[key] for key in list(linear.at(index).keys()) if key in owner})
         pairs += [(rows[0], row) for row in rows[1:]]
     at = np.array(pairs).T
     count = len(sensors)
@@ -32,7 +32,7 @@ def clusters_of(linear: gtsam.GaussianFactorGraph, sensors: list[int]) -> list[t
 
 def sensors_in(linear: gtsam.GaussianFactorGraph) -> list[int]:
     """Return the sensors whose positions are variables of a graph."""
-    keys = {key for index in range(linear.size()) for key in linear.at(index).keys()}  # noqa: SIM118
+    keys = {key for index in range(linear.size()) for key in list(linear.at(index).keys())}
     symbols = (gtsam.Symbol(key) for key in keys)
     return sorted(int(each.index()) for each in symbols if each.key() == T(each.index()))
 
