@@ -27,8 +27,8 @@ from l2m_gtsam.graph.rigid import placed
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.motion import Motion, extra_motions, loop, places_around, strongest
+from l2m_gtsam.plan_results import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.prepare import prepare
-from l2m_gtsam.results import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
 from l2m_gtsam.solve.rotation import polar_rotation

@@ -10,9 +10,10 @@ from l2m_gtsam.calibrate import calibrate
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.plan import assumed_recording, plan
+from l2m_gtsam.plan_results import DrivePlan
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.figures import calibration_figure, save_figure
-from l2m_gtsam.results import CalibrationResult, DrivePlan
+from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.digest import source_file

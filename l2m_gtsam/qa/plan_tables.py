@@ -5,7 +5,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.results import DrivePlan, SensorPlan, Worst
+from l2m_gtsam.plan_results import DrivePlan, SensorPlan, Worst
 
 OPEN = "-"  # stands for a sigma that nothing bounds
 UNITS = {"t": (1e3, "mm"), "C": (1.0, ""), "H": (1.0, "uT")}

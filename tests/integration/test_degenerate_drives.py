@@ -9,7 +9,8 @@ from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.plan import plan
-from l2m_gtsam.results import DrivePlan, SensorCalibration, SensorStatus
+from l2m_gtsam.plan_results import DrivePlan
+from l2m_gtsam.results import SensorCalibration, SensorStatus
 from tests.degenerate_drives import (
     CALM,
     NOISE,
