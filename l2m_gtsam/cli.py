@@ -5,20 +5,14 @@ Heavy modules are imported inside the commands, so that ``--help`` answers at on
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from l2m_gtsam.commands.study import study
+from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
 from l2m_gtsam.errors import L2MError
-
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
-    from l2m_gtsam.progress import Progress
 
 app = typer.Typer(
     name="l2m",
@@ -31,6 +25,7 @@ map_app = typer.Typer(
     help="Build, update, compare, describe and draw magnetic maps.", no_args_is_help=True
 )
 app.add_typer(map_app, name="map")
+app.command()(study)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
@@ -101,9 +96,9 @@ def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import bag_table
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         report = inspect_file(bag, load_config(config), progress)
-    _print(bag_table(report))
+    print_table(bag_table(report))
     for obstacle in report.obstacles:
         typer.echo(f"cannot be calibrated as it is: {obstacle}")
     typer.echo("clock: record time less header stamp, median; |B|: lowest - median - highest")
@@ -127,7 +122,7 @@ def simulate(
     if unknown := [each for each in kind or [] if each not in known]:
         msg = f"--kind: unknown bag kind {unknown[0]!r}; accepted: {', '.join(known)}"
         raise ConfigError(msg)
-    with _progress() as progress:
+    with shown_progress() as progress:
         simulate_bags(
             out, ScenarioOptions(seed=seed), [BagKind(k) for k in kind or known], progress
         )
@@ -161,16 +156,16 @@ def calibrate(
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
-    with _progress() as progress:
+    with shown_progress() as progress:
         result = calibrate_bag(bag, map_path, chosen, out, progress)
-    _print(calibration_table(result))
+    print_table(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
-    _warn(result.doubts)
-    _warn([disagreement_note(each) for each in result.disagreements])
+    warn(result.doubts)
+    warn([disagreement_note(each) for each in result.disagreements])
     if held := held_clocks_note(result):
         typer.echo(held)
     for table in model_tables(result) if models else ():
-        _print(table)
+        print_table(table)
     for note in filter(None, map(model_note, result.sensors)):
         typer.echo(note)
     typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
@@ -201,15 +196,15 @@ def plan(
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen, places = load_config(config), [_place(text) for text in at or []]
-    with _progress() as progress:
+    with shown_progress() as progress:
         found = plan_bag(bag, map_path, chosen, places, progress)
-    _print(plan_table(found))
+    print_table(plan_table(found))
     if held := held_plan_note(found):
         typer.echo(held)
-    _print(motion_table(found))
+    print_table(motion_table(found))
     typer.echo(advice(found))
     typer.echo(UNCERTAINTY[found.uncertainty])
-    _warn(found.doubts)
+    warn(found.doubts)
 
 
 @app.command()
@@ -222,9 +217,9 @@ def demo(
     from l2m_gtsam.qa.tables import honesty_note, truth_table
     from l2m_gtsam.simulate.scenario import ScenarioOptions
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         outcome = run_demo(out, ScenarioOptions(seed=seed), progress)
-    _print(truth_table(outcome.result, outcome.truth))
+    print_table(truth_table(outcome.result, outcome.truth))
     typer.echo(honesty_note(outcome.result, outcome.truth))
     typer.echo(f"picture: {outcome.picture}; everything else is in {out}")
 
@@ -242,10 +237,10 @@ def map_build(
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import map_table
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         built = build_map_file(bags, out, load_config(config), suite, progress, structure)
-    _print(map_table(built.description))
-    _warn(built.description.summary.doubts)
+    print_table(map_table(built.description))
+    warn(built.description.summary.doubts)
     typer.echo(f"written: {out}")
 
 
@@ -265,10 +260,10 @@ def map_update(
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.tables import map_table
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         updated = update_map_file(map_path, bags, out, load_config(config), suite, progress)
-    _print(map_table(updated.description))
-    _warn(updated.description.summary.doubts)
+    print_table(map_table(updated.description))
+    warn(updated.description.summary.doubts)
     typer.echo(f"written: {out}")
 
 
@@ -284,9 +279,9 @@ def map_compare(
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.comparison import comparison_table
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         comparison = compare_map_kinds(bags, load_config(config), suite, structure, progress)
-    _print(comparison_table(comparison))
+    print_table(comparison_table(comparison))
 
 
 @map_app.command("info")
@@ -295,10 +290,10 @@ def map_info(map_path: MapArgument) -> None:
     from l2m_gtsam.batch.maps import describe_map_file
     from l2m_gtsam.qa.tables import map_table
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         description = describe_map_file(map_path, progress)
-    _print(map_table(description))
-    _warn(description.summary.doubts)
+    print_table(map_table(description))
+    warn(description.summary.doubts)
 
 
 @map_app.command("plot")
@@ -312,7 +307,7 @@ def map_plot(
     """Draw strength and uncertainty of a map at one height."""
     from l2m_gtsam.batch.maps import plot_map_file
 
-    with _progress() as progress:
+    with shown_progress() as progress:
         plot_map_file(map_path, out, height, progress)
     typer.echo(f"written: {out}")
 
@@ -332,48 +327,3 @@ def _place(text: str) -> tuple[float, float, float]:
             f"--at: {text!r} is not a place; accepted: three numbers, x,y,z in metres"
         )
     return x, y, z
-
-
-def _warn(doubts: Sequence[str]) -> None:
-    """Say on the error stream what speaks against a result that was written all the same."""
-    for doubt in doubts:
-        typer.echo(f"l2m: warning: {doubt}", err=True)
-
-
-def _print(table: "Table") -> None:
-    """Print a table as wide as its numbers need: a narrow terminal wraps, it cuts no digits."""
-    from rich.console import Console
-
-    console = Console()
-    wide = console.width if console.is_terminal else 200
-    Console(width=max(_needed(console, table), wide)).print(table)
-
-
-def _needed(console: "Console", table: "Table") -> int:
-    """Return the width of a table whose words, and lines that do not wrap, are whole."""
-    from rich.measure import Measurement
-
-    options, widths = console.options.update(width=1000), []
-    for column in table.columns:
-        cells = (Measurement.get(console, options, cell) for cell in (column.header, *column.cells))
-        widths.append(max(cell.maximum if column.no_wrap else cell.minimum for cell in cells))
-    borders = 3 * len(widths) + 1
-    return sum(widths) + borders
-
-
-@contextmanager
-def _progress() -> Iterator["Progress"]:
-    """Show one bar per stage on the error stream while it runs."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description:<28}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        stages: dict[str, TaskID] = {}
-
-        def tell(stage: str, fraction: float) -> None:
-            if stage not in stages:
-                stages[stage] = bars.add_task(stage, total=1.0)
-            bars.update(stages[stage], completed=fraction)
-
-        yield tell

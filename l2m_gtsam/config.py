@@ -1,7 +1,7 @@
 """One configuration composed of the options beside each algorithm, read from YAML."""
 
 from pathlib import Path
-from typing import Any, get_origin
+from typing import Any, TypeVar, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 
@@ -20,6 +20,8 @@ from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
 from l2m_gtsam.sync import SyncOptions
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class MappingOptions(Options):
@@ -92,11 +94,16 @@ def load_config(path: Path | None) -> Config:
     """
     if path is None:
         return Config()
+    return load_options(path, Config)
+
+
+def load_options(path: Path, model: type[Model]) -> Model:
+    """Return the options of a kind in a YAML file; errors as of ``load_config``."""
     content = read_yaml(path, ConfigError)
     try:
-        return Config.model_validate({} if content is None else content)
+        return model.model_validate({} if content is None else content)
     except ValidationError as error:
-        raise ConfigError(_explain(path, error)) from error
+        raise ConfigError(_explain(path, error, model)) from error
 
 
 def with_uncertainty(config: Config, name: str | None) -> Config:
@@ -117,12 +124,12 @@ def with_uncertainty(config: Config, name: str | None) -> Config:
     return config.model_copy(update={"calibration": calibration})
 
 
-def _explain(path: Path, error: ValidationError) -> str:
+def _explain(path: Path, error: ValidationError, model: type[BaseModel]) -> str:
     """Return one line about the first fault."""
     fault = error.errors()[0]
     key = ".".join(str(part) for part in fault["loc"]) or "the file"
     if fault["type"] == "extra_forbidden":
-        accepted = ", ".join(_accepted(Config, fault["loc"][:-1]))
+        accepted = ", ".join(_accepted(model, fault["loc"][:-1]))
         return f"{path}: unknown key {key!r}; accepted here: {accepted}"
     return f"{path}: {key}: {fault['msg']}, got {fault['input']!r}"
 

@@ -35,3 +35,7 @@ class ConfigError(L2MError):
 
 class OutputError(L2MError):
     """A result that cannot be written."""
+
+
+class ClusterError(L2MError):
+    """Work that cannot be shared out."""

@@ -12,8 +12,8 @@ find the same place and end in the same result, which is then computed once. Sta
 no independent trials of one-key; distortions, each with a drive and noise of its own, are, given
 the site and its map, which all of them share.
 
-A cell of the study, one distortion and one ring, is a function of the options alone, up to
-rounding: cells may be computed in any order and anywhere.
+All cells of one distortion are a function of the options and the site alone: distortions may be
+computed in any order and anywhere.
 """
 
 from collections.abc import Sequence
@@ -28,9 +28,10 @@ from l2m_gtsam.graph.global_start import StartOptions, find_starts_around
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.options import Options
 from l2m_gtsam.results import FoundStart, Uncertainty
+from l2m_gtsam.studies.json_array import JsonBools, JsonFloats
 from l2m_gtsam.studies.levenberg_marquardt import levenberg_marquardt
 from l2m_gtsam.studies.share import Share
-from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, mapped_site, random_drive
+from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, random_drive
 
 DRIVE, STARTS = 1, 2  # streams of randomness
 
@@ -79,7 +80,8 @@ class Cell:
     t_found
         Where one-key started from, NaN where it found no start, shape (N, 3).
     margin
-        How clearly, see ``FoundStart``; infinite where nothing was found, shape (N,).
+        How clearly, see ``FoundStart``; NaN where there is no second place, or none at all,
+        shape (N,).
     ambiguous
         Which calibrations one-key would call ambiguous, shape (N,).
     t_one_key
@@ -90,17 +92,24 @@ class Cell:
 
     distortion: int
     ring: int
-    t_true: FloatArray
-    t_start: FloatArray
-    t_found: FloatArray
-    margin: FloatArray
-    ambiguous: BoolArray
-    t_one_key: FloatArray
-    t_lm: FloatArray
+    t_true: JsonFloats
+    t_start: JsonFloats
+    t_found: JsonFloats
+    margin: JsonFloats
+    ambiguous: JsonBools
+    t_one_key: JsonFloats
+    t_lm: JsonFloats
 
     def error(self, t: FloatArray) -> FloatArray:
         """Return how far ends (N, 3) are from the truth in metres, shape (N,), NaN for none."""
         return np.asarray(np.linalg.norm(t - self.t_true, axis=1))
+
+
+@dataclass(frozen=True)
+class DistortionCells:
+    """All rings of one distortion, from the truth outwards."""
+
+    rings: tuple[Cell, ...]
 
 
 @dataclass(frozen=True)
@@ -168,9 +177,9 @@ class Found:
     ambiguous: BoolArray
 
 
-def cells_of(options: BasinOptions, distortion: int, rings: Sequence[int]) -> list[Cell]:
-    """Calibrate one sensor from all starts of some rings."""
-    site = mapped_site(options.site)
+def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCells:
+    """Calibrate one sensor from all starts of all rings."""
+    rings = range(options.rings)
     rng = np.random.default_rng([options.seed, distortion, 0, DRIVE])
     drive = random_drive(site, options.site, rng)
     t_true = drive.sensor.t_lidar_mag
@@ -192,7 +201,7 @@ def cells_of(options: BasinOptions, distortion: int, rings: Sequence[int]) -> li
             t_lm=plain_lm(site, drive, t_start[rows][: options.lm_starts], options),
         )
         cells.append(cell)
-    return cells
+    return DistortionCells(tuple(cells))
 
 
 def random_starts(

@@ -19,6 +19,20 @@ WIDE = {"fmt": "s--", "markersize": 8, "markerfacecolor": "white"}
 ASIDE = 0.06  # of a ring's width: the methods' intervals stand side by side
 
 
+def basin_page(table: BasinTable) -> str:
+    """Return the page of a study, but for its title."""
+    options = table.options
+    intro = (
+        f"The paper's protocol: {options.distortions} random sensors, each on its own drive "
+        f"through the simulated warehouse, {options.starts} random starts in each ring of "
+        f"{options.width:g} m around the true place. *One-key* is told the start alone: it looks "
+        f"for the sensor within {options.search.search_radius:g} m of it. *LM* is "
+        "Levenberg-Marquardt over t, C and H from there."
+    )
+    picture = "![Success rates over the initial offset](basin.png)"
+    return f"{intro}\n\n{picture}\n\n{basin_markdown(table)}"
+
+
 def basin_markdown(table: BasinTable) -> str:
     """Return the table of a study with 95 % intervals, and under it what was counted."""
     small, medium = sizes(table.options)
@@ -27,7 +41,7 @@ def basin_markdown(table: BasinTable) -> str:
         f"| LM within {small} | within {medium} | ambiguous | wrong, not ambiguous |"
     )
     rows = [table_line(row) for row in table.rows]
-    return "\n".join([head, "|---" * 9 + "|", *rows, "", sensors(table), "", note(table), ""])
+    return "\n".join([head, "|---" * 9 + "|", *rows, "", sensors(table), "", note(table)])
 
 
 def sensors(table: BasinTable) -> str:

@@ -6,20 +6,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import TypeAdapter
 from scipy.stats import binomtest
 
+from l2m_gtsam.cluster import ClusterOptions
 from l2m_gtsam.config import MappingOptions
-from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
-from l2m_gtsam.studies.basin import DRIVE, BasinOptions, Cell, basin_table, cells_of
-from l2m_gtsam.studies.basin_file import BasinStudy, read_study, write_study
+from l2m_gtsam.studies.basin import (
+    DRIVE,
+    BasinOptions,
+    Cell,
+    DistortionCells,
+    basin_table,
+    cells_of,
+)
 from l2m_gtsam.studies.basin_report import basin_figure, basin_markdown
-from l2m_gtsam.studies.basin_run import FIGURE_FILE, STUDY_FILE, TABLE_FILE, run_basin
+from l2m_gtsam.studies.basin_study import BASIN
+from l2m_gtsam.studies.run import run_study
 from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive
 from tests.quick_maps import quick
@@ -38,7 +46,7 @@ TINY = BasinOptions(distortions=1, starts=3, lm_starts=2, rings=2, width=1.5, si
 
 @lru_cache
 def tiny_cells() -> tuple[Cell, ...]:
-    return tuple(cells_of(TINY, 0, range(TINY.rings)))
+    return cells_of(TINY, mapped_site(SITE), 0).rings
 
 
 def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
@@ -73,9 +81,10 @@ def test_starts_lie_in_their_ring() -> None:
         assert ((offset >= each.ring) & (offset < each.ring + 1)).all()
 
 
-def test_a_cell_repeats_itself_also_without_the_others() -> None:
-    (again,) = cells_of(TINY, 0, [1])
-    for name, value in vars(tiny_cells()[1]).items():
+def test_a_ring_repeats_itself_also_without_the_others() -> None:
+    alone = TINY.model_copy(update={"rings": 1})
+    (again,) = cells_of(alone, mapped_site(SITE), 0).rings
+    for name, value in vars(tiny_cells()[0]).items():
         # Descents go in step with those of other starts: sums over other batches round otherwise.
         np.testing.assert_allclose(getattr(again, name), value, rtol=1e-9, atol=1e-9)
 
@@ -136,38 +145,21 @@ def test_intervals_are_wilsons(successes: int, trials: int) -> None:
     assert Share(successes, trials).interval == pytest.approx((expected.low, expected.high))
 
 
-def test_a_study_comes_back_from_its_file(tmp_path: Path) -> None:
-    lost = replace(tiny_cells()[0], t_one_key=np.full((3, 3), np.nan), margin=np.full(3, np.inf))
-    study = BasinStudy(TINY, (lost, tiny_cells()[1]))
-    write_study(tmp_path / STUDY_FILE, study)
-    back = read_study(tmp_path / STUDY_FILE)
-    assert back.options == TINY
-    for before, after in zip(study.cells, back.cells, strict=True):
+def test_cells_come_back_from_json() -> None:
+    lost = replace(tiny_cells()[0], t_one_key=np.full((3, 3), np.nan), margin=np.full(3, np.nan))
+    adapter = TypeAdapter(DistortionCells)
+    cells = DistortionCells((lost, tiny_cells()[1]))
+    back = adapter.validate_json(adapter.dump_json(cells))
+    for before, after in zip(cells.rings, back.rings, strict=True):
         for name, value in vars(before).items():
             np.testing.assert_array_equal(getattr(after, name), value)
-
-
-def test_a_run_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    write_study(tmp_path / STUDY_FILE, BasinStudy(TINY, tiny_cells()[1:]))
-    new: list[Cell] = []
-    table = run_basin(TINY, tmp_path, 1, lambda each, share: new.append(each))
-    assert [each.ring for each in new] == [0]
-    assert table == basin_table(TINY, tiny_cells())
-    assert (tmp_path / TABLE_FILE).read_text() == basin_markdown(table)
-    assert (tmp_path / FIGURE_FILE).stat().st_size > 1000
-
-
-def test_a_folder_holds_one_study(tmp_path: Path) -> None:
-    write_study(tmp_path / STUDY_FILE, BasinStudy(TINY, tiny_cells()))
-    other = TINY.model_copy(update={"seed": 2})
-    with pytest.raises(ConfigError, match="other options"):
-        run_basin(other, tmp_path, 1, lambda each, share: None)
 
 
 @pytest.mark.study
 def test_the_global_start_forgives_any_guess_within_three_metres(tmp_path: Path) -> None:
     """The paper's protocol: 99.5 % within 2 cm in every ring, where plain LM falls off."""
-    table = run_basin(BasinOptions(), tmp_path, 2, lambda each, share: None)
+    cluster = ClusterOptions(workers=2)
+    table = run_study(BASIN, BasinOptions(), tmp_path, cluster, lambda *_: None, "").summary
     assert len(table.rows) == 12
     for row in table.rows:
         assert row.one_key_small.trials == 2000

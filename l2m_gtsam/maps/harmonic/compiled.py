@@ -1,6 +1,7 @@
 """The harmonic map for solvers: the same field, hundreds of times faster."""
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import Protocol
@@ -97,6 +98,9 @@ class CompiledTiles:
     def of(cls, exact: ExactMap) -> "CompiledTiles":
         """Return the tiles of a map, none of them made yet."""
         return cls(exact, locks=tuple(Lock() for _ in range(len(exact.tiles) + 1)))
+
+    def __reduce__(self) -> tuple[Callable[[ExactMap], "CompiledTiles"], tuple[ExactMap]]:
+        return CompiledTiles.of, (self.exact,)
 
     def tile(self, index: int) -> CompiledTile | Tile:
         """Return a tile, compiled; the exact one where no grid is good enough."""

@@ -33,6 +33,10 @@ class Tiles:
         self._held = sum(tile.nbytes for tile in self._solved.values())
         self._lock = Lock()
 
+    def __reduce__(self) -> tuple[type["Tiles"], tuple[Learnt]]:
+        # Another process solves the tiles that it needs: they are ten times as large.
+        return Tiles, (self._learnt,)
+
     def __len__(self) -> int:
         return len(self._learnt.tiling)
 

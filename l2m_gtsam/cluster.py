@@ -1,0 +1,127 @@
+"""Many independent tasks on local processes or on a running Dask cluster."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from os import cpu_count
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from pydantic import Field
+
+from l2m_gtsam.errors import ClusterError
+from l2m_gtsam.options import Options
+from l2m_gtsam.threads import THREADS
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Key = TypeVar("Key")
+Place = TypeVar("Place")
+Value = TypeVar("Value")
+
+LOOPBACK = "127.0.0.1"
+CONNECT_S = 20  # a scheduler that is there answers at once
+
+
+class ClusterOptions(Options):
+    """Who computes."""
+
+    workers: int = Field(default=cpu_count() or 1, ge=1)
+    """Processes on this machine, one core each; not looked at with a scheduler."""
+    scheduler: str | None = None
+    """Address of a running Dask scheduler, tcp://host:port, whose workers have this package."""
+
+
+@dataclass(frozen=True)
+class Work(Generic[Key, Place, Value]):
+    """Tasks, and what several of them need first. Functions must be importable on the workers.
+
+    Attributes
+    ----------
+    place
+        What a task needs, by name, from its key.
+    prepare
+        Makes what is needed from its name, once for all tasks that need it.
+    task
+        The result from the key and what was prepared for it.
+    """
+
+    place: Callable[[Key], Place]
+    prepare: Callable[[Place], Any]
+    task: Callable[[Key, Any], Value]
+
+
+def computed(
+    work: Work[Key, Place, Value], keys: Sequence[Key], options: ClusterOptions
+) -> Iterator[tuple[Key, Value]]:
+    """Yield each key with its result, as they get ready; a lost worker's tasks go to others.
+
+    Parameters
+    ----------
+    work
+        What is to be done.
+    keys
+        Of the tasks, in the order in which they are begun: best those of one place together.
+    options
+        Who computes.
+
+    Raises
+    ------
+    ClusterError
+        Dask is not installed, the scheduler does not answer, or a task kills its workers.
+    """
+    if not keys:
+        return
+    with _client(options) as client:
+        from distributed import as_completed
+        from distributed.scheduler import KilledWorker
+
+        places = list(dict.fromkeys(map(work.place, keys)))
+        prepared = {place: client.submit(work.prepare, place, pure=False) for place in places}
+        names = {
+            client.submit(work.task, key, prepared[work.place(key)], pure=False): key
+            for key in keys
+        }
+        del prepared  # each is kept by the tasks that wait for it, and forgotten after the last
+        for future in as_completed(list(names)):
+            key = names[future]
+            try:
+                value = future.result()
+            except KilledWorker as error:
+                raise ClusterError(
+                    f"{key}: every worker that began it died; give the workers more memory"
+                ) from error
+            yield key, value
+            future.release()
+
+
+@contextmanager
+def _client(options: ClusterOptions) -> "Iterator[Client]":
+    """Yield a connection to the workers, and stop those that were started here."""
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise ClusterError("Dask is missing: pip install 'l2m-gtsam[cluster]'") from error
+    if options.scheduler is not None:
+        try:
+            client = Client(options.scheduler, timeout=CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise ClusterError(f"--scheduler {options.scheduler}: {error}") from error
+        with client:
+            yield client
+        return
+    # Each worker has a core to itself, and so one thread for everything.
+    one = {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, THREADS: 1}
+    with (
+        dask.config.set({"distributed.nanny.pre-spawn-environ": one}),
+        LocalCluster(
+            n_workers=options.workers,
+            threads_per_worker=1,
+            host=LOOPBACK,
+            dashboard_address=None,
+            memory_limit=None,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client

@@ -1,0 +1,1 @@
+"""Groups of commands: parsing and printing only."""
