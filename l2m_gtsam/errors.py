@@ -35,3 +35,7 @@ class ConfigError(L2MError):
 
 class OutputError(L2MError):
     """A result that cannot be written."""
+
+
+class PeerError(L2MError):
+    """A peer of a study that is not installed, or that cannot be run on what it is given."""
