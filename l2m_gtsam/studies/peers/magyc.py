@@ -6,7 +6,7 @@ Position, rotation and scale it cannot tell. What it needs contradicts what we n
 2), so that it has an environment of its own, made by ``make magyc``.
 
 It is made for chips that hold both a magnetometer and a gyroscope, along the same axes, and wants
-them so: six degrees between the two cost it 2 uT. A study that knows the truth gives it the rates
+them so: six degrees between the two cost it 1.5 uT. A study that knows the truth gives it the rates
 that a gyroscope on the sensor's own chip would have told, to the noise of the poses.
 """
 
