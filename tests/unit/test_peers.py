@@ -76,9 +76,9 @@ def test_soft_iron_is_what_a_turn_and_a_scale_leave(seed: int, scale: float) -> 
     np.testing.assert_allclose(S, soft_iron(turned), rtol=0, atol=1e-13)
     np.testing.assert_allclose(S, S.T, rtol=0, atol=1e-14)
     assert np.linalg.det(S) == pytest.approx(1.0, abs=1e-13)
-    # C C^T and S S^T are the same ellipsoid.
-    ratio = C @ C.T / (S @ S)
-    np.testing.assert_allclose(ratio / ratio[0, 0], 1.0, rtol=1e-10)
+    # C C^T and S S are the same ellipsoid, but for its size.
+    ellipsoid = C @ C.T / np.cbrt(np.linalg.det(C)) ** 2
+    np.testing.assert_allclose(S @ S, ellipsoid, rtol=0, atol=1e-13)
 
 
 def test_the_naive_peer_finds_a_sensor_on_easy_ground() -> None:
