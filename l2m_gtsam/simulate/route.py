@@ -143,19 +143,22 @@ def slalom(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
 
 
 def wander(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
-    """Return a route from crossing to crossing, never at once back, at random."""
+    """Return a route from crossing to crossing at random, never at once back, then home."""
     rng = np.random.default_rng(options.seed)
     x, y = plan.cross_x, plan.aisle_y
-    here = np.array([len(x) // 2, len(y) // 2])
-    before, corners, travelled = here, [], 0.0
+    home = (len(x) // 2, len(y) // 2)
+    crossings, travelled = [home], 0.0
     while travelled < options.length:
-        places = [here + move for move in ([1, 0], [-1, 0], [0, 1], [0, -1])]
-        open_ways = [p for p in places if 0 <= p[0] < len(x) and 0 <= p[1] < len(y)]
-        onward = [p for p in open_ways if not np.array_equal(p, before)]
-        before, here = here, onward[rng.integers(len(onward))]
-        travelled += float(np.hypot(x[here[0]] - x[before[0]], y[here[1]] - y[before[1]]))
-        corners.append([x[here[0]], y[here[1]]] + rng.uniform(-ASIDE, ASIDE, 2))
-    return np.array(corners)
+        (i, j), before = crossings[-1], crossings[-2:-1]
+        around = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
+        ways = [(m, n) for m, n in around if 0 <= m < len(x) and 0 <= n < len(y)]
+        ways = [way for way in ways if [way] != before]
+        m, n = ways[rng.integers(len(ways))]
+        crossings.append((m, n))
+        travelled += float(abs(x[m] - x[i]) + abs(y[n] - y[j]))
+    crossings.append((home[0], crossings[-1][1]))
+    corners = np.array([[x[i], y[j]] for i, j in crossings])
+    return np.asarray(corners + rng.uniform(-ASIDE, ASIDE, corners.shape))
 
 
 SHAPES = {
