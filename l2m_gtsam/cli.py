@@ -5,20 +5,19 @@ Heavy modules are imported inside the commands, so that ``--help`` answers at on
 
 import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from l2m_gtsam.commands import exports
+from l2m_gtsam.commands.console import progress_bars as _progress
+from l2m_gtsam.commands.console import warn as _warn
 from l2m_gtsam.errors import L2MError
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
-
-    from l2m_gtsam.progress import Progress
 
 app = typer.Typer(
     name="l2m",
@@ -31,6 +30,7 @@ map_app = typer.Typer(
     help="Build, update, compare, describe and draw magnetic maps.", no_args_is_help=True
 )
 app.add_typer(map_app, name="map")
+exports.register(app)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
@@ -334,12 +334,6 @@ def _place(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _warn(doubts: Sequence[str]) -> None:
-    """Say on the error stream what speaks against a result that was written all the same."""
-    for doubt in doubts:
-        typer.echo(f"l2m: warning: {doubt}", err=True)
-
-
 def _print(table: "Table") -> None:
     """Print a table as wide as its numbers need: a narrow terminal wraps, it cuts no digits."""
     from rich.console import Console
@@ -359,21 +353,3 @@ def _needed(console: "Console", table: "Table") -> int:
         widths.append(max(cell.maximum if column.no_wrap else cell.minimum for cell in cells))
     borders = 3 * len(widths) + 1
     return sum(widths) + borders
-
-
-@contextmanager
-def _progress() -> Iterator["Progress"]:
-    """Show one bar per stage on the error stream while it runs."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description:<28}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        stages: dict[str, TaskID] = {}
-
-        def tell(stage: str, fraction: float) -> None:
-            if stage not in stages:
-                stages[stage] = bars.add_task(stage, total=1.0)
-            bars.update(stages[stage], completed=fraction)
-
-        yield tell
