@@ -83,7 +83,7 @@ def test_the_launch_file_publishes_the_sensors_place(R: FloatArray, t: FloatArra
     turn = Rotation.from_quat([float(given[f"--q{axis}"]) for axis in "xyzw"])
     place = np.array([float(given[f"--{axis}"]) for axis in "xyz"])
     found = turn.apply([0.4, -0.3, 1.1]) + place
-    np.testing.assert_allclose(found, point_in_lidar(R, t), atol=CLOSE)
+    np.testing.assert_allclose(found, point_in_lidar(R, t), rtol=0, atol=CLOSE)
     assert set(given) == {"--frame-id", "--child-frame-id"} | {
         f"--{each}" for each in ("x", "y", "z", "qx", "qy", "qz", "qw")
     }
@@ -95,7 +95,7 @@ def test_kalibrs_matrix_goes_from_the_lidar_to_the_sensor(R: FloatArray, t: Floa
     T = np.array(entry["T_mag_lidar"])
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
     found = T @ [*point_in_lidar(R, t), 1.0]
-    np.testing.assert_allclose(found[:3], [0.4, -0.3, 1.1], atol=CLOSE)
+    np.testing.assert_allclose(found[:3], [0.4, -0.3, 1.1], rtol=0, atol=CLOSE)
     assert entry["timeshift_mag_lidar"] == 0.012
     assert entry["rostopic"] == "/m"
 
@@ -117,11 +117,13 @@ def test_json_corrects_readings_and_moves_points(R: FloatArray) -> None:
     reading = R @ P @ field_ut + [3.0, -2.0, 7.0]
     C, H = np.array(entry["C"]), np.array(entry["H"])
     # Condition of C times the strength times the precision is 1e-13.
-    np.testing.assert_allclose(np.linalg.solve(C, reading - H), field_ut, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.solve(C, reading - H), field_ut, rtol=0, atol=1e-12)
     there = entry["transforms"]["T_lidar_mag"]
     turn = Rotation.from_quat(there["quaternion_xyzw"])
     found = turn.apply([0.4, -0.3, 1.1]) + there["translation"]
-    np.testing.assert_allclose(found, point_in_lidar(R, np.array([0.31, -0.12, 0.05])), atol=CLOSE)
+    np.testing.assert_allclose(
+        found, point_in_lidar(R, np.array([0.31, -0.12, 0.05])), rtol=0, atol=CLOSE
+    )
     np.testing.assert_allclose(np.array(entry["C_sigma"]).shape, (3, 3))
 
 
