@@ -67,7 +67,7 @@ def apply(
     ] = False,
 ) -> None:
     """Copy a bag and add the corrected readings, in the axes of the LiDAR, as TOPIC/calibrated."""
-    from l2m_gtsam.batch.application import Application, apply_calibration
+    from l2m_gtsam.batch.corrected_bag import Application, apply_calibration
 
     wanted = Application(bag, calibration, out, config, lidar_frame, replace)
     with progress_bars() as progress:

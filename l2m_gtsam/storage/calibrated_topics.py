@@ -115,15 +115,15 @@ class Calibrator:
         Of a reading of 1 as it stands in the bag.
     frame
         Of the corrected readings: the lidar's.
-    replace
-        Whether the topics that are corrected are left out.
+    left_out
+        Topics that are not copied.
     """
 
     bag: Bag
     topics: Mapping[Key, CalibratedTopic]
     microtesla: float
     frame: str
-    replace: bool
+    left_out: frozenset[str]
     _codecs: dict[int, Codec] = field(default_factory=dict)
 
     def copy(self, into: BagCopy, progress: Progress | None) -> None:
@@ -139,11 +139,7 @@ class Calibrator:
             c for c in self.bag.connections if c.msgtype == FIELD_TYPE and c.topic in corrected
         ]
         self._codecs = {c.id: self.bag.codec(c) for c in sources}
-        kept = {
-            c.id: into.add(c)
-            for c in self.bag.connections
-            if not (self.replace and c.id in self._codecs)
-        }
+        kept = {c.id: into.add(c) for c in self.bag.connections if c.topic not in self.left_out}
         added = self._connections(into, sources)
         for block in _blocks(self.bag.raw_messages(self.bag.connections, progress)):
             extra = self._corrections(block)

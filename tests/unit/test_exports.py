@@ -206,6 +206,14 @@ def test_a_name_cannot_leave_its_place() -> None:
     assert YAML(typ="safe").load(kalibr_text(mounted([sensor(name)])))["mag0"]["frame"] == name
 
 
+@pytest.mark.parametrize("text", [json_text, kalibr_text, launch_text])
+def test_half_characters_of_a_damaged_name_are_written(text: Any) -> None:
+    """Half a surrogate pair, which YAML can spell and UTF-8 cannot hold."""
+    whole = calibration(sensor("m\ud800"), unsolved("n", SensorStatus.DEAD_AXIS, "\ud800"))
+    export = export_of(whole, not_mounted, "lidar", {"m\ud800": "m"})
+    assert text(export).encode()
+
+
 def test_comments_stay_comments() -> None:
     bad = unsolved("n", SensorStatus.NO_READINGS, "gone\nimport os\r--> \x1b[31m\u2028x: 1")
     export = mounted([sensor("m"), bad])

@@ -171,6 +171,15 @@ def test_a_comment_ends_where_it_should(line: str) -> None:
             ),
             "link 'lidar' of the LiDAR hangs below the sensor's link 'mag'",
         ),
+        (
+            (
+                '<robot><link name="lidar"/><link name="mag"/>'
+                '<joint name="a" type="fixed"><parent link="lidar"/><child link="mag"/></joint>'
+                '<joint name="b" type="fixed"><parent link="lidar"/><child link="mag"/></joint>'
+                "</robot>"
+            ),
+            "link 'mag' hangs below two joints; remove one",
+        ),
     ],
 )
 def test_what_is_no_robot_is_refused(robot: str, message: str) -> None:

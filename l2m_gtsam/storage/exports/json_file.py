@@ -32,7 +32,7 @@ def json_text(export: Export) -> str:
             for each in export.sensors
         },
     }
-    return json.dumps(_finite(content), indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+    return json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
 
 
 def _finite(value: Any) -> Any:

@@ -50,6 +50,9 @@ def _check(urdf: UrdfFile, export: Export) -> None:
             f"{urdf.name}: no link {export.lidar_frame!r} for the LiDAR; name it with "
             f"--lidar-frame; there are: {there}"
         )
+    children = [joint.child for joint in urdf.joints]
+    if twice := next((s for s in export.sensors if children.count(s.frame) > 1), None):
+        raise ConfigError(f"{urdf.name}: link {twice.frame!r} hangs below two joints; remove one")
     above = urdf.ancestors(export.lidar_frame)
     if below := next((s for s in export.sensors if s.frame in above), None):
         raise ConfigError(

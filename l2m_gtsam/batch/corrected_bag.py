@@ -1,4 +1,4 @@
-"""A calibration applied to a bag."""
+"""A bag with the readings of its magnetometers corrected by a calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -103,9 +103,9 @@ def apply_calibration(wanted: Application, progress: Progress) -> Applied:
         name = wanted.bag.name
         found = sensor_topics(bag, options, counter(f"reading {name}", progress))
         topics = _calibrated_topics(bag, found, usable, options)
-        calibrator = Calibrator(
-            bag, topics, MICROTESLA_PER[options.units], wanted.lidar_frame, wanted.replace
-        )
+        left_out = frozenset(topic for topic, _ in topics) if wanted.replace else frozenset()
+        unit = MICROTESLA_PER[options.units]
+        calibrator = Calibrator(bag, topics, unit, wanted.lidar_frame, left_out)
         with bag_copy(bag, wanted.out) as copy:
             calibrator.copy(copy, counter(f"copying {name}", progress))
     names = {found[key].sensor: new.topic for key, new in topics.items()}
