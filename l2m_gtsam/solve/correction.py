@@ -6,7 +6,7 @@ from l2m_gtsam.data import CorrectedField, Distortion, FloatArray
 
 
 def corrected(
-    readings: FloatArray, distortion: Distortion, covariance: FloatArray, noise: float
+    readings: FloatArray, distortion: Distortion, covariance: FloatArray, variance: FloatArray
 ) -> CorrectedField:
     """Return ``b = inv(C) @ (z - H)`` and what noise and an inexact C and H make of it.
 
@@ -22,8 +22,8 @@ def corrected(
         C and H.
     covariance
         Of C row by row and H, in uT, shape (12, 12).
-    noise
-        Standard deviation of the readings' noise in uT.
+    variance
+        Of the readings' own errors along the sensor's axes in uT^2, shape (N, 3).
 
     Returns
     -------
@@ -35,11 +35,40 @@ def corrected(
     spread = np.full((len(readings), 3, 3), np.nan)
     b[known] = distortion.undo(readings[known])
     J = _jacobian(b[known])
-    of_reading = J @ covariance @ J.transpose(0, 2, 1) + noise**2 * np.eye(3)
+    of_reading = J @ covariance @ J.transpose(0, 2, 1) + variance[known, :, None] * np.eye(3)
     half = np.linalg.solve(distortion.C, of_reading)
     found = np.linalg.solve(distortion.C, half.transpose(0, 2, 1))
     spread[known] = (found + found.transpose(0, 2, 1)) / 2
     return CorrectedField(b, spread)
+
+
+def without_moving(readings: FloatArray, numbers: FloatArray, h: FloatArray) -> FloatArray:
+    """Return readings without what follows K recorded numbers.
+
+    Parameters
+    ----------
+    readings
+        Of one sensor in microtesla, shape (N, 3).
+    numbers
+        At each reading, shape (N, K).
+    h
+        What they add, in uT per unit of each, shape (K, 3).
+    """
+    return np.asarray(readings - numbers @ h)
+
+
+def moving_variance(numbers: FloatArray, h_sigma: FloatArray) -> FloatArray:
+    """Return what the errors of h add to the variance of readings along each axis, uT^2, (N, 3).
+
+    Parameters
+    ----------
+    numbers
+        At each reading, shape (N, K).
+    h_sigma
+        Standard deviations of h in uT per unit, shape (K, 3); taken as independent of each other
+        and of C and H.
+    """
+    return np.asarray(numbers**2 @ h_sigma**2)
 
 
 def _jacobian(b: FloatArray) -> FloatArray:

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Connection
 
-from l2m_gtsam.data import CorrectedField, FloatArray
+from l2m_gtsam.data import CorrectedField, FloatArray, IntArray
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.storage.bag_copy import BagCopy
-from l2m_gtsam.storage.bag_options import BagOptions
-from l2m_gtsam.storage.messages import FIELD_TYPE, FieldBuffer
+from l2m_gtsam.storage.bag_options import BagOptions, Stamps
+from l2m_gtsam.storage.messages import FIELD_TYPE, FieldBuffer, header_ns
 from l2m_gtsam.storage.open_bag import Bag, Codec, Progress, RawMessage
 from l2m_gtsam.storage.selection import select_fields, sensor_names, several_frames
 from l2m_gtsam.storage.units import MICROTESLA_PER, fault, is_turning, strength
 
-Correct = Callable[[FloatArray], CorrectedField]
-"""What corrects readings in microtesla, shape (N, 3)."""
+Correct = Callable[[FloatArray, IntArray], CorrectedField]
+"""What corrects readings in microtesla, shape (N, 3), of times in nanoseconds, shape (N,)."""
 Key = tuple[str, str]
 """Topic and frame of a sensor."""
 
@@ -111,8 +111,8 @@ class Calibrator:
         The source.
     topics
         What is added, by topic and frame of the sensors.
-    microtesla
-        Of a reading of 1 as it stands in the bag.
+    options
+        How readings are read.
     frame
         Of the corrected readings: the lidar's.
     left_out
@@ -121,7 +121,7 @@ class Calibrator:
 
     bag: Bag
     topics: Mapping[Key, CalibratedTopic]
-    microtesla: float
+    options: BagOptions
     frame: str
     left_out: frozenset[str]
     _codecs: dict[int, Codec] = field(default_factory=dict)
@@ -171,14 +171,20 @@ class Calibrator:
                 key = (message.connection.topic, contents[row].header.frame_id)
                 rows[key].append(row)
         found: dict[int, tuple[str, bytes]] = {}
+        unit = MICROTESLA_PER[self.options.units]
         for key, new in self.topics.items():
-            field_ut = self.microtesla * _readings([contents[row] for row in rows[key]])
-            result = new.correct(field_ut)
+            stamps = [self._stamp(block[row], contents[row]) for row in rows[key]]
+            field_ut = unit * _readings([contents[row] for row in rows[key]])
+            result = new.correct(field_ut, np.array(stamps, dtype=np.int64))
             for row, b, spread in zip(rows[key], result.field, result.covariance, strict=True):
                 message = self._message(contents[row], b, spread)
                 codec = self._codecs[block[row].connection.id]
                 found[row] = (new.topic, codec.encode(message))
         return found
+
+    def _stamp(self, message: RawMessage, content: Any) -> int:
+        header = self.options.stamps is Stamps.HEADER
+        return header_ns(content) if header else message.record_ns
 
     def _message(self, content: Any, b: FloatArray, covariance: FloatArray) -> Any:
         """Return a reading of the lidar's axes in tesla; a covariance of zero is an unknown one."""

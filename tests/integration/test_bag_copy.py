@@ -344,20 +344,53 @@ def test_a_type_without_a_definition_is_copied(tmp_path: Path) -> None:
 
 def test_sensors_that_cannot_be_corrected_are_named(tmp_path: Path) -> None:
     bag = write(tmp_path, "mcap", entries("mcap", readings()))
-    moving = sensor("b", moving=(MovingField("motor", np.ones(3), np.ones(3)),))
+    endless = MovingField("motor", np.ones(3), np.full(3, np.inf))
     dead = unsolved("c", SensorStatus.DEAD_AXIS, "x is dead")
-    follows = "a part of its readings follows recorded numbers (motor), which is not undone here"
-    done = applied(tmp_path, bag, calibration(*made().sensors, moving, dead))
+    done = applied(
+        tmp_path, bag, calibration(*made().sensors, sensor("b", moving=(endless,)), dead)
+    )
     assert done.notes == (
-        f"b is left out: {follows}",
+        "b is left out: what follows motor is not determined",
         "c is left out: it is not calibrated (dead axis): x is dead",
         "b is not in the bag",
         "c is not in the bag",
     )
     with pytest.raises(CalibrationError, match="no sensor is left to be written: c: it is not"):
         applied(tmp_path, bag, calibration(dead), out=tmp_path / "x")
-    with pytest.raises(BagError, match=r"none of its sensors \(imu/mag\) is one that the cal"):
+    with pytest.raises(BagError, match=r"can correct none of its sensors \(imu/mag\)"):
         applied(tmp_path, bag, calibration(sensor("other")), out=tmp_path / "x")
+
+
+@pytest.mark.parametrize("stamps", ["header", "record"])
+def test_what_follows_a_motor_is_taken_out(stamps: str, tmp_path: Path) -> None:
+    """Its current is known up to the twentieth reading; the clock of the record is 5 ms later."""
+    h, sigma = np.array([0.5, -0.2, 0.1]), np.array([0.01, 0.02, 0.03])
+    make, found, b = ros("mcap"), [], readings()
+    current = 3 + np.sin(np.arange(30))
+    for k, amperes in enumerate(current):
+        stamp = START + k * STEP
+        reading = make.magnetic(stamp, (b[k] + [3.0, -2.0, 7.0] + amperes * h) * 1e-6)
+        found.append(Entry("/mag", "sensor_msgs/MagneticField", stamp + 5_000_000, reading))
+        if k < 20:
+            told = make.pose_stamped(stamp, [1000 * amperes, 0, 0], [0, 0, 0, 1])
+            found.append(Entry("/motor", "geometry_msgs/PoseStamped", stamp + 5_000_000, told))
+    bag = write(tmp_path, "mcap", found)
+    motor = {"topic": "/motor", "field": "pose.position.x", "scale": 0.001}
+    options = {"bag": {"regressors": {"motor": motor}, "stamps": stamps}}
+    exact: dict[str, Any] = {"covariance": np.zeros((15, 15)), "time_offset": None, "noise": 0.1}
+    moving = sensor("mag", moving=(MovingField("motor", h, sigma),), **exact)
+    applied(tmp_path, bag, calibration(moving, options=options))
+    field_ut = calibrated(tmp_path / "out", "/mag/calibrated").field
+    np.testing.assert_allclose(field_ut[:20], b[:20], rtol=0, atol=1e-12)
+    assert np.isnan(field_ut[20:]).all()
+    raw = content(tmp_path / "out")["/mag/calibrated"][7][1]
+    message: Any = ros("mcap").store.deserialize_cdr(raw, "sensor_msgs/msg/MagneticField")
+    expected = 1e-12 * np.diag(0.1**2 + (current[7] * sigma) ** 2)
+    np.testing.assert_allclose(
+        message.magnetic_field_covariance, expected.ravel(), rtol=1e-12, atol=1e-27
+    )
+    with pytest.raises(ConfigError, match="follows 'motor', which `bag"):
+        applied(tmp_path, bag, calibration(moving), out=tmp_path / "x")
 
 
 @pytest.mark.parametrize(
@@ -410,6 +443,13 @@ def test_a_frame_that_is_no_name(tmp_path: Path) -> None:
 
 def test_options_that_were_tampered_with(tmp_path: Path) -> None:
     bag = write(tmp_path, "mcap", entries("mcap", readings()))
-    odd = calibration(sensor("imu/mag"), options={"bag": {"units": "furlong"}})
-    with pytest.raises(CalibrationError, match=r"calibration.yaml: options.bag.units: "):
-        applied(tmp_path, bag, odd)
+    options: dict[str, Any]
+    for options, key in (
+        ({"bag": {"units": "furlong"}}, "options.bag.units: "),
+        ({"bag": 7}, "options.bag: "),
+        ({"calibration": {"regressors": {"max_gap_s": -1}}}, "options.calibration.regressors.max"),
+        ({"calibration": 7}, "options.calibration.regressors: "),
+    ):
+        odd = calibration(sensor("imu/mag"), options=options)
+        with pytest.raises(CalibrationError, match=f"calibration.yaml: {key}"):
+            applied(tmp_path, bag, odd)

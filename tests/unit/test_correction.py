@@ -21,7 +21,7 @@ def distortion(rng: np.random.Generator) -> Distortion:
 def test_what_was_distorted_comes_back(seed: int) -> None:
     rng = np.random.default_rng(seed)
     true, b = distortion(rng), rng.normal(0, 40, (50, 3))
-    found = corrected(true.apply(b), true, np.zeros((12, 12)), 0.0)
+    found = corrected(true.apply(b), true, np.zeros((12, 12)), np.zeros((50, 3)))
     # 200 uT at a condition of 2 or so, in double precision
     np.testing.assert_allclose(found.field, b, rtol=0, atol=1e-11)
     np.testing.assert_allclose(found.covariance, 0, atol=1e-20)
@@ -35,12 +35,13 @@ def test_the_covariance_is_that_of_finite_differences(seed: int) -> None:
     """
     rng = np.random.default_rng(seed)
     made, z = distortion(rng), rng.normal(0, 50, (4, 3))
-    covariance, noise, h = sensor().covariance[3:, 3:], 0.3, 1e-4
+    covariance, h = sensor().covariance[3:, 3:], 1e-4
+    variance = rng.uniform(0, 0.2, (4, 3))
 
     def undone(changed: FloatArray, reading: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.inv(changed[:9].reshape(3, 3)) @ (reading - changed[9:]))
 
-    found = corrected(z, made, covariance, noise)
+    found = corrected(z, made, covariance, variance)
     for n, reading in enumerate(z):
         by_model, by_reading = np.zeros((3, 12)), np.zeros((3, 3))
         for k, step in enumerate(h * np.eye(12)):
@@ -49,7 +50,8 @@ def test_the_covariance_is_that_of_finite_differences(seed: int) -> None:
         for k, step in enumerate(h * np.eye(3)):
             after = undone(made.vector(), reading + step)
             by_reading[:, k] = (after - undone(made.vector(), reading - step)) / (2 * h)
-        expected = by_model @ covariance @ by_model.T + noise**2 * by_reading @ by_reading.T
+        expected = by_model @ covariance @ by_model.T
+        expected += by_reading @ np.diag(variance[n]) @ by_reading.T
         scale = np.abs(expected).max()
         np.testing.assert_allclose(found.covariance[n], expected, rtol=0, atol=1e-5 * scale)
 
@@ -67,14 +69,14 @@ def test_the_covariance_is_what_sampling_shows() -> None:
             for e, n in zip(errors, rng.normal(0, 0.2, (40_000, 3)), strict=True)
         ]
     )
-    found = corrected(z[None], made, covariance, 0.2).covariance[0]
+    found = corrected(z[None], made, covariance, np.full((1, 3), 0.2**2)).covariance[0]
     np.testing.assert_allclose(np.std(draws, axis=0), np.sqrt(np.diag(found)), rtol=0.02)
 
 
 def test_a_missing_axis_leaves_nothing_known_and_harms_no_other() -> None:
     made = sensor()
     z = np.array([[20.0, 1.0, 2.0], [20.0, np.nan, 2.0], [3.0, 40.0, np.inf]])
-    found = corrected(z, made.distortion, made.covariance[3:, 3:], 0.1)
+    found = corrected(z, made.distortion, made.covariance[3:, 3:], np.ones((3, 3)))
     np.testing.assert_array_equal(
         np.isfinite(found.field), np.repeat([[True], [False], [False]], 3, axis=1)
     )
@@ -85,6 +87,7 @@ def test_a_missing_axis_leaves_nothing_known_and_harms_no_other() -> None:
 @pytest.mark.parametrize("readings", [0, 1])
 def test_few_readings(readings: int) -> None:
     made = sensor()
-    found = corrected(np.ones((readings, 3)), made.distortion, made.covariance[3:, 3:], 0.1)
+    ones = np.ones((readings, 3))
+    found = corrected(ones, made.distortion, made.covariance[3:, 3:], ones)
     assert found.field.shape == (readings, 3)
     assert found.covariance.shape == (readings, 3, 3)
