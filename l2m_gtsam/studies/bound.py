@@ -3,6 +3,7 @@
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.errors import MapError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.coverage import UncertainMap, cover
@@ -35,6 +36,11 @@ def cramer_rao(
         Standard deviation of the sensor's noise in uT.
     options
         Which of the readings enter.
+
+    Raises
+    ------
+    MapError
+        The map does not know how its errors are correlated.
     """
     none = np.zeros(1)
     truth = Estimate(
@@ -46,7 +52,8 @@ def cramer_rao(
     )
     view = observe(readings, field_map, truth, options.min_readings)
     problem = joint_problem(view, field_map, truth, options)
-    assert isinstance(field_map, UncertainMap)
+    if not isinstance(field_map, UncertainMap):
+        raise MapError("a bound needs a map that knows how its errors are correlated: harmonic")
     coverage = cover(view, field_map, truth, options.pose_noise.correlation_s)
     values = starting_values(truth, view.sensors, coverage)
     tests = problem.determinacies

@@ -105,7 +105,9 @@ def mapped_site(options: SiteOptions) -> Site:
     return Site(site.world, site.plan, site.map(options.mapping.model))
 
 
-def random_drive(site: Site | Surveyed, options: SiteOptions, rng: np.random.Generator) -> SiteDrive:
+def random_drive(
+    site: Site | Surveyed, options: SiteOptions, rng: np.random.Generator
+) -> SiteDrive:
     """Return a drive through the site with a sensor of random place and distortion."""
     scenario = options.scenario
     place = random_place(options, rng)
