@@ -1,0 +1,154 @@
+"""The honesty study's figures: NEES with bands, coverage of each parameter, z-scores."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import norm
+
+from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.studies.honesty.page import setting
+from l2m_gtsam.studies.honesty.summary import (
+    EDGES,
+    GROUPS,
+    NAMES,
+    Histogram,
+    HonestySummary,
+    Verdict,
+)
+from l2m_gtsam.studies.statistics import LEVEL
+
+# These differ for all kinds of colour vision.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+STYLES = {
+    Uncertainty.FULL: ("#0072b2", "o"),
+    Uncertainty.INDEPENDENT: ("#d55e00", "s"),
+}
+GREY = "#777777"
+
+
+def honesty_figures(summary: HonestySummary) -> dict[str, Figure]:
+    """Return all figures by name."""
+    full = summary.of(Uncertainty.FULL)
+    return {
+        "nees": nees_figure(summary),
+        "coverage": coverage_figure(full),
+        "zscores": score_figure(full),
+    }
+
+
+def nees_figure(summary: HonestySummary) -> Figure:
+    """Draw the NEES of all blocks over what is expected of them, with their bands."""
+    full = summary.of(Uncertainty.FULL)
+    figure = Figure(figsize=(8.0, 3.6), layout="constrained", dpi=150)
+    panels = figure.subplots(1, len(full), sharey=True, squeeze=False)[0]
+    for axes, verdict in zip(panels, full, strict=True):
+        axes.set_title(setting(verdict), fontsize=10)
+        axes.axhline(1.0, color=GREY, linewidth=0.8)
+        axes.grid(axis="y", which="both", alpha=0.25)
+        names = [row.name for row in verdict.blocks]
+        axes.set_xticks(range(len(names)), names)
+        axes.set_xlim(-0.6, max(len(names), 1) - 0.4)
+        for each in summary.verdicts:
+            if setting(each) == setting(verdict):
+                draw_nees(axes, each)
+    panels[0].set_yscale("log")
+    panels[0].set_ylabel("mean NEES / its expectation")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)
+    return figure
+
+
+def draw_nees(axes: Axes, verdict: Verdict) -> None:
+    """Draw the NEES of one way to count the map's errors; the band of the full one."""
+    each = [row.honesty for row in verdict.blocks]
+    at, dof = np.arange(len(each), dtype=np.float64), np.array([h.dof for h in each])
+    if verdict.uncertainty is Uncertainty.FULL:
+        low = np.array([h.band.low for h in each]) / dof
+        high = np.array([h.band.high for h in each]) / dof
+        axes.bar(at, high - low, 0.7, low, color="#0072b2", alpha=0.22, label="95 % band (full)")
+    values = np.array([h.nees for h in each]) / dof
+    colour, marker = STYLES[verdict.uncertainty]
+    axes.plot(at, values, marker, color=colour, label=f"{verdict.uncertainty}")
+
+
+def coverage_figure(verdicts: Sequence[Verdict]) -> Figure:
+    """Draw the share of 95 % intervals that hold the truth, parameter by parameter."""
+    figure = Figure(figsize=(8.0, 3.8), layout="constrained", dpi=150)
+    axes = figure.add_subplot()
+    axes.axhline(100 * LEVEL, color=GREY, linewidth=0.8)
+    shown = [name for name in NAMES if any(has(verdict, name) for verdict in verdicts)]
+    aside = np.linspace(-0.27, 0.27, len(verdicts)) if len(verdicts) > 1 else np.zeros(1)
+    for verdict, shift, colour in zip(verdicts, aside, COLOURS * len(verdicts), strict=False):
+        rows = verdict.parameters
+        at = np.array([shown.index(row.name) for row in rows]) + shift
+        share = 100 * np.array([row.covered for row in rows])
+        low = 100 * np.array([row.interval.low for row in rows])
+        high = 100 * np.array([row.interval.high for row in rows])
+        reach = np.maximum([share - low, high - share], 0.0)
+        axes.errorbar(
+            at,
+            share,
+            reach,
+            fmt="o",
+            markersize=3.5,
+            linewidth=1,
+            color=colour,
+            label=setting(verdict),
+        )
+    for edge in np.arange(len(shown) - 1) + 0.5:
+        axes.axvline(edge, color=GREY, linewidth=0.4, alpha=0.4)
+    axes.set_xticks(range(len(shown)), shown)
+    axes.set_xlim(-0.5, max(len(shown), 1) - 0.5)
+    axes.set_ylabel("95 % intervals that hold the truth (%)")
+    axes.grid(axis="y", alpha=0.25)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=9)
+    return figure
+
+
+def has(verdict: Verdict, name: str) -> bool:
+    """Return whether a verdict is on a parameter."""
+    return any(row.name == name for row in verdict.parameters)
+
+
+def score_figure(verdicts: Sequence[Verdict]) -> Figure:
+    """Draw histograms of z-scores beside the normal distribution: a row for each condition."""
+    groups = [g for g in GROUPS if any(g == h.name for v in verdicts for h in v.histograms)]
+    size = (2.1 * max(len(groups), 1) + 0.8, 1.45 * len(verdicts) + 0.7)
+    figure = Figure(figsize=size, layout="constrained", dpi=150)
+    panels = figure.subplots(
+        len(verdicts), max(len(groups), 1), sharex=True, sharey=True, squeeze=False
+    )
+    for verdict, row in zip(verdicts, panels, strict=True):
+        row[0].set_ylabel(setting(verdict).replace(", ", ",\n"), fontsize=9)
+        found = {each.name: each for each in verdict.histograms}
+        for name, axes in zip(groups, row, strict=False):
+            axes.set_yticks([])
+            if name in found:
+                draw_scores(axes, found[name])
+            else:
+                axes.text(
+                    0.5,
+                    0.5,
+                    "not estimated",
+                    transform=axes.transAxes,
+                    ha="center",
+                    va="center",
+                    color=GREY,
+                    fontsize=8,
+                )
+    for name, axes in zip(groups, panels[0], strict=False):
+        axes.set_title(name, fontsize=10)
+    figure.supxlabel("z: error / stated sigma", fontsize=10)
+    return figure
+
+
+def draw_scores(axes: Axes, each: Histogram) -> None:
+    """Draw one histogram with the normal density."""
+    counts = np.array(each.counts, dtype=np.float64)
+    density = counts / counts.sum() / np.diff(EDGES)
+    axes.stairs(density, EDGES, fill=True, color="#0072b2", alpha=0.45)
+    z = np.linspace(EDGES[0], EDGES[-1], 161)
+    axes.plot(z, norm.pdf(z), color="black", linewidth=1)
+    axes.set_xticks([-4, -2, 0, 2, 4])
