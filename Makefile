@@ -5,7 +5,7 @@ export MPLBACKEND := Agg
 # Blocks of a few hundred readings are too small for BLAS threads.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test study benchmark lock clean
+.PHONY: demo test study benchmark magyc lock clean
 
 demo: .venv/runtime.stamp
 	$(BIN)/l2m demo --out demo_out
@@ -22,6 +22,15 @@ study: .venv/dev.stamp
 
 benchmark: .venv/dev.stamp
 	$(BIN)/python scripts/benchmark.py
+
+# A peer of the studies, in an environment of its own: its needs contradict ours.
+magyc: .venv-magyc/stamp
+
+.venv-magyc/stamp: requirements-magyc.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)) and "magyc needs Python 3.11 or 3.12: make PYTHON=python3.12 magyc")'
+	$(PYTHON) -m venv .venv-magyc
+	.venv-magyc/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-magyc.txt
+	touch $@
 
 .venv/bin/python:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=python3.11 ...")'
@@ -42,4 +51,4 @@ lock:
 	pip-compile --quiet --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --extra dev --constraint requirements.lock --output-file requirements-dev.lock pyproject.toml
 
 clean:
-	rm -rf .venv demo_out
+	rm -rf .venv .venv-magyc demo_out

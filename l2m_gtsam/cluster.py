@@ -119,7 +119,7 @@ def _client(options: ClusterOptions) -> "Iterator[Client]":
             n_workers=options.workers,
             threads_per_worker=1,
             host=LOOPBACK,
-            dashboard_address=None,
+            dashboard_address=f"{LOOPBACK}:0",
             memory_limit=None,
         ) as cluster,
         Client(cluster) as client,

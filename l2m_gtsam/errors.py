@@ -39,3 +39,7 @@ class OutputError(L2MError):
 
 class ClusterError(L2MError):
     """Work that cannot be shared out."""
+
+
+class PeerError(L2MError):
+    """A peer of a study that is not installed, or that cannot be run on what it is given."""

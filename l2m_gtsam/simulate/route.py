@@ -1,5 +1,6 @@
 """Routes over a warehouse floor, as corner points that a drive rounds off."""
 
+from enum import StrEnum
 from typing import Annotated
 
 import numpy as np
@@ -10,6 +11,9 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.floor_plan import FloorPlan
 
 POINTS_PER_TURN = 48
+ASIDE = 0.4  # metres beside the middle of an aisle: what is swept for a map lies beyond
+SERPENTINE_AISLES = 4
+WAVE_LENGTH, POINTS_PER_WAVE = 6.0, 24  # of a slalom, in metres
 
 
 class MappingRouteOptions(Options):
@@ -21,8 +25,27 @@ class MappingRouteOptions(Options):
     """Least distance from a lane to the racks or walls beside its aisle, in metres."""
 
 
+class RouteShape(StrEnum):
+    """A way through the aisles."""
+
+    CIRCLES = "circles"
+    EIGHT = "eight"
+    SERPENTINE = "serpentine"
+    SLALOM = "slalom"
+    WANDER = "wander"
+
+
 class CalibrationRouteOptions(Options):
     """How a vehicle is driven to calibrate its sensors."""
+
+    shape: RouteShape = RouteShape.CIRCLES
+    """`circles` (round a block of racks, with circles in both cross aisles), `eight` (round two
+    blocks, one way and then the other), `serpentine` (to and fro through neighbouring aisles),
+    `slalom` (round a block, weaving), or `wander` (from crossing to crossing at random)."""
+    length: Annotated[float, Field(gt=0)] = 100.0
+    """Of `wander`, in metres."""
+    seed: Annotated[int, Field(ge=0)] = 1
+    """Of `wander`."""
 
     turns: Annotated[int, Field(ge=0)] = 3
     """Full circles in each of the two cross aisles, one way in the first, the other in the next."""
@@ -57,10 +80,7 @@ def mapping_route(options: MappingRouteOptions, plan: FloorPlan) -> FloatArray:
 
 
 def calibration_route(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
-    """Return a route round a block of racks in the middle, circling in both cross aisles.
-
-    The circles turn the vehicle through all headings, both ways; the loop takes it past the
-    steel of the racks.
+    """Return the route of a calibration drive.
 
     Parameters
     ----------
@@ -73,7 +93,17 @@ def calibration_route(options: CalibrationRouteOptions, plan: FloorPlan) -> Floa
     -------
     Corner points in the map in metres, shape (M, 2).
     """
-    row, block = (len(plan.rack_y) - 1) // 2, (len(plan.block_x) - 1) // 2
+    lap = SHAPES[options.shape](options, plan)
+    return np.concatenate([np.tile(lap, (options.laps, 1)), lap[:1]])
+
+
+def circles(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
+    """Return a route round a block of racks in the middle, circling in both cross aisles.
+
+    The circles turn the vehicle through all headings, both ways; the loop takes it past the
+    steel of the racks.
+    """
+    row, block = _middle(plan)
     y_low, y_high = plan.aisle_y[row : row + 2]
     x_low, x_high = plan.cross_x[block : block + 2]
     # The drive passes both cross aisles on their right-hand side, where their circles begin.
@@ -82,8 +112,84 @@ def calibration_route(options: CalibrationRouteOptions, plan: FloorPlan) -> Floa
     up = _coil(options, x_high, middle - reach, middle + reach, options.turns)
     down = _coil(options, x_low, middle + reach, middle - reach, -options.turns)
     corners = [[x_low, y_low], [x_high, y_low], [x_high, y_high], [x_low, y_high]]
-    lap = np.concatenate([corners[:2], up, corners[2:], down])
-    return np.concatenate([np.tile(lap, (options.laps, 1)), lap[:1]])
+    return np.concatenate([corners[:2], up, corners[2:], down])
+
+
+def eight(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
+    """Return a route round two neighbouring blocks, or twice round the only one.
+
+    The second is driven round the other way, along other lines of the aisles.
+    """
+    row, block = _middle(plan)
+    other = min(block + 1, len(plan.block_x) - 1)
+    first = _block_corners(plan, row, block, aside=-ASIDE)[[1, 2, 3, 0]]
+    return np.concatenate([first, _block_corners(plan, row, other, aside=ASIDE)[[0, 3, 2, 1]]])
+
+
+def serpentine(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
+    """Return a route to and fro through up to four aisles beside each other."""
+    row, block = _middle(plan)
+    x_low, x_high = plan.cross_x[block : block + 2]
+    first = max(0, min(row, len(plan.aisle_y) - SERPENTINE_AISLES))
+    lanes = plan.aisle_y[first : first + SERPENTINE_AISLES]
+    return _serpentine(lanes, x_low, x_high)
+
+
+def slalom(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
+    """Return a route round a block in the middle that weaves from side to side."""
+    corners = _block_corners(plan, *_middle(plan), aside=0.0)
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    return np.concatenate([_woven(start, end) for start, end in sides])
+
+
+def wander(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
+    """Return a route from crossing to crossing at random, never at once back, then home."""
+    rng = np.random.default_rng(options.seed)
+    x, y = plan.cross_x, plan.aisle_y
+    home = (len(x) // 2, len(y) // 2)
+    crossings, travelled = [home], 0.0
+    while travelled < options.length:
+        (i, j), before = crossings[-1], crossings[-2:-1]
+        around = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
+        ways = [(m, n) for m, n in around if 0 <= m < len(x) and 0 <= n < len(y)]
+        ways = [way for way in ways if [way] != before]
+        m, n = ways[rng.integers(len(ways))]
+        crossings.append((m, n))
+        travelled += float(abs(x[m] - x[i]) + abs(y[n] - y[j]))
+    crossings.append((home[0], crossings[-1][1]))
+    corners = np.array([[x[i], y[j]] for i, j in crossings])
+    return np.asarray(corners + rng.uniform(-ASIDE, ASIDE, corners.shape))
+
+
+SHAPES = {
+    RouteShape.CIRCLES: circles,
+    RouteShape.EIGHT: eight,
+    RouteShape.SERPENTINE: serpentine,
+    RouteShape.SLALOM: slalom,
+    RouteShape.WANDER: wander,
+}
+
+
+def _middle(plan: FloorPlan) -> tuple[int, int]:
+    """Return row and block of the racks in the middle."""
+    return (len(plan.rack_y) - 1) // 2, (len(plan.block_x) - 1) // 2
+
+
+def _block_corners(plan: FloorPlan, row: int, block: int, aside: float) -> FloatArray:
+    """Return the crossings round a block anticlockwise, moved outwards by metres, shape (4, 2)."""
+    (x_low, x_high), (y_low, y_high) = plan.cross_x[block : block + 2], plan.aisle_y[row : row + 2]
+    x_low, x_high, y_low, y_high = x_low - aside, x_high + aside, y_low - aside, y_high + aside
+    return np.array([[x_low, y_low], [x_high, y_low], [x_high, y_high], [x_low, y_high]])
+
+
+def _woven(start: FloatArray, end: FloatArray) -> FloatArray:
+    """Return a wave from one corner to another, without the other, shape (M, 2)."""
+    way = end - start
+    length = float(np.hypot(*way))
+    waves = max(1, round(length / WAVE_LENGTH))
+    share = np.arange(waves * POINTS_PER_WAVE) / (waves * POINTS_PER_WAVE)
+    left = np.array([-way[1], way[0]]) / length
+    return start + share[:, None] * way + ASIDE * np.sin(2 * np.pi * waves * share)[:, None] * left
 
 
 def _lanes(options: MappingRouteOptions, centres: FloatArray, width: float) -> FloatArray:

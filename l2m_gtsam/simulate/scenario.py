@@ -41,6 +41,9 @@ class ScenarioOptions(Options):
 
     seed: Annotated[int, Field(ge=0)] = 1
     """Seed of all randomness."""
+    survey_seed: Annotated[int, Field(ge=0)] | None = None
+    """Seed of the mapping drive alone: another survey of the same hall; follows `seed` if not
+    given."""
     floor_plan: FloorPlanOptions = FloorPlanOptions()
     """The hall and its racks."""
     warehouse: WarehouseOptions = WarehouseOptions()
@@ -122,6 +125,8 @@ def simulate(options: ScenarioOptions, progress: Progress | None = None) -> Scen
     steel, array, mapping, calibration, lidar = (
         np.random.default_rng(seed) for seed in np.random.SeedSequence(options.seed).spawn(5)
     )
+    if options.survey_seed is not None:
+        mapping = np.random.default_rng([options.seed, options.survey_seed])
     plan = plan_floor(options.floor_plan)
     world = build_warehouse(options.warehouse, plan, earth_field(options.earth), steel)
     suite, truth = mapping_suite(options.suite), random_array(options.array, array)

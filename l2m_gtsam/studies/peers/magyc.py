@@ -1,0 +1,122 @@
+"""The calibrator from the package index: `magyc`, which wants a gyroscope and a uniform field.
+
+It knows no map. From readings and turn rates it tells H and the soft iron: where the field is the
+same everywhere it changes, seen from the sensor, only as the sensor turns, dB/dt = -w x B.
+Position, rotation and scale it cannot tell. What it needs contradicts what we need (numpy below
+2), so that it has an environment of its own, made by ``make magyc``.
+
+It is made for chips that hold both a magnetometer and a gyroscope, along the same axes, and wants
+them so: six degrees between the two cost it 1.5 uT. A study that knows the truth gives it the rates
+that a gyroscope on the sensor's own chip would have told, to the noise of the poses.
+"""
+
+import os
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.errors import PeerError
+from l2m_gtsam.studies.peers.estimate import PeerEstimate, soft_iron
+
+PYTHON_VARIABLE = "L2M_MAGYC_PYTHON"
+PYTHON = Path(".venv-magyc/bin/python")
+PROGRAM = Path(__file__).with_name("magyc_program.py")
+GAUSS = 100.0  # microtesla
+
+
+@dataclass(frozen=True)
+class ChipDrive:
+    """What a chip with a magnetometer and a gyroscope measured on a drive.
+
+    Attributes
+    ----------
+    readings
+        Of its magnetometer, with ``motion``.
+    R_mag_lidar
+        Rotation from the lidar to the chip, shape (3, 3): turns the lidar's rates into the chip's.
+    """
+
+    readings: Readings
+    R_mag_lidar: FloatArray
+
+
+def magyc_python() -> Path:
+    """Return the Python of the environment of magyc.
+
+    Raises
+    ------
+    PeerError
+        There is none, neither where ``L2M_MAGYC_PYTHON`` says nor in this folder.
+    """
+    python = Path(os.environ.get(PYTHON_VARIABLE, PYTHON))
+    if not python.is_file():
+        msg = (
+            f"magyc has no environment at {python}: run `make magyc`, or name its Python in "
+            f"{PYTHON_VARIABLE}"
+        )
+        raise PeerError(msg)
+    # The link in bin/ is what makes it that environment: never resolved.
+    return python.absolute()
+
+
+def magyc_peer(drives: Sequence[ChipDrive], python: Path) -> tuple[PeerEstimate, ...]:
+    """Return what magyc finds on each of some drives: H and the soft iron.
+
+    Loading it takes longer than a calibration, so that all drives go into one process. All
+    readings enter, for it differences them.
+
+    Parameters
+    ----------
+    drives
+        What one chip measured on each.
+    python
+        Of the environment of magyc.
+
+    Raises
+    ------
+    PeerError
+        Readings without motion, or a program that cannot be run.
+    """
+    with TemporaryDirectory() as folder:
+        source, target = Path(folder, "drives.npz"), Path(folder, "results.npz")
+        np.savez(source, allow_pickle=False, **_arrays(drives))
+        _run(python, source, target)
+        with np.load(target) as results:
+            columns = [results[name] for name in ("hard_iron", "soft_iron", "seconds")]
+    return tuple(_estimate(*row) for row in zip(*columns, strict=True))
+
+
+def _arrays(drives: Sequence[ChipDrive]) -> dict[str, FloatArray]:
+    """Return what the program reads: gauss, rad/s and seconds."""
+    arrays = {"count": np.array(float(len(drives)))}
+    for index, each in enumerate(drives):
+        readings, motion = each.readings, each.readings.motion
+        if motion is None:
+            msg = f"magyc needs turn rates: the readings of drive {index} have no motion"
+            raise PeerError(msg)
+        arrays[f"field_{index}"] = readings.field / GAUSS
+        arrays[f"rate_{index}"] = motion.twist_lidar[:, :3] @ each.R_mag_lidar.T
+        arrays[f"time_{index}"] = (readings.stamp_ns - readings.stamp_ns[:1]) * 1e-9
+    return arrays
+
+
+def _run(python: Path, source: Path, target: Path) -> None:
+    """Run the program isolated: neither our packages nor our folders are to be found by it."""
+    command = [str(python), "-I", str(PROGRAM), str(source), str(target)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode or not target.exists():
+        last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise PeerError(f"magyc does not run in {python}: {last}; make its environment anew")
+
+
+def _estimate(hard_iron: FloatArray, matrix: FloatArray, seconds: float) -> PeerEstimate:
+    """Return a result in microtesla."""
+    nothing = PeerEstimate.nothing(float(seconds))
+    if not np.isfinite([*hard_iron, *matrix.ravel()]).all():
+        return nothing
+    return PeerEstimate(nothing.t, nothing.C, hard_iron * GAUSS, soft_iron(matrix), nothing.seconds)
