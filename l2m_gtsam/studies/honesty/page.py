@@ -16,7 +16,7 @@ from l2m_gtsam.studies.statistics import LEVEL
 
 UNITS = {"t": (1e3, "mm"), "C": (1.0, ""), "H": (1.0, "uT"), "offset": (1e3, "ms")}
 """Factor from SI and uT, and unit, of the parameters as tables show them."""
-
+SPELT = {"C, H": "(C, H)", "all": "all together", "offset": "the time offset"}
 BLOCK_NOTE = (
     "NEES: mean of e' inv(P) e, which true covariances bring to the number of parameters. The band "
     "holds it with 95 %; calibrations on one survey share its map, so that only surveys count as "
@@ -75,19 +75,36 @@ def setting(verdict: Verdict) -> str:
 
 def sentence(verdict: Verdict) -> str:
     """Return whether sigmas are true under one condition, and errors near the bound."""
-    said = f"**{setting(verdict).capitalize()}**: {counted(verdict)}"
+    said = f"**{setting(verdict)}**: {counted(verdict)}"
     if not verdict.blocks:
         return f"{said}; of too few surveys to judge."
-    out = [row.name for row in verdict.blocks if not row.honesty.honest]
-    names = ", ".join(row.name for row in verdict.blocks if row.name not in out)
-    held = f"the NEES of {names} in band" if names else "no NEES in band"
-    missed = f", that of {', '.join(out)} out of it" if out else ""
     place = verdict.bounds[0]
     met = "within" if place.ratio <= TARGET else "beyond"
     return (
-        f"{said}; {held}{missed}; the error of t is {place.ratio:.2f} times the bound, {met} the "
-        f"{TARGET:g} aimed at."
+        f"{said}; {in_band(verdict)}; the error of t is {place.ratio:.2f} times the bound "
+        f"({place.interval.low:.2f}-{place.interval.high:.2f}), {met} the {TARGET:g} aimed at."
     )
+
+
+def in_band(verdict: Verdict) -> str:
+    """Return of which parameters the NEES is in its band, and on which side it is not."""
+    sides = {
+        "in band": [r for r in verdict.blocks if r.honesty.honest],
+        "above it (sigmas too small)": [
+            r for r in verdict.blocks if r.honesty.nees > r.honesty.band.high
+        ],
+        "below it (sigmas too large)": [
+            r for r in verdict.blocks if r.honesty.nees < r.honesty.band.low
+        ],
+    }
+    parts = [f"{listed([r.name for r in rows])} {side}" for side, rows in sides.items() if rows]
+    return f"NEES of {', of '.join(parts)}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return blocks in words."""
+    words = [SPELT.get(name, name) for name in names]
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def counted(verdict: Verdict) -> str:

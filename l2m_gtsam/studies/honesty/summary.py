@@ -29,7 +29,7 @@ NAMES = (
 GROUPS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15), "offset": OFFSET}
 """Parameters of one unit."""
 TARGET = 1.3  # root mean square error of t over the bound, at most
-EDGES = np.linspace(-4.0, 4.0, 33)  # of the histograms of z-scores
+EDGES = np.linspace(-4.0, 4.0, 17)  # of the histograms of z-scores
 
 
 @dataclass(frozen=True)
