@@ -137,9 +137,12 @@ def test_what_was_not_solved_or_determined_is_counted_and_left_out() -> None:
     cells[0].full.error[0] = np.nan
     cells[0].full.covariance[0] = np.nan
     cells[1].full.covariance[2, 4, 4] = np.inf
+    cells[2].bound[3] = np.nan
+    cells[3].bound[4, 15, 15] = np.inf
     verdict = judged(cells)
-    assert (verdict.wanted, verdict.solved, verdict.determined) == (200, 199, 198)
-    assert sum(verdict.histograms[0].counts) == 3 * 198
+    assert (verdict.wanted, verdict.solved, verdict.determined) == (200, 199, 197)
+    assert sum(verdict.histograms[0].counts) == 3 * 197
+    assert [row.name for row in verdict.bounds] == ["t", "C", "H"]
 
 
 def test_one_survey_is_not_judged() -> None:

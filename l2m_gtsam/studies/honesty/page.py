@@ -60,11 +60,13 @@ def intro(options: HonestyOptions) -> str:
     """Return what was tried."""
     heights = ", ".join(f"{height:g}" for height in options.heights)
     return (
-        f"At each noise level {options.surveys} halls of magnetised steel, each surveyed anew "
-        f"({options.survey_readings:,} readings at {heights} m) and mapped, and on each map "
-        f"{options.drives} drives with a sensor of random place and distortion, "
+        f"{options.surveys} halls of magnetised steel, each surveyed ({options.survey_readings:,} "
+        f"readings at {heights} m) and mapped, and on each map {options.drives} drives with a "
+        "sensor of random place and distortion, "
         f"{options.readings} readings each. *Troubled* drives are off in everything: clocks by up "
-        "to 40 ms, poses by errors that last, a tenth of the readings by tens of microtesla."
+        "to 40 ms, poses by errors that last, a tenth of the readings by tens of microtesla. "
+        "All conditions have the same halls, paths and sensors: what differs between them is due "
+        "to noise and trouble, and chance is partly the same."
     )
 
 

@@ -28,6 +28,7 @@ STYLES = {
     Uncertainty.FULL: ("#0072b2", "o", -ASIDE),
     Uncertainty.INDEPENDENT: ("#d55e00", "s", ASIDE),
 }
+TICKS = (1, 1.25, 1.6, 2, 2.5, 3.2, 4, 5, 6.3, 8)  # of a decade
 MARKERS = ("o", "s", "D", "^")
 GREY = "#777777"
 
@@ -59,7 +60,7 @@ def nees_figure(summary: HonestySummary) -> Figure:
             if setting(each) == setting(verdict):
                 draw_nees(axes, each)
     panels[0].set_yscale("log")
-    panels[0].yaxis.set_major_locator(LogLocator(2))
+    panels[0].yaxis.set_major_locator(LogLocator(10, TICKS))
     panels[0].yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panels[0].yaxis.set_minor_locator(NullLocator())
     panels[0].set_ylabel("mean NEES / its expectation")

@@ -102,8 +102,8 @@ class Verdict:
     condition, noise, uncertainty
         What was judged; noise in uT.
     wanted, solved, determined
-        Calibrations tried, with a result, and with t, C and H all determined: only these are
-        judged, and none if they are of fewer than two surveys.
+        Calibrations tried, with a result, and with t, C and H all determined, at the truth too:
+        only these are judged, and none if they are of fewer than two surveys.
     blocks, parameters, bounds, histograms
         Of t, C, H, and the time offset where all calibrations know it.
     """
@@ -157,6 +157,8 @@ def verdict(cells: Sequence[Cell], uncertainty: Uncertainty) -> Verdict:
     outcomes = Outcomes.joined([cell.outcomes(uncertainty) for cell in cells])
     bound = np.concatenate([cell.bound for cell in cells])
     rows = outcomes.determined_rows()
+    # Where the solve had enough readings, and the truth a few less, there is no bound.
+    rows = rows[np.isfinite(bound[rows, :15, :15]).all(axis=(1, 2))]
     judged, bound = outcomes[rows], bound[rows]
     names = tuple(judged.blocks) if judged.enough else ()
     groups = [g for g in GROUPS if names and (g != "offset" or g in names)]
@@ -169,7 +171,11 @@ def verdict(cells: Sequence[Cell], uncertainty: Uncertainty) -> Verdict:
         determined=len(judged),
         blocks=tuple(BlockRow(n, honesty(judged, judged.blocks[n])) for n in names),
         parameters=tuple(row for g in groups for row in parameter_rows(judged, GROUPS[g])),
-        bounds=tuple(bound_row(g, judged, bound) for g in groups),
+        bounds=tuple(
+            bound_row(g, judged, bound)
+            for g in groups
+            if np.isfinite(bound[:, GROUPS[g], GROUPS[g]]).all()
+        ),
         histograms=tuple(histogram(g, judged) for g in groups),
     )
 
