@@ -11,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from l2m_gtsam.cluster import ClusterOptions
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.studies.bound import cramer_rao
 from l2m_gtsam.studies.honesty.cells import Cell, Stated, bound_of, cell_of
 from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
 from l2m_gtsam.studies.honesty.page import honesty_page
@@ -159,6 +160,11 @@ def test_a_study_of_one_survey_is_refused() -> None:
         HonestyOptions(surveys=1)
 
 
+def test_a_map_that_does_not_know_its_errors_is_refused() -> None:
+    with pytest.raises(ValidationError, match="accepted: harmonic"):
+        HonestyOptions(map=quick("sliding_gp"))
+
+
 def test_both_conditions_of_a_survey_share_its_map() -> None:
     names = keys(HonestyOptions())
     assert len(names) == len(set(names)) == 80
@@ -205,6 +211,9 @@ def test_the_bound_is_what_the_solve_states_at_the_truth() -> None:
     )
     np.testing.assert_allclose(stated, least, rtol=0.2)
     drive = drive_through(TINY, place, Condition.CLEAN, 0)
+    truth, readings = drive.drive.sensors[0], drive.drive.readings
+    bound = cramer_rao(readings, place.field_map, truth, 0.2, TINY.solve)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(bound)), least)
     # Half as many readings tell less of every parameter.
     spoilt = replace(drive, change=np.resize([0.0, 1.0], len(drive.change)))
     worse = np.sqrt(np.diagonal(bound_of(place, spoilt, TINY.solve))[:15])

@@ -1,17 +1,16 @@
 """The drives through one hall at one noise level: errors, stated covariances, and the bound."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.alternation import OneKeyOptions, fit_distortions
+from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.forecast import stated_at
 from l2m_gtsam.graph.one_key import solve_one_key
-from l2m_gtsam.graph.view import observe
 from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.studies.bound import bound_at
 from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
 from l2m_gtsam.studies.honesty.outcomes import Outcomes
 from l2m_gtsam.studies.honesty.place import Place, drive_through, start_near
@@ -103,23 +102,15 @@ def stated_by(
 def bound_of(place: Place, disturbed: Disturbed, options: OneKeyOptions) -> FloatArray:
     """Return the Cramer-Rao bound of the full model for one sensor, shape (16, 16).
 
-    The inverse information at the true t, C, H, time offset and noise, of all readings inside the
-    map that are not spoilt, which the solve has to find out by itself. Errors of map and poses are
-    unknowns with the distributions that map and poses state (the Bayesian bound), weighed and
-    linearised by the code of the solve. NaN if no bound exists.
+    Of the readings that are not spoilt, which the solve has to find out by itself; see
+    ``bound_at``.
     """
-    drive, noise = disturbed.drive, place.noise
+    drive = disturbed.drive
     readings = drive.readings.select(disturbed.change == 0)
     if readings.motion is not None:
         readings = with_offsets(readings, drive.trajectory, drive.offset)
-    told = options.model_copy(update={"sensor_noise_ut": noise, "uncertainty": Uncertainty.FULL})
-    truth = true_estimate(drive.truth(), noise)
-    view = observe(readings, place.field_map, truth, told.min_readings)
-    if not view.sensors:
-        return np.full((PARAMETERS, PARAMETERS), np.nan)
-    ridge = fit_distortions(view, truth, told).ridge
-    at = stated_at(view, place.field_map, replace(truth, ridge=ridge), told)
-    return at.solved[0].joint_covariance
+    truth = true_estimate(drive.truth(), place.noise)
+    return bound_at(readings, place.field_map, truth, options)
 
 
 def true_estimate(truth: FloatArray, noise: float) -> Estimate:

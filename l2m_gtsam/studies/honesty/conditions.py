@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.maps.build import MapOptions
@@ -48,3 +48,10 @@ class HonestyOptions(Options):
     """How the map is made of the survey, and of the structure that the LiDAR saw."""
     solve: OneKeyOptions = OneKeyOptions(pose_noise=POSE_NOISE)
     """How a calibration is solved; its `uncertainty` is set to each kind in turn."""
+
+    @field_validator("map")
+    @classmethod
+    def _knows_its_errors(cls, chosen: MapOptions) -> MapOptions:
+        if chosen.kind != "harmonic":
+            raise ValueError(f"kind {chosen.kind} does not know its errors; accepted: harmonic")
+        return chosen
