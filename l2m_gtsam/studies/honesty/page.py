@@ -65,8 +65,8 @@ def intro(options: HonestyOptions) -> str:
         "sensor of random place and distortion, "
         f"{options.readings} readings each. *Troubled* drives are off in everything: clocks by up "
         "to 40 ms, poses by errors that last, a tenth of the readings by tens of microtesla. "
-        "All conditions have the same halls, paths and sensors: what differs between them is due "
-        "to noise and trouble, and chance is partly the same."
+        "All conditions have the same halls, paths and sensors and, scaled to each level, the "
+        "same draws of noise: their rows are no independent trials of each other."
     )
 
 
