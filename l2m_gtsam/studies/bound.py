@@ -6,10 +6,10 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.coverage import UncertainMap, cover
-from l2m_gtsam.graph.joint import joint_problem
-from l2m_gtsam.graph.uncertain import UncertainProblem, starting_values
+from l2m_gtsam.graph.coverage import UncertainMap
+from l2m_gtsam.graph.forecast import stated_at
 from l2m_gtsam.graph.view import QueryableMap, observe
+from l2m_gtsam.results import Uncertainty
 
 
 def cramer_rao(
@@ -19,7 +19,7 @@ def cramer_rao(
     noise: float,
     options: OneKeyOptions,
 ) -> FloatArray:
-    """Return the least covariance of (t, C, H, time offset) of one sensor, shape (16, 16).
+    """Return the least covariance of (t, C, H) of one sensor, shape (15, 15).
 
     It is the inverse of the information at the truth, with the map's errors unknown, too, and
     their prior from the survey (the Bayesian bound of Van Trees).
@@ -50,12 +50,40 @@ def cramer_rao(
         none,
         none,
     )
-    view = observe(readings, field_map, truth, options.min_readings)
-    problem = joint_problem(view, field_map, truth, options)
+    return bound_at(readings, field_map, truth, options)[:-1, :-1]
+
+
+def bound_at(
+    readings: Readings, field_map: QueryableMap, truth: Estimate, options: OneKeyOptions
+) -> FloatArray:
+    """Return the least covariance of (t, C, H, time offset) of one sensor, shape (16, 16).
+
+    Parameters
+    ----------
+    readings
+        Of the sensor, with the poses that they have at its true time offset, as far as these are
+        known: errors of poses are unknowns, too.
+    field_map
+        The magnetic map, which has to know how its errors are correlated.
+    truth
+        The sensor, without a ridge.
+    options
+        Which of the readings enter, and how long errors of poses last.
+
+    Returns
+    -------
+    Infinite for what the data do not determine; NaN if too few readings lie inside the map.
+
+    Raises
+    ------
+    MapError
+        The map does not know how its errors are correlated.
+    """
     if not isinstance(field_map, UncertainMap):
         raise MapError("a bound needs a map that knows how its errors are correlated: harmonic")
-    coverage = cover(view, field_map, truth, options.pose_noise.correlation_s)
-    values = starting_values(truth, view.sensors, coverage)
-    tests = problem.determinacies
-    (solution,) = UncertainProblem(view, field_map, coverage, truth, tests).solutions(values)
-    return solution.covariance
+    view = observe(readings, field_map, truth, options.min_readings)
+    if not view.sensors:
+        return np.full((16, 16), np.nan)
+    shared = options.model_copy(update={"uncertainty": Uncertainty.FULL})
+    (solution,) = stated_at(view, field_map, truth, shared).solved
+    return solution.joint_covariance
