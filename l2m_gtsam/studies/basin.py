@@ -220,9 +220,10 @@ def search(site: Site, drive: SiteDrive, t_start: FloatArray, options: StartOpti
     each = find_starts_around(drive.readings, site.field_map, t_start, options)
     found = [starts[0] for starts in each]
     nowhere = FoundStart(np.full(3, np.nan), np.inf, None)
+    margin = np.array([(start or nowhere).margin for start in found])
     return Found(
         np.array([(start or nowhere).t_lidar_mag for start in found]),
-        np.array([(start or nowhere).margin for start in found]),
+        np.where(np.isfinite(margin), margin, np.nan),
         np.array([start is not None and start.ambiguous(options.clear) for start in found]),
     )
 
