@@ -29,13 +29,16 @@ from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_map
 from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
 from l2m_gtsam.studies.table1_methods import (
     HARMONIC,
+    MAGYC,
     NAIVE,
+    NO_MAP,
     OTHERS,
     OURS,
     SLIDING,
     THINNED,
     Found,
     from_each,
+    magyc,
     naive,
     one_key,
 )
@@ -63,6 +66,9 @@ class Table1Options(Options):
     """On the first so many drives of each path and noise the other methods run, too."""
     other_starts: int = Field(default=1, ge=1)
     """From so many of their starts."""
+    magyc: int = Field(default=0, ge=0)
+    """On the first so many drives of each path and noise magyc runs, too, in an environment of its
+    own (`make magyc`)."""
     bounds: int = Field(default=10, ge=1)
     """On the first so many drives of each path and noise the Cramer-Rao bound is computed."""
     site: SiteOptions = SiteOptions(
@@ -195,6 +201,9 @@ def compute(options: Table1Options, place: Place, level: int, row: int, number: 
             drive.readings, place.naive_map(path, drive, options.naive), few, options.naive
         )
         ends.append(ends_of(NAIVE, THINNED, drive, peer))
+    if number < options.magyc:
+        peer = magyc(drive.readings, drive.sensor.distortion.C)
+        ends.append(ends_of(MAGYC, NO_MAP, drive, peer))
     bound = np.empty(0)
     if number < options.bounds:
         bound = drive_bound(drive, field_map, noise, options.solve)

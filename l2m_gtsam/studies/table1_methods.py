@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from time import process_time
 
 import numpy as np
+from scipy.linalg import polar
 
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
@@ -13,10 +14,11 @@ from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from l2m_gtsam.studies.methods import published, two_step
+from l2m_gtsam.studies.peers.magyc import ChipDrive, magyc_peer, magyc_python
 from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_peer
 
-OURS, NAIVE = "one-key", "naive peer"
-HARMONIC, SLIDING, THINNED = "harmonic", "sliding_gp", "thinned GP"
+OURS, NAIVE, MAGYC = "one-key", "naive peer", "magyc"
+HARMONIC, SLIDING, THINNED, NO_MAP = "harmonic", "sliding_gp", "thinned GP", "none"
 
 Solver = Callable[[Readings, QueryableMap, FloatArray], FloatArray]
 """From the readings of one sensor, a map and a start (3,) to t, C row by row and H, (15,)."""
@@ -81,6 +83,22 @@ def naive(
     ends = [naive_peer(readings, field_map, t, options) for t in t_start]
     vector = np.array([np.concatenate([end.t, end.C.ravel(), end.H]) for end in ends])
     return Found(vector, len(ends), (process_time() - begin) / len(ends))
+
+
+def magyc(readings: Readings, C: FloatArray) -> Found:
+    """Return what magyc says of H on one drive; it looks for no place, and C only up to a turn.
+
+    It takes the turn rates along the chip's axes, which the truth C, shape (3, 3), tells it.
+
+    Raises
+    ------
+    PeerError
+        It has no environment, or fails.
+    """
+    R_mag_lidar = np.asarray(polar(C)[0])
+    (estimate,) = magyc_peer([ChipDrive(readings, R_mag_lidar)], magyc_python())
+    vector = np.concatenate([estimate.t, estimate.C.ravel(), estimate.H])
+    return Found(vector[None], 1, estimate.seconds)
 
 
 def one_key(

@@ -190,7 +190,9 @@ def notes() -> str:
         "the step for t. Its intercept and its Jacobian are mended: as printed, H comes out as "
         "zero and nothing converges. The naive peer fits t, C and H at once by scipy on "
         "scikit-learn's Gaussian processes of a thinned survey. All of them but one-key are told "
-        "the start, and look no further."
+        "the start, and look no further. magyc, where it ran, knows neither map nor place: of C it "
+        "tells the shape up to a turn, so that only its H stands here; it is told the turn rates "
+        "along the sensor's true axes."
     )
 
 
@@ -227,7 +229,8 @@ def efficiency_lines(summary: Table1Summary) -> Iterator[str]:
 def figures(summary: Table1Summary) -> dict[str, Figure]:
     """Return the errors of t by method, a panel for each noise level."""
     noises = summary.options.noises
-    kinds = list(dict.fromkeys((each.method, each.map_kind) for each in summary.entries))
+    placed = [each for each in summary.entries if each.t is not None]
+    kinds = list(dict.fromkeys((each.method, each.map_kind) for each in placed))
     size = (2.5 + 3.2 * len(noises), 0.5 * len(kinds) + 1.8)
     figure = Figure(figsize=size, layout="constrained", dpi=130)
     panels = figure.subplots(1, len(noises), sharex=True, sharey=True, squeeze=False)[0]

@@ -173,27 +173,27 @@ def entries_of(cells: Sequence[Table1Cell]) -> list[Entry]:
 def entry_of(cell: Table1Cell, ends: Sequence[Ends]) -> Entry:
     """Return the figures of one method on one map."""
     t, C, H = (np.concatenate(each) for each in zip(*((e.t, e.C, e.H) for e in ends), strict=True))
-    known = np.isfinite(t)
     return Entry(
         method=ends[0].method,
         map_kind=ends[0].map_kind,
         path=cell.path,
         noise=cell.noise,
         calibrations=len(t),
-        lost=int(np.count_nonzero(~known)),
-        far=int(np.count_nonzero(t[known] > FAR)),
-        t=spread(t[known]),
-        t2=spread(t[known] ** 2),
-        C=spread(C[known]),
-        H=spread(H[known]),
-        H2=spread(H[known] ** 2),
+        lost=int(np.count_nonzero(~np.isfinite(H))),  # which every method has an answer for
+        far=int(np.count_nonzero(t > FAR)),
+        t=spread(t),
+        t2=spread(t**2),
+        C=spread(C),
+        H=spread(H),
+        H2=spread(H**2),
         seconds=float(np.mean([each.seconds for each in ends])),
     )
 
 
 def spread(values: FloatArray) -> Spread | None:
-    """Return the figures of values; None if there are none."""
-    return Spread.of(values) if len(values) else None
+    """Return the figures of the finite values; None if there are none."""
+    finite = values[np.isfinite(values)]
+    return Spread.of(finite) if len(finite) else None
 
 
 def bound_of(cells: Sequence[Table1Cell]) -> Bound:
