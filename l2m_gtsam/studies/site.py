@@ -9,7 +9,9 @@ from pydantic import Field
 from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.graph.view import Compilable, QueryableMap
-from l2m_gtsam.mapping import map_recordings
+from l2m_gtsam.mapping import suite_readings
+from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
+from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.drive import drive
 from l2m_gtsam.simulate.floor_plan import FloorPlan
@@ -46,6 +48,32 @@ class SiteOptions(Options):
 
 
 @dataclass(frozen=True)
+class Surveyed:
+    """A world and what a survey of it measured.
+
+    Attributes
+    ----------
+    world, plan
+        Steel, racks and aisles.
+    survey
+        Places and readings in the map frame.
+    cloud
+        What a LiDAR saw: points of the map frame in metres, shape (M, 3).
+    """
+
+    world: SteelWorld
+    plan: FloorPlan
+    survey: TrainingSet
+    cloud: FloatArray
+
+    def map(self, options: MapOptions) -> QueryableMap:
+        """Return a map of the survey, in its form for solvers."""
+        cloud = self.cloud if KINDS[options.kind].uses_structure else None
+        learnt = build_map(self.survey.points, self.survey.field, options, cloud)
+        return learnt.compile() if isinstance(learnt, Compilable) else learnt
+
+
+@dataclass(frozen=True)
 class Site:
     """A world and the map that a survey of it gave."""
 
@@ -62,17 +90,24 @@ class SiteDrive:
     readings: Readings
 
 
-@lru_cache(maxsize=1)
-def mapped_site(options: SiteOptions) -> Site:
-    """Return the site; made once in each process."""
+def surveyed(options: SiteOptions) -> Surveyed:
+    """Return the site and its survey."""
     scenario = simulate(options.scenario)
     suite = {sensor.sensor: sensor for sensor in scenario.suite}
-    learnt = map_recordings([scenario.mapping.recording], suite, options.mapping, scenario.cloud)
-    field_map = learnt.compile() if isinstance(learnt, Compilable) else learnt
-    return Site(scenario.world, scenario.plan, field_map)
+    survey = suite_readings([scenario.mapping.recording], suite, options.mapping.sync)
+    return Surveyed(scenario.world, scenario.plan, survey, scenario.cloud)
 
 
-def random_drive(site: Site, options: SiteOptions, rng: np.random.Generator) -> SiteDrive:
+@lru_cache(maxsize=1)
+def mapped_site(options: SiteOptions) -> Site:
+    """Return the site with its map; made once in each process."""
+    site = surveyed(options)
+    return Site(site.world, site.plan, site.map(options.mapping.model))
+
+
+def random_drive(
+    site: Site | Surveyed, options: SiteOptions, rng: np.random.Generator
+) -> SiteDrive:
     """Return a drive through the site with a sensor of random place and distortion."""
     scenario = options.scenario
     place = random_place(options, rng)
