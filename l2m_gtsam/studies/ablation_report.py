@@ -1,6 +1,6 @@
 """The ablation study as a page of Markdown."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from l2m_gtsam.studies.ablation import Solver
 from l2m_gtsam.studies.ablation_table import (
@@ -13,6 +13,7 @@ from l2m_gtsam.studies.ablation_table import (
 )
 from l2m_gtsam.studies.ablation_verdict import verdicts
 from l2m_gtsam.studies.ablation_words import density_label, kind_label, spacing_label
+from l2m_gtsam.studies.markdown import table_lines
 
 ERROR_NOTE = (
     "Lengths of the errors of t (cm), of C (Frobenius) and of H (uT). The paper squares that of t."
@@ -77,7 +78,7 @@ def intro(table: AblationTable) -> str:
 def map_lines(table: AblationTable) -> str:
     """Return the maps as a table."""
     head = "| fingerprints | map | readings | rms error (uT) | predicted (uT) | inside (%) |"
-    return lined(head, (map_cells(row) for row in table.maps))
+    return table_lines(head, (map_cells(row) for row in table.maps))
 
 
 def map_cells(row: MapRow) -> list[str]:
@@ -101,7 +102,7 @@ def error_lines(rows: Sequence[Combination]) -> str:
     """Return the errors at one density as a table."""
     each = "mean | median | p95"
     head = f"| map | method | t (cm): {each} | C: {each} | H (uT): {each} | no result |"
-    return lined(head, map(error_cells, rows))
+    return table_lines(head, map(error_cells, rows))
 
 
 def error_cells(row: Combination) -> list[str]:
@@ -121,7 +122,7 @@ def three(spread: Spread | None, scale: float, digits: int) -> list[str]:
 def gain_lines(comparisons: Sequence[Comparison], what: str) -> str:
     """Return comparisons as a table; ``what`` heads the method's column."""
     head = f"| fingerprints | map | {what} | to | t (cm) | better | H (uT) | better |"
-    return lined(head, map(gain_cells, comparisons))
+    return table_lines(head, map(gain_cells, comparisons))
 
 
 def gain_cells(each: Comparison) -> list[str]:
@@ -137,9 +138,3 @@ def said(gain: Gain | None, scale: float, digits: int) -> list[str]:
     mean = f"{scale * gain.mean:+.{digits}f}"
     marked = f"**{mean}**" if gain.sure else mean
     return [f"{marked} ± {scale * gain.margin:.{digits}f}", f"{100 * gain.better:.0f} %"]
-
-
-def lined(head: str, rows: Iterable[Sequence[str]]) -> str:
-    """Return a table of Markdown."""
-    rule = "|---" * (head.count("|") - 1) + "|"
-    return "\n".join([head, rule, *(f"| {' | '.join(cells)} |" for cells in rows)])
