@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import LogLocator, ScalarFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from l2m_gtsam.studies.ablation import Solver
 from l2m_gtsam.studies.ablation_table import AblationTable, Combination, Spread
@@ -56,9 +56,9 @@ def draw_boxes(
         draw_box(axes, at, box(spread, scale), COLOURS[each.solver])
     axes.set_yscale("log")
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(LogLocator(subs=tuple(np.arange(1.0, 10.0))))
-    axes.yaxis.set_minor_formatter("")
+    axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_xticks(range(len(kinds)), [kind_label(kind) for kind in kinds])
     axes.set_xlim(-0.55, len(kinds) - 0.45)
     axes.grid(axis="y", alpha=0.3)

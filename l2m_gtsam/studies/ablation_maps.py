@@ -11,14 +11,17 @@ from l2m_gtsam.studies.ablation_words import density_label, kind_label
 from l2m_gtsam.studies.map_picture import MapPicture
 
 COLOURS = "cividis"  # reads the same for all kinds of colour vision
-CUT = (0.01, 0.99)  # quantiles of the true strength that the colours span
+WIDTH = 2.8  # inches of a map
+CUT = (0.02, 0.98)  # quantiles of the true strength that the colours span
 
 
 def map_figure(table: AblationTable) -> Figure:
     """Draw the strength of the field: rows of the figure are densities, columns kinds of maps."""
     spacings, kinds = table.options.spacings, table.options.kinds
-    shown = (len(kinds) + 1) * 3.3 + 0.8, len(spacings) * 2.7 + 0.4
-    figure = Figure(figsize=shown, layout="constrained", dpi=150)
+    left, right, bottom, top = table.maps[0].picture.extent
+    high = WIDTH * (top - bottom) / (right - left)
+    size = (len(kinds) + 1) * WIDTH + 1.8, len(spacings) * (high + 0.15) + 0.7
+    figure = Figure(figsize=size, layout="constrained", dpi=150)
     grid = figure.subplots(len(spacings), len(kinds) + 1, sharex=True, sharey=True, squeeze=False)
     span = strengths(table.maps)
     for row, spacing in zip(grid, spacings, strict=True):
@@ -32,7 +35,9 @@ def map_figure(table: AblationTable) -> Figure:
         axes.set_title(name)
     for axes in grid[-1]:
         axes.set_xlabel("x (m)")
-    figure.colorbar(drawn, ax=grid, label="field strength (uT)", shrink=0.7, extend="both")
+    figure.colorbar(
+        drawn, ax=grid, label="field strength (uT)", shrink=0.8, pad=0.01, extend="both"
+    )
     return figure
 
 

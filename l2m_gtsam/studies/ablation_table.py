@@ -10,6 +10,7 @@ from l2m_gtsam.studies.ablation import AblationCell, AblationOptions, Batch, Sol
 from l2m_gtsam.studies.map_picture import MapPicture
 
 SURE = 1.96  # standard errors on each side of a mean that hold 95 %
+ROUNDING = 1e-6  # metres or microtesla; what differs by less is the same
 FEWEST = 2  # pairs of which a standard error can be told
 
 
@@ -72,8 +73,8 @@ class Gain:
 
     @property
     def sure(self) -> bool:
-        """Whether the interval leaves out zero."""
-        return abs(self.mean) > self.margin
+        """Whether the interval leaves out zero, by more than rounding."""
+        return abs(self.mean) > max(self.margin, ROUNDING)
 
 
 @dataclass(frozen=True)
@@ -211,4 +212,4 @@ def gain(before: FloatArray, after: FloatArray) -> Gain | None:
     if len(less) < FEWEST:
         return None
     margin = SURE * less.std(ddof=1) / np.sqrt(len(less))
-    return Gain(float(less.mean()), float(margin), float(np.mean(less > 0)))
+    return Gain(float(less.mean()), float(margin), float(np.mean(less > ROUNDING)))

@@ -27,7 +27,7 @@ def map_verdicts(table: AblationTable) -> list[str]:
 def map_verdict(base: str, kind: str, comparisons: Sequence[Comparison]) -> str:
     """Return what a kind of map gains over the first one at each density, densest first."""
     gains = [(each.spacing, each.H) for each in comparisons if each.H is not None]
-    lowered = "; ".join(f"{spacing_label(s)}: {amount(g)}" for s, g in gains)
+    lowered = ", ".join(f"{amount(g)} ({spacing_label(s)})" for s, g in gains)
     text = (
         f"*{kind_label(kind)} against {kind_label(base)}*, with the paper's method: the mean error "
         f"of H shrinks by {lowered}."
@@ -35,12 +35,13 @@ def map_verdict(base: str, kind: str, comparisons: Sequence[Comparison]) -> str:
     if kind != "sliding_gp" or not gains:
         return text
     dense, sparse = gains[0][1], gains[-1][1]
-    more = "more" if sparse.mean - dense.mean > max(dense.margin, sparse.margin) else "not more"
+    grown = sparse.mean - dense.mean > max(dense.margin, sparse.margin)
+    more = "clearly larger" if grown else "not clearly larger"
     held = "is" if dense.mean > CLAIMED_UT else "is not"
     return (
         f"{text} The paper says over {CLAIMED_UT:g} uT where fingerprints are dense and much more "
         f"where they are sparse. Here the gain {held} over {CLAIMED_UT:g} uT at the densest, and "
-        f"clearly {more} at the sparsest than there."
+        f"{more} at the sparsest."
     )
 
 
@@ -57,7 +58,8 @@ def weight_verdict(table: AblationTable) -> str:
     ]
     return (
         "*Weights.* The paper says that they improve the result at all densities. "
-        f"{' '.join(sentences)}"
+        f"{' '.join(sentences)} Where a map has one variance for all places, as the bilinear one, "
+        "weights change nothing."
     )
 
 

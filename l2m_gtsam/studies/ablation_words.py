@@ -12,7 +12,7 @@ def kind_label(kind: str) -> str:
 
 def spacing_label(spacing: float) -> str:
     """Return a density in words."""
-    return "the whole survey" if spacing == 0.0 else f"one each {spacing:g} m"
+    return "the whole survey" if spacing == 0.0 else f"one every {spacing:g} m"
 
 
 def density_label(table: AblationTable, spacing: float) -> str:

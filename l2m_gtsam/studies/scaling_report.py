@@ -52,10 +52,13 @@ def about(table: ScalingTable, part: Part) -> str:
         "The peer is one least squares over t, C and H of all sensors together with numeric "
         "derivatives, on the same map and from the truth, which spares it the search."
     )
-    ours = "Ours includes the search for starts."
+    ours = (
+        "Ours includes the search for starts; the map has been used before, for it makes ready "
+        "what it is asked for the first time."
+    )
     return {
         Part.READINGS: f"One sensor on one drive. {ours} {peer}",
-        Part.SENSORS: f"{options.each:,} readings of each sensor, calibrated together. {ours} "
+        Part.SENSORS: f"{options.each:,} readings of each sensor, calibrated together. "
         "The peer's work grows with the square of the sensors for its derivatives, and with the "
         "cube for its algebra.",
         Part.SURVEY: "Maps of the survey's readings next to the middle of the hall: the floor "

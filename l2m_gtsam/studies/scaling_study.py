@@ -15,6 +15,7 @@ from l2m_gtsam.studies.scaling_tasks import (
     mapped_drive,
     measured_map,
     measured_solves,
+    warmed,
 )
 from l2m_gtsam.studies.scaling_workers import measured_workers
 from l2m_gtsam.studies.site import Surveyed, surveyed
@@ -47,10 +48,11 @@ def prepare(options: ScalingOptions, name: str) -> Place:
     """Return what the cells of a quantity share."""
     match Part(name):
         case Part.READINGS:
-            return mapped_drive(options, hall(options), 1, options.rate)
+            return warmed(options, mapped_drive(options, hall(options), 1, options.rate))
         case Part.SENSORS:
             rate = options.site.scenario.calibration_sampling.field_rate
-            return mapped_drive(options, hall(options), max(options.sensors), rate)
+            work = mapped_drive(options, hall(options), max(options.sensors), rate)
+            return warmed(options, work)
         case Part.SURVEY:
             return hall(options)
         case Part.WORKERS:

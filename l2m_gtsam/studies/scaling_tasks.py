@@ -25,6 +25,7 @@ from l2m_gtsam.studies.stopwatch import taken
 from l2m_gtsam.sync import synchronise
 
 KINDS = {Way.HARMONIC: "harmonic", Way.SLIDING: "sliding_gp", Way.DENSE: "dense_gp"}
+WARM = 200  # readings that pass everywhere on the drive
 SENSORS, ROUTE = 1, 2  # streams of randomness
 
 
@@ -83,6 +84,17 @@ def mapped_drive(options: ScalingOptions, site: Surveyed, sensors: int, rate: fl
     part = around(site, readings.p_map_lidar, options.around)
     t_true = np.array([sensor.t_lidar_mag for sensor in known])
     return MappedDrive(part.map(options.site.mapping.model), readings, t_true)
+
+
+def warmed(options: ScalingOptions, work: MappedDrive) -> MappedDrive:
+    """Return a drive on whose map something was calibrated before.
+
+    A map makes ready what it is asked for the first time, which may take longer than the rest;
+    compiled functions are loaded.
+    """
+    for uncertainty in Uncertainty:
+        solved(options, work.thinned(WARM), uncertainty)
+    return work
 
 
 def measured_solves(
