@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from l2m_gtsam.commands import exports
 from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
 from l2m_gtsam.errors import L2MError
@@ -26,6 +27,7 @@ map_app = typer.Typer(
 )
 app.add_typer(map_app, name="map")
 app.command()(study)
+exports.register(app)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")

@@ -328,6 +328,22 @@ class Distortion:
 
 
 @dataclass(frozen=True)
+class CorrectedField:
+    """Readings of one sensor with its distortion undone.
+
+    Attributes
+    ----------
+    field
+        In the axes of the lidar in microtesla, shape (N, 3); NaN where it is not known.
+    covariance
+        Of each, in square microtesla, shape (N, 3, 3); NaN where the field is.
+    """
+
+    field: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
 class KnownSensor:
     """A magnetometer whose place and distortion are known, as on a mapping suite or in a truth.
 

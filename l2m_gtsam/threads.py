@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from os import cpu_count, environ
 from typing import TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 MOST_THREADS = 8
 THREADS = "L2M_THREADS"
@@ -22,5 +23,14 @@ def in_threads(work: Callable[[In], Out], items: Iterable[In]) -> list[Out]:
     with them a warehouse took three times as long.
     """
     threads = min(int(environ.get(THREADS) or cpu_count() or 1), MOST_THREADS)
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(work, items))
+    with _libraries().limit(limits=1, user_api="blas"):
+        if threads == 1:
+            return [work(item) for item in items]
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(work, items))
+
+
+@lru_cache(maxsize=1)
+def _libraries() -> ThreadpoolController:
+    """Return the BLAS libraries of this process: looking for them takes longer than a task."""
+    return ThreadpoolController()

@@ -1,36 +1,13 @@
-"""What goes wrong on a drive: spikes, bursts, steel that was moved since the survey."""
-
-from dataclasses import dataclass, replace
+"""What goes wrong on a drive beside spikes: bursts, steel that was moved since the survey."""
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray
-from tests.steel_drives import CalibrationDrive
+from l2m_gtsam.data import BoolArray
+from l2m_gtsam.simulate.hall_drives import CalibrationDrive
+from l2m_gtsam.studies.honesty.trouble import SHARE, Disturbed, disturbed
 
-SHARE = 0.1  # of the readings
 MOMENT = 4.0  # A m^2, of a steel part: felt beyond thrice the noise along 5 m of the drive
 ASIDE_M = 0.9
-
-
-@dataclass(frozen=True)
-class Disturbed:
-    """A drive with something wrong, and by how much each reading is off in uT, shape (N,)."""
-
-    drive: CalibrationDrive
-    change: FloatArray
-
-
-def disturbed(drive: CalibrationDrive, change: FloatArray) -> Disturbed:
-    """Return the drive with changes in uT, shape (N, 3), added to its readings."""
-    readings = replace(drive.readings, field=drive.readings.field + change)
-    return Disturbed(replace(drive, readings=readings), np.linalg.norm(change, axis=1))
-
-
-def spikes(drive: CalibrationDrive, seed: int) -> Disturbed:
-    """A tenth of the readings is off by tens of microtesla, here and there."""
-    rng = np.random.default_rng([seed, 1])
-    wrong = rng.random(len(drive.readings)) < SHARE
-    return disturbed(drive, wrong[:, None] * 50 * rng.standard_normal((len(wrong), 3)))
 
 
 def bursts(drive: CalibrationDrive, seed: int) -> Disturbed:

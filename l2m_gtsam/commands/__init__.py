@@ -1,1 +1,1 @@
-"""Groups of commands: parsing and printing only."""
+"""Commands of the command line, a module for each group."""

@@ -69,13 +69,32 @@ def forecast(
     view = ideal.view
     if not view.sensors:
         return Forecast(view, (), options.uncertainty)
-    problem = joint_problem(view, field_map, ideal.estimate, options)
+    return stated_at(view, field_map, ideal.estimate, options)
+
+
+def stated_at(
+    view: View, field_map: QueryableMap, estimate: Estimate, options: OneKeyOptions
+) -> Forecast:
+    """Return what the graph of a solve says at an estimate, which is not optimised.
+
+    Parameters
+    ----------
+    view
+        The readings that count, of one sensor or more.
+    field_map
+        The magnetic map.
+    estimate
+        Where the graph is weighed and linearised.
+    options
+        How the solve would go.
+    """
+    problem = joint_problem(view, field_map, estimate, options)
     if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
         tests = problem.determinacies
         lasts = options.pose_noise.correlation_s
-        solved = _uncertain(view, field_map, field_map, ideal.estimate, tests, lasts)
+        solved = _uncertain(view, field_map, field_map, estimate, tests, lasts)
         return Forecast(view, solved, Uncertainty.FULL)
-    return Forecast(view, sensor_solutions(problem, ideal.estimate), Uncertainty.INDEPENDENT)
+    return Forecast(view, sensor_solutions(problem, estimate), Uncertainty.INDEPENDENT)
 
 
 def rank_tests(
@@ -128,11 +147,11 @@ def _uncertain(
     view: View,
     field_map: QueryableMap,
     errors: UncertainMap,
-    ideal: Estimate,
+    estimate: Estimate,
     tests: dict[int, Determinacy],
     correlation_s: float,
 ) -> tuple[SensorSolution, ...]:
     """Return the solutions with the map's error, of which nothing is known yet, in the graph."""
-    coverage = cover(view, errors, ideal, correlation_s)
-    values = starting_values(ideal, view.sensors, coverage)
-    return UncertainProblem(view, field_map, coverage, ideal, tests).solutions(values)
+    coverage = cover(view, errors, estimate, correlation_s)
+    values = starting_values(estimate, view.sensors, coverage)
+    return UncertainProblem(view, field_map, coverage, estimate, tests).solutions(values)

@@ -8,7 +8,7 @@ to the dense process as the margin grows.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -143,6 +143,10 @@ class SlidingGP:
         """
         options = options_from_state(state, SlidingGPOptions)
         return cls.condition(trained_from_state(state), options)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Factors of all blocks are hundreds of times as large as what they follow from.
+        return SlidingGP.condition, (self.trained, self.options)
 
     @property
     def kind(self) -> str:

@@ -138,11 +138,11 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "uncertainty": str(result.uncertainty),
         "doubts": list(result.doubts),
         "disagreements": [_disagreement_entry(each) for each in result.disagreements],
-        "bag": _source(result.bag),
-        "map": _source(result.map),
+        "bag": source_entry(result.bag),
+        "map": source_entry(result.map),
         "versions": result.versions,
         "iterations": result.iterations,
-        "sensors": {sensor.sensor: _sensor_entry(sensor) for sensor in result.sensors},
+        "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": result.options,
     }
     write_yaml(path, content, HEADER)
@@ -170,7 +170,8 @@ def read_calibration(path: Path) -> CalibrationResult:
     )
 
 
-def _sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
+def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
+    """Return all that is known of a sensor as plain values."""
     return {
         "status": sensor.status.value,
         "message": sensor.message,
@@ -245,7 +246,8 @@ def _residuals_entry(figures: ResidualFigures | None) -> dict[str, Any] | None:
     return {**vars(figures), "rms_axes": figures.rms_axes.tolist()}
 
 
-def _source(source: SourceFile | None) -> dict[str, str] | None:
+def source_entry(source: SourceFile | None) -> dict[str, str] | None:
+    """Return where data came from as plain values."""
     return None if source is None else {"path": source.path, "sha256": source.sha256}
 
 

@@ -38,6 +38,50 @@ class Message:
     content: Any
 
 
+@dataclass(frozen=True)
+class RawMessage:
+    """A message as it was recorded, its connection and when (nanoseconds)."""
+
+    connection: Connection
+    record_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Codec:
+    """How the messages of one type are decoded and encoded.
+
+    Attributes
+    ----------
+    path
+        The bag, for messages to its user.
+    msgtype
+        The type.
+    store
+        Its definition, and those of what it consists of.
+    is_ros1
+        Whether ROS1 encodes them.
+    """
+
+    path: Path
+    msgtype: str
+    store: Typestore
+    is_ros1: bool
+
+    def decode(self, data: bytes) -> Any:
+        """Return a message; a BagError if it is damaged."""
+        decode = self.store.deserialize_ros1 if self.is_ros1 else self.store.deserialize_cdr
+        try:
+            return decode(data, self.msgtype)
+        except Exception as error:
+            raise BagError(_damaged(self.path, error)) from error
+
+    def encode(self, message: Any) -> bytes:
+        """Return a message as it is recorded."""
+        encode = self.store.serialize_ros1 if self.is_ros1 else self.store.serialize_cdr
+        return bytes(encode(message, self.msgtype))
+
+
 class Bag:
     """An open bag: what it holds, and its messages one by one."""
 
@@ -54,6 +98,11 @@ class Bag:
     def duration_s(self) -> float:
         """Time between the first and the last record in seconds."""
         return self._reader.duration * 1e-9
+
+    @property
+    def reader(self) -> Ros1Reader | Ros2Reader:
+        """What reads it, for those who copy it."""
+        return self._reader
 
     def messages(
         self, connections: Sequence[Connection], progress: Progress | None = None
@@ -72,9 +121,16 @@ class Bag:
         BagError
             The bag is damaged, or holds fewer messages than its index promises.
         """
+        codecs = {c.id: self.codec(c) for c in connections}
+        for raw in self.raw_messages(connections, progress):
+            yield Message(raw.connection, raw.record_ns, codecs[raw.connection.id].decode(raw.data))
+
+    def raw_messages(
+        self, connections: Sequence[Connection], progress: Progress | None = None
+    ) -> Iterator[RawMessage]:
+        """Yield the messages of these connections as ``messages`` does, but not decoded."""
         if not connections:
             return
-        decoders = {c.id: self._decoder(c) for c in connections}
         stream, received = self._reader.messages(list(connections)), 0
         promised = sum(c.msgcount for c in connections)
         while True:
@@ -82,7 +138,6 @@ class Bag:
                 progress(received, promised)
             try:
                 connection, record_ns, raw = next(stream)
-                content = decoders[connection.id](raw)
             except StopIteration:
                 break
             except Exception as error:
@@ -90,7 +145,7 @@ class Bag:
             if record_ns > LATEST_NS:
                 raise BagError(f"{self.path}: damaged: a message is recorded at {record_ns} ns")
             received += 1
-            yield Message(connection, record_ns, content)
+            yield RawMessage(connection, record_ns, raw)
         if progress is not None:
             progress(received, promised)
         if received < promised:
@@ -99,20 +154,26 @@ class Bag:
                 f"that are read, {received} are there; record it again or reindex it"
             )
 
-    def _decoder(self, connection: Connection) -> Callable[[bytes], Any]:
+    def codec(self, connection: Connection) -> Codec:
+        """Return how messages of a connection are decoded and encoded.
+
+        Raises
+        ------
+        BagError
+            The definition of its type cannot be understood.
+        """
         # tf/tfMessage, which ROS1 used before tf2, has the layout of its successor.
         msgtype = TF_TYPE if connection.msgtype in TF_TYPES else connection.msgtype
         is_ros1 = isinstance(self._reader, Ros1Reader)
         try:
-            store = _typestore(is_ros1, msgtype, connection.msgdef)
+            store = typestore(is_ros1, msgtype, connection.msgdef)
         except Exception as error:
             reason = " ".join(str(error).split())[:120]
             raise BagError(
                 f"{self.path}: the definition of {msgtype} on {connection.topic} cannot be "
                 f"understood ({reason})"
             ) from error
-        decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-        return lambda raw: decode(raw, msgtype)
+        return Codec(self.path, msgtype, store, is_ros1)
 
 
 @contextmanager
@@ -155,7 +216,7 @@ def _default_typestore(is_ros1: bool) -> Typestore:
     return store
 
 
-def _typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typestore:
+def typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typestore:
     """Return the bag's own definition of a type, or ROS's where it has none as text."""
     if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
         store = _default_typestore(is_ros1)

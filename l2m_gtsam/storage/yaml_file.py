@@ -44,6 +44,12 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
 
 def write_yaml(path: Path, content: dict[str, Any], header: str) -> None:
     """Write plain content with a comment on top; short lists of numbers stay on one line."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(yaml_text(content, header), encoding="utf-8")
+
+
+def yaml_text(content: dict[str, Any], header: str) -> str:
+    """Return plain content as YAML, with a comment on top."""
     yaml: Any = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False
@@ -51,5 +57,4 @@ def write_yaml(path: Path, content: dict[str, Any], header: str) -> None:
     stream = StringIO()
     stream.write("".join(f"# {line}\n" for line in header.splitlines()))
     yaml.dump(content, stream)
-    with atomic_path(path) as temporary:
-        temporary.write_text(stream.getvalue(), encoding="utf-8")
+    return stream.getvalue()

@@ -2,9 +2,7 @@
 
 from dataclasses import dataclass
 
-from scipy.stats import binomtest
-
-LEVEL = 0.95
+from l2m_gtsam.studies.statistics import wilson_interval
 
 
 @dataclass(frozen=True)
@@ -22,5 +20,5 @@ class Share:
     @property
     def interval(self) -> tuple[float, float]:
         """Wilson's 95 % interval of the probability."""
-        found = binomtest(self.successes, self.trials).proportion_ci(LEVEL, method="wilson")
-        return float(found.low), float(found.high)
+        band = wilson_interval(self.rate, self.trials)
+        return band.low, band.high

@@ -12,10 +12,11 @@ from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
+from l2m_gtsam.simulate.steel_hall import CloudVariant, hall_cloud, steel_hall
 from l2m_gtsam.solve.robust import Loss, RobustOptions
-from tests.disturbances import Disturbed, bursts, moved_steel, spikes
-from tests.steel import CloudVariant, steel_hall, structure_cloud
-from tests.steel_drives import CalibrationDrive, calibration_drive, survey
+from l2m_gtsam.studies.honesty.trouble import Disturbed, spikes
+from tests.disturbances import bursts, moved_steel
 
 NOISE = 0.2
 # Noises: a reading that is off by more must be found, one that is off by less must not. Between,
@@ -36,7 +37,7 @@ class Place:
 def place(seed: int) -> Place:
     hall = steel_hall(seed)
     data = survey(hall, seed, noise=NOISE)
-    cloud = structure_cloud(hall, CloudVariant.ACCURATE, seed)
+    cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
     field_map = HarmonicMap.fit(data.points, data.field, cloud=cloud)
     drive = calibration_drive(hall, seed, data.span, NOISE, sensors=3, count=600)
     return Place(field_map.compile(), drive)

@@ -1,30 +1,21 @@
-"""How far calibrations are off, and whether their covariances say so: NEES over many surveys."""
+"""How far calibrations with any kind of map are off, and whether their covariances say so."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Self
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
-from tests.statistical.figures import (
-    Band,
-    chi_square_band,
-    clustered_mean,
-    ellipsoid_coverage,
-    nees,
-    wilson_interval,
-)
+from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
+from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, hall_cloud, steel_hall
+from l2m_gtsam.studies.honesty.outcomes import Honesty, Outcomes, honesty
+from l2m_gtsam.studies.honesty.place import drive_seed, start_near
 from tests.statistical.study_maps import Build, Scene, StudiedMap
-from tests.steel import MILD, CloudVariant, SteelHall, steel_hall, structure_cloud
-from tests.steel_drives import CalibrationDrive, calibration_drive, survey
 
 START_M = 0.05  # each axis of a start is at most this far from the truth
-BLOCKS = {"t": slice(0, 3), "C, H": slice(3, 15), "all": slice(0, 15)}
-OFFSET = slice(15, 16)
 
 
 @dataclass(frozen=True)
@@ -70,15 +61,6 @@ def solved_by(solution: OneKeySolution) -> Sequence[Solved]:
     ]
 
 
-Trouble = Callable[[CalibrationDrive, int], CalibrationDrive]
-"""What goes wrong on a drive, from a seed."""
-
-
-def untroubled(drive: CalibrationDrive, _: int) -> CalibrationDrive:
-    """Return the drive as it is."""
-    return drive
-
-
 @dataclass(frozen=True)
 class CalibrationCase:
     """A kind of map, the cloud it is given, and the ways to calibrate with it, by name."""
@@ -114,8 +96,6 @@ class CalibrationConditions:
         Of each survey.
     seed
         Of the first world.
-    trouble
-        What goes wrong on every drive.
     """
 
     surveys: int = 20
@@ -128,82 +108,6 @@ class CalibrationConditions:
     strength: float = MILD
     survey_readings: int = 1500
     seed: int = 100
-    trouble: Trouble = untroubled
-
-
-@dataclass(frozen=True)
-class Outcomes:
-    """What came of calibrations.
-
-    Attributes
-    ----------
-    error
-        Estimate minus truth of (t, C, H, time offset), shape (N, 16).
-    covariance
-        As the calibrations say, shape (N, 16, 16).
-    survey
-        Number of the survey of each, shape (N,).
-    """
-
-    error: FloatArray
-    covariance: FloatArray
-    survey: IntArray
-
-    @classmethod
-    def joined(cls, parts: "Sequence[Outcomes]") -> Self:
-        """Return the outcomes of all parts."""
-        return cls(
-            np.concatenate([part.error for part in parts]),
-            np.concatenate([part.covariance for part in parts]),
-            np.concatenate([part.survey for part in parts]),
-        )
-
-    def determined(self) -> "Outcomes":
-        """Return those of which t, C and H have a finite variance."""
-        keep = np.isfinite(self.covariance[:, :15, :15]).all(axis=(1, 2))
-        return Outcomes(self.error[keep], self.covariance[keep], self.survey[keep])
-
-
-@dataclass(frozen=True)
-class Honesty:
-    """Whether the covariance of some parameters is true.
-
-    Attributes
-    ----------
-    dof
-        Number of the parameters: what the NEES is expected to be.
-    nees
-        Mean over all calibrations.
-    standard_error
-        Of that mean, surveys being independent.
-    band
-        Of chi-square, for as many independent calibrations as leave the mean equally unsure.
-    narrow
-        Of chi-square, had no two calibrations anything in common.
-    coverage, coverage_band
-        Of the 95 % ellipsoid, with Wilson's interval for the effective number.
-    """
-
-    dof: int
-    nees: float
-    standard_error: float
-    band: Band
-    narrow: Band
-    coverage: float
-    coverage_band: Band
-
-    @property
-    def honest(self) -> bool:
-        """Whether the mean NEES is in its band."""
-        return self.nees in self.band
-
-    def __str__(self) -> str:
-        mark = "in" if self.honest else "OUT of"
-        return (
-            f"NEES {self.nees:8.2f} +- {self.standard_error:<6.2f} {mark} {self.band!s:<10}"
-            f" (independent: {self.narrow!s}),"
-            f" 95 % ellipsoid holds {100 * self.coverage:5.1f} % ({self.coverage_band!s})"
-        )
 
 
 @dataclass(frozen=True)
@@ -267,29 +171,6 @@ def calibration_study(
     return tuple(rows)
 
 
-def honesty(outcomes: Outcomes, block: slice) -> Honesty:
-    """Return whether the covariances of a block of the parameters are true.
-
-    Raises
-    ------
-    ValueError
-        If the outcomes are of fewer than two surveys.
-    """
-    dof = block.stop - block.start
-    values = nees(outcomes.error[:, block], outcomes.covariance[:, block, block])
-    mean = clustered_mean(values, outcomes.survey)
-    covered = clustered_mean(ellipsoid_coverage(values, dof), outcomes.survey)
-    return Honesty(
-        dof,
-        mean.mean,
-        mean.standard_error,
-        chi_square_band(dof, mean.effective),
-        chi_square_band(dof, len(values)),
-        covered.mean,
-        wilson_interval(covered.mean, covered.effective),
-    )
-
-
 def _outcomes(
     case: CalibrationCase,
     conditions: CalibrationConditions,
@@ -301,10 +182,10 @@ def _outcomes(
     for seed in range(conditions.seed, conditions.seed + conditions.surveys):
         hall = steel_hall(seed, conditions.strength)
         surveyed = survey(hall, seed, heights, noise, conditions.survey_readings)
-        field_map = case.build(Scene(surveyed, structure_cloud(hall, case.cloud, seed), hall))
+        field_map = case.build(Scene(surveyed, hall_cloud(hall, case.cloud, seed), hall))
         span = conditions.sensor_span or surveyed.span
         for number, drive in enumerate(_drives(hall, conditions, seed, span, noise)):
-            start = _start(drive, seed, number)
+            start = start_near(drive, seed, number, START_M)
             for method, calibrate in case.methods.items():
                 solved = calibrate(drive, field_map, start)
                 parts[method].append(_compared(solved, drive, seed))
@@ -320,16 +201,8 @@ def _drives(
 ) -> Iterator[CalibrationDrive]:
     """Yield the drives on one survey."""
     for number in range(conditions.drives):
-        own = 1000 * seed + number  # no two drives of a study are alike
-        drive = calibration_drive(hall, own, span, noise, conditions.sensors, conditions.readings)
-        yield conditions.trouble(drive, own)
-
-
-def _start(drive: CalibrationDrive, seed: int, number: int) -> FloatArray:
-    """Return starts near the truth: the basin of attraction is not what is studied here."""
-    rng = np.random.default_rng([seed, number, 6])
-    away = rng.uniform(-START_M, START_M, (len(drive.sensors), 3))
-    return np.asarray(drive.truth()[:, :3] + away)
+        own = drive_seed(seed, number)
+        yield calibration_drive(hall, own, span, noise, conditions.sensors, conditions.readings)
 
 
 def _compared(solved: Sequence[Solved], drive: CalibrationDrive, seed: int) -> Outcomes:
@@ -353,10 +226,9 @@ def _row(
 ) -> CalibrationRow:
     """Return the figures of a method under one condition."""
     determined = outcomes.determined()
-    enough = len(np.unique(determined.survey)) > 1
+    enough = determined.enough
     variances = np.diagonal(determined.covariance, axis1=1, axis2=2)
-    timed = {"offset": OFFSET} if np.isfinite(variances).all() else {}
-    blocks = BLOCKS | timed
+    blocks = determined.blocks
     return CalibrationRow(
         case,
         method,

@@ -10,9 +10,16 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.field_map import MapSummary
-from tests.statistical.figures import interval_coverage, z_scores
-from tests.steel import MILD, STRONG, CloudVariant, SteelHall, steel_hall, structure_cloud
-from tests.steel_drives import Survey, held_out, survey
+from l2m_gtsam.simulate.hall_drives import Survey, held_out, survey
+from l2m_gtsam.simulate.steel_hall import (
+    MILD,
+    STRONG,
+    CloudVariant,
+    SteelHall,
+    hall_cloud,
+    steel_hall,
+)
+from l2m_gtsam.studies.statistics import interval_coverage, z_scores
 
 # Of a map's summary.
 NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "field"
@@ -210,7 +217,7 @@ def predict(
     """Return the errors of the map of one survey."""
     hall = steel_hall(world, strength)
     surveyed = survey(hall, world, heights, conditions.noise, conditions.readings)
-    field_map = build(Scene(surveyed, structure_cloud(hall, cloud, world), hall))
+    field_map = build(Scene(surveyed, hall_cloud(hall, cloud, world), hall))
     low, high = surveyed.span
     truth = held_out(hall, world, (low - conditions.off_plane, high + conditions.off_plane))
     sample = field_map.query(truth.points)

@@ -8,6 +8,8 @@ import pytest
 
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.field_map import MapSummary
+from l2m_gtsam.simulate.hall_drives import CalibrationDrive
+from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, steel_hall
 from l2m_gtsam.simulate.world import SteelWorld
 from tests.statistical import study_calibration
 from tests.statistical.study_calibration import (
@@ -25,8 +27,6 @@ from tests.statistical.study_maps import (
     StudiedMap,
     map_study,
 )
-from tests.steel import MILD, CloudVariant, SteelHall, steel_hall
-from tests.steel_drives import CalibrationDrive
 from tests.worlds import DipoleWorld, dipole_world
 
 Exact = Callable[[FloatArray], tuple[FloatArray, FloatArray]]

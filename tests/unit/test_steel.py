@@ -6,23 +6,22 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from tests.steel import (
-    EARTH,
-    HALF_AREA,
-    SHIFT_M,
-    STRONG,
-    VOXEL_M,
-    CloudVariant,
-    SteelHall,
-    steel_hall,
-    structure_cloud,
-)
-from tests.steel_drives import (
+from l2m_gtsam.simulate.hall_drives import (
     CLEARANCE_M,
     Survey,
     calibration_drive,
     held_out,
     survey,
+)
+from l2m_gtsam.simulate.hall_parts import HALF_AREA, VOXEL_M
+from l2m_gtsam.simulate.steel_hall import (
+    EARTH,
+    SHIFT_M,
+    STRONG,
+    CloudVariant,
+    SteelHall,
+    hall_cloud,
+    steel_hall,
 )
 
 SEEDS = [0, 1, 2]
@@ -62,7 +61,7 @@ def test_a_seed_gives_everything_again() -> None:
     def draw(seed: int) -> list[FloatArray]:
         hall = steel_hall(seed)
         s, d = survey(hall, seed), calibration_drive(hall, seed, (0.4, 1.0))
-        cloud = structure_cloud(hall, CloudVariant.SHIFTED_FALSE, seed)
+        cloud = hall_cloud(hall, CloudVariant.SHIFTED_FALSE, seed)
         return [s.points, s.field, held_out(hall, seed, s.span).field, cloud, d.readings.field]
 
     first, again, other = draw(3), draw(3), draw(4)
@@ -198,7 +197,7 @@ def test_a_drive_is_planar_and_turns_all_ways(hall: SteelHall, seed: int) -> Non
 
 def test_clouds_lie_on_bodies_and_cover_them(hall: SteelHall, seed: int) -> None:
     """Voxel means lie on or within a body, or between two parts in one voxel."""
-    accurate = structure_cloud(hall, CloudVariant.ACCURATE, seed)
+    accurate = hall_cloud(hall, CloudVariant.ACCURATE, seed)
     assert out_of_bodies(hall, accurate).max() < VOXEL_M / 2
     for structure in hall.steel:
         box = structure.boxes
@@ -213,11 +212,11 @@ def test_clouds_lie_on_bodies_and_cover_them(hall: SteelHall, seed: int) -> None
 
 def test_a_shifted_cloud_is_off_by_three_centimetres(hall: SteelHall, seed: int) -> None:
     """Shifting back every structure, by its own amount, lands on the bodies again."""
-    shifted = structure_cloud(hall, CloudVariant.SHIFTED, seed)
+    shifted = hall_cloud(hall, CloudVariant.SHIFTED, seed)
     away = out_of_bodies(hall, shifted)
     # Surfaces that face the shift stand out by up to all of it, and no voxel by much more.
     assert 0.7 * SHIFT_M < away.max() < SHIFT_M + VOXEL_M / 2
-    accurate = structure_cloud(hall, CloudVariant.ACCURATE, seed)
+    accurate = hall_cloud(hall, CloudVariant.ACCURATE, seed)
     for place in np.stack([s.centre for s in hall.steel]):
         a, b = (
             cloud[np.all(np.abs(cloud[:, :2] - place) < 0.7, axis=1)]
@@ -229,9 +228,9 @@ def test_a_shifted_cloud_is_off_by_three_centimetres(hall: SteelHall, seed: int)
 
 
 def test_false_structures_double_the_cloud(hall: SteelHall, seed: int) -> None:
-    accurate = structure_cloud(hall, CloudVariant.ACCURATE, seed)
-    doubled = structure_cloud(hall, CloudVariant.FALSE, seed)
-    assert structure_cloud(hall, CloudVariant.NONE, seed).shape == (0, 3)
+    accurate = hall_cloud(hall, CloudVariant.ACCURATE, seed)
+    doubled = hall_cloud(hall, CloudVariant.FALSE, seed)
+    assert hall_cloud(hall, CloudVariant.NONE, seed).shape == (0, 3)
     np.testing.assert_array_equal(doubled[: len(accurate)], accurate)
     false = doubled[len(accurate) :]
     assert 0.6 < len(false) / len(accurate) < 1.6

@@ -1,24 +1,46 @@
 """Drives on which clock, poses and readings are wrong together."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Readings, Trajectory
 from l2m_gtsam.pose_noise import PoseNoiseOptions, pose_roots
+from l2m_gtsam.simulate.hall_drives import STEP_NS, CalibrationDrive
 from l2m_gtsam.sync import with_offsets
-from tests.disturbances import spikes
-from tests.steel_drives import STEP_NS, CalibrationDrive
 
+SHARE = 0.1  # of the readings
 LATE_S = 0.04  # clocks are off by up to this
 FASTEST_M_S, FASTEST_RAD_S = 1.0, 1.0
 POSE_NOISE = PoseNoiseOptions(position_m=0.005, rotation_deg=0.1, correlation_s=1.0)
 
 
-def troubled(drive: CalibrationDrive, seed: int) -> CalibrationDrive:
+@dataclass(frozen=True)
+class Disturbed:
+    """A drive with something wrong, and by how much each reading is off in uT, shape (N,)."""
+
+    drive: CalibrationDrive
+    change: FloatArray
+
+
+def disturbed(drive: CalibrationDrive, change: FloatArray) -> Disturbed:
+    """Return the drive with changes in uT, shape (N, 3), added to its readings."""
+    readings = replace(drive.readings, field=drive.readings.field + change)
+    return Disturbed(replace(drive, readings=readings), np.linalg.norm(change, axis=1))
+
+
+def spikes(drive: CalibrationDrive, seed: int) -> Disturbed:
+    """Return a drive of which a tenth of the readings is off by tens of microtesla."""
+    rng = np.random.default_rng([seed, 1])
+    wrong = rng.random(len(drive.readings)) < SHARE
+    return disturbed(drive, wrong[:, None] * 50 * rng.standard_normal((len(wrong), 3)))
+
+
+def troubled(drive: CalibrationDrive, seed: int) -> Disturbed:
     """Return a drive with clocks, poses and a tenth of its readings wrong."""
-    return misplaced(mistimed(spikes(driven(drive), seed).drive, seed), seed)
+    spiked = spikes(driven(drive), seed)
+    return replace(spiked, drive=misplaced(mistimed(spiked.drive, seed), seed))
 
 
 def driven(drive: CalibrationDrive) -> CalibrationDrive:

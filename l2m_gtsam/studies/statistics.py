@@ -65,9 +65,14 @@ def z_scores(sample: FieldSample, truth: FloatArray) -> FloatArray:
     return np.asarray(z[sample.inside])
 
 
+def inside_interval(z: FloatArray, level: float = LEVEL) -> FloatArray:
+    """Return which z-scores of any shape lie within the central interval of a level, 0 or 1."""
+    return np.asarray(np.abs(z) <= norm.ppf(0.5 + level / 2), dtype=np.float64)
+
+
 def interval_coverage(z: FloatArray, level: float = LEVEL) -> float:
     """Return the share of z-scores of any shape within the central interval of a level."""
-    return float(np.mean(np.abs(z) <= norm.ppf(0.5 + level / 2)))
+    return float(np.mean(inside_interval(z, level)))
 
 
 def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:

@@ -6,7 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, Readings, Trajectory
-from tests.steel import HALF_AREA, SteelHall
+from l2m_gtsam.simulate.hall_parts import HALF_AREA
+from l2m_gtsam.simulate.steel_hall import SteelHall
 
 CLEARANCE_M = 0.4  # of every reading to posts and racks, horizontally
 BODY_M = 0.55  # of the vehicle's middle

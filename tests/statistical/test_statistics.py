@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from l2m_gtsam.data import FieldSample, FloatArray
-from tests.statistical.figures import (
+from l2m_gtsam.studies.statistics import (
     chi_square_band,
     clustered_mean,
     ellipsoid_coverage,

@@ -1,0 +1,225 @@
+"""Corrected readings as topics beside those of the magnetometers."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Connection
+
+from l2m_gtsam.data import CorrectedField, FloatArray, IntArray
+from l2m_gtsam.errors import BagError, UnitsError
+from l2m_gtsam.storage.bag_copy import BagCopy
+from l2m_gtsam.storage.bag_options import BagOptions, Stamps
+from l2m_gtsam.storage.messages import FIELD_TYPE, FieldBuffer, header_ns
+from l2m_gtsam.storage.open_bag import Bag, Codec, Progress, RawMessage
+from l2m_gtsam.storage.selection import select_fields, sensor_names, several_frames
+from l2m_gtsam.storage.units import MICROTESLA_PER, fault, is_turning, strength
+
+Correct = Callable[[FloatArray, IntArray], CorrectedField]
+"""What corrects readings in microtesla, shape (N, 3), of times in nanoseconds, shape (N,)."""
+Key = tuple[str, str]
+"""Topic and frame of a sensor."""
+
+ENDING = "calibrated"
+TESLA_PER_MICROTESLA = 1e-6
+# Enough to judge a unit by; more are not kept.
+MOST_JUDGED = 20_000
+# Of messages that are worked on at once: many readings, but few images.
+BLOCK_MESSAGES = 2000
+BLOCK_BYTES = 32_000_000
+
+
+@dataclass(frozen=True)
+class SensorTopic:
+    """A magnetometer of a bag.
+
+    Attributes
+    ----------
+    sensor
+        Its name.
+    topic
+        Of the corrected readings.
+    sample
+        Its first readings in microtesla, shape (N, 3).
+    """
+
+    sensor: str
+    topic: str
+    sample: FloatArray
+
+
+def sensor_topics(
+    bag: Bag, options: BagOptions, progress: Progress | None
+) -> dict[Key, SensorTopic]:
+    """Return the magnetometers of a bag by topic and frame.
+
+    Raises
+    ------
+    BagError
+        No such topic, or one of several sensors that are not to be told apart.
+    """
+    buffers: dict[Key, FieldBuffer] = {}
+    for message in bag.messages(select_fields(bag, options), progress):
+        key = (message.connection.topic, message.content.header.frame_id)
+        buffer = buffers.setdefault(key, FieldBuffer(*key))
+        if len(buffer.stamp_ns) < MOST_JUDGED:
+            buffer.add(message.record_ns, message.content.magnetic_field)
+    frames: dict[str, list[str]] = defaultdict(list)
+    for topic, frame in buffers:
+        frames[topic].append(frame)
+    for topic, several in frames.items():
+        if len(several) > 1 and not options.split_by_frame:
+            raise BagError(f"{bag.path}: {several_frames(topic, several)}")
+    names, unit = sensor_names(buffers, options), MICROTESLA_PER[options.units]
+    return {
+        key: SensorTopic(names[key], _topic(key, frames), buffer.field() * unit)
+        for key, buffer in buffers.items()
+    }
+
+
+def check_units(bag: Bag, key: Key, found: SensorTopic, options: BagOptions) -> None:
+    """Raise a UnitsError if a sensor's readings are not in the unit that they are said to be in."""
+    if wrong := fault(strength(found.sample), is_turning(found.sample), options.units):
+        raise UnitsError(f"{bag.path}: topic {key[0]}: {wrong}")
+
+
+@dataclass(frozen=True)
+class CalibratedTopic:
+    """Corrected readings of one sensor.
+
+    Attributes
+    ----------
+    topic
+        Their name.
+    correct
+        What makes them.
+    """
+
+    topic: str
+    correct: Correct
+
+
+@dataclass
+class Calibrator:
+    """Copies a bag and puts corrected readings beside those of its magnetometers.
+
+    Attributes
+    ----------
+    bag
+        The source.
+    topics
+        What is added, by topic and frame of the sensors.
+    options
+        How readings are read.
+    frame
+        Of the corrected readings: the lidar's.
+    left_out
+        Topics that are not copied.
+    """
+
+    bag: Bag
+    topics: Mapping[Key, CalibratedTopic]
+    options: BagOptions
+    frame: str
+    left_out: frozenset[str]
+    _codecs: dict[int, Codec] = field(default_factory=dict)
+
+    def copy(self, into: BagCopy, progress: Progress | None) -> None:
+        """Write all messages of the source and, right after each reading, its correction.
+
+        Raises
+        ------
+        BagError
+            The source is damaged.
+        """
+        corrected = {topic for topic, _ in self.topics}
+        sources = [
+            c for c in self.bag.connections if c.msgtype == FIELD_TYPE and c.topic in corrected
+        ]
+        self._codecs = {c.id: self.bag.codec(c) for c in sources}
+        kept = {c.id: into.add(c) for c in self.bag.connections if c.topic not in self.left_out}
+        added = self._connections(into, sources)
+        for block in _blocks(self.bag.raw_messages(self.bag.connections, progress)):
+            extra = self._corrections(block)
+            for row, message in enumerate(block):
+                if message.connection.id in kept:
+                    into.write(kept[message.connection.id], message.record_ns, message.data)
+                if row in extra:
+                    topic, data = extra[row]
+                    into.write(added[message.connection.id, topic], message.record_ns, data)
+
+    def _connections(
+        self, into: BagCopy, sources: Sequence[Connection]
+    ) -> dict[tuple[int, str], Connection]:
+        """Return the new connections by that of the readings and their topic."""
+        return {
+            (c.id, new.topic): into.add(c, new.topic)
+            for c in sources
+            for (topic, _), new in self.topics.items()
+            if topic == c.topic
+        }
+
+    def _corrections(self, block: Sequence[RawMessage]) -> dict[int, tuple[str, bytes]]:
+        """Return the corrected readings of a block: topics and messages by row."""
+        rows: dict[Key, list[int]] = defaultdict(list)
+        contents: dict[int, Any] = {}
+        for row, message in enumerate(block):
+            if (codec := self._codecs.get(message.connection.id)) is not None:
+                contents[row] = codec.decode(message.data)
+                key = (message.connection.topic, contents[row].header.frame_id)
+                rows[key].append(row)
+        found: dict[int, tuple[str, bytes]] = {}
+        unit = MICROTESLA_PER[self.options.units]
+        for key, new in self.topics.items():
+            stamps = [self._stamp(block[row], contents[row]) for row in rows[key]]
+            field_ut = unit * _readings([contents[row] for row in rows[key]])
+            result = new.correct(field_ut, np.array(stamps, dtype=np.int64))
+            for row, b, spread in zip(rows[key], result.field, result.covariance, strict=True):
+                message = self._message(contents[row], b, spread)
+                codec = self._codecs[block[row].connection.id]
+                found[row] = (new.topic, codec.encode(message))
+        return found
+
+    def _stamp(self, message: RawMessage, content: Any) -> int:
+        header = self.options.stamps is Stamps.HEADER
+        return header_ns(content) if header else message.record_ns
+
+    def _message(self, content: Any, b: FloatArray, covariance: FloatArray) -> Any:
+        """Return a reading of the lidar's axes in tesla; a covariance of zero is an unknown one."""
+        x, y, z = (b * TESLA_PER_MICROTESLA).tolist()
+        spread = np.nan_to_num(covariance.ravel(), nan=0.0) * TESLA_PER_MICROTESLA**2
+        return replace(
+            content,
+            header=replace(content.header, frame_id=self.frame),
+            magnetic_field=replace(content.magnetic_field, x=x, y=y, z=z),
+            magnetic_field_covariance=spread,
+        )
+
+
+def _topic(key: Key, frames: Mapping[str, Sequence[str]]) -> str:
+    """Return the name of the corrected readings; of several sensors, each has its frame in it."""
+    topic, frame = key
+    told = [frame.strip("/")] if len(frames[topic]) > 1 else []
+    return "/".join([topic, *filter(None, told), ENDING])
+
+
+def _readings(contents: Sequence[Any]) -> FloatArray:
+    """Return readings as they were written, shape (N, 3)."""
+    vectors = [content.magnetic_field for content in contents]
+    return np.array([(v.x, v.y, v.z) for v in vectors], dtype=np.float64).reshape(-1, 3)
+
+
+def _blocks(messages: Iterator[RawMessage]) -> Iterator[list[RawMessage]]:
+    """Yield messages in blocks that are worth a batch and fit into memory."""
+    block: list[RawMessage] = []
+    size = 0
+    for message in messages:
+        block.append(message)
+        size += len(message.data)
+        if len(block) >= BLOCK_MESSAGES or size >= BLOCK_BYTES:
+            yield block
+            block, size = [], 0
+    if block:
+        yield block

@@ -1,0 +1,1 @@
+"""Honesty: whether calibrations err as much as they say, and as little as the data allow."""

@@ -1,0 +1,248 @@
+"""The paper's Table I: errors of t, C and H over paths, noise levels, distortions and starts.
+
+One survey of a warehouse gives the maps; its noise stays while that of the sensors to calibrate
+changes, as the paper adds noise to these alone. Each cell is one drive: a path, a noise level and
+a sensor of random place and distortion. Our full method runs from all starts. As it looks for the
+sensor around each start first, starts from which it finds the same place share one solve. The
+other methods run from fewer starts on the first few drives of each path.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.graph.global_start import StartOptions
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.maps.build import MapOptions
+from l2m_gtsam.options import Options
+from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.simulate.route import RouteShape
+from l2m_gtsam.simulate.scenario import ScenarioOptions
+from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
+from l2m_gtsam.studies.bound import cramer_rao
+from l2m_gtsam.studies.json_array import JsonFloats
+from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_map
+from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
+from l2m_gtsam.studies.table1_methods import (
+    HARMONIC,
+    NAIVE,
+    OTHERS,
+    OURS,
+    SLIDING,
+    THINNED,
+    Found,
+    from_each,
+    naive,
+    one_key,
+)
+
+DRIVE, STARTS = 1, 2  # streams of randomness
+BLOCKS = (slice(0, 3), slice(3, 12), slice(12, 15))  # t, C, H
+
+
+class Table1Options(Options):
+    """Size and conditions of the study."""
+
+    seed: int = Field(default=1, ge=0)
+    """Of drives, sensors and starts; the site has its own."""
+    noises: tuple[float, ...] = (0.1, 0.2, 0.5)
+    """Of the sensors to calibrate, in microtesla."""
+    paths: tuple[RouteShape, ...] = tuple(RouteShape)
+    """What drives look like; the rows of the paper's table in its order."""
+    distortions: int = Field(default=50, ge=1)
+    """Sensors of random place and distortion on each path at each noise, each on its own drive."""
+    starts: int = Field(default=50, ge=1)
+    """Of each sensor."""
+    reach: float = Field(default=1.0, gt=0)
+    """Starts are up to so many metres from the truth."""
+    others: int = Field(default=3, ge=0)
+    """On the first so many drives of each path and noise the other methods run, too."""
+    other_starts: int = Field(default=1, ge=1)
+    """From so many of their starts."""
+    bounds: int = Field(default=10, ge=1)
+    """On the first so many drives of each path and noise the Cramer-Rao bound is computed."""
+    site: SiteOptions = SiteOptions(
+        scenario=ScenarioOptions(
+            array=ArrayOptions(count=1),
+            noise=NoiseOptions(field=0.05),
+            calibration_sampling=SamplingOptions(field_rate=20.0),
+        )
+    )
+    """World, survey and drives."""
+    search: StartOptions = StartOptions()
+    """How one-key looks for its start."""
+    solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
+    """How one-key solves: the table is of estimates, not of sigmas."""
+    naive: NaiveOptions = NaiveOptions()
+    """How much of the data the naive peer can bear."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A surveyed warehouse.
+
+    Attributes
+    ----------
+    site
+        World and survey.
+    maps
+        Of the survey, by kind.
+    naive
+        What the naive peer makes of the survey on the paths that it was asked for.
+    """
+
+    site: Surveyed
+    maps: dict[str, QueryableMap]
+    naive: dict[RouteShape, NaiveMap] = field(default_factory=dict)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # The naive peer's maps are fifty times as large as all others together.
+        return Place, (self.site, self.maps)
+
+    def naive_map(self, path: RouteShape, drive: SiteDrive, options: NaiveOptions) -> NaiveMap:
+        """Return the naive peer's map around a path, made from its first drive."""
+        if path not in self.naive:
+            survey, line = self.site.survey, drive.readings.p_map_lidar
+            self.naive[path] = naive_map(survey.points, survey.field, line, options)
+        return self.naive[path]
+
+
+@dataclass(frozen=True)
+class Ends:
+    """Where one method ended on one drive from N starts.
+
+    Attributes
+    ----------
+    method, map_kind
+        What was done.
+    t, C, H
+        Norms of the errors, in metres, Frobenius, and microtesla; NaN without a result,
+        shape (N,).
+    seconds
+        Of one core for each calibration.
+    """
+
+    method: str
+    map_kind: str
+    t: JsonFloats
+    C: JsonFloats
+    H: JsonFloats
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Table1Cell:
+    """One drive.
+
+    Attributes
+    ----------
+    noise
+        In microtesla.
+    path
+        Its shape.
+    readings
+        Number of readings.
+    places
+        Distinct places from which one-key solved.
+    bound
+        Root of the bound's trace over t (m), C, and H (uT), shape (3,); empty where it was not
+        computed.
+    ends
+        All methods.
+    """
+
+    noise: float
+    path: RouteShape
+    readings: int
+    places: int
+    bound: JsonFloats
+    ends: tuple[Ends, ...]
+
+
+def prepare(options: Table1Options) -> Place:
+    """Survey the warehouse and make its maps."""
+    site = surveyed(options.site)
+    return Place(site, {kind: site.map(MapOptions(kind=kind)) for kind in (HARMONIC, SLIDING)})
+
+
+def compute(options: Table1Options, place: Place, level: int, row: int, number: int) -> Table1Cell:
+    """Calibrate the sensor of one drive by all methods.
+
+    Parameters
+    ----------
+    options
+        The study.
+    place
+        Where.
+    level, row, number
+        Which noise, which path, which of their drives.
+    """
+    noise, path = options.noises[level], options.paths[row]
+    rng = np.random.default_rng([options.seed, level, row, number, DRIVE])
+    drive = random_drive(place.site, drive_options(options, noise, path), rng)
+    t_start = random_starts(options, drive.sensor.t_lidar_mag, [level, row, number])
+    field_map = place.maps[HARMONIC]
+    found = one_key(drive.readings, field_map, t_start, options.search, options.solve)
+    ends = [ends_of(OURS, HARMONIC, drive, found)]
+    if number < options.others:
+        few = t_start[: options.other_starts]
+        ends += other_ends(drive, place, few, options)
+        peer = naive(
+            drive.readings, place.naive_map(path, drive, options.naive), few, options.naive
+        )
+        ends.append(ends_of(NAIVE, THINNED, drive, peer))
+    bound = np.empty(0)
+    if number < options.bounds:
+        bound = drive_bound(drive, field_map, noise, options.solve)
+    return Table1Cell(noise, path, len(drive.readings), found.solves, bound, tuple(ends))
+
+
+def other_ends(
+    drive: SiteDrive, place: Place, t_start: FloatArray, options: Table1Options
+) -> list[Ends]:
+    """Return where the paper's methods end on both maps, and ours on the paper's."""
+    ends = [
+        ends_of(name, kind, drive, from_each(solve, drive.readings, field_map, t_start))
+        for kind, field_map in place.maps.items()
+        for name, solve in OTHERS.items()
+    ]
+    found = one_key(drive.readings, place.maps[SLIDING], t_start, options.search, options.solve)
+    return [*ends, ends_of(OURS, SLIDING, drive, found)]
+
+
+def ends_of(method: str, map_kind: str, drive: SiteDrive, found: Found) -> Ends:
+    """Return how far ends are from the truth."""
+    sensor = drive.sensor
+    truth = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])
+    t, C, H = (np.linalg.norm((found.vector - truth)[:, block], axis=1) for block in BLOCKS)
+    return Ends(method, map_kind, t, C, H, found.seconds)
+
+
+def drive_bound(
+    drive: SiteDrive, field_map: QueryableMap, noise: float, options: OneKeyOptions
+) -> FloatArray:
+    """Return the root of the bound's trace over t, C and H, shape (3,)."""
+    variance = np.diagonal(cramer_rao(drive.readings, field_map, drive.sensor, noise, options))
+    return np.array([np.sqrt(variance[block].sum()) for block in BLOCKS])
+
+
+def drive_options(options: Table1Options, noise: float, path: RouteShape) -> SiteOptions:
+    """Return the options of the drives of one path at one noise level."""
+    scenario = options.site.scenario
+    update = {
+        "noise": scenario.noise.model_copy(update={"field": noise}),
+        "calibration_route": scenario.calibration_route.model_copy(update={"shape": path}),
+    }
+    return options.site.model_copy(update={"scenario": scenario.model_copy(update=update)})
+
+
+def random_starts(options: Table1Options, t_true: FloatArray, which: list[int]) -> FloatArray:
+    """Return starts about the truth, shape (N, 3): any direction, any offset up to the reach."""
+    rng = np.random.default_rng([options.seed, *which, STARTS])
+    direction = rng.standard_normal((options.starts, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return np.asarray(t_true + options.reach * rng.uniform(size=(options.starts, 1)) * direction)

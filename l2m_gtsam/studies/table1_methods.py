@@ -1,0 +1,110 @@
+"""The methods of Table I on one drive, from one start or from many."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import process_time
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.graph.global_start import StartOptions, find_starts_around
+from l2m_gtsam.graph.one_key import solve_one_key
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
+from l2m_gtsam.studies.methods import published, two_step
+from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_peer
+
+OURS, NAIVE = "one-key", "naive peer"
+HARMONIC, SLIDING, THINNED = "harmonic", "sliding_gp", "thinned GP"
+
+Solver = Callable[[Readings, QueryableMap, FloatArray], FloatArray]
+"""From the readings of one sensor, a map and a start (3,) to t, C row by row and H, (15,)."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a method ended from N starts.
+
+    Attributes
+    ----------
+    vector
+        t, C row by row and H; NaN without a result, shape (N, 15).
+    solves
+        That were computed.
+    seconds
+        Of one core for a calibration from one start.
+    """
+
+    vector: FloatArray
+    solves: int
+    seconds: float
+
+
+def in_two_steps(method: Method) -> Solver:
+    """Return the alternation of a closed form with the translation graph."""
+
+    def solve(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
+        inner = ClosedFormOptions(method=method)
+        return two_step(readings, field_map, t_start, inner).vector(0)
+
+    return solve
+
+
+def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
+    """Return where the paper's algorithm ends."""
+    return published(readings, field_map, t_start).vector(0)
+
+
+OTHERS: dict[str, Solver] = {
+    "OLS": in_two_steps(Method.OLS),
+    "RRTLS": in_two_steps(Method.RRTLS),
+    "w-RRTLS as published": as_published,
+    "w-RRTLS corrected": in_two_steps(Method.W_RRTLS),
+}
+
+
+def from_each(
+    solve: Solver, readings: Readings, field_map: QueryableMap, t_start: FloatArray
+) -> Found:
+    """Return where a method ends from each start, shape (N, 3)."""
+    begin = process_time()
+    ends = np.array([solve(readings, field_map, t) for t in t_start])
+    return Found(ends, len(t_start), (process_time() - begin) / len(t_start))
+
+
+def naive(
+    readings: Readings, field_map: NaiveMap, t_start: FloatArray, options: NaiveOptions
+) -> Found:
+    """Return where the naive peer ends from each start, shape (N, 3)."""
+    begin = process_time()
+    ends = [naive_peer(readings, field_map, t, options) for t in t_start]
+    vector = np.array([np.concatenate([end.t, end.C.ravel(), end.H]) for end in ends])
+    return Found(vector, len(ends), (process_time() - begin) / len(ends))
+
+
+def one_key(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    search: StartOptions,
+    options: OneKeyOptions,
+) -> Found:
+    """Return where the full method ends from each start, shape (N, 3).
+
+    Starts from which the search finds the same place share the solve from there.
+    """
+    begin = process_time()
+    found = [each[0] for each in find_starts_around(readings, field_map, t_start, search)]
+    none = np.full(3, np.nan)
+    t_found = np.array([none if each is None else each.t_lidar_mag for each in found])
+    looked = (process_time() - begin) / len(t_start)
+    places, which = np.unique(t_found, axis=0, return_inverse=True)
+    vector = np.full((len(places), 15), np.nan)
+    begin, somewhere = process_time(), np.flatnonzero(np.isfinite(places).all(axis=1))
+    for row in somewhere:
+        solution = solve_one_key(readings, field_map, places[row][None], options)
+        if solution.solved:
+            vector[row] = solution.estimate.vector(0)
+    solved = (process_time() - begin) / max(len(somewhere), 1)
+    return Found(vector[which.ravel()], len(somewhere), looked + solved)
