@@ -17,13 +17,19 @@ from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
-from l2m_gtsam.studies.ablation import AblationCell, AblationOptions, Batch, Solver, map_options
-from l2m_gtsam.studies.ablation_report import ablation_page
-from l2m_gtsam.studies.ablation_study import ABLATION
-from l2m_gtsam.studies.ablation_table import AblationTable, ablation_table, gain
+from l2m_gtsam.studies.ablation.cells import (
+    AblationCell,
+    AblationOptions,
+    Batch,
+    Solver,
+    map_options,
+)
+from l2m_gtsam.studies.ablation.map_picture import MapPicture, WindowOptions
+from l2m_gtsam.studies.ablation.packed import STEP, Packed
+from l2m_gtsam.studies.ablation.page import ablation_page
+from l2m_gtsam.studies.ablation.study import ABLATION
+from l2m_gtsam.studies.ablation.table import AblationTable, ablation_table, gain
 from l2m_gtsam.studies.fingerprints import LAYER, thinned_rows
-from l2m_gtsam.studies.map_picture import MapPicture, WindowOptions
-from l2m_gtsam.studies.packed import STEP, Packed
 from l2m_gtsam.studies.site import SiteOptions
 from tests.inline_study import run_inline
 from tests.quick_maps import quick

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.maps.training import training_set
-from l2m_gtsam.studies.numeric_peer import numeric_least_squares
-from l2m_gtsam.studies.scaling import Measurement, Part, ScalingOptions, Way
-from l2m_gtsam.studies.scaling_report import scaling_page
-from l2m_gtsam.studies.scaling_study import SCALING
-from l2m_gtsam.studies.scaling_table import ScalingTable, exponent, scaling_table
-from l2m_gtsam.studies.scaling_tasks import middle
-from l2m_gtsam.studies.scaling_workers import Stint, rate
+from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
+from l2m_gtsam.studies.scaling.page import scaling_page
+from l2m_gtsam.studies.scaling.stopwatch import taken
+from l2m_gtsam.studies.scaling.study import SCALING
+from l2m_gtsam.studies.scaling.table import ScalingTable, exponent, scaling_table
+from l2m_gtsam.studies.scaling.tasks import middle
+from l2m_gtsam.studies.scaling.workers import Stint, rate
 from l2m_gtsam.studies.site import SiteOptions
-from l2m_gtsam.studies.stopwatch import taken
 from tests.inline_study import run_inline
 from tests.quick_maps import quick
 from tests.statistical.test_ablation import HALL

@@ -6,18 +6,18 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.scaling import Part, ScalingCell, ScalingOptions, Way
-from l2m_gtsam.studies.scaling_figure import scaling_figure
-from l2m_gtsam.studies.scaling_report import scaling_page
-from l2m_gtsam.studies.scaling_table import ScalingTable, scaling_table
-from l2m_gtsam.studies.scaling_tasks import (
+from l2m_gtsam.studies.scaling.figure import scaling_figure
+from l2m_gtsam.studies.scaling.measurements import Part, ScalingCell, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.page import scaling_page
+from l2m_gtsam.studies.scaling.table import ScalingTable, scaling_table
+from l2m_gtsam.studies.scaling.tasks import (
     MappedDrive,
     mapped_drive,
     measured_map,
     measured_solves,
     warmed,
 )
-from l2m_gtsam.studies.scaling_workers import measured_workers
+from l2m_gtsam.studies.scaling.workers import measured_workers
 from l2m_gtsam.studies.site import Surveyed, surveyed
 from l2m_gtsam.studies.study import Study
 

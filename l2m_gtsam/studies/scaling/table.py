@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.studies.scaling import Measurement, Part, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
 
 STEEP = 3  # the largest sizes, of which the exponent is taken: small ones cost what is fixed
 

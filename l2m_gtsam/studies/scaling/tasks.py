@@ -18,10 +18,10 @@ from l2m_gtsam.simulate.recorder import Vehicle, record
 from l2m_gtsam.simulate.route import calibration_route
 from l2m_gtsam.simulate.sensors import random_array
 from l2m_gtsam.studies.fingerprints import around
-from l2m_gtsam.studies.numeric_peer import numeric_least_squares
-from l2m_gtsam.studies.scaling import Measurement, Part, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
+from l2m_gtsam.studies.scaling.stopwatch import taken
 from l2m_gtsam.studies.site import Surveyed
-from l2m_gtsam.studies.stopwatch import taken
 from l2m_gtsam.sync import synchronise
 
 KINDS = {Way.HARMONIC: "harmonic", Way.SLIDING: "sliding_gp", Way.DENSE: "dense_gp"}

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from l2m_gtsam.studies.ablation import Solver
-from l2m_gtsam.studies.ablation_table import AblationTable, Comparison, Gain
-from l2m_gtsam.studies.ablation_words import kind_label, spacing_label
+from l2m_gtsam.studies.ablation.cells import Solver
+from l2m_gtsam.studies.ablation.table import AblationTable, Comparison, Gain
+from l2m_gtsam.studies.ablation.words import kind_label, spacing_label
 
 CLAIMED_UT = 0.2
 """By so much, the paper says, the sliding GP lowers the mean error of H where fingerprints are

@@ -9,7 +9,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.world import SteelWorld
-from l2m_gtsam.studies.packed import Packed
+from l2m_gtsam.studies.ablation.packed import Packed
 from l2m_gtsam.studies.site import SiteDrive, Surveyed
 
 

@@ -1,6 +1,6 @@
 """What page and figures of the ablation study call things."""
 
-from l2m_gtsam.studies.ablation_table import AblationTable
+from l2m_gtsam.studies.ablation.table import AblationTable
 
 KINDS = {"sliding_gp": "sliding GP", "dense_gp": "dense GP"}
 

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from l2m_gtsam.studies.ablation import Solver
-from l2m_gtsam.studies.ablation_table import (
+from l2m_gtsam.studies.ablation.cells import Solver
+from l2m_gtsam.studies.ablation.table import (
     AblationTable,
     Combination,
     Comparison,
@@ -11,8 +11,8 @@ from l2m_gtsam.studies.ablation_table import (
     MapRow,
     Spread,
 )
-from l2m_gtsam.studies.ablation_verdict import verdicts
-from l2m_gtsam.studies.ablation_words import density_label, kind_label, spacing_label
+from l2m_gtsam.studies.ablation.verdict import verdicts
+from l2m_gtsam.studies.ablation.words import density_label, kind_label, spacing_label
 from l2m_gtsam.studies.markdown import table_lines
 
 ERROR_NOTE = (

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 
 from l2m_gtsam.studies.markdown import table_lines
-from l2m_gtsam.studies.scaling import Measurement, Part
-from l2m_gtsam.studies.scaling_table import Curve, Ratio, ScalingTable
+from l2m_gtsam.studies.scaling.measurements import Measurement, Part
+from l2m_gtsam.studies.scaling.table import Curve, Ratio, ScalingTable
 
 HEADS = {
     Part.READINGS: "Readings",

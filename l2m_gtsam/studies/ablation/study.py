@@ -4,18 +4,18 @@ from collections.abc import Mapping
 
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.ablation import (
+from l2m_gtsam.studies.ablation.boxes import box_figure
+from l2m_gtsam.studies.ablation.cells import (
     AblationCell,
     AblationOptions,
     AblationPlace,
     ablation_batch,
     ablation_place,
 )
-from l2m_gtsam.studies.ablation_boxes import box_figure
-from l2m_gtsam.studies.ablation_maps import map_figure
-from l2m_gtsam.studies.ablation_report import ablation_page
-from l2m_gtsam.studies.ablation_table import AblationTable, ablation_table
-from l2m_gtsam.studies.map_picture import map_picture
+from l2m_gtsam.studies.ablation.map_picture import map_picture
+from l2m_gtsam.studies.ablation.maps import map_figure
+from l2m_gtsam.studies.ablation.page import ablation_page
+from l2m_gtsam.studies.ablation.table import AblationTable, ablation_table
 from l2m_gtsam.studies.study import Study
 
 PICTURE = "map"

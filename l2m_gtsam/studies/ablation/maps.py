@@ -6,9 +6,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.studies.ablation_table import AblationTable, MapRow
-from l2m_gtsam.studies.ablation_words import density_label, kind_label
-from l2m_gtsam.studies.map_picture import MapPicture
+from l2m_gtsam.studies.ablation.map_picture import MapPicture
+from l2m_gtsam.studies.ablation.table import AblationTable, MapRow
+from l2m_gtsam.studies.ablation.words import density_label, kind_label
 
 COLOURS = "cividis"  # reads the same for all kinds of colour vision
 WIDTH = 2.8  # inches of a map

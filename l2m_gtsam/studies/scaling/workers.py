@@ -20,7 +20,7 @@ from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.options import Options
 from l2m_gtsam.results import Uncertainty
-from l2m_gtsam.studies.scaling import Measurement, Part, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
 from l2m_gtsam.studies.site import Site, mapped_site, random_drive
 
 

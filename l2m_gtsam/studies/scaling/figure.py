@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.studies.scaling import Part, Way
-from l2m_gtsam.studies.scaling_table import Curve, ScalingTable
+from l2m_gtsam.studies.scaling.measurements import Part, Way
+from l2m_gtsam.studies.scaling.table import Curve, ScalingTable
 
 # Okabe and Ito's colours differ for all kinds of colour vision; peers are grey.
 STYLES = {

@@ -24,9 +24,9 @@ from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method, Weighting
+from l2m_gtsam.studies.ablation.map_picture import MapPicture, WindowOptions
 from l2m_gtsam.studies.fingerprints import around, surveyed_floor, thinned
 from l2m_gtsam.studies.json_array import JsonFloats
-from l2m_gtsam.studies.map_picture import MapPicture, WindowOptions
 from l2m_gtsam.studies.methods import two_step
 from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
 

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from l2m_gtsam.studies.ablation import Solver
-from l2m_gtsam.studies.ablation_table import AblationTable, Combination, Spread
-from l2m_gtsam.studies.ablation_words import density_label, kind_label
+from l2m_gtsam.studies.ablation.cells import Solver
+from l2m_gtsam.studies.ablation.table import AblationTable, Combination, Spread
+from l2m_gtsam.studies.ablation.words import density_label, kind_label
 
 # Okabe and Ito's colours differ for all kinds of colour vision.
 COLOURS = {

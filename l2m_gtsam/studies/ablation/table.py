@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.studies.ablation import AblationCell, AblationOptions, Batch, Solver
-from l2m_gtsam.studies.map_picture import MapPicture
+from l2m_gtsam.studies.ablation.cells import AblationCell, AblationOptions, Batch, Solver
+from l2m_gtsam.studies.ablation.map_picture import MapPicture
 
 SURE = 1.96  # standard errors on each side of a mean that hold 95 %
 ROUNDING = 1e-6  # metres or microtesla; what differs by less is the same
