@@ -26,8 +26,8 @@ from tests.statistical.test_ablation import HALL
 from tests.worlds import dipole_world, random_sensors
 from tests.worlds import drive as simulated
 
-QUICK = MappingOptions(model=quick("harmonic"))
-BILINEAR = MappingOptions(model=quick("bilinear"))
+# Calibrations on a harmonic map take longer; others test them.
+SITE = SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("bilinear")))
 TINY = ScalingOptions(
     readings=(60, 120),
     numeric_readings=60,
@@ -39,8 +39,8 @@ TINY = ScalingOptions(
     calibrations=2,
     rounds=1,
     rate=4.0,
-    site=SiteOptions(scenario=HALL, mapping=QUICK),
-    small_site=SiteOptions(scenario=HALL, mapping=BILINEAR),
+    site=SITE,
+    small_site=SITE,
     search=StartOptions(search_radius=1.0, poses=40),
 )
 
