@@ -1,0 +1,1 @@
+"""The ablation study: kinds of maps, densities of fingerprints, closed forms."""

@@ -1,0 +1,231 @@
+"""What map, density of its survey and weights do to a calibration: the paper's ablation.
+
+Maps of each kind are made of fingerprints of one survey at several densities. Random sensors,
+each on its own drive, are calibrated on each of them by each method. All maps and methods get the
+same drives and the same guesses, so that differences are paired.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import lru_cache
+
+import numpy as np
+from pydantic import Field
+
+from l2m_gtsam.data import Distortion, FloatArray, Readings
+from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.graph.calibration import Estimate
+from l2m_gtsam.graph.global_start import StartOptions, find_starts
+from l2m_gtsam.graph.one_key import solve_one_key
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.maps.build import MapOptions
+from l2m_gtsam.options import Options
+from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.simulate.scenario import ScenarioOptions
+from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
+from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method, Weighting
+from l2m_gtsam.studies.ablation.map_picture import MapPicture, WindowOptions
+from l2m_gtsam.studies.fingerprints import around, surveyed_floor, thinned
+from l2m_gtsam.studies.json_array import JsonFloats
+from l2m_gtsam.studies.methods import two_step
+from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
+
+DRIVE, START = 1, 2  # streams of randomness
+
+
+class Solver(StrEnum):
+    """A method of the study; its value is what page and figures call it."""
+
+    OLS = "OLS"
+    RRTLS = "RRTLS"
+    PAPER = "w-RRTLS (paper's weights)"
+    LIKELIHOOD = "w-RRTLS"
+    ONE_KEY = "ours"
+
+
+CLOSED_FORMS = {
+    Solver.OLS: ClosedFormOptions(method=Method.OLS),
+    Solver.RRTLS: ClosedFormOptions(method=Method.RRTLS),
+    Solver.PAPER: ClosedFormOptions(method=Method.W_RRTLS, weighting=Weighting.PAPER),
+    Solver.LIKELIHOOD: ClosedFormOptions(method=Method.W_RRTLS),
+}
+"""The closed form in the two-step loop of each method; ours is no such loop."""
+
+
+class AblationOptions(Options):
+    """Size and conditions of the study; lengths in metres."""
+
+    seed: int = Field(default=1, ge=0)
+    """Of drives, sensors and guesses; the site has its own."""
+    batches: int = Field(default=10, ge=1)
+    """Cells of each map."""
+    batch: int = Field(default=5, ge=1)
+    """Sensors of random place and distortion in each, each on its own drive."""
+    kinds: tuple[str, ...] = ("bilinear", "sliding_gp", "harmonic")
+    """Kinds of maps."""
+    spacings: tuple[float, ...] = (0.0, 0.5, 1.0)
+    """Densities of fingerprints: of each cell of the floor of this size one is kept at each
+    height; 0 keeps the whole survey."""
+    around: float = Field(default=3.0, gt=0)
+    """Fingerprints within so many metres of the calibration drive take part: the rest of the hall
+    is not looked at."""
+    guess: float = Field(default=0.3, gt=0)
+    """Guesses are off the truth by up to this."""
+    window: WindowOptions = WindowOptions()
+    """The part of the maps that is drawn."""
+    site: SiteOptions = SiteOptions(
+        scenario=ScenarioOptions(
+            array=ArrayOptions(count=1),
+            noise=NoiseOptions(field=0.5),
+            calibration_sampling=SamplingOptions(field_rate=10.0),
+        )
+    )
+    """World, survey and drives, with the noise of the paper's study in both drives."""
+    search: StartOptions = StartOptions()
+    """How our method looks for its start, around the guess."""
+    solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
+    """How our method solves: the study looks at values, not at sigmas."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Errors of R calibrations by each of M methods, NaN for those without a result.
+
+    Attributes
+    ----------
+    t
+        Distance of the sensor's estimated position from the true one in metres, shape (R, M).
+    C
+        Frobenius norm of the error of C, shape (R, M).
+    H
+        Length of the error of H in microtesla, shape (R, M).
+    """
+
+    t: JsonFloats
+    C: JsonFloats
+    H: JsonFloats
+
+
+@dataclass(frozen=True)
+class AblationCell:
+    """A batch of calibrations on one map, or the map itself."""
+
+    batch: Batch | None = None
+    picture: MapPicture | None = None
+
+
+@dataclass(frozen=True)
+class Hall:
+    """What all maps share.
+
+    Attributes
+    ----------
+    part
+        The survey around the drives.
+    floor
+        That it covers, in square metres.
+    drives
+        All of the study.
+    """
+
+    part: Surveyed
+    floor: float
+    drives: tuple[SiteDrive, ...]
+
+
+@dataclass(frozen=True)
+class AblationPlace:
+    """A map of one kind at one density.
+
+    Attributes
+    ----------
+    hall
+        Drives, and the fingerprints of which the map is made.
+    field_map
+        The map.
+    """
+
+    hall: Hall
+    field_map: QueryableMap
+
+
+def ablation_place(options: AblationOptions, kind: str, spacing: float) -> AblationPlace:
+    """Return a map and the drives through it."""
+    hall = ablation_hall(options)
+    part = thinned(hall.part, spacing)
+    chosen = map_options(options.site.mapping.model, kind, spacing)
+    return AblationPlace(replace(hall, part=part), part.map(chosen))
+
+
+@lru_cache(maxsize=1)
+def ablation_hall(options: AblationOptions) -> Hall:
+    """Return survey and drives; made once in each process."""
+    whole = surveyed(options.site)
+    drives = tuple(
+        random_drive(whole, options.site, np.random.default_rng([options.seed, which, DRIVE]))
+        for which in range(options.batches * options.batch)
+    )
+    # All drives take one route.
+    part = around(whole, drives[0].readings.p_map_lidar, options.around)
+    return Hall(part, surveyed_floor(part.survey.points), drives)
+
+
+def map_options(base: MapOptions, kind: str, spacing: float) -> MapOptions:
+    """Return the options of a kind of map for a density; a bilinear grid is no finer than that."""
+    bilinear = base.bilinear.model_copy(
+        update={
+            "spacing": max(base.bilinear.spacing, spacing),
+            "reach": max(base.bilinear.reach, spacing),
+        }
+    )
+    return base.model_copy(update={"kind": kind, "bilinear": bilinear})
+
+
+def ablation_batch(options: AblationOptions, place: AblationPlace, number: int) -> Batch:
+    """Calibrate the sensors of one batch by all methods."""
+    first = number * options.batch
+    errors = np.array(
+        [
+            [calibration_errors(options, place, which, solver) for solver in Solver]
+            for which in range(first, first + options.batch)
+        ]
+    )
+    return Batch(errors[..., 0], errors[..., 1], errors[..., 2])
+
+
+def calibration_errors(
+    options: AblationOptions, place: AblationPlace, which: int, solver: Solver
+) -> FloatArray:
+    """Return the errors of t, C and H of one calibration, shape (3,)."""
+    drive = place.hall.drives[which]
+    truth, guess = drive.sensor, drive.sensor.t_lidar_mag + random_offset(options, which)
+    end = calibrated(options, place.field_map, drive.readings, guess, solver)
+    if end is None:
+        return np.full(3, np.nan)
+    found = Distortion.from_vector(end.distortion[0])
+    off = end.t[0] - truth.t_lidar_mag, found.C - truth.distortion.C, found.H - truth.distortion.H
+    return np.array([np.linalg.norm(each) for each in off])
+
+
+def random_offset(options: AblationOptions, which: int) -> FloatArray:
+    """Return how far off the guess of one sensor is, metres, shape (3,): any direction."""
+    rng = np.random.default_rng([options.seed, which, START])
+    direction = rng.standard_normal(3)
+    return np.asarray(options.guess * rng.uniform() * direction / np.linalg.norm(direction))
+
+
+def calibrated(
+    options: AblationOptions,
+    field_map: QueryableMap,
+    readings: Readings,
+    t_guess: FloatArray,
+    solver: Solver,
+) -> Estimate | None:
+    """Return what a method makes of the readings of one sensor; None for no result."""
+    if solver is not Solver.ONE_KEY:
+        return two_step(readings, field_map, t_guess, CLOSED_FORMS[solver])
+    (found,) = find_starts(readings, field_map, t_guess, options.search)
+    if found is None:
+        return None
+    solution = solve_one_key(readings, field_map, found.t_lidar_mag[None], options.solve)
+    return solution.estimate if solution.solved else None

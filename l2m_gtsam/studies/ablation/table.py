@@ -1,0 +1,215 @@
+"""What came of the ablation study: errors of each combination, and paired differences."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.studies.ablation.cells import AblationCell, AblationOptions, Batch, Solver
+from l2m_gtsam.studies.ablation.map_picture import MapPicture
+
+SURE = 1.96  # standard errors on each side of a mean that hold 95 %
+ROUNDING = 1e-6  # metres or microtesla; what differs by less is the same
+FEWEST = 2  # pairs of which a standard error can be told
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Where the errors of some calibrations lie, in the unit of these errors."""
+
+    mean: float
+    p05: float
+    p25: float
+    median: float
+    p75: float
+    p95: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class Combination:
+    """Calibrations by one method on one map.
+
+    Attributes
+    ----------
+    kind, spacing
+        Of the map.
+    solver
+        The method.
+    calibrations, failed
+        How many there are, and how many of them ended without a result.
+    t, C, H
+        Errors in metres, without unit, and in microtesla; absent if all failed.
+    """
+
+    kind: str
+    spacing: float
+    solver: Solver
+    calibrations: int
+    failed: int
+    t: Spread | None
+    C: Spread | None
+    H: Spread | None
+
+
+@dataclass(frozen=True)
+class Gain:
+    """By how much errors shrink from one combination to another on the same drives.
+
+    Attributes
+    ----------
+    mean
+        Mean of the paired differences; positive where the other is better.
+    margin
+        Half of its 95 % interval.
+    better
+        Share of the drives on which the other is better.
+    """
+
+    mean: float
+    margin: float
+    better: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether the interval leaves out zero, by more than rounding."""
+        return abs(self.mean) > max(self.margin, ROUNDING)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What changing one thing gains; see ``Gain``.
+
+    Attributes
+    ----------
+    kind, spacing, solver
+        The combination from which a thing is changed.
+    to
+        What the map's kind or the method is changed to.
+    t, H
+        Gains in metres and microtesla; absent if there are no pairs.
+    """
+
+    kind: str
+    spacing: float
+    solver: Solver
+    to: str
+    t: Gain | None
+    H: Gain | None
+
+
+@dataclass(frozen=True)
+class MapRow:
+    """A map of the study."""
+
+    kind: str
+    spacing: float
+    picture: MapPicture
+
+
+@dataclass(frozen=True)
+class AblationTable:
+    """The study's outcome.
+
+    Attributes
+    ----------
+    options
+        The study.
+    maps
+        By density, then kind.
+    rows
+        In the same order, then by method.
+    map_gains
+        From the first kind of map to each other one, with the paper's method.
+    weight_gains
+        From no weights to each kind of weights, on each map.
+    method_gains
+        From the paper's method to ours, on each map.
+    """
+
+    options: AblationOptions
+    maps: tuple[MapRow, ...]
+    rows: tuple[Combination, ...]
+    map_gains: tuple[Comparison, ...]
+    weight_gains: tuple[Comparison, ...]
+    method_gains: tuple[Comparison, ...]
+
+
+Place = tuple[str, float]
+"""Kind and spacing of a map."""
+
+
+def ablation_table(
+    options: AblationOptions, cells: Mapping[Place, Sequence[AblationCell]]
+) -> AblationTable:
+    """Return errors and gains of all cells, given by map."""
+    places = [(kind, spacing) for spacing in options.spacings for kind in options.kinds]
+    errors = {place: joined(cells[place]) for place in places}
+    pictures = {p: next(c.picture for c in cells[p] if c.picture is not None) for p in places}
+    first, paper = options.kinds[0], Solver.PAPER
+    return AblationTable(
+        options=options,
+        maps=tuple(MapRow(*place, pictures[place]) for place in places),
+        rows=tuple(combination(p, solver, errors[p]) for p in places for solver in Solver),
+        map_gains=tuple(
+            compared((first, spacing), paper, errors, (kind, spacing), paper)
+            for spacing in options.spacings
+            for kind in options.kinds[1:]
+        ),
+        weight_gains=tuple(
+            compared(place, Solver.RRTLS, errors, place, to)
+            for place in places
+            for to in (Solver.PAPER, Solver.LIKELIHOOD)
+        ),
+        method_gains=tuple(compared(p, paper, errors, p, Solver.ONE_KEY) for p in places),
+    )
+
+
+def joined(cells: Sequence[AblationCell]) -> Batch:
+    """Return all calibrations of one map."""
+    batches = [each.batch for each in cells if each.batch is not None]
+    return Batch(*(np.concatenate([getattr(b, name) for b in batches]) for name in "tCH"))
+
+
+def combination(place: Place, solver: Solver, errors: Batch) -> Combination:
+    """Return the errors of one method on one map."""
+    of = by(solver)
+    failed = int(np.count_nonzero(~np.isfinite(of(errors.t))))
+    spreads = (spread(of(errors.t)), spread(of(errors.C)), spread(of(errors.H)))
+    return Combination(*place, solver, len(errors.t), failed, *spreads)
+
+
+def by(solver: Solver) -> Callable[[FloatArray], FloatArray]:
+    """Return what takes a method's column, shape (R,), of errors, shape (R, M)."""
+    column = list(Solver).index(solver)
+    return lambda errors: errors[:, column]
+
+
+def spread(errors: FloatArray) -> Spread | None:
+    """Return where errors, shape (R,), lie; those that are NaN do not count."""
+    known = errors[np.isfinite(errors)]
+    if not len(known):
+        return None
+    p05, p25, median, p75, p95 = np.quantile(known, [0.05, 0.25, 0.5, 0.75, 0.95]).tolist()
+    return Spread(float(known.mean()), p05, p25, median, p75, p95, float(known.max()))
+
+
+def compared(
+    place: Place, solver: Solver, errors: Mapping[Place, Batch], other: Place, to: Solver
+) -> Comparison:
+    """Return what one combination gains over another."""
+    before, after = errors[place], errors[other]
+    said = other[0] if to is solver else to.value
+    gains = (gain(by(solver)(getattr(before, n)), by(to)(getattr(after, n))) for n in "tH")
+    return Comparison(*place, solver, said, *gains)
+
+
+def gain(before: FloatArray, after: FloatArray) -> Gain | None:
+    """Return by how much errors shrank, shapes (R,); pairs with a NaN do not count."""
+    less = before - after
+    less = less[np.isfinite(less)]
+    if len(less) < FEWEST:
+        return None
+    margin = SURE * less.std(ddof=1) / np.sqrt(len(less))
+    return Gain(float(less.mean()), float(margin), float(np.mean(less > ROUNDING)))

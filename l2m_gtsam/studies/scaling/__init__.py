@@ -1,0 +1,1 @@
+"""The scaling study: time and memory against readings, sensors, maps and workers."""

@@ -1,0 +1,161 @@
+"""The scaling study: its exponents and ratios, and the whole of it at a tiny size."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from l2m_gtsam.config import MappingOptions
+from l2m_gtsam.graph.global_start import StartOptions
+from l2m_gtsam.maps.training import training_set
+from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
+from l2m_gtsam.studies.scaling.page import scaling_page
+from l2m_gtsam.studies.scaling.stopwatch import taken
+from l2m_gtsam.studies.scaling.study import SCALING
+from l2m_gtsam.studies.scaling.table import ScalingTable, exponent, scaling_table
+from l2m_gtsam.studies.scaling.tasks import middle
+from l2m_gtsam.studies.scaling.workers import Stint, rate
+from l2m_gtsam.studies.site import SiteOptions
+from tests.inline_study import run_inline
+from tests.quick_maps import quick
+from tests.statistical.test_ablation import HALL
+from tests.worlds import dipole_world, random_sensors
+from tests.worlds import drive as simulated
+
+# Calibrations on a harmonic map take longer; others test them.
+SITE = SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("bilinear")))
+TINY = ScalingOptions(
+    readings=(60, 120),
+    numeric_readings=60,
+    sensors=(1,),
+    each=60,
+    survey=(300, 600),
+    dense=(100, 200),
+    workers=(1,),
+    calibrations=2,
+    rounds=1,
+    rate=4.0,
+    site=SITE,
+    small_site=SITE,
+    search=StartOptions(search_radius=1.0, poses=40),
+)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("scaling")
+
+
+@pytest.fixture(scope="module")
+def table(out: Path) -> ScalingTable:
+    return run_inline(SCALING, TINY, out)
+
+
+def test_every_size_is_timed(table: ScalingTable) -> None:
+    found = {(c.part, c.way): [each.size for each in c.points] for c in table.curves}
+    assert found == {
+        (Part.READINGS, Way.POINT): [60, 120],
+        (Part.READINGS, Way.FULL): [60, 120],
+        (Part.READINGS, Way.NUMERIC): [60],
+        (Part.SENSORS, Way.POINT): [1],
+        (Part.SENSORS, Way.FULL): [1],
+        (Part.SENSORS, Way.NUMERIC): [1],
+        (Part.SURVEY, Way.HARMONIC): [300, 600],
+        (Part.SURVEY, Way.SLIDING): [300, 600],
+        (Part.SURVEY, Way.DENSE): [100, 200],
+        (Part.WORKERS, Way.BATCH): [1],
+        (Part.WORKERS, Way.STARTED): [1],
+    }
+    assert all(point.seconds > 0 for curve in table.curves for point in curve.points)
+
+
+def test_the_start_of_workers_takes_time(table: ScalingTable) -> None:
+    alone, started = (c.points[0] for c in table.curves if c.part is Part.WORKERS)
+    assert started.seconds > alone.seconds
+
+
+def test_page_and_figure_are_made_of_the_file(out: Path, table: ScalingTable) -> None:
+    page = (out / "scaling.md").read_text(encoding="utf-8")
+    assert scaling_page(table) in page
+    for name in re.findall(r"!\[.*\]\((.*)\)", page):
+        assert (out / name).stat().st_size > 10_000
+
+
+def points(part: Part, way: Way, seconds: dict[int, float]) -> list[Measurement]:
+    return [Measurement(part, way, size, each) for size, each in seconds.items()]
+
+
+@given(power=st.floats(-2.0, 4.0), unit=st.floats(1e-4, 1e3))
+def test_the_exponent_is_that_of_a_power(power: float, unit: float) -> None:
+    measured = points(Part.SURVEY, Way.DENSE, {n: unit * n**power for n in (10, 100, 1000)})
+    # Logarithms up to 30 are rounded to 1e-15 of themselves.
+    assert exponent(tuple(measured)) == pytest.approx(power, abs=1e-9)
+
+
+def test_the_exponent_is_that_of_the_largest_sizes() -> None:
+    seconds = {1: 5.0, 2: 5.0, 4: 4.0, 8: 8.0, 16: 16.0}
+    assert exponent(tuple(points(Part.SURVEY, Way.DENSE, seconds))) == pytest.approx(1.0)
+
+
+def test_one_size_has_no_exponent() -> None:
+    assert exponent(tuple(points(Part.SURVEY, Way.DENSE, {5: 1.0}))) is None
+
+
+def test_ratios_are_those_at_the_largest_size_of_both() -> None:
+    measured = [
+        *points(Part.READINGS, Way.POINT, {10: 1.0, 20: 2.0, 40: 4.0}),
+        *points(Part.READINGS, Way.NUMERIC, {10: 3.0, 20: 12.0}),
+        *points(Part.SENSORS, Way.POINT, {1: 1.0}),
+    ]
+    (found,) = scaling_table(ScalingOptions(), measured).ratios
+    assert (found.size, found.times, found.peer) == (20, 6.0, Way.NUMERIC)
+
+
+def test_speeds_are_relative_to_the_fewest_workers() -> None:
+    measured = [
+        *points(Part.WORKERS, Way.BATCH, {1: 10.0, 2: 5.0}),
+        *points(Part.WORKERS, Way.STARTED, {1: 12.0, 2: 8.0}),
+    ]
+    one, two = scaling_table(ScalingOptions(), measured).speeds
+    assert (one.times, two.workers, two.times, two.started) == (1.0, 2, 2.0, 1.5)
+
+
+def test_a_page_of_a_part_has_no_empty_sections() -> None:
+    table = scaling_table(ScalingOptions(), points(Part.SURVEY, Way.DENSE, {10: 1.0}))
+    assert re.findall(r"^## (.*)", scaling_page(table), flags=re.M) == ["Size of the map"]
+
+
+def test_the_first_calibration_of_a_process_does_not_count() -> None:
+    # One process takes 9 s for the first and 1 s for each other, another has only one of 2 s.
+    stints = [Stint(1, 0.0, 9.0), Stint(1, 9.0, 10.0), Stint(1, 10.0, 11.0), Stint(2, 0.0, 2.0)]
+    assert rate(stints) == pytest.approx(1.0 + 0.5)
+
+
+def test_the_middle_of_a_survey_grows_about_its_middle() -> None:
+    points_ = np.random.default_rng(3).uniform(0.0, 10.0, (200, 3))
+    survey = training_set(points_, np.zeros((200, 3)))
+    small, large = middle(survey, 20), middle(survey, 80)
+    assert (len(small), len(large)) == (20, 80)
+    assert {tuple(p) for p in small.points} <= {tuple(p) for p in large.points}
+
+
+def test_memory_of_work_is_seen() -> None:
+    took = taken(lambda: np.ones(8_000_000), rounds=1, long=1.0)
+    if took.peak_mib is None:
+        pytest.skip("this system does not tell the peak of a process' memory")
+    # 61 MiB; pages that were there before are filled first.
+    assert took.peak_mib > 30
+
+
+def test_the_peer_finds_the_truth_of_two_sensors_on_an_exact_map() -> None:
+    world, sensors = dipole_world(0), random_sensors(0, 2)
+    readings = simulated(1, sensors, world, count=150)
+    start = np.array([sensor.t_lidar_mag for sensor in sensors]) + 0.02
+    found = numeric_least_squares(readings, world, start)
+    truth = [np.concatenate([s.t_lidar_mag, s.distortion.vector()]) for s in sensors]
+    # It stops when steps or gains are a hundred millionth; numeric derivatives are off by as much.
+    np.testing.assert_allclose(found, truth, rtol=0, atol=1e-4)
