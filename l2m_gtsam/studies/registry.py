@@ -3,11 +3,11 @@
 from typing import Any
 
 from l2m_gtsam.studies.ablation.study import ABLATION
-from l2m_gtsam.studies.basin_study import BASIN
+from l2m_gtsam.studies.basin.study import BASIN
 from l2m_gtsam.studies.honesty.study import HONESTY
 from l2m_gtsam.studies.scaling.study import SCALING
 from l2m_gtsam.studies.study import Study
-from l2m_gtsam.studies.table1_study import TABLE1
+from l2m_gtsam.studies.table1.study import TABLE1
 
 STUDIES: dict[str, Study[Any, Any, Any]] = {
     study.name: study for study in (TABLE1, BASIN, ABLATION, HONESTY, SCALING)

@@ -17,7 +17,7 @@ from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
-from l2m_gtsam.studies.basin import (
+from l2m_gtsam.studies.basin.cells import (
     DRIVE,
     BasinOptions,
     Cell,
@@ -25,8 +25,8 @@ from l2m_gtsam.studies.basin import (
     basin_table,
     cells_of,
 )
-from l2m_gtsam.studies.basin_report import basin_figure, basin_markdown
-from l2m_gtsam.studies.basin_study import BASIN
+from l2m_gtsam.studies.basin.report import basin_figure, basin_markdown
+from l2m_gtsam.studies.basin.study import BASIN
 from l2m_gtsam.studies.run import run_study
 from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive

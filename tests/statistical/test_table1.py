@@ -10,12 +10,12 @@ from pydantic import TypeAdapter
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.sensors import NoiseOptions
-from l2m_gtsam.studies import table1_report
-from l2m_gtsam.studies.paper_table import NOISES, printed
-from l2m_gtsam.studies.table1 import Ends, Table1Cell, Table1Options, compute, prepare
-from l2m_gtsam.studies.table1_methods import HARMONIC, NAIVE, OTHERS, OURS, SLIDING
-from l2m_gtsam.studies.table1_study import TABLE1, keys
-from l2m_gtsam.studies.table1_summary import Table1Summary, summarise
+from l2m_gtsam.studies.table1 import report
+from l2m_gtsam.studies.table1.cells import Ends, Table1Cell, Table1Options, compute, prepare
+from l2m_gtsam.studies.table1.methods import HARMONIC, NAIVE, OTHERS, OURS, SLIDING
+from l2m_gtsam.studies.table1.paper import NOISES, printed
+from l2m_gtsam.studies.table1.study import TABLE1, keys
+from l2m_gtsam.studies.table1.summary import Table1Summary, summarise
 from tests.statistical.test_basin import SITE
 
 NOISE = 0.2
@@ -117,8 +117,8 @@ def test_errors_are_counted_and_squared() -> None:
 def test_a_row_that_misses_its_aim_is_named_with_its_bound(bound: float, word: str) -> None:
     aim = printed("t", 0, NOISE)
     assert aim is not None
-    error = 1.1 * np.sqrt(aim.mean / table1_report.BETTER)
-    (line,) = table1_report.missed(summarise(TINY, {"a": made_up([error], bound)}))
+    error = 1.1 * np.sqrt(aim.mean / report.BETTER)
+    (line,) = report.missed(summarise(TINY, {"a": made_up([error], bound)}))
     assert "path 1 at 0.2 uT" in line
     assert f"the bound {word} it" in line
 
@@ -136,7 +136,7 @@ def test_a_peer_that_knows_no_place_is_not_lost() -> None:
 
 
 def test_a_row_that_reaches_its_aim_is_not() -> None:
-    assert not list(table1_report.missed(summarise(TINY, {"a": made_up([0.001])})))
+    assert not list(report.missed(summarise(TINY, {"a": made_up([0.001])})))
 
 
 def test_the_printed_table_is_the_papers() -> None:

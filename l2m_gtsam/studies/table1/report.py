@@ -8,9 +8,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.simulate.route import RouteShape
-from l2m_gtsam.studies.paper_table import Printed, printed
-from l2m_gtsam.studies.table1_methods import HARMONIC, OURS
-from l2m_gtsam.studies.table1_summary import Bound, Entry, Spread, Table1Summary
+from l2m_gtsam.studies.table1.methods import HARMONIC, OURS
+from l2m_gtsam.studies.table1.paper import Printed, printed
+from l2m_gtsam.studies.table1.summary import Bound, Entry, Spread, Table1Summary
 
 BETTER = 10  # our mean of e_t is to be at most the paper's over this
 EFFICIENT = 1.3  # our error of t is to be at most so many times the bound

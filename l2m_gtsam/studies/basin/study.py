@@ -4,14 +4,14 @@ from collections.abc import Mapping
 
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.basin import (
+from l2m_gtsam.studies.basin.cells import (
     BasinOptions,
     BasinTable,
     DistortionCells,
     basin_table,
     cells_of,
 )
-from l2m_gtsam.studies.basin_report import basin_figure, basin_page
+from l2m_gtsam.studies.basin.report import basin_figure, basin_page
 from l2m_gtsam.studies.site import Site, mapped_site
 from l2m_gtsam.studies.study import Study
 

@@ -27,7 +27,7 @@ from l2m_gtsam.studies.bound import cramer_rao
 from l2m_gtsam.studies.json_array import JsonFloats
 from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_map
 from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
-from l2m_gtsam.studies.table1_methods import (
+from l2m_gtsam.studies.table1.methods import (
     HARMONIC,
     MAGYC,
     NAIVE,

@@ -28,8 +28,8 @@ from l2m_gtsam.graph.global_start import StartOptions, find_starts_around
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.options import Options
 from l2m_gtsam.results import FoundStart, Uncertainty
+from l2m_gtsam.studies.basin.levenberg_marquardt import levenberg_marquardt
 from l2m_gtsam.studies.json_array import JsonBools, JsonFloats
-from l2m_gtsam.studies.levenberg_marquardt import levenberg_marquardt
 from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, random_drive
 

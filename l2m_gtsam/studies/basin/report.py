@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.studies.basin import BasinOptions, BasinTable, RingRow
+from l2m_gtsam.studies.basin.cells import BasinOptions, BasinTable, RingRow
 from l2m_gtsam.studies.share import Share
 
 # Blue and vermilion differ for all kinds of colour vision.

@@ -2,10 +2,10 @@
 
 from itertools import product
 
-from l2m_gtsam.studies import table1_report
 from l2m_gtsam.studies.study import Study
-from l2m_gtsam.studies.table1 import Place, Table1Cell, Table1Options, compute, prepare
-from l2m_gtsam.studies.table1_summary import Table1Summary, summarise
+from l2m_gtsam.studies.table1 import report
+from l2m_gtsam.studies.table1.cells import Place, Table1Cell, Table1Options, compute, prepare
+from l2m_gtsam.studies.table1.summary import Table1Summary, summarise
 
 
 def keys(options: Table1Options) -> tuple[str, ...]:
@@ -42,6 +42,6 @@ TABLE1 = Study(
     prepare=place,
     compute=cell,
     summarise=summarise,
-    page=table1_report.page,
-    figures=table1_report.figures,
+    page=report.page,
+    figures=report.figures,
 )

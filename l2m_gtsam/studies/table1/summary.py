@@ -8,8 +8,8 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.route import RouteShape
-from l2m_gtsam.studies.table1 import Ends, Table1Cell, Table1Options
-from l2m_gtsam.studies.table1_methods import HARMONIC, OURS
+from l2m_gtsam.studies.table1.cells import Ends, Table1Cell, Table1Options
+from l2m_gtsam.studies.table1.methods import HARMONIC, OURS
 
 FAR = 0.05  # metres: an error beyond counts as a failure
 

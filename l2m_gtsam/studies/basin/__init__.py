@@ -1,0 +1,1 @@
+"""How far off a guess may be: success against the initial offset."""

@@ -1,0 +1,1 @@
+"""The paper's Table I, beside other methods and the bound."""
