@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from l2m_gtsam.commands.report import report
 from l2m_gtsam.errors import L2MError
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ map_app = typer.Typer(
     help="Build, update, compare, describe and draw magnetic maps.", no_args_is_help=True
 )
 app.add_typer(map_app, name="map")
+app.command()(report)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
@@ -153,16 +155,19 @@ def calibrate(
         bool, typer.Option("--models", help="Show how models of each sensor compare.")
     ] = False,
 ) -> None:
-    """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
+    """Calibrate every magnetometer of a drive; write calibration.yaml, a picture and a report."""
     from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
+    from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
     from l2m_gtsam.config import load_config, with_uncertainty
     from l2m_gtsam.qa.model_table import model_note, model_tables
     from l2m_gtsam.qa.tables import calibration_table, disagreement_note, held_clocks_note
+    from l2m_gtsam.qa.verdict_text import verdict_lines
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with _progress() as progress:
         result = calibrate_bag(bag, map_path, chosen, out, progress)
+        verdict = report_folder(out, config)
     _print(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
     _warn(result.doubts)
@@ -173,7 +178,9 @@ def calibrate(
         _print(table)
     for note in filter(None, map(model_note, result.sensors)):
         typer.echo(note)
-    typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
+    typer.echo("\n".join(verdict_lines(verdict)))
+    names = (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)
+    typer.echo(f"written: {', '.join(str(out / name) for name in names)}")
 
 
 @app.command()

@@ -1,0 +1,1 @@
+"""Commands of ``l2m``, a module each."""
