@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.reasons.ending import ending
-from l2m_gtsam.qa.reasons.fit import clock, fit
+from l2m_gtsam.qa.reasons.fit import clock, fit, misfit
 from l2m_gtsam.qa.reasons.mounting import mounting
 from l2m_gtsam.qa.reasons.precision import precision
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason, worst
@@ -15,6 +15,7 @@ from l2m_gtsam.results import CalibrationResult
 
 # In the order in which a person would ask; the gravest stand first in the end.
 RULES = (repeat, ending, mounting, fit, own_stretches, clock, precision)
+RULES_OF_A_MISFIT = (fit, ending)
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ def judge(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Ve
 
 
 def _on_sensor(case: Case) -> SensorVerdict:
-    reasons = _ordered([reason for rule in RULES for reason in rule(case)])
+    rules = RULES_OF_A_MISFIT if misfit(case) else RULES
+    reasons = _ordered([reason for rule in rules for reason in rule(case)])
     return SensorVerdict(case.sensor.sensor, worst(reasons), reasons)
 
 

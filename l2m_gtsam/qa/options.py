@@ -80,10 +80,11 @@ class QaOptions(Options):
     axes_deg: float = Field(default=15.0, gt=0, lt=45)
     """Sensor axes that lie this close to axes of the lidar are taken to be meant so, degrees."""
     short_drive_m: float = Field(default=5.0, ge=0)
-    """A drive that leaves something open and is shorter is called short, metres."""
+    """A drive that leaves something open, or known too little, and is shorter is called short,
+    metres."""
     few_headings: float = Field(default=0.3, ge=0, le=1)
-    """A drive that leaves something open and took a smaller share of all headings is called
-    straight."""
+    """A drive that leaves something open, or known too little, and took a smaller share of all
+    headings is called straight."""
     halves: bool = True
     """Whether both halves of a drive are calibrated by themselves."""
     half_readings: int = Field(default=100, ge=30)

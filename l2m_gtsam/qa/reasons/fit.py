@@ -21,6 +21,12 @@ def fit(case: Case) -> list[Reason]:
     return reasons
 
 
+def misfit(case: Case) -> bool:
+    """Whether the map explains nothing: what else is found of the sensor means nothing then."""
+    found = _explained(case)
+    return bool(found) and found[0].level is Level.FAIL
+
+
 def _explained(case: Case) -> list[Reason]:
     # Where the place is open, the field is too even to say anything of the map.
     if case.metrics is None or not np.isfinite(case.sensor.t_sigma).all():

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from l2m_gtsam.qa.reasons.fit import misfit
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason
 from l2m_gtsam.results import CalibrationResult, Disagreement, Return, SensorStatus
 
@@ -23,12 +24,13 @@ def whole(cases: tuple[Case, ...], result: CalibrationResult) -> list[Reason]:
     if len(shared) > MANY:
         more = f"The place differs from the map along {len(shared) - MANY} more stretches."
         reasons.append(Reason(Level.WARN, more))
-    return [*_misfit(cases), *_drive(cases), *reasons]
+    # What a map of another place says of this one means nothing.
+    return _misfit(cases) or [*_drive(cases), *reasons]
 
 
 def _drive(cases: tuple[Case, ...]) -> list[Reason]:
     """Return what the drive lacks, if it left something open."""
-    if not cases or all(case.sensor.status not in OPEN for case in cases):
+    if not any(map(_left_open, cases)):
         return []
     drive, options = cases[0].all.drive, cases[0].options
     reasons = []
@@ -45,6 +47,12 @@ def _drive(cases: tuple[Case, ...]) -> list[Reason]:
         )
         reasons.append(Reason(Level.WARN, text))
     return reasons
+
+
+def _left_open(case: Case) -> bool:
+    """Whether the drive does not say of a sensor what it should."""
+    too_large = case.sensor.t_sigma.max() > case.options.position_sigma_m.warn
+    return case.sensor.status in OPEN or bool(too_large)
 
 
 def own_stretches(case: Case) -> list[Reason]:
@@ -87,13 +95,8 @@ def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
 
 def _misfit(cases: tuple[Case, ...]) -> list[Reason]:
     """Return that the map is the wrong one, if no sensor fits it."""
-    fits = [
-        (case, case.metrics.fit)
-        for case in cases
-        if case.metrics is not None and np.isfinite(case.sensor.t_sigma).all()
-    ]
-    bad = [fit for case, fit in fits if fit.unexplained > case.options.unexplained.fail]
-    if not bad or len(bad) < len(fits):
+    told = [case for case in cases if case.metrics and np.isfinite(case.sensor.t_sigma).all()]
+    if not told or not all(map(misfit, told)):
         return []
     text = (
         "The map does not fit this drive: a field that is the same everywhere explains the "

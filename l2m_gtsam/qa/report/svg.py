@@ -31,15 +31,17 @@ AXES = (X, Y, Z)
 DASHES = ("-", "--", "-.")  # lines of x, y, z differ without their colours, too
 MARKERS = ("o", "s", "^")
 
+SMALL = 9.3  # points; a figure is drawn at about its own size on a phone
+
 SETTINGS: Any = {
     "svg.fonttype": "none",  # text stays text: sharp, small, read aloud
     "svg.hashsalt": "l2m",
     "text.parse_math": False,  # names from bags are text, whatever they hold
     "font.family": "sans-serif",
-    "font.size": 9,
-    "axes.titlesize": 9.5,
-    "axes.labelsize": 9,
-    "legend.fontsize": 8.5,
+    "font.size": 10,
+    "axes.titlesize": 10.5,
+    "axes.labelsize": 10,
+    "legend.fontsize": SMALL,
     "text.color": INK,
     "axes.labelcolor": INK,
     "axes.titlecolor": INK,
@@ -62,6 +64,7 @@ SETTINGS: Any = {
     "lines.linewidth": 1.1,
     "path.simplify": False,  # it would take dots for nothing
 }
+LONGEST = 18  # letters of a name
 WIDTH = 4.7  # inches of every figure: its text is then as large on a phone as on a desk
 
 
@@ -106,6 +109,11 @@ def dots(axes: Axes, x: FloatArray, y: FloatArray, size: float, **style: Any) ->
     across = np.column_stack([x, x, np.full(len(x), np.nan)]).ravel()
     along = np.column_stack([y, y, np.full(len(y), np.nan)]).ravel()
     axes.plot(across, along, "-", linewidth=size, solid_capstyle="round", **style)
+
+
+def short_name(name: str) -> str:
+    """Return a name that fits into a figure."""
+    return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
 
 
 def _short(path: str) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.report.svg import PAPER, new_figure
+from l2m_gtsam.qa.report.svg import PAPER, SMALL, new_figure
 from l2m_gtsam.results import SensorCalibration
 
 NAMES = ("tx", "ty", "tz", *(f"C{r}{c}" for r in "xyz" for c in "xyz"), "Hx", "Hy", "Hz")
@@ -27,8 +27,8 @@ def correlation_figure(sensor: SensorCalibration) -> Figure:
     axes = figure.add_subplot()
     rho = correlations(sensor)
     drawn = axes.imshow(rho, cmap="PuOr", vmin=-1, vmax=1)
-    axes.set_xticks(range(15), NAMES, rotation=90, fontsize=8)
-    axes.set_yticks(range(15), NAMES, fontsize=8)
+    axes.set_xticks(range(15), NAMES, rotation=90, fontsize=SMALL)
+    axes.set_yticks(range(15), NAMES, fontsize=SMALL)
     axes.grid(visible=False)
     for edge in (2.5, 11.5):
         axes.axhline(edge, color=PAPER, linewidth=2)
@@ -36,7 +36,17 @@ def correlation_figure(sensor: SensorCalibration) -> Figure:
     # Strong ones are told by their sign, too.
     for i, j in zip(*np.nonzero(np.abs(np.tril(np.nan_to_num(rho), -1)) > 0.5), strict=True):
         axes.text(
-            j, i, "+" if rho[i, j] > 0 else "−", ha="center", va="center", color="white", fontsize=8
+            j,
+            i,
+            "+" if rho[i, j] > 0 else "−",
+            ha="center",
+            va="center",
+            color="white",
+            fontsize=SMALL,
         )
     figure.colorbar(drawn, ax=axes, label="correlation", shrink=0.8)
     return figure
+
+
+def _sign(value: float) -> str:
+    return "+" if value > 0 else "−"

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.metric_results import Metrics, Rows, SensorMetrics
-from l2m_gtsam.qa.report.svg import BAD, PAPER, WIDTH, new_figure
+from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.results import CalibrationResult
 
 # Of colour bars: a drive is wider than high more often than not.
@@ -90,7 +90,7 @@ def _drive(axes: Axes, metrics: Metrics) -> None:
         tuple(path[:, 0]),
         xytext=(6, 6),
         textcoords="offset points",
-        fontsize=8,
+        fontsize=SMALL,
         color="black",
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1},
     )

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from l2m_gtsam.metric_results import SensorMetrics
-from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, X, Y, new_figure
+from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, SMALL, X, Y, new_figure
 
 CUT = 7.81  # 95 % of chi-square of three
 ALIKE = 3.0  # sigmas: of fifteen parameters one is beyond in 4 % of all drives
@@ -28,7 +28,7 @@ def chi_square_figure(sensor: SensorMetrics) -> Figure:
         xycoords=("data", "axes fraction"),
         xytext=(4, -14),
         textcoords="offset points",
-        fontsize=8,
+        fontsize=SMALL,
     )
     axes.set(xlabel="squared normalised residual; the last bar holds all beyond", ylabel="density")
     axes.legend(loc="upper right")
@@ -66,7 +66,7 @@ def halves_figure(sensor: SensorMetrics) -> Figure:
     axes.bar(place[~beyond], ratio[~beyond], color=X, width=0.7)
     axes.bar(place[beyond], ratio[beyond], color=BAD, width=0.7, hatch="//", edgecolor=INK)
     axes.axhline(0, color=MUTED, linewidth=0.7)
-    axes.set_xticks(place, names, rotation=60, fontsize=8)
+    axes.set_xticks(place, names, rotation=60, fontsize=SMALL)
     high = max(1.4 * ALIKE, 1.15 * float(np.abs(ratio).max()))
     axes.set(ylabel="second less first half (sigmas)", ylim=(-high, high))
     axes.grid(visible=False, axis="x")

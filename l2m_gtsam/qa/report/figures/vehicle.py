@@ -10,7 +10,7 @@ from matplotlib.patches import Ellipse
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.reasons.reason import Level
-from l2m_gtsam.qa.report.svg import BAD, FAIR, GOOD, INK, MUTED, new_figure
+from l2m_gtsam.qa.report.svg import BAD, FAIR, GOOD, INK, MUTED, SMALL, new_figure, short_name
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 
 CHI2_95 = 5.991  # of two degrees of freedom
@@ -46,7 +46,7 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: View) -> F
     axes.annotate("lidar", (0, 0), xytext=(-14, -13), textcoords="offset points", color=MUTED)
     names = ["xyz"[k] for k in view.axes]
     axes.set(xlabel=f"{names[0]} (m), forward", ylabel=f"{names[1]} (m)")
-    axes.set_title(f"{view.name}; 95 % ellipses{_drawn(factor)}")
+    axes.set_title(f"95 % ellipses{_drawn(factor)}")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.18)
     return figure
@@ -82,11 +82,19 @@ def _name(axes: Axes, found: list[SensorCalibration], view: View) -> None:
             labels.append((at, [sensor.sensor]))
         else:
             there.append(sensor.sensor)
+    middle = float(np.mean(_places(found, view)[:, 0]))
     for at, names in labels:
-        text = "\n".join(names)
-        axes.annotate(
-            text, tuple(at), xytext=(6, 4), textcoords="offset points", fontsize=8, linespacing=1.1
+        text = "\n".join(map(short_name, names))
+        right = at[0] > middle
+        label = axes.annotate(
+            text,
+            tuple(at),
+            xytext=(-7 if right else 7, 4),
+            textcoords="offset points",
+            ha="right" if right else "left",
+            fontsize=SMALL,
         )
+        label.set_in_layout(False)  # a long name is no reason to draw the vehicle smaller
 
 
 def _drawn(factor: int) -> str:
