@@ -5,7 +5,7 @@ from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import Recording
 from l2m_gtsam.metric_results import Halves, Metrics
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.metrics.assemble import metrics_of
+from l2m_gtsam.qa.metrics.assemble import MapForms, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.repeatability import compared_halves
@@ -41,6 +41,5 @@ def appraise(
         tell("halves of the drive", 1.0)
     solution = calibrated.solution
     evidence = DriveEvidence(solution.readings, solution.inside, solution.rejected)
-    return metrics_of(
-        calibrated.result, evidence, recording.trajectory, calibrated.field_map, halves
-    )
+    maps = MapForms(calibrated.field_map, calibrated.solver_map)
+    return metrics_of(calibrated.result, evidence, recording.trajectory, maps, halves)

@@ -48,13 +48,14 @@ class Calibrated:
         The calibration.
     solution
         Of the solve, with its readings.
-    field_map
-        The map as it was asked.
+    field_map, solver_map
+        The map, and the form of it that is asked faster along the drive.
     """
 
     result: CalibrationResult
     solution: OneKeySolution
     field_map: QueryableMap
+    solver_map: QueryableMap
 
 
 def calibrate(
@@ -141,7 +142,7 @@ def calibrated(
         options=options.model_dump(mode="json"),
         versions={name: version(name) for name in VERSIONED},
     )
-    return Calibrated(result, solution, solver_map)
+    return Calibrated(result, solution, field_map, solver_map)
 
 
 def _starts(

@@ -233,7 +233,7 @@ def demo(
         outcome = run_demo(out, ScenarioOptions(seed=seed), progress)
     _print(truth_table(outcome.result, outcome.truth))
     typer.echo(honesty_note(outcome.result, outcome.truth))
-    typer.echo(f"picture: {outcome.picture}; everything else is in {out}")
+    typer.echo(f"picture: {outcome.picture}; report: {outcome.report}; everything else is in {out}")
 
 
 @map_app.command("build")

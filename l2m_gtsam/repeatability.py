@@ -49,7 +49,7 @@ def _half(
     """Return what some of the readings say of each sensor that they are enough for."""
     few = spread(readings, max(most, options.solve.min_readings))
     solution = solve_one_key(
-        few, calibrated.field_map, calibrated.solution.estimate.t, options.solve
+        few, calibrated.solver_map, calibrated.solution.estimate.t, options.solve
     )
     return {
         found.sensor: Half(solution.estimate.vector(found.sensor), found.covariance)

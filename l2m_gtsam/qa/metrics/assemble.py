@@ -1,6 +1,7 @@
 """All metrics of one calibration."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -27,11 +28,19 @@ CELLS = 90  # along the longer side of the map's picture
 AROUND_M = 1.5
 
 
+@dataclass(frozen=True)
+class MapForms:
+    """One map in two forms: asked at few places anywhere, and fast along the drive."""
+
+    anywhere: Queryable
+    along_drive: Queryable
+
+
 def metrics_of(
     result: CalibrationResult,
     evidence: DriveEvidence,
     trajectory: Trajectory,
-    field_map: Queryable,
+    maps: MapForms,
     halves: Mapping[str, Halves],
 ) -> Metrics:
     """Return the figures of all sensors that were solved, and of the drive.
@@ -44,7 +53,7 @@ def metrics_of(
         Its readings.
     trajectory
         Poses of the lidar in the map.
-    field_map
+    maps
         The map.
     halves
         Comparison of both halves of the drive by sensor, as far as there is one.
@@ -52,7 +61,7 @@ def metrics_of(
     solved = [each for each in result.sensors if each.residuals is not None]
     most = int(np.clip(DRAWN // max(len(solved), 1), FEWEST, MOST))
     start_ns = int(evidence.readings.stamp_ns.min())
-    seen = {each.sensor: sensor_evidence(evidence, each, field_map) for each in solved}
+    seen = {each.sensor: sensor_evidence(evidence, each, maps.along_drive) for each in solved}
     sensors = tuple(
         _sensor(
             each,
@@ -64,7 +73,7 @@ def metrics_of(
         for each in solved
     )
     places = np.concatenate([each.place for each in seen.values()])
-    picture = map_picture(field_map, places)
+    picture = map_picture(maps.anywhere, places)
     return Metrics(sensors, drive_metrics(trajectory), picture)
 
 

@@ -73,6 +73,15 @@ def new_figure(height: float) -> Figure:
     return Figure(figsize=(WIDTH, height), layout="constrained", dpi=110)
 
 
+def plain_figure(height: float) -> Figure:
+    """Return an empty figure with margins for usual labels: laying out takes as long as drawing."""
+    figure = Figure(figsize=(WIDTH, height), dpi=110)
+    figure.subplots_adjust(
+        left=0.15, right=0.975, bottom=0.5 / height, top=1 - 0.3 / height, hspace=0.12
+    )
+    return figure
+
+
 def as_svg(figure: Figure, name: str, alt: str) -> Markup:
     """Return a figure as an element of a page.
 

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.report.svg import PAPER, SMALL, new_figure
+from l2m_gtsam.qa.report.svg import PAPER, SMALL, plain_figure
 from l2m_gtsam.results import SensorCalibration
 
 NAMES = ("tx", "ty", "tz", *(f"C{r}{c}" for r in "xyz" for c in "xyz"), "Hx", "Hy", "Hz")
@@ -23,8 +23,8 @@ def correlations(sensor: SensorCalibration) -> FloatArray:
 
 def correlation_figure(sensor: SensorCalibration) -> Figure:
     """Draw the correlations as a matrix; what is not determined stays blank."""
-    figure = new_figure(4.0)
-    axes = figure.add_subplot()
+    figure = plain_figure(4.0)
+    axes, bar = figure.add_axes((0.1, 0.13, 0.7, 0.83)), figure.add_axes((0.84, 0.2, 0.03, 0.7))
     rho = correlations(sensor)
     drawn = axes.imshow(rho, cmap="PuOr", vmin=-1, vmax=1)
     axes.set_xticks(range(15), NAMES, rotation=90, fontsize=SMALL)
@@ -44,7 +44,7 @@ def correlation_figure(sensor: SensorCalibration) -> Figure:
             color="white",
             fontsize=SMALL,
         )
-    figure.colorbar(drawn, ax=axes, label="correlation", shrink=0.8)
+    figure.colorbar(drawn, cax=bar, label="correlation")
     return figure
 
 

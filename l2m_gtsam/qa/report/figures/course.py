@@ -4,12 +4,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from l2m_gtsam.metric_results import SensorMetrics
-from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MUTED, X, Y, dots, new_figure
+from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MUTED, X, Y, dots, plain_figure
 
 
 def residuals_figure(sensor: SensorMetrics) -> Figure:
     """Draw residuals over time, an axis each, with rejected readings marked."""
-    figure = new_figure(3.8)
+    figure = plain_figure(3.8)
     parts = figure.subplots(3, 1, sharex=True, sharey=True)
     seconds, wrong = np.array(sensor.series.seconds), np.array(sensor.series.rejected)
     residual = np.array(sensor.series.residual)
@@ -28,7 +28,7 @@ def residuals_figure(sensor: SensorMetrics) -> Figure:
 
 def curves_figure(sensor: SensorMetrics) -> Figure:
     """Draw readings before and after the calibration beside those of the map, an axis each."""
-    figure = new_figure(4.6)
+    figure = plain_figure(4.6)
     parts = figure.subplots(3, 1, sharex=True)
     seconds = np.array(sensor.series.seconds)
     course = sensor.series
@@ -40,6 +40,6 @@ def curves_figure(sensor: SensorMetrics) -> Figure:
         axes.plot(seconds, there, "-", color=INK, linewidth=2.2, alpha=0.35, label="map (MR)")
         axes.plot(seconds, after, "--", color=Y, linewidth=1.0, label="after (AC)")
         axes.set_ylabel(f"{'xyz'[k]} (µT)")
-    figure.legend(*parts[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    figure.legend(*parts[0].get_legend_handles_labels(), loc="upper center", ncols=3)
     parts[-1].set_xlabel("time (s)")
     return figure

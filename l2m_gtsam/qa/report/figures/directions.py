@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.metric_results import SensorMetrics
-from l2m_gtsam.qa.report.svg import GRID, MUTED, X, Y, dots, new_figure
+from l2m_gtsam.qa.report.svg import GRID, MUTED, X, Y, dots, plain_figure
 
 
 def equal_area(unit: FloatArray) -> FloatArray:
@@ -22,7 +22,8 @@ def equal_area(unit: FloatArray) -> FloatArray:
 
 def directions_figure(sensor: SensorMetrics) -> Figure:
     """Draw the directions on two disks: the upper and the lower half of space."""
-    figure = new_figure(2.7)
+    figure = plain_figure(2.7)
+    figure.subplots_adjust(left=0.02, right=0.98, bottom=0.03, top=0.86, wspace=0.08)
     b = np.array(sensor.series.map)
     unit = b / np.linalg.norm(b, axis=1, keepdims=True)
     for axes, side, name, colour, size in zip(

@@ -5,7 +5,7 @@ from matplotlib.figure import Figure
 from scipy.stats import chi2
 
 from l2m_gtsam.metric_results import SensorMetrics
-from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, SMALL, X, Y, new_figure
+from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, SMALL, X, Y, plain_figure
 
 CUT = 7.81  # 95 % of chi-square of three
 ALIKE = 3.0  # sigmas: of fifteen parameters one is beyond in 4 % of all drives
@@ -13,7 +13,7 @@ ALIKE = 3.0  # sigmas: of fifteen parameters one is beyond in 4 % of all drives
 
 def chi_square_figure(sensor: SensorMetrics) -> Figure:
     """Draw squared normalised residuals beside the chi-square that they should have."""
-    figure = new_figure(2.9)
+    figure = plain_figure(2.9)
     axes = figure.add_subplot()
     found = sensor.normalised
     edges, counts = np.array(found.edges), np.array(found.counts)
@@ -37,7 +37,7 @@ def chi_square_figure(sensor: SensorMetrics) -> Figure:
 
 def autocorrelation_figure(sensor: SensorMetrics) -> Figure:
     """Draw how alike residuals are that lie some readings apart."""
-    figure = new_figure(2.9)
+    figure = plain_figure(2.9)
     axes = figure.add_subplot()
     found = sensor.autocorrelation
     bound = 1.96 / np.sqrt(max(sensor.fit.readings, 1))
@@ -54,7 +54,7 @@ def autocorrelation_figure(sensor: SensorMetrics) -> Figure:
 
 def halves_figure(sensor: SensorMetrics) -> Figure:
     """Draw by how many sigmas both halves of the drive differ, parameter by parameter."""
-    figure = new_figure(2.9)
+    figure = plain_figure(2.9)
     axes = figure.add_subplot()
     d, sigma = np.array(sensor.halves.difference), np.array(sensor.halves.sigma)
     known = np.isfinite(sigma) & (sigma > 0)
@@ -66,6 +66,7 @@ def halves_figure(sensor: SensorMetrics) -> Figure:
     axes.bar(place[~beyond], ratio[~beyond], color=X, width=0.7)
     axes.bar(place[beyond], ratio[beyond], color=BAD, width=0.7, hatch="//", edgecolor=INK)
     axes.axhline(0, color=MUTED, linewidth=0.7)
+    figure.subplots_adjust(bottom=0.17)
     axes.set_xticks(place, names, rotation=60, fontsize=SMALL)
     high = max(1.4 * ALIKE, 1.15 * float(np.abs(ratio).max()))
     axes.set(ylabel="second less first half (sigmas)", ylim=(-high, high))
