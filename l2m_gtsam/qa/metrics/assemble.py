@@ -25,7 +25,7 @@ from l2m_gtsam.results import CalibrationResult, SensorCalibration
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
 FEWEST, MOST = 100, 500  # of each
 CELLS = 90  # along the longer side of the map's picture
-AROUND_M = 1.5
+AROUND = 0.15  # of the drive, on each side
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,9 @@ def _sensor(
 
 def map_picture(field_map: Queryable, places: FloatArray) -> MapPicture:
     """Return the map around places, shape (N, 3), at their middle height, coarsely."""
-    low = places[:, :2].min(axis=0) - AROUND_M
-    high = places[:, :2].max(axis=0) + AROUND_M
+    low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
+    around = AROUND * max(float((high - low).max()), 1.0)
+    low, high = low - around, high + around
     cell = float((high - low).max()) / CELLS
     x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
     height = float(np.median(places[:, 2]))

@@ -82,10 +82,12 @@ def sensor_evidence(
     index = drive.readings.sensors.index(sensor.sensor)
     own = np.arange(len(drive.inside))[drive.readings.rows_of(index)]
     own = own[drive.inside[own]]
-    readings, C = drive.readings[own], sensor.distortion.C
+    place = _places(drive.readings[own], sensor)
+    # The last step of the solve may have carried a reading over the edge of the map.
+    there = field_map.query(place).inside
+    own, place = own[there], place[there]
+    sample, readings, C = field_map.query(place), drive.readings[own], sensor.distortion.C
     R = readings.R_map_lidar
-    place = R @ sensor.t_lidar_mag + readings.p_map_lidar
-    sample = field_map.query(place)
     b = np.einsum("nji,nj->ni", R, sample.field)
     residual = sensor.distortion.apply(b) - readings.field
     map_share = map_covariance(np.broadcast_to(C, R.shape), R, sample.variance)
@@ -102,6 +104,11 @@ def sensor_evidence(
         pose_share=poses,
         white=np.asarray(np.einsum("nij,nj->ni", W, residual)),
     )
+
+
+def _places(readings: Readings, sensor: SensorCalibration) -> FloatArray:
+    """Return where a sensor was at its readings in the map in metres, shape (N, 3)."""
+    return np.asarray(readings.R_map_lidar @ sensor.t_lidar_mag + readings.p_map_lidar)
 
 
 def _pose_share(

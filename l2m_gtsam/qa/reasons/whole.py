@@ -6,11 +6,15 @@ from l2m_gtsam.qa.reasons.fit import misfit
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason
 from l2m_gtsam.results import CalibrationResult, Disagreement, Return, SensorStatus
 
-CHANGED = {
-    Return.NEVER: "It was not passed again, so that something passing by and a changed place look "
-    "alike",
-    Return.AS_MAPPED: "Passed again it was as mapped: something moved by",
-    Return.DIFFERS: "Passed again it differed too: the field has changed since it was mapped",
+HEADS = {
+    Return.NEVER: "The environment has changed, or something passed by",
+    Return.AS_MAPPED: "Something passed by",
+    Return.DIFFERS: "The environment has changed since it was mapped",
+}
+TAILS = {
+    Return.NEVER: "It was not passed again, which would tell",
+    Return.AS_MAPPED: "Passed again the place was as mapped",
+    Return.DIFFERS: "Passed again it differed, too: map it anew",
 }
 OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED, SensorStatus.NO_READINGS)
 MANY = 4  # stretches that are told one by one
@@ -86,10 +90,10 @@ def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
     after = 1e-9 * (stretch.start_ns - start)
     when = f", {after:.0f} s after the first" if after >= 1 else ""
     return (
-        f"The environment has changed: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on the "
-        f"map{when}, {stretch.length:.1f} m long, {count} sensor{'s' if count > 1 else ''} "
+        f"{HEADS[stretch.passed_again]}: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on "
+        f"the map{when}, {stretch.length:.1f} m long, {count} sensor{'s' if count > 1 else ''} "
         f"differ{'' if count > 1 else 's'} by {stretch.size:.2g} µT. "
-        f"{CHANGED[stretch.passed_again]}. These {stretch.readings} readings do not count."
+        f"{TAILS[stretch.passed_again]}. These {stretch.readings} readings do not count."
     )
 
 

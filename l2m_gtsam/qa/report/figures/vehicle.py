@@ -47,6 +47,7 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: View) -> F
     names = ["xyz"[k] for k in view.axes]
     axes.set(xlabel=f"{names[0]} (m), forward", ylabel=f"{names[1]} (m)")
     axes.set_title(f"95 % ellipses{_drawn(factor)}")
+    axes.locator_params(nbins=6)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.18)
     return figure
