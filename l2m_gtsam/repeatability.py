@@ -7,6 +7,7 @@ import numpy as np
 from l2m_gtsam.calibrate import Calibrated
 from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import Readings
+from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import spread
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.metric_results import Halves
@@ -36,10 +37,15 @@ def compared_halves(
     solved = [found.sensor for found in solution.solved]
     usable = solution.inside & np.isin(readings.sensor, solved)
     middle = np.median(readings.stamp_ns[usable])
-    first, second = (
-        _half(calibrated, readings.select(usable & part), options, each_half)
-        for part in (readings.stamp_ns < middle, readings.stamp_ns >= middle)
-    )
+    parts = (readings.stamp_ns < middle, readings.stamp_ns >= middle)
+    try:
+        first, second = (
+            _half(calibrated, readings.select(usable & part), options, each_half) for part in parts
+        )
+    except (CalibrationError, np.linalg.LinAlgError) as error:
+        # The whole is calibrated: that a half is not is no reason to lose it.
+        reason = f"a half of the drive cannot be calibrated: {error}"
+        return {readings.sensors[index]: no_halves(reason) for index in solved}
     return {readings.sensors[index]: _compared(first, second, index) for index in solved}
 
 

@@ -14,6 +14,7 @@ from l2m_gtsam.plan import assumed_recording, plan
 from l2m_gtsam.plan_results import DrivePlan
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.figures import calibration_figure, save_figure
+from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
 from l2m_gtsam.storage.calibration_file import write_calibration
@@ -65,6 +66,7 @@ def calibrate_bag(
     saved = SavedMap.read(map_path)
     recording = read_drive_and_numbers(bag, config, progress)
     field_map, source = saved.open(progress, [recording]), source_file(map_path)
+    check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, field_map, config.calibration, source, progress)
     metrics = appraise(recording, found, config.calibration, config.qa, progress)
     result = replace(found.result, options=config.model_dump(mode="json"))

@@ -10,6 +10,7 @@ from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.qa.judge import Verdict, judge
+from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.page import report_page
 from l2m_gtsam.results import CalibrationResult
@@ -52,7 +53,16 @@ def report_folder(folder: Path, config: Path | None, *, pdf: bool = False) -> Ve
 def write_report(
     folder: Path, result: CalibrationResult, metrics: Metrics, options: QaOptions
 ) -> Verdict:
-    """Write the report on a calibration and return its verdict."""
+    """Write the report on a calibration and return its verdict.
+
+    Raises
+    ------
+    ConfigError
+        The options name a sensor that is not there.
+    OutputError
+        It cannot be written.
+    """
+    check_names([each.sensor for each in result.sensors], options)
     page = report_page(result, metrics, options)
     with atomic_path(folder / REPORT_FILE) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="replace")

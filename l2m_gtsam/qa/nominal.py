@@ -1,5 +1,6 @@
 """How sensors were meant to be mounted, from wherever the configuration says it."""
 
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from typing import Any
 
@@ -7,8 +8,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.results import CalibrationResult
+
+
+def check_names(sensors: Sequence[str], options: QaOptions) -> None:
+    """Raise a ConfigError if something is said of a sensor that is not there."""
+    if unknown := sorted(set(options.nominal) - set(sensors)):
+        msg = f"qa.nominal: no sensor named {unknown[0]!r}; there are {', '.join(sensors)}"
+        raise ConfigError(msg)
 
 
 def nominal_place(sensor: str, result: CalibrationResult, options: QaOptions) -> FloatArray | None:

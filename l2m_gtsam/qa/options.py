@@ -1,8 +1,12 @@
 """Where a verdict changes from PASS to WARN and from WARN to FAIL."""
 
+from typing import Self
+
 from pydantic import Field, PositiveFloat, model_validator
 
 from l2m_gtsam.options import Options
+
+UNIT = 1e-3  # a quaternion given to three digits is as long as this
 
 
 class Limit(Options):
@@ -14,7 +18,7 @@ class Limit(Options):
     """Above this the verdict is FAIL."""
 
     @model_validator(mode="after")
-    def _is_ordered(self) -> "Limit":
+    def _is_ordered(self) -> Self:
         if self.fail < self.warn:
             msg = f"fail must not be less than warn, it is {self.fail:g} against {self.warn:g}"
             raise ValueError(msg)
@@ -28,6 +32,14 @@ class Nominal(Options):
     """Its place in the lidar frame, metres."""
     quaternion_xyzw: tuple[float, float, float, float] | None = None
     """R_lidar_mag, from the sensor's axes to the lidar's."""
+
+    @model_validator(mode="after")
+    def _is_a_rotation(self) -> Self:
+        length = sum(part**2 for part in self.quaternion_xyzw or (1.0,)) ** 0.5
+        if abs(length - 1) > UNIT:
+            msg = f"quaternion_xyzw must have length 1, this one has {length:.4g}"
+            raise ValueError(msg)
+        return self
 
 
 class QaOptions(Options):

@@ -15,13 +15,14 @@ from l2m_gtsam.calibrate import Calibrated, calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.metric_results import Metrics
+from l2m_gtsam.qa.judge import judge
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
-from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.reasons.reason import Level
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.metrics_file import read_metrics, write_metrics
 from tests.end_to_end.conftest import complaint_here
-from tests.verdict_drives import changed_place
+from tests.verdict_drives import EIGHT, changed_place, drive, with_series
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,39 @@ def test_thresholds_come_from_the_configuration(made: Made, tmp_path: Path) -> N
     assert "1e-05" in (made.folder / REPORT_FILE).read_text()
 
 
+def scaled(factor: float) -> QaOptions:
+    """All limits times a factor."""
+    limits = {
+        name: Limit(warn=factor * value.warn, fail=factor * value.fail)
+        for name, value in QaOptions()
+        if isinstance(value, Limit)
+    }
+    return QaOptions().model_copy(update=limits)
+
+
+@pytest.mark.parametrize(("less", "more"), [(0.01, 0.1), (0.1, 1.0), (1.0, 3.0), (3.0, 100.0)])
+def test_looser_thresholds_never_judge_worse(made: Made, less: float, more: float) -> None:
+    strict, loose = (
+        judge(made.calibrated.result, made.metrics, scaled(factor)) for factor in (less, more)
+    )
+    for one, other in zip(strict.sensors, loose.sensors, strict=True):
+        assert other.level.rank <= one.level.rank
+    assert loose.level.rank <= strict.level.rank
+
+
+def test_a_stuck_sensor_has_its_place_in_the_report(tmp_path: Path) -> None:
+    whole = drive()
+    whole = with_series(whole, 1, np.tile([1.0, 2.0, 3.0], (len(EIGHT), 1)))
+    found = calibrated(whole.recording, whole.field_map, whole.options)
+    metrics = appraise(whole.recording, found, whole.options, QaOptions(halves=False))
+    verdict = write_report(tmp_path, found.result, metrics, QaOptions())
+    assert verdict["mag_1"].level is Level.FAIL
+    assert "it is stuck" in verdict["mag_1"].reasons[0].text
+    page = (tmp_path / REPORT_FILE).read_text()
+    assert page.count("<figure>") == 4 + 2 * 7
+    assert "were not calibrated by themselves" in page
+
+
 def test_bad_input_is_one_line(made: Made, tmp_path: Path) -> None:
     assert "calibration.yaml: no such file" in complaint_here("report", tmp_path)
     (tmp_path / CALIBRATION_FILE).write_bytes((made.folder / CALIBRATION_FILE).read_bytes())
@@ -131,6 +165,14 @@ def test_bad_input_is_one_line(made: Made, tmp_path: Path) -> None:
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text("qa: {rejected: {warn: 0.5, fail: 0.1}}\n")
     assert "fail must not be less than warn" in complaint_here(
+        "report", made.folder, "--config", wrong
+    )
+    wrong.write_text("qa: {nominal: {mag_9: {t_lidar_mag: [0, 0, 0]}}}\n")
+    assert "no sensor named 'mag_9'; there are mag_0, mag_1, mag_2" in complaint_here(
+        "report", made.folder, "--config", wrong
+    )
+    wrong.write_text("qa: {nominal: {mag_0: {quaternion_xyzw: [0, 0, 0, 2]}}}\n")
+    assert "must have length 1, this one has 2" in complaint_here(
         "report", made.folder, "--config", wrong
     )
     assert not (tmp_path / REPORT_FILE).exists()

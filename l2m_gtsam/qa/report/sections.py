@@ -57,7 +57,9 @@ def overall_pictures(
 ) -> tuple[tuple[Picture, ...], tuple[Picture, ...]]:
     """Return pictures of the vehicle, and those of the place."""
     names = ", ".join(
-        f"{each.sensor} at {words.vector(each.t_lidar_mag, 3)} m" for each in result.sensors
+        f"{each.sensor} at {words.vector(each.t_lidar_mag, 3)} m"
+        for each in result.sensors
+        if np.isfinite(each.t_lidar_mag).all()
     )
     vehicle = tuple(
         _picture(

@@ -19,7 +19,9 @@ def with_sigma(value: float, sigma: float, digits: int) -> str:
 
 def vector(values: FloatArray, digits: int) -> str:
     """Return a vector in brackets."""
-    return "(" + ", ".join(f"{value:.{digits}f}" for value in np.asarray(values)) + ")"
+    # adding zero takes the sign from a zero
+    rounded = np.round(np.asarray(values, dtype=float), digits) + 0.0
+    return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
 
 
 def position(sensor: SensorCalibration) -> list[tuple[str, str]]:
