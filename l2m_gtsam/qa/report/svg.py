@@ -77,7 +77,7 @@ def plain_figure(height: float) -> Figure:
     """Return an empty figure with margins for usual labels: laying out takes as long as drawing."""
     figure = Figure(figsize=(WIDTH, height), dpi=110)
     figure.subplots_adjust(
-        left=0.15, right=0.975, bottom=0.5 / height, top=1 - 0.3 / height, hspace=0.12
+        left=0.17, right=0.975, bottom=0.5 / height, top=1 - 0.3 / height, hspace=0.12
     )
     return figure
 

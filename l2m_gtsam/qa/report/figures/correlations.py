@@ -44,7 +44,7 @@ def correlation_figure(sensor: SensorCalibration) -> Figure:
             color="white",
             fontsize=SMALL,
         )
-    figure.colorbar(drawn, cax=bar, label="correlation")
+    figure.colorbar(drawn, cax=bar, ticks=[-1, -0.5, 0, 0.5, 1])
     return figure
 
 

@@ -30,7 +30,7 @@ def chi_square_figure(sensor: SensorMetrics) -> Figure:
         textcoords="offset points",
         fontsize=SMALL,
     )
-    axes.set(xlabel="squared normalised residual; the last bar holds all beyond", ylabel="density")
+    axes.set(xlabel="squared normalised residual (last bar: all beyond)", ylabel="density")
     axes.legend(loc="upper right")
     return figure
 

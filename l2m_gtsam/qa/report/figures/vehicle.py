@@ -19,6 +19,7 @@ SHAPES = {Level.PASS: "o", Level.WARN: "^", Level.FAIL: "X"}
 # An ellipse that is less than this share of the picture is a dot: all are drawn larger then.
 SEEN = 0.06
 BEHIND = 0.08  # of the picture: names closer than this would cover each other
+FAR = 0.75  # of the picture: names beyond this stand on the left of their dot
 ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200)
 
 
@@ -83,10 +84,11 @@ def _name(axes: Axes, found: list[SensorCalibration], view: View) -> None:
             labels.append((at, [sensor.sensor]))
         else:
             there.append(sensor.sensor)
-    middle = float(np.mean(_places(found, view)[:, 0]))
+    x = _places(found, view)[:, 0]
+    far = x.min() + FAR * np.ptp(x)
     for at, names in labels:
         text = "\n".join(map(short_name, names))
-        right = at[0] > middle
+        right = at[0] > far
         label = axes.annotate(
             text,
             tuple(at),
