@@ -13,6 +13,8 @@ from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.metric_results import Halves
 from l2m_gtsam.qa.metrics.halves import Half, compare_halves, no_halves
 
+STEPS = 3  # alternations from where the whole was found; the joint graph does the rest
+
 
 def compared_halves(
     calibrated: Calibrated, options: CalibrationOptions, each_half: int
@@ -54,9 +56,8 @@ def _half(
 ) -> dict[int, Half]:
     """Return what some of the readings say of each sensor that they are enough for."""
     few = spread(readings, max(most, options.solve.min_readings))
-    solution = solve_one_key(
-        few, calibrated.solver_map, calibrated.solution.estimate.t, options.solve
-    )
+    near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
+    solution = solve_one_key(few, calibrated.solver_map, calibrated.solution.estimate.t, near)
     return {
         found.sensor: Half(solution.estimate.vector(found.sensor), found.covariance)
         for found in solution.solved

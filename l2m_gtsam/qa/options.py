@@ -99,5 +99,5 @@ class QaOptions(Options):
     headings is called straight."""
     halves: bool = True
     """Whether both halves of a drive are calibrated by themselves."""
-    half_readings: int = Field(default=100, ge=30)
+    half_readings: int = Field(default=50, ge=30)
     """Readings of each sensor that a half is calibrated on, spread evenly over it."""

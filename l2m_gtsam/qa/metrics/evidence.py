@@ -84,9 +84,9 @@ def sensor_evidence(
     own = own[drive.inside[own]]
     place = _places(drive.readings[own], sensor)
     # The last step of the solve may have carried a reading over the edge of the map.
-    there = field_map.query(place).inside
-    own, place = own[there], place[there]
-    sample, readings, C = field_map.query(place), drive.readings[own], sensor.distortion.C
+    whole = field_map.query(place)
+    own, place, sample = own[whole.inside], place[whole.inside], _where_inside(whole)
+    readings, C = drive.readings[own], sensor.distortion.C
     R = readings.R_map_lidar
     b = np.einsum("nji,nj->ni", R, sample.field)
     residual = sensor.distortion.apply(b) - readings.field
@@ -103,6 +103,14 @@ def sensor_evidence(
         map_share=map_share,
         pose_share=poses,
         white=np.asarray(np.einsum("nij,nj->ni", W, residual)),
+    )
+
+
+def _where_inside(sample: FieldSample) -> FieldSample:
+    """Return what a map says about the points that it has data for."""
+    there = sample.inside
+    return FieldSample(
+        sample.field[there], sample.gradient[there], sample.variance[there], sample.inside[there]
     )
 
 
