@@ -1,5 +1,6 @@
 """Recording + map + options -> calibration. Pure: no files, no terminal."""
 
+from dataclasses import dataclass
 from importlib.metadata import version
 
 import numpy as np
@@ -17,6 +18,7 @@ from l2m_gtsam.graph.explanation import explained
 from l2m_gtsam.graph.global_start import find_starts
 from l2m_gtsam.graph.moving_solve import MovingProblem, solve_moving
 from l2m_gtsam.graph.named_priors import priors_of
+from l2m_gtsam.graph.one_key import OneKeySolution
 from l2m_gtsam.graph.priors import Priors
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
@@ -34,6 +36,26 @@ from l2m_gtsam.sync import stuck_sensors
 from l2m_gtsam.verdicts import SolvedDrive, sensor_verdicts
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration with what it rests on.
+
+    Attributes
+    ----------
+    result
+        The calibration.
+    solution
+        Of the solve, with its readings.
+    field_map, solver_map
+        The map, and the form of it that is asked faster along the drive.
+    """
+
+    result: CalibrationResult
+    solution: OneKeySolution
+    field_map: QueryableMap
+    solver_map: QueryableMap
 
 
 def calibrate(
@@ -66,6 +88,17 @@ def calibrate(
         No sensor can be solved: the map does not cover the drive, or nothing was read. Or a start
         or prior names no sensor of the recording.
     """
+    return calibrated(recording, field_map, options, map_source, progress).result
+
+
+def calibrated(
+    recording: Recording,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    map_source: SourceFile | None = None,
+    progress: Progress | None = None,
+) -> Calibrated:
+    """Calibrate as ``calibrate`` does, and keep what the result rests on, to judge it by."""
     synchronised = prepare(recording, options)
     stuck = stuck_sensors(synchronised.readings)
     alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
@@ -98,7 +131,7 @@ def calibrate(
     if not solution.solved:
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
     verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
-    return CalibrationResult(
+    result = CalibrationResult(
         sensors=sensors,
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
@@ -109,6 +142,7 @@ def calibrate(
         options=options.model_dump(mode="json"),
         versions={name: version(name) for name in VERSIONED},
     )
+    return Calibrated(result, solution, field_map, solver_map)
 
 
 def _starts(

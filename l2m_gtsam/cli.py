@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from l2m_gtsam.commands import exports
+from l2m_gtsam.commands.report import report
 from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
 from l2m_gtsam.errors import L2MError
@@ -28,6 +29,7 @@ map_app = typer.Typer(
 app.add_typer(map_app, name="map")
 app.command()(study)
 exports.register(app)
+app.command()(report)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
@@ -150,16 +152,19 @@ def calibrate(
         bool, typer.Option("--models", help="Show how models of each sensor compare.")
     ] = False,
 ) -> None:
-    """Calibrate every magnetometer of a drive; write calibration.yaml and a picture."""
+    """Calibrate every magnetometer of a drive; write calibration.yaml, a picture and a report."""
     from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
+    from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
     from l2m_gtsam.config import load_config, with_uncertainty
     from l2m_gtsam.qa.model_table import model_note, model_tables
     from l2m_gtsam.qa.tables import calibration_table, disagreement_note, held_clocks_note
+    from l2m_gtsam.qa.verdict_text import verdict_lines
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with shown_progress() as progress:
         result = calibrate_bag(bag, map_path, chosen, out, progress)
+        verdict = report_folder(out, config)
     print_table(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
     warn(result.doubts)
@@ -170,7 +175,9 @@ def calibrate(
         print_table(table)
     for note in filter(None, map(model_note, result.sensors)):
         typer.echo(note)
-    typer.echo(f"written: {out / CALIBRATION_FILE}, {out / OVERVIEW_FILE}")
+    typer.echo("\n".join(verdict_lines(verdict)))
+    names = (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)
+    typer.echo(f"written: {', '.join(str(out / name) for name in names)}")
 
 
 @app.command()
@@ -223,7 +230,7 @@ def demo(
         outcome = run_demo(out, ScenarioOptions(seed=seed), progress)
     print_table(truth_table(outcome.result, outcome.truth))
     typer.echo(honesty_note(outcome.result, outcome.truth))
-    typer.echo(f"picture: {outcome.picture}; everything else is in {out}")
+    typer.echo(f"picture: {outcome.picture}; report: {outcome.report}; everything else is in {out}")
 
 
 @map_app.command("build")

@@ -13,6 +13,7 @@ from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
 from l2m_gtsam.options import Options
+from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.regressors import ResampleOptions
 from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.model_comparison import ModelOptions
@@ -81,6 +82,8 @@ class Config(Options):
     """`l2m calibrate`, and `l2m plan` before it."""
     plan: PlanOptions = PlanOptions()
     """`l2m plan`."""
+    qa: QaOptions = QaOptions()
+    """Verdicts of `l2m report`."""
 
 
 def load_config(path: Path | None) -> Config:

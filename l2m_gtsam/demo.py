@@ -5,6 +5,7 @@ from pathlib import Path
 
 from l2m_gtsam.batch.drives import OVERVIEW_FILE, calibrate_bag
 from l2m_gtsam.batch.maps import build_map_file
+from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
 from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, bag_name, simulate_bags
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor
@@ -16,11 +17,12 @@ from l2m_gtsam.simulate.scenario import ScenarioOptions
 
 @dataclass(frozen=True)
 class Demonstration:
-    """What the demonstration found, what is true, and where the picture is."""
+    """What the demonstration found, what is true, and where picture and report are."""
 
     result: CalibrationResult
     truth: tuple[KnownSensor, ...]
     picture: Path
+    report: Path
 
 
 def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonstration:
@@ -41,4 +43,5 @@ def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonst
     cloud = str(out / STRUCTURE_FILE)
     build_map_file([mapping], map_path, config, out / SUITE_FILE, progress, cloud)
     result = calibrate_bag(drive, map_path, config, out, progress, scenario.truth)
-    return Demonstration(result, scenario.truth, out / OVERVIEW_FILE)
+    report_folder(out, None)
+    return Demonstration(result, scenario.truth, out / OVERVIEW_FILE, out / REPORT_FILE)

@@ -4,23 +4,27 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from l2m_gtsam.appraise import appraise
 from l2m_gtsam.batch.opening import SavedMap, read_drive, read_drive_and_numbers
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
-from l2m_gtsam.calibrate import calibrate
+from l2m_gtsam.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.plan import assumed_recording, plan
 from l2m_gtsam.plan_results import DrivePlan
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.figures import calibration_figure, save_figure
+from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
+from l2m_gtsam.storage.metrics_file import write_metrics
 
 CALIBRATION_FILE = "calibration.yaml"
 OVERVIEW_FILE = "overview.png"
+METRICS_FILE = "metrics.json"
 
 
 def inspect_file(bag: Path, config: Config, progress: Progress) -> BagReport:
@@ -36,7 +40,7 @@ def calibrate_bag(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
 ) -> CalibrationResult:
-    """Calibrate all magnetometers of a bag and write `calibration.yaml` and a picture.
+    """Calibrate all magnetometers of a bag; write `calibration.yaml`, metrics and a picture.
 
     Parameters
     ----------
@@ -58,15 +62,18 @@ def calibrate_bag(
     L2MError
         Whatever is wrong with the input, in one line; nothing is written then.
     """
-    check_outputs(out / CALIBRATION_FILE, out / OVERVIEW_FILE)
+    check_outputs(*(out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE)))
     saved = SavedMap.read(map_path)
     recording = read_drive_and_numbers(bag, config, progress)
     field_map, source = saved.open(progress, [recording]), source_file(map_path)
-    result = calibrate(recording, field_map, config.calibration, source, progress)
-    result = replace(result, options=config.model_dump(mode="json"))
+    check_names([each.sensor for each in recording.series], config.qa)
+    found = calibrated(recording, field_map, config.calibration, source, progress)
+    metrics = appraise(recording, found, config.calibration, config.qa, progress)
+    result = replace(found.result, options=config.model_dump(mode="json"))
     figure = calibration_figure(field_map, recording.trajectory, result, truth)
     ensure_folder(out)
     write_calibration(out / CALIBRATION_FILE, result)
+    write_metrics(out / METRICS_FILE, metrics)
     save_figure(figure, out / OVERVIEW_FILE)
     return result
 

@@ -32,7 +32,7 @@ def l2m(*arguments: str | Path, fails: bool = False) -> Finished:
         text=True,
         env=environment,
         check=False,
-        timeout=300,
+        timeout=600,
     )
     if bool(run.returncode) != fails:
         pytest.fail(f"l2m {' '.join(map(str, arguments))}:\n{run.stdout}\n{run.stderr}")

@@ -17,7 +17,9 @@ from tests.end_to_end.conftest import Demo, complaint, l2m
 
 def test_help_loads_nothing_heavy() -> None:
     """It answers within half a second only as long as the mathematics stays unloaded."""
-    heavy = {"numpy", "scipy", "gtsam", "rosbags", "matplotlib", "magpylib", "pydantic"}
+    heavy = {"numpy", "scipy", "gtsam", "rosbags", "matplotlib", "magpylib", "pydantic"} | {
+        "jinja2"
+    }
     code = (
         "import sys; sys.argv = ['l2m', '--help']\n"
         "from l2m_gtsam.cli import main\n"

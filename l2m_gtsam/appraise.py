@@ -1,0 +1,45 @@
+"""A calibration -> the figures that it is judged by. Pure: no files, no terminal."""
+
+from l2m_gtsam.calibrate import Calibrated
+from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.data import Recording
+from l2m_gtsam.metric_results import Halves, Metrics
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.qa.metrics.assemble import MapForms, metrics_of
+from l2m_gtsam.qa.metrics.evidence import DriveEvidence
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.repeatability import compared_halves
+
+
+def appraise(
+    recording: Recording,
+    calibrated: Calibrated,
+    options: CalibrationOptions,
+    qa: QaOptions,
+    progress: Progress | None = None,
+) -> Metrics:
+    """Return the metrics of a calibration.
+
+    Parameters
+    ----------
+    recording
+        That was calibrated.
+    calibrated
+        The calibration, with what it rests on.
+    options
+        That it was computed with.
+    qa
+        Whether halves are calibrated, and on how many readings.
+    progress
+        Called with a stage and the fraction of it that is done.
+    """
+    tell = progress or (lambda stage, fraction: None)
+    halves: dict[str, Halves] = {}
+    if qa.halves:
+        tell("halves of the drive", 0.0)
+        halves = compared_halves(calibrated, options, qa.half_readings)
+        tell("halves of the drive", 1.0)
+    solution = calibrated.solution
+    evidence = DriveEvidence(solution.readings, solution.inside, solution.rejected)
+    maps = MapForms(calibrated.field_map, calibrated.solver_map)
+    return metrics_of(calibrated.result, evidence, recording.trajectory, maps, halves)

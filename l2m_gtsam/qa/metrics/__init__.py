@@ -1,0 +1,1 @@
+"""Figures of a calibration: arrays in, plain records out."""

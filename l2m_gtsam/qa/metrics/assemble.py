@@ -1,0 +1,114 @@
+"""All metrics of one calibration."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.metric_results import Halves, MapPicture, Metrics, SensorMetrics
+from l2m_gtsam.qa.metrics.autocorrelation import autocorrelation
+from l2m_gtsam.qa.metrics.coverage import directions, drive_metrics
+from l2m_gtsam.qa.metrics.curves import curve_errors, curves, series
+from l2m_gtsam.qa.metrics.evidence import (
+    DriveEvidence,
+    Queryable,
+    SensorEvidence,
+    sensor_evidence,
+)
+from l2m_gtsam.qa.metrics.fit import fit_figures, normalised_figures
+from l2m_gtsam.qa.metrics.halves import NOT_DONE, no_halves
+from l2m_gtsam.qa.metrics.mounting import mounting
+from l2m_gtsam.qa.metrics.plain import row, rows
+from l2m_gtsam.results import CalibrationResult, SensorCalibration
+
+DRAWN = 6000  # readings of all sensors together, so that a report stays small
+FEWEST, MOST = 100, 500  # of each
+CELLS = 90  # along the longer side of the map's picture
+AROUND = 0.15  # of the drive, on each side
+
+
+@dataclass(frozen=True)
+class MapForms:
+    """One map in two forms: asked at few places anywhere, and fast along the drive."""
+
+    anywhere: Queryable
+    along_drive: Queryable
+
+
+def metrics_of(
+    result: CalibrationResult,
+    evidence: DriveEvidence,
+    trajectory: Trajectory,
+    maps: MapForms,
+    halves: Mapping[str, Halves],
+) -> Metrics:
+    """Return the figures of all sensors that were solved, and of the drive.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    evidence
+        Its readings.
+    trajectory
+        Poses of the lidar in the map.
+    maps
+        The map.
+    halves
+        Comparison of both halves of the drive by sensor, as far as there is one.
+    """
+    solved = [each for each in result.sensors if each.residuals is not None]
+    most = int(np.clip(DRAWN // max(len(solved), 1), FEWEST, MOST))
+    start_ns = int(evidence.readings.stamp_ns.min())
+    seen = {each.sensor: sensor_evidence(evidence, each, maps.along_drive) for each in solved}
+    sensors = tuple(
+        _sensor(
+            each,
+            seen[each.sensor],
+            halves.get(each.sensor, no_halves(NOT_DONE)),
+            start_ns,
+            most,
+        )
+        for each in solved
+    )
+    places = np.concatenate([each.place for each in seen.values()])
+    picture = map_picture(maps.anywhere, places)
+    return Metrics(sensors, drive_metrics(trajectory), picture)
+
+
+def _sensor(
+    sensor: SensorCalibration, evidence: SensorEvidence, halves: Halves, start_ns: int, most: int
+) -> SensorMetrics:
+    found = curves(evidence, sensor)
+    return SensorMetrics(
+        sensor=sensor.sensor,
+        mounting=mounting(sensor),
+        fit=fit_figures(evidence, sensor.noise),
+        normalised=normalised_figures(evidence),
+        autocorrelation=autocorrelation(evidence),
+        directions=directions(evidence),
+        curves=curve_errors(found, evidence),
+        halves=halves,
+        series=series(found, evidence, start_ns, most),
+    )
+
+
+def map_picture(field_map: Queryable, places: FloatArray) -> MapPicture:
+    """Return the map around places, shape (N, 3), at their middle height, coarsely."""
+    low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
+    around = AROUND * max(float((high - low).max()), 1.0)
+    low, high = low - around, high + around
+    cell = float((high - low).max()) / CELLS
+    x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
+    height = float(np.median(places[:, 2]))
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    sample = field_map.query(np.column_stack([grid, np.full(len(grid), height)]))
+    sigma = np.sqrt(np.where(sample.inside[:, None], sample.variance, np.nan).mean(axis=1))
+    strength = np.linalg.norm(sample.field, axis=1)
+    return MapPicture(
+        extent=row([x[0], x[-1], y[0], y[-1]], 3),
+        height=height,
+        strength=rows(strength.reshape(len(y), len(x)), 2),
+        sigma=rows(sigma.reshape(len(y), len(x)), 3),
+    )

@@ -1,0 +1,53 @@
+"""What a drive showed a sensor: directions of the field, headings, heights."""
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.metric_results import Directions, DriveMetrics
+from l2m_gtsam.qa.metrics.evidence import SensorEvidence
+from l2m_gtsam.qa.metrics.plain import evenly, row, rows
+
+SPHERE = 400  # directions, about 10 degrees apart
+NEAR_DEG = 15.0
+HEADING_DEG = 15.0
+PATH = 800
+
+
+def directions(evidence: SensorEvidence) -> Directions:
+    """Return from which directions the field came, as the map has it along the lidar's axes."""
+    b = evidence.b_lidar[evidence.used]
+    unit = b / np.linalg.norm(b, axis=1, keepdims=True)
+    away, _ = cKDTree(unit).query(sphere(SPHERE))
+    elevation = np.rad2deg(np.arcsin(np.clip(unit[:, 2], -1, 1)))
+    spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False) / np.sqrt(len(b))
+    return Directions(
+        covered=float(np.mean(away < 2 * np.sin(np.deg2rad(NEAR_DEG) / 2))),
+        spread=row(spread, 4),
+        tilt_deg=float(np.ptp(elevation)),
+    )
+
+
+def sphere(count: int) -> FloatArray:
+    """Return directions spread evenly over all of space, shape (count, 3): a golden spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    r = np.sqrt(1 - z**2)
+    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+
+
+def drive_metrics(trajectory: Trajectory) -> DriveMetrics:
+    """Return how the vehicle moved."""
+    p, up = trajectory.p, trajectory.R[:, :, 2]
+    mean = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
+    tilt = np.arccos(np.clip(up @ mean, -1, 1))
+    heading = np.arctan2(trajectory.R[:, 1, 0], trajectory.R[:, 0, 0])
+    sector = np.floor(np.rad2deg(heading) % 360 / HEADING_DEG)
+    return DriveMetrics(
+        path=rows(p[evenly(len(p), PATH)], 3),
+        seconds=float(1e-9 * (trajectory.stamp_ns[-1] - trajectory.stamp_ns[0])),
+        length=float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()),
+        heave=float(np.ptp(p[:, 2])),
+        tilt_deg=float(np.rad2deg(tilt.max())),
+        heading=float(len(np.unique(sector)) / (360 / HEADING_DEG)),
+    )

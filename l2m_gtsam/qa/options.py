@@ -1,0 +1,103 @@
+"""Where a verdict changes from PASS to WARN and from WARN to FAIL."""
+
+from typing import Self
+
+from pydantic import Field, PositiveFloat, model_validator
+
+from l2m_gtsam.options import Options
+
+UNIT = 1e-3  # a quaternion given to three digits is as long as this
+
+
+class Limit(Options):
+    """From where on a figure is worth a warning, and from where on a failure."""
+
+    warn: PositiveFloat
+    """Above this the verdict is WARN at least."""
+    fail: PositiveFloat
+    """Above this the verdict is FAIL."""
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> Self:
+        if self.fail < self.warn:
+            msg = f"fail must not be less than warn, it is {self.fail:g} against {self.warn:g}"
+            raise ValueError(msg)
+        return self
+
+
+class Nominal(Options):
+    """How a sensor was meant to be mounted, to judge by; the solve does not use it."""
+
+    t_lidar_mag: tuple[float, float, float] | None = None
+    """Its place in the lidar frame, metres."""
+    quaternion_xyzw: tuple[float, float, float, float] | None = None
+    """R_lidar_mag, from the sensor's axes to the lidar's."""
+
+    @model_validator(mode="after")
+    def _is_a_rotation(self) -> Self:
+        length = sum(part**2 for part in self.quaternion_xyzw or (1.0,)) ** 0.5
+        if abs(length - 1) > UNIT:
+            msg = f"quaternion_xyzw must have length 1, this one has {length:.4g}"
+            raise ValueError(msg)
+        return self
+
+
+class QaOptions(Options):
+    """Thresholds of the verdict in a report."""
+
+    position_sigma_m: Limit = Limit(warn=0.01, fail=0.03)
+    """Largest standard deviation of a sensor's position, metres."""
+    rotation_sigma_deg: Limit = Limit(warn=0.5, fail=2.0)
+    """Largest standard deviation of its rotation, degrees."""
+    hard_iron_sigma_ut: Limit = Limit(warn=0.5, fail=2.0)
+    """Largest standard deviation of H, microtesla."""
+    unexplained: Limit = Limit(warn=0.5, fail=0.75)
+    """What the calibration leaves of the readings beside what a uniform field would leave (0 is
+    all explained, 1 nothing): more says that the map does not fit the drive."""
+    rejected: Limit = Limit(warn=0.02, fail=0.4)
+    """Share of the readings inside the map that no distortion explains."""
+    outside_map: Limit = Limit(warn=0.3, fail=0.9)
+    """Share of the readings for which the map has no data."""
+    halves_sigmas: Limit = Limit(warn=2.0, fail=4.0)
+    """Distance of the calibrations of both halves of the drive, root mean square in sigmas; 1 is
+    consistent."""
+    halves_m: float = Field(default=0.003, ge=0)
+    """Halves that differ by less than this in position, and by less than `halves_deg` in rotation
+    and `halves_ut` in H, are alike whatever the sigmas, metres."""
+    halves_deg: float = Field(default=0.2, ge=0)
+    """See `halves_m`, degrees."""
+    halves_ut: float = Field(default=0.3, ge=0)
+    """See `halves_m`, microtesla."""
+    chi_square: Limit = Limit(warn=1.5, fail=4.0)
+    """Mean square of the normalised residuals per degree of freedom; 1 is consistent."""
+    autocorrelation: float = Field(default=0.5, gt=0, le=1)
+    """Correlation of the residuals of neighbouring readings above which sigmas that count each
+    reading as independent are worth a warning."""
+    time_offset_s: Limit = Limit(warn=0.005, fail=1.0)
+    """Size of a time offset that was found and taken into account, seconds."""
+    hard_iron_ut: float = Field(default=50.0, gt=0)
+    """Length of H from which it is named in the verdict: more than the Earth's field."""
+    scale: Limit = Limit(warn=0.3, fail=0.8)
+    """How far the gain of a sensor's axis may be from 1."""
+    skew_deg: Limit = Limit(warn=10.0, fail=30.0)
+    """How far the angle between two sensor axes may be from a right angle, degrees."""
+    nominal: dict[str, Nominal] = Field(default_factory=dict)
+    """How sensors were meant to be mounted, by name; where nothing is given, the places of
+    `calibration.start` and of `calibration.priors.position`, and the rotations of
+    `calibration.priors.rotation`."""
+    nominal_m: Limit = Limit(warn=0.05, fail=0.3)
+    """Distance between found and nominal place, metres."""
+    nominal_deg: Limit = Limit(warn=10.0, fail=45.0)
+    """Angle between found and nominal rotation, degrees."""
+    axes_deg: float = Field(default=15.0, gt=0, lt=45)
+    """Sensor axes that lie this close to axes of the lidar are taken to be meant so, degrees."""
+    short_drive_m: float = Field(default=5.0, ge=0)
+    """A drive that leaves something open, or known too little, and is shorter is called short,
+    metres."""
+    few_headings: float = Field(default=0.3, ge=0, le=1)
+    """A drive that leaves something open, or known too little, and took a smaller share of all
+    headings is called straight."""
+    halves: bool = True
+    """Whether both halves of a drive are calibrated by themselves."""
+    half_readings: int = Field(default=50, ge=30)
+    """Readings of each sensor that a half is calibrated on, spread evenly over it."""

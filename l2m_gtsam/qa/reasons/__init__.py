@@ -1,0 +1,1 @@
+"""Reasons of a verdict: what speaks for and against a calibration, one sentence each."""

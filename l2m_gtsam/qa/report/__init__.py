@@ -1,0 +1,1 @@
+"""The report: figures and pages from a calibration and its metrics."""

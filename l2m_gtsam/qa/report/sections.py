@@ -1,0 +1,237 @@
+"""What the page shows of one sensor and of the whole: figures with captions, and words."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from l2m_gtsam.metric_results import Metrics, SensorMetrics
+from l2m_gtsam.qa.judge import SensorVerdict, Verdict
+from l2m_gtsam.qa.report import words
+from l2m_gtsam.qa.report.figures import course, place, statistics
+from l2m_gtsam.qa.report.figures.correlations import correlation_figure
+from l2m_gtsam.qa.report.figures.directions import directions_figure
+from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
+from l2m_gtsam.qa.report.svg import as_svg
+from l2m_gtsam.results import CalibrationResult, SensorCalibration
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure of the page: its title, the drawing, and what to look for."""
+
+    title: str
+    svg: Markup
+    caption: str
+
+
+@dataclass(frozen=True)
+class SensorSection:
+    """Everything that the page shows of one sensor.
+
+    Attributes
+    ----------
+    anchor
+        Name of the section in the page.
+    sensor, metrics, verdict
+        What it is drawn from; no metrics where it was not solved.
+    pictures
+        In the order of the page.
+    rotation, distortion, rests_on
+        In words; empty where it was not solved.
+    """
+
+    anchor: str
+    sensor: SensorCalibration
+    metrics: SensorMetrics | None
+    verdict: SensorVerdict
+    pictures: tuple[Picture, ...] = ()
+    rotation: str = ""
+    distortion: tuple[str, ...] = ()
+    rests_on: tuple[str, ...] = ()
+
+
+def overall_pictures(
+    result: CalibrationResult, metrics: Metrics, verdict: Verdict
+) -> tuple[tuple[Picture, ...], tuple[Picture, ...]]:
+    """Return pictures of the vehicle, and those of the place."""
+    names = ", ".join(
+        f"{each.sensor} at {words.vector(each.t_lidar_mag, 3)} m"
+        for each in result.sensors
+        if np.isfinite(each.t_lidar_mag).all()
+    )
+    vehicle = tuple(
+        _picture(
+            f"Sensors {view.name}",
+            vehicle_figure(result, verdict, view),
+            f"vehicle-{index}",
+            f"The vehicle {view.name}: {names}, the lidar at the origin.",
+            "Circle passes, triangle warns, cross fails; the square is the lidar. A dotted line "
+            "is a direction in which the place is not known.",
+        )
+        for index, view in enumerate((TOP, SIDE))
+    )
+    drive = metrics.drive
+    where = f"A drive of {drive.length:.0f} m in {drive.seconds:.0f} s"
+    on_map = (
+        _picture(
+            "Field and drive",
+            place.strength_figure(metrics, result),
+            "map-strength",
+            f"{where} over the map's field strength; {len(result.disagreements)} stretches where "
+            "readings and map disagree.",
+            "Position is told by how the field changes from place to place; a drive through even "
+            "colour tells little. Thick marks: where readings and map disagree.",
+        ),
+        _picture(
+            "How well the map knows it",
+            place.sigma_figure(metrics),
+            "map-sigma",
+            f"{where} over the map's standard deviation.",
+            "The drive should stay where the map is sure of itself.",
+        ),
+    )
+    return vehicle, on_map
+
+
+def sensor_section(
+    index: int,
+    sensor: SensorCalibration,
+    result: CalibrationResult,
+    metrics: Metrics,
+    verdict: SensorVerdict,
+) -> SensorSection:
+    """Return what the page shows of a sensor."""
+    anchor, found = f"sensor-{index}", metrics.get(sensor.sensor)
+    if found is None:
+        return SensorSection(anchor, sensor, None, verdict)
+    return SensorSection(
+        anchor=anchor,
+        sensor=sensor,
+        metrics=found,
+        verdict=verdict,
+        pictures=_pictures(anchor, sensor, found),
+        rotation=words.rotation(sensor, found),
+        distortion=tuple(words.distortion(sensor, found)),
+        rests_on=tuple(words.rests_on(found, result)),
+    )
+
+
+def _pictures(anchor: str, sensor: SensorCalibration, found: SensorMetrics) -> tuple[Picture, ...]:
+    name = sensor.sensor
+    pictures = [
+        _curves(anchor, name, found),
+        _residuals(anchor, name, found),
+        _over_the_map(anchor, name, found),
+        _chi_square(anchor, name, found),
+        _autocorrelation(anchor, name, found),
+        _directions(anchor, name, found),
+        _correlations(anchor, sensor),
+    ]
+    if not found.halves.reason:
+        pictures.insert(3, _halves(anchor, name, found))
+    return tuple(pictures)
+
+
+def _curves(anchor: str, name: str, found: SensorMetrics) -> Picture:
+    before, after = found.curves.before**0.5, found.curves.after**0.5
+    return _picture(
+        "Before, after, map",
+        course.curves_figure(found),
+        f"{anchor}-curves",
+        f"Readings of {name} along the lidar's axes before and after the calibration beside the "
+        f"map's: {before:.1f} and {after:.2f} µT rms away from it.",
+        f"After the calibration the dashed line should lie on the broad one: {before:.1f} µT away "
+        f"before, {after:.2f} µT after (rms of the length).",
+    )
+
+
+def _residuals(anchor: str, name: str, found: SensorMetrics) -> Picture:
+    rms = ", ".join(f"{each:.2f}" for each in found.fit.rms)
+    wrong = sum(found.series.rejected)
+    return _picture(
+        "Residuals over time",
+        course.residuals_figure(found),
+        f"{anchor}-residuals",
+        f"Residuals of {name} over time: rms {rms} µT along x, y, z; {wrong} drawn readings are "
+        "rejected.",
+        f"Should look like noise around zero: rms {rms} µT. Crosses do not count; those beyond the "
+        "picture stand at its edge.",
+    )
+
+
+def _over_the_map(anchor: str, name: str, found: SensorMetrics) -> Picture:
+    return _picture(
+        "Residuals over the map",
+        place.residual_figure(found),
+        f"{anchor}-place",
+        f"Length of the residuals of {name} where they were read.",
+        "Bright spots that keep together are places where map and readings disagree.",
+    )
+
+
+def _halves(anchor: str, name: str, found: SensorMetrics) -> Picture:
+    halves = found.halves
+    return _picture(
+        "Repeatability",
+        statistics.halves_figure(found),
+        f"{anchor}-halves",
+        f"{name} calibrated on each half of the drive: {halves.distance:.1f} sigmas apart.",
+        f"Each half of the drive by itself: {halves.distance:.1f} times as far apart as expected "
+        f"(1 is consistent), by {1e3 * np.linalg.norm(halves.difference[:3]):.0f} mm and "
+        f"{halves.turned_deg:.1f}°.",
+    )
+
+
+def _chi_square(anchor: str, name: str, found: SensorMetrics) -> Picture:
+    std = ", ".join(f"{each:.2f}" for each in found.normalised.std)
+    return _picture(
+        "Normalised residuals",
+        statistics.chi_square_figure(found),
+        f"{anchor}-chi2",
+        f"Squared normalised residuals of {name} beside chi-square: standard deviations {std} "
+        f"along x, y, z, {found.normalised.beyond_95:.1%} beyond the 95 % quantile.",
+        f"Bars on the dashed line: the noise is as assumed. Standard deviations {std} (1 is "
+        "consistent).",
+    )
+
+
+def _autocorrelation(anchor: str, name: str, found: SensorMetrics) -> Picture:
+    next_ = found.autocorrelation.next
+    return _picture(
+        "Autocorrelation",
+        statistics.autocorrelation_figure(found),
+        f"{anchor}-auto",
+        f"Autocorrelation of the residuals of {name}: {next_:.2f} between neighbours.",
+        f"Neighbours (about {found.autocorrelation.step_s:.2g} s apart) err alike by {next_:.2f}: "
+        "what lies above the band is no noise of the sensor but of map or poses.",
+    )
+
+
+def _directions(anchor: str, name: str, found: SensorMetrics) -> Picture:
+    spread = ", ".join(f"{each:.1f}" for each in found.directions.spread)
+    return _picture(
+        "Directions of the field",
+        directions_figure(found),
+        f"{anchor}-directions",
+        f"Directions from which the field came to {name}: {found.directions.covered:.0%} of space.",
+        f"{found.directions.covered:.0%} of all directions, {found.directions.tilt_deg:.0f}° of "
+        f"elevation; spread {spread} µT along its principal axes. A ring is a drive on level "
+        "ground.",
+    )
+
+
+def _correlations(anchor: str, sensor: SensorCalibration) -> Picture:
+    strongest = words.strongest(sensor)
+    return _picture(
+        "Correlations",
+        correlation_figure(sensor),
+        f"{anchor}-correlations",
+        f"Correlations between the parameters of {sensor.sensor}; the strongest: {strongest}.",
+        f"The strongest: {strongest}. + and − mark those above 0.5; blank rows are not determined.",
+    )
+
+
+def _picture(title: str, figure: Figure, name: str, alt: str, caption: str) -> Picture:
+    return Picture(title, as_svg(figure, name, alt), caption)

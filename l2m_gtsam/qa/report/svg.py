@@ -1,0 +1,137 @@
+"""Matplotlib figures as SVG that belongs to a page: its colours, its fonts, no names in common."""
+
+import re
+from io import StringIO
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from l2m_gtsam.data import FloatArray
+
+# Colours that stand for variables of the page's style, so that a figure follows light and dark.
+INK, MUTED, GRID, PAPER = "#010203", "#040506", "#070809", "#0a0b0c"
+X, Y, Z = "#0b0a01", "#0b0a02", "#0b0a03"
+GOOD, FAIR, BAD = "#0b0a04", "#0b0a05", "#0b0a06"
+VARIABLES = {
+    INK: "--ink",
+    MUTED: "--muted",
+    GRID: "--grid",
+    PAPER: "--card",
+    X: "--x",
+    Y: "--y",
+    Z: "--z",
+    GOOD: "--pass",
+    FAIR: "--warn",
+    BAD: "--fail",
+}
+AXES = (X, Y, Z)
+DASHES = ("-", "--", "-.")  # lines of x, y, z differ without their colours, too
+MARKERS = ("o", "s", "^")
+
+SMALL = 9.3  # points; a figure is drawn at about its own size on a phone
+
+SETTINGS: Any = {
+    "svg.fonttype": "none",  # text stays text: sharp, small, read aloud
+    "svg.hashsalt": "l2m",
+    "text.parse_math": False,  # names from bags are text, whatever they hold
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "axes.titlesize": 10.5,
+    "axes.labelsize": 10,
+    "legend.fontsize": SMALL,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.edgecolor": MUTED,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "grid.color": GRID,
+    "axes.grid": True,
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.7,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "legend.frameon": False,
+    "lines.linewidth": 1.1,
+    "path.simplify": False,  # it would take dots for nothing
+}
+LONGEST = 18  # letters of a name
+WIDTH = 4.7  # inches of every figure: its text is then as large on a phone as on a desk
+
+
+def new_figure(height: float) -> Figure:
+    """Return an empty figure of so many inches."""
+    return Figure(figsize=(WIDTH, height), layout="constrained", dpi=110)
+
+
+def plain_figure(height: float) -> Figure:
+    """Return an empty figure with margins for usual labels: laying out takes as long as drawing."""
+    figure = Figure(figsize=(WIDTH, height), dpi=110)
+    figure.subplots_adjust(
+        left=0.17, right=0.975, bottom=0.5 / height, top=1 - 0.3 / height, hspace=0.12
+    )
+    return figure
+
+
+def as_svg(figure: Figure, name: str, alt: str) -> Markup:
+    """Return a figure as an element of a page.
+
+    Parameters
+    ----------
+    figure
+        Drawn under ``SETTINGS``.
+    name
+        Unique in the page; put before all names inside, so that figures do not share any.
+    alt
+        What it shows, for those who do not see it.
+    """
+    stream = StringIO()
+    figure.savefig(
+        stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
+    )
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = _renamed(text, name)
+    text = re.sub(r' d="([^"]*)"', lambda found: f' d="{_short(found.group(1))}"', text)
+    for colour, variable in VARIABLES.items():
+        text = text.replace(colour, f"var({variable})")
+    head, rest = text.split(">", 1)
+    box = re.search(r'viewBox="[^"]*"', head)
+    shape = box.group() if box else ""
+    label = f'role="img" aria-label="{escape(alt)}"'
+    # what is inside comes from matplotlib, which escapes its text
+    return Markup(f'<svg xmlns:xlink="http://www.w3.org/1999/xlink" {shape} {label}>{rest}')  # noqa: S704
+
+
+def dots(axes: Axes, x: FloatArray, y: FloatArray, size: float, **style: Any) -> None:
+    """Draw points as one path of round caps: a marker each would take five times the space."""
+    across = np.column_stack([x, x, np.full(len(x), np.nan)]).ravel()
+    along = np.column_stack([y, y, np.full(len(y), np.nan)]).ravel()
+    axes.plot(across, along, "-", linewidth=size, solid_capstyle="round", **style)
+
+
+def short_name(name: str) -> str:
+    """Return a name that fits into a figure."""
+    return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
+
+
+def _short(path: str) -> str:
+    """Return a path with coordinates to a tenth of a point, and blanks for ends of lines."""
+    return re.sub(r"(\.\d)\d+", r"\1", path).replace("\n", " ").strip()
+
+
+def _renamed(text: str, name: str) -> str:
+    """Return SVG with a prefix for every name, where it is given and where it is used."""
+    text = re.sub(r' id="([^"]+)"', rf' id="{name}-\1"', text)
+    text = re.sub(r"url\(#([^)]+)\)", rf"url(#{name}-\1)", text)
+    return re.sub(r'href="#([^"]+)"', rf'href="#{name}-\1"', text)

@@ -1,0 +1,90 @@
+"""A calibration in words and numbers for people."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.metric_results import SensorMetrics
+from l2m_gtsam.qa.report.figures.correlations import NAMES, correlations
+from l2m_gtsam.results import CalibrationResult, SensorCalibration, Uncertainty
+from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
+
+
+def with_sigma(value: float, sigma: float, digits: int) -> str:
+    """Return a value with its standard deviation; "not determined" where that is infinite."""
+    if not np.isfinite(sigma) or not np.isfinite(value):
+        return "not determined"
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def vector(values: FloatArray, digits: int) -> str:
+    """Return a vector in brackets."""
+    # adding zero takes the sign from a zero
+    rounded = np.round(np.asarray(values, dtype=float), digits) + 0.0
+    return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
+
+
+def position(sensor: SensorCalibration) -> list[tuple[str, str]]:
+    """Return the place of a sensor, coordinate by coordinate, in millimetres."""
+    return [
+        (f"{axis} (mm)", with_sigma(1e3 * value, 1e3 * sigma, 1))
+        for axis, value, sigma in zip("xyz", sensor.t_lidar_mag, sensor.t_sigma, strict=True)
+    ]
+
+
+def rotation(sensor: SensorCalibration, metrics: SensorMetrics) -> str:
+    """Return how a sensor is turned, as a sentence."""
+    found = metrics.mounting
+    if not np.isfinite(sensor.R_lidar_mag).all():
+        return "Its rotation is not known: C is no rotation with scale, see the verdict."
+    # intrinsic z, y, x: what ROS calls yaw, pitch, roll
+    yaw, pitch, roll = Rotation.from_matrix(sensor.R_lidar_mag).as_euler("ZYX", degrees=True)
+    known = np.isfinite(found.angle_sigma_deg)
+    sigma = f" ± {found.angle_sigma_deg:.2f}°" if known else ", part of it not determined"
+    text = (
+        f"Turned by {found.angle_deg:.1f}°{sigma} about {vector(np.array(found.turned_about), 2)} "
+        f"of the lidar; roll {roll:.1f}°, pitch {pitch:.1f}°, yaw {yaw:.1f}°."
+    )
+    axes = ", ".join(found.axes.along)
+    return f"{text} Its axes x, y, z lie along the lidar's {axes}, to {found.axes.off_deg:.0f}°."
+
+
+def distortion(sensor: SensorCalibration, metrics: SensorMetrics) -> list[str]:
+    """Return gains, angles between axes and hard iron, a sentence each."""
+    found = metrics.mounting
+    gains = ", ".join(f"{axis} {gain:.3f}" for axis, gain in zip("xyz", found.scale, strict=True))
+    pairs = ("x and y", "y and z", "z and x")
+    angles = ", ".join(
+        f"{pair} {90 - skew:.2f}°" for pair, skew in zip(pairs, found.skew_deg, strict=True)
+    )
+    H = vector(sensor.distortion.H, 2)
+    worst = max(map(abs, found.skew_deg))
+    return [
+        f"Scale per axis (1 is ideal): {gains}.",
+        f"Angles between its axes (90° is ideal): {angles}; {worst:.2f}° off at the most.",
+        f"Hard iron: H = {H} µT, {found.hard_iron:.1f} µT long.",
+    ]
+
+
+def rests_on(metrics: SensorMetrics, result: CalibrationResult) -> list[str]:
+    """Return what the sigmas of a sensor rest on, a sentence each."""
+    fit = metrics.fit
+    parts = f"sensor {fit.sensor_noise:.2f} µT, map {fit.map_noise:.2f} µT"
+    if fit.pose_noise > 0:
+        parts += f", poses {fit.pose_noise:.2f} µT"
+    worth = metrics.autocorrelation.independent
+    sentences = [
+        f"{fit.readings:,} readings, as correlated in time as {worth:,.0f} independent ones.",
+        f"Noise of each, per axis: {parts}.",
+        f"How the map's errors count: {UNCERTAINTY[result.uncertainty]}.",
+    ]
+    if result.uncertainty is Uncertainty.INDEPENDENT:
+        sentences.append("Sigmas of this kind are lower bounds.")
+    return sentences
+
+
+def strongest(sensor: SensorCalibration) -> str:
+    """Return the pair of parameters that depend on each other most."""
+    lower = np.abs(np.tril(np.nan_to_num(correlations(sensor)), -1))
+    i, j = np.unravel_index(int(np.argmax(lower)), lower.shape)
+    return f"{NAMES[j]} and {NAMES[i]}, {correlations(sensor)[i, j]:+.2f}"
