@@ -1,5 +1,6 @@
 """Time and memory that a piece of work takes."""
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,6 +39,7 @@ def taken(work: Callable[[], object], rounds: int, long: float) -> Taken:
     long
         Work that takes so many seconds is not repeated.
     """
+    gc.collect()  # what earlier work left would be freed meanwhile, and hide what this takes
     before = _memory("VmRSS") if _forget_peak() else None
     seconds = timed(work)
     after = _memory("VmHWM")
