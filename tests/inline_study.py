@@ -8,12 +8,12 @@ from l2m_gtsam.studies.cell_files import CellFolder
 from l2m_gtsam.studies.run import FORMAT, StudyFile, made_cell, provenance, publish
 from l2m_gtsam.studies.study import Study
 
-O = TypeVar("O", bound=Options)  # noqa: E741
+Opts = TypeVar("Opts", bound=Options)
 Cell = TypeVar("Cell")
 Summary = TypeVar("Summary")
 
 
-def run_inline(study: Study[O, Cell, Summary], options: O, out: Path) -> Summary:
+def run_inline(study: Study[Opts, Cell, Summary], options: Opts, out: Path) -> Summary:
     """Return the summary of all cells after they went through files, and write page and figures."""
     folder = CellFolder.opened(out / "cells", study, options)
     name, place = "", None

@@ -68,6 +68,7 @@ class CellFolder(Generic[Cell]):
 
     def write(self, key: str, made: Made[Cell]) -> None:
         """Write a cell, whole or not at all."""
+        # mypy: the class of the cells is a value here, known when a study is run.
         _write(self._file(key), TypeAdapter(Made[self.cell]).dump_python(made, mode="json"))  # type: ignore[name-defined]
 
     def read(self, key: str) -> Made[Cell] | None:

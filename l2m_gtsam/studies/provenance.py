@@ -46,7 +46,7 @@ def code_version() -> str:
         return released
     # The folder of a checkout of something else would tell its commit.
     asked = [git, "-C", str(folder), "log", "-1", "--format=%h", "--", "."]
-    said = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603
+    said = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - fixed words
     return f"{released} ({said.stdout.strip()})" if said.stdout.strip() else released
 
 

@@ -19,7 +19,7 @@ from l2m_gtsam.studies.cell_files import CellFolder, Made
 from l2m_gtsam.studies.provenance import Provenance, code_version, machine_class
 from l2m_gtsam.studies.study import Study
 
-O = TypeVar("O", bound=Options)  # noqa: E741
+Opts = TypeVar("Opts", bound=Options)
 Cell = TypeVar("Cell")
 Summary = TypeVar("Summary")
 
@@ -28,7 +28,7 @@ FORMAT = "l2m-study-1"
 
 
 @dataclass(frozen=True)
-class StudyFile(Generic[O, Summary]):
+class StudyFile(Generic[Opts, Summary]):
     """``study.json``: everything that page and figures are made of.
 
     Attributes
@@ -46,18 +46,18 @@ class StudyFile(Generic[O, Summary]):
     format: str
     study: str
     made: Provenance
-    options: O
+    options: Opts
     summary: Summary
 
 
 def run_study(
-    study: Study[O, Cell, Summary],
-    options: O,
+    study: Study[Opts, Cell, Summary],
+    options: Opts,
     out: Path,
     cluster: ClusterOptions,
     progress: Progress,
     command: str,
-) -> StudyFile[O, Summary]:
+) -> StudyFile[Opts, Summary]:
     """Compute all cells that a folder does not hold yet, then write summary, page and figures.
 
     Parameters
@@ -104,7 +104,7 @@ def run_study(
 
 
 def made_cell(
-    compute: Callable[[O, str, Any], Cell], options: O, key: str, site: Any
+    compute: Callable[[Opts, str, Any], Cell], options: Opts, key: str, site: Any
 ) -> Made[Cell]:
     """Compute a cell, on whichever worker."""
     start = process_time()
@@ -124,14 +124,14 @@ def provenance(cells: Mapping[str, Made[Cell]], command: str) -> Provenance:
 
 
 def publish(
-    study: Study[O, Cell, Summary], content: StudyFile[O, Summary], out: Path
-) -> StudyFile[O, Summary]:
+    study: Study[Opts, Cell, Summary], content: StudyFile[Opts, Summary], out: Path
+) -> StudyFile[Opts, Summary]:
     """Write ``study.json``, and page and figures from what it holds; return what was read back."""
     adapter = TypeAdapter(StudyFile[study.options, study.summary])  # type: ignore[name-defined]
     plain = adapter.dump_python(content, mode="json")
     with atomic_path(out / STUDY_FILE) as temporary:
         temporary.write_text(json.dumps(plain, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    read: StudyFile[O, Summary] = adapter.validate_json((out / STUDY_FILE).read_bytes())
+    read: StudyFile[Opts, Summary] = adapter.validate_json((out / STUDY_FILE).read_bytes())
     figures = study.figures(read.summary)
     for name, figure in figures.items():
         save_figure(figure, out / f"{name}.png")

@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.options import Options
 
-O = TypeVar("O", bound=Options)  # noqa: E741
+Opts = TypeVar("Opts", bound=Options)
 Cell = TypeVar("Cell")
 Summary = TypeVar("Summary")
 
 
 @dataclass(frozen=True)
-class Study(Generic[O, Cell, Summary]):
+class Study(Generic[Opts, Cell, Summary]):
     """One study: its parts, each a function of what the last one made.
 
     Cells and summary are dataclasses of plain values (numbers, text, None, tuples, options), for
@@ -52,14 +52,14 @@ class Study(Generic[O, Cell, Summary]):
 
     name: str
     title: str
-    options: type[O]
+    options: type[Opts]
     size: frozenset[str]
     cell: type[Cell]
     summary: type[Summary]
-    keys: Callable[[O], tuple[str, ...]]
-    site: Callable[[O, str], str]
-    prepare: Callable[[O, str], Any]
-    compute: Callable[[O, str, Any], Cell]
-    summarise: Callable[[O, Mapping[str, Cell]], Summary]
+    keys: Callable[[Opts], tuple[str, ...]]
+    site: Callable[[Opts, str], str]
+    prepare: Callable[[Opts, str], Any]
+    compute: Callable[[Opts, str, Any], Cell]
+    summarise: Callable[[Opts, Mapping[str, Cell]], Summary]
     page: Callable[[Summary], str]
     figures: Callable[[Summary], Mapping[str, Figure]]

@@ -50,6 +50,7 @@ def measured_workers(options: ScalingOptions, workers: int) -> tuple[Measurement
     """
     told = Batch(options=options, workers=workers).model_dump_json()
     program = [sys.executable, "-c", f"from {__name__} import main; main()"]
+    # Our own program: nothing that it is called with comes from outside.
     ran = subprocess.run(program, input=told, capture_output=True, text=True, check=False)  # noqa: S603
     if ran.returncode:
         reason = (ran.stderr.strip().splitlines() or ["no reason given"])[-1]
