@@ -48,7 +48,7 @@ magyc: .venv-magyc/stamp
 # Rewrites the lock files from pyproject.toml; needs pip-tools on the PATH.
 lock:
 	pip-compile --quiet --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --output-file requirements.lock pyproject.toml
-	pip-compile --quiet --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --extra dev --extra cluster --extra studies --constraint requirements.lock --output-file requirements-dev.lock pyproject.toml
+	pip-compile --quiet --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --extra dev --extra cluster --extra studies --extra fleet --extra viewer --extra lidar --extra docs --constraint requirements.lock --output-file requirements-dev.lock pyproject.toml
 
 clean:
 	rm -rf .venv .venv-magyc demo_out
