@@ -41,7 +41,7 @@ class Block:
     line
         Where it begins.
     language
-        `sh`, `python`, `yaml` or `text`.
+        `sh`, `bash`, `python`, `yaml` or `text`.
     title
         Name of the file that a block of YAML is saved as, or `Output`; may be empty.
     not_run
@@ -74,7 +74,7 @@ def blocks(page: Path) -> list[Block]:
         indent, info = opening.groups()
         end = next(n for n in range(k + 1, len(lines)) if lines[n] == f"{indent}```")
         language = info.split(" ")[0]
-        assert language in ("sh", "python", "yaml", "text"), f"{page.name}:{k + 1}: {language!r}"
+        assert language in ("sh", "bash", "python", "yaml", "text"), f"{page.name}:{k + 1}: {language!r}"
         title, above = TITLE.search(info), lines[k - 1] if k else ""
         not_run, part = NOT_RUN.match(above), PLAIN.match(above)
         found.append(
@@ -116,7 +116,7 @@ def run_page(page: Path, folder: Path, names: dict[str, Any] | None = None) -> N
             where = f"{page.name}:{block.line}"
             if block.not_run:
                 continue
-            if block.language == "sh":
+            if block.language in ("sh", "bash"):
                 printed = "".join(map(_run, commands(block)))
             elif block.language == "python":
                 printed = _printed(lambda text=block.text, at=where: exec(compile(text, at, "exec"), shared))  # noqa: E501, S102
