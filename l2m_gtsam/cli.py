@@ -116,9 +116,7 @@ def simulate(
     ] = None,
     seed: Annotated[
         int | None,
-        typer.Option(
-            min=0, help="Of world, drives and sensors, instead of that in --options (1)."
-        ),
+        typer.Option(min=0, help="Of world, drives and sensors, instead of that in --options (1)."),
     ] = None,
     kind: Annotated[
         list[str] | None, typer.Option(help="ros1, sqlite3 or mcap; all three if not given.")

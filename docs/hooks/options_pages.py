@@ -41,7 +41,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def options_page(head: str, model: type[Options]) -> str:
-    """Return a page in Markdown: a table for every options model, under the full name of its key."""
+    """Return a page in Markdown: a table for every model, under the full name of its key."""
     return head + "".join(_sections(model, "", model()))
 
 
@@ -57,9 +57,10 @@ def _sections(model: type[BaseModel], prefix: str, values: BaseModel | None) -> 
     if rows:
         yield f"\n| key | value | default | meaning |\n|---|---|---|---|\n{''.join(rows)}"
     below = {name: inside for name, inside in nested.items() if inside is not None}
+    yield "\n"
     for name, inside in below.items():
         key = f"{prefix}.{name}{inside.through}".lstrip(".")
-        yield f"\n[`{key}`](#{key}): {_text(model.model_fields[name].description or '')}\n"
+        yield f"- [`{key}`](#{key}): {_text(model.model_fields[name].description or '')}\n"
     for name, inside in below.items():
         key = f"{prefix}.{name}{inside.through}".lstrip(".")
         value = getattr(values, name, None)
@@ -70,7 +71,7 @@ def _row(model: type[BaseModel], name: str, values: BaseModel | None) -> str:
     field = model.model_fields[name]
     kind = _cell(_kind(field.annotation) + _limits(field))
     default = "required" if field.is_required() else f"`{_cell(_default(field, name, values))}`"
-    return f"| `{name}` | {kind} | {default} | {_text(field.description or '')} |\n"
+    return f"| `{field.alias or name}` | {kind} | {default} | {_text(field.description or '')} |\n"
 
 
 @dataclass(frozen=True)
