@@ -153,9 +153,13 @@ def _run(command: list[str]) -> str:
     assert name == "l2m", f"{shlex.join(command)}: mark it as not run, and say why"
 
     out = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as end:
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["l2m", *arguments])
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(out):
+        with (
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(out),
+            pytest.raises(SystemExit) as end,
+        ):
             main()
     assert not end.value.code, f"{shlex.join(command)}:\n{out.getvalue()}"
     if "--out" in arguments:
