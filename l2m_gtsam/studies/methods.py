@@ -42,7 +42,7 @@ def two_step(
 def published(
     readings: Readings, field_map: QueryableMap, t_start: FloatArray, steps: int = 100
 ) -> Estimate | None:
-    """Return where the paper's algorithm 1 ends, None if that is off the map: weights as printed, and none outside.
+    """Return where the paper's algorithm 1 ends, None if that is off the map.
 
     Weights of the closed form are the map's variance to the power -2, as the printed norm has
     them; the Gauss-Newton step for t knows no weights. Three slips of the print are mended, for
