@@ -28,6 +28,7 @@ MODELS: dict[str, type[Options] | None] = {
     "simulation": ScenarioOptions,
     "result": None,
     "suite": None,
+    "manifest": None,
 }
 """What a block of YAML is part of; those of no model are only parsed."""
 

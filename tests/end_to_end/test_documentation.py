@@ -51,6 +51,7 @@ def workplace(tutorial: Path, tmp_path: Path) -> Path:
         (sim / "structure.ply", "cloud.ply"),
         (tutorial / "map.npz", "map.npz"),
         (tutorial / "result" / "calibration.yaml", "calibration.yaml"),
+        (tutorial / "result" / "calibration.yaml", "old.yaml"),
     ):
         shutil.copy(source, tmp_path / name)
     robot = '<robot name="r"><link name="velodyne"/></robot>'
