@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
@@ -23,7 +23,7 @@ from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.field_error import field_error, refitted
 from l2m_gtsam.qa.metrics.fit import fit_figures
 from l2m_gtsam.results import CalibrationResult, SensorCalibration, SensorStatus, Uncertainty
-from l2m_gtsam.solve.alterations import COLUMNS, columns_of, noticeable, width
+from l2m_gtsam.solve.alterations import COLUMNS, PARAMETERS, columns_of, noticeable, width
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.sync import stuck_sensors
 from l2m_gtsam.validation_results import (
@@ -35,6 +35,7 @@ from l2m_gtsam.validation_results import (
     ValidatedSensor,
 )
 
+BAND = np.array([0.025, 0.975])
 NOTICED_SIGMAS = 5.0  # a change of so many is missed once in a hundred times, or less often
 SAME_BAG = (
     "This is the drive that the calibration was computed from: it agrees with itself. Take another."
@@ -256,8 +257,8 @@ def _validated(
         expected=float(np.sqrt(fit.sensor_noise**2 + fit.map_noise**2 + fit.pose_noise**2)),
         refitted=refitted(evidence.b_lidar[used], evidence.readings.field[used]),
         uniform=fit.without_map,
-        nis=_chi_square(told.squared, freedom[0]),
-        parameters=_chi_square(told.explained(range(16)), freedom[1]),
+        nis=_of_readings(told.squared, freedom[0], sensor),
+        parameters=_chi_square(told.explained(range(PARAMETERS)), freedom[1]),
         changes=_changes(found),
         noticeable=tuple(
             Noticeable(part, noticeable(told, part, NOTICED_SIGMAS)) for part in COLUMNS
@@ -266,8 +267,20 @@ def _validated(
     )
 
 
+def _of_readings(value: float, freedom: int, sensor: SensorCalibration) -> ChiSquare:
+    """Return the sum over readings; the noise that it counts in was itself estimated from others.
+
+    Then it is Fisher's distribution that says what chance does, not chi-square's.
+    """
+    if sensor.residuals is None:
+        return _chi_square(value, freedom)
+    freedom, others = max(freedom, 1), max(3 * sensor.residuals.readings - PARAMETERS, 1)
+    low, high = freedom * f.ppf(BAND, freedom, others)
+    return ChiSquare(value, freedom, float(low), float(high))
+
+
 def _chi_square(value: float, freedom: int) -> ChiSquare:
-    low, high = chi2.ppf([0.025, 0.975], max(freedom, 1))
+    low, high = chi2.ppf(BAND, max(freedom, 1))
     return ChiSquare(value, freedom, float(low), float(high))
 
 

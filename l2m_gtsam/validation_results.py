@@ -63,7 +63,8 @@ class ChiSquare(Record):
     freedom
         Its degrees of freedom.
     low, high
-        Between these it lies in 95 % of all cases if everything is as stated.
+        Between these it lies in 95 % of all cases if everything is as stated. Of readings it is
+        counted that the sensor's noise was itself estimated from so many others.
     """
 
     value: float
