@@ -84,7 +84,7 @@ def validate_calibration(asked: ValidationRequest, progress: Progress) -> Valida
     sources = [_source("calibration", asked.calibration)]
     drive, comparison = None, None
     if asked.compare is not None:
-        comparison = _compared(asked, new, config.qa)
+        comparison = _compared(asked, asked.compare, new, config.qa)
         sources.append(_source("old calibration", asked.compare))
     if asked.bag is not None and asked.map_path is not None:
         drive = _tested(asked.bag, asked.map_path, new, config, progress)
@@ -169,15 +169,14 @@ def _config(asked: ValidationRequest, new: CalibrationResult) -> Config:
 
 
 def _compared(
-    asked: ValidationRequest, new: CalibrationResult, options: QaOptions
+    asked: ValidationRequest, old_path: Path, new: CalibrationResult, options: QaOptions
 ) -> CalibrationComparison:
-    assert asked.compare is not None
-    old = read_sound_calibration(asked.compare)
+    old = read_sound_calibration(old_path)
     found = compare_calibrations(new, old, options.validation.chance)
     if not found.sensors:
         names = [", ".join(each.sensor for each in result.sensors) for result in (new, old)]
         raise CalibrationError(
-            f"{asked.compare}: no sensor that both calibrations know: there are {names[1]}, in "
+            f"{old_path}: no sensor that both calibrations know: there are {names[1]}, in "
             f"{asked.calibration} there are {names[0]}"
         )
     return found

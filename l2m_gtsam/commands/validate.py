@@ -21,9 +21,7 @@ def validate(
     ] = None,
     compare: Annotated[
         Path | None,
-        typer.Option(
-            help="An older calibration.yaml: has the vehicle changed since? No BAG needed."
-        ),
+        typer.Option(help="An older calibration.yaml: what has changed since? Needs no BAG."),
     ] = None,
     config: Annotated[
         Path | None,
@@ -34,9 +32,9 @@ def validate(
         typer.Option("--out", help="Folder for validation.json and validation.html."),
     ] = None,
 ) -> None:
-    """Say whether a calibration holds on another drive and map, or what has changed since an old one.
+    """Say whether a calibration still holds: on another drive and map, or beside an older one.
 
-    Sensors' readings are predicted from pose, map and calibration, with all their uncertainties.
+    Readings are predicted from poses, map and calibration with all that is uncertain of these.
     """
     from l2m_gtsam.batch.validation import (
         PAGE_FILE,

@@ -50,7 +50,7 @@ class ValidationOptions(Options):
 
     chance: float = Field(default=1e-3, gt=0, lt=0.1)
     """Share of unchanged sensors of which it may be said, by chance, that something changed."""
-    place_m: Limit = Limit(warn=0.005, fail=0.02)
+    place_m: Limit = Limit(warn=0.01, fail=0.03)
     """Change of a sensor's place, metres. A change counts if chance does not explain it."""
     rotation_deg: Limit = Limit(warn=0.3, fail=1.0)
     """Change of its rotation, degrees."""

@@ -19,6 +19,7 @@ from l2m_gtsam.validation_results import (
 )
 
 SHARED_LIMITS = ("unexplained", "rejected", "outside_map")
+BLIND_TIMES = 2.0  # a change that would fail, so many times over, and would not show
 EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map
 
 
@@ -175,7 +176,7 @@ def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     hidden = [
         f"{NAMES[each.part]} (below {amount(each.part, each.size)})"
         for each in sensor.noticeable
-        if each.part not in named and each.size > limits[each.part].fail
+        if each.part not in named and each.size > BLIND_TIMES * limits[each.part].fail
     ]
     if not hidden:
         return []

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.qa.report.svg import BAD, GOOD, GRID, INK, MUTED, X, Y, new_figure, short_name
 from l2m_gtsam.validation_results import ValidatedSensor
@@ -29,7 +30,7 @@ def field_errors_figure(sensors: Sequence[ValidatedSensor]) -> Figure:
         color=Y,
         label="after, ± 1 std",
     )
-    axes.set_xscale("log")
+    _logarithmic(axes)
     axes.set(xlabel="distance to the map's field (µT)")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return figure
@@ -50,13 +51,25 @@ def nis_figure(sensors: Sequence[ValidatedSensor]) -> Figure:
     axes.axvline(1, color=MUTED, linewidth=0.8)
     values = [each.nis.ratio for each in sensors]
     if max(values) > 3:
-        axes.set_xscale("log")
+        _logarithmic(axes)
     axes.plot([], [], "-", color=GRID, linewidth=6, label="95 % of all cases")
     axes.plot([], [], "o", color=INK, label="found")
     axes.margins(x=ROUND)
     axes.set(xlabel="normalised innovation squared per degree of freedom")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return figure
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Count along x in decades, with plain numbers: mathematics is text in these figures."""
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    axes.set_xlim(low / (1 + ROUND), high * (1 + ROUND))
+    wide = high > 20 * low
+    steps = [1.0] if wide else [1.0, 2.0, 5.0]
+    axes.xaxis.set_major_locator(LogLocator(subs=steps))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _rows(sensors: Sequence[ValidatedSensor]) -> tuple[Figure, Axes]:
