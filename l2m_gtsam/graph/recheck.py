@@ -7,7 +7,7 @@ import numpy as np
 from l2m_gtsam.data import BoolArray, FloatArray, Readings, Trajectory
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.innovation import KnownCalibration, told_by
-from l2m_gtsam.graph.trust import plausible
+from l2m_gtsam.graph.trust import plausible, residuals
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.solve.alterations import (
     OPEN_SIGMAS,
@@ -17,6 +17,7 @@ from l2m_gtsam.solve.alterations import (
     columns_of,
     parts_changed,
 )
+from l2m_gtsam.solve.robust import grown, median_noise
 from l2m_gtsam.sync import with_offsets
 from l2m_gtsam.validation_results import Part
 
@@ -177,7 +178,7 @@ def inside(drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration)
     """Return which readings lie inside the map, shape (N,)."""
     readings = drive.at(float(known.vector[15]))
     places = readings.R_map_lidar @ known.vector[:3] + readings.p_map_lidar
-    return field_map.query(places).inside
+    return field_map.query(places).inside.copy()
 
 
 def usable(
@@ -185,8 +186,16 @@ def usable(
 ) -> BoolArray:
     """Return the readings inside the map that one distortion explains beside the others, (N,)."""
     readings = drive.at(float(known.vector[15]))
-    keep = plausible(readings, field_map, known.vector[None, :3], options.robust)
-    return np.asarray(inside(drive, field_map, known) & keep)
+    within = inside(drive, field_map, known)
+    rows = np.flatnonzero(within)
+    own, t = readings[rows], known.vector[None, :3]
+    wrong = ~plausible(own, field_map, t, options.robust)
+    if wrong.any():
+        variance = field_map.query(own.R_map_lidar @ t[0] + own.p_map_lidar).variance.mean(axis=1)
+        e = residuals(own, field_map, known.estimate())
+        wrong = grown(wrong, e, median_noise(e, variance), variance)
+    within[rows[wrong]] = False
+    return within
 
 
 def finite(covariance: FloatArray, options: OneKeyOptions) -> FloatArray:

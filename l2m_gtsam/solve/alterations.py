@@ -31,6 +31,7 @@ COLUMNS = {
     Part.CLOCK: slice(15, 16),
 }
 PAIRS = ((0, 1), (1, 2), (2, 0))
+UNTOLD = 1e-9  # of the best told direction of a part: zero but for rounding
 OPEN_SIGMAS = 30.0  # of the largest useful ones: a parameter that a calibration leaves open
 
 
@@ -192,5 +193,5 @@ def is_told(told: Told, part: Part) -> bool:
 def noticeable(told: Told, part: Part, sigmas: float) -> float:
     """Return the largest standard deviation of a part by itself, so many times; maybe infinite."""
     own = told.root[:, COLUMNS[part]]
-    least = float(np.linalg.svd(own, compute_uv=False)[-1])
-    return sigmas / least if least > 0 else float("inf")
+    values = np.linalg.svd(own, compute_uv=False)
+    return float(sigmas / values[-1]) if values[-1] > UNTOLD * values[0] else float("inf")

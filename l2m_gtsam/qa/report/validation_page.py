@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib as mpl
+import numpy as np
 
 from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.qa.report.figures import course, place
@@ -83,7 +84,13 @@ def _section(index: int, verdict: SensorRemarks, found: Validation) -> Validatio
 
 def _noticed(sensor: ValidatedSensor) -> str:
     """Return what the drive would have shown, as a sentence."""
-    shown = [f"{NAMES[each.part]} {amount(each.part, each.size)}" for each in sensor.noticeable]
+    shown = [
+        f"{NAMES[each.part]} by {amount(each.part, each.size)}"
+        for each in sensor.noticeable
+        if np.isfinite(each.size)
+    ]
+    if not shown:
+        return "This drive would show no change of a single part."
     return f"Each by itself, this drive would show a change of {', '.join(shown)} or more."
 
 

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+import numpy as np
+
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.reasons.reason import Level, Reason, against, level_of, worst
 from l2m_gtsam.qa.validation.sentences import MEANINGS, NAMES, amount, by_how_much, limits_of
@@ -11,6 +13,7 @@ from l2m_gtsam.validation_results import (
     ComparedSensor,
     DriveValidation,
     NotValidated,
+    Part,
     Remark,
     SensorRemarks,
     Threshold,
@@ -123,20 +126,24 @@ def _on_sensor(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
 
 
 def _changed(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    share = sensor.rejected / (sensor.readings + sensor.rejected)
+    doubt = ""
+    if level_of(share, options.rejected) is not Level.PASS:
+        doubt = " (Readings were rejected, see below; what else differs near these pulls at this.)"
     return [
-        _change(each, options, "On this drive {name} is not as calibrated, by {amount}")
+        _change(each, options, "On this drive {name} is not as calibrated, by {amount}", doubt)
         for each in sensor.changes
     ]
 
 
-def _change(change: Change, options: QaOptions, text: str) -> Reason:
+def _change(change: Change, options: QaOptions, text: str, doubt: str = "") -> Reason:
     """Return a change as a reason; one that nobody minds is only worth knowing."""
     level = level_of(change.size, limits_of(options.validation)[change.part])
     told = text.format(name=NAMES[change.part], amount=by_how_much(change))
     told = told[0].upper() + told[1:]
     if level is Level.PASS:
         return Reason(level, f"{told}: more than chance, but too little to mind.")
-    return Reason(level, f"{told}: {MEANINGS[change.part]}.")
+    return Reason(level, f"{told}: {MEANINGS[change.part]}.{doubt}")
 
 
 def _consistent(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
@@ -174,13 +181,16 @@ def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     """Return which changes the drive would not have shown."""
     limits, named = limits_of(options.validation), {each.part for each in sensor.changes}
     hidden = [
-        f"{NAMES[each.part]} (below {amount(each.part, each.size)})"
+        f"{NAMES[each.part]} (a change of less than {amount(each.part, each.size)})"
+        if np.isfinite(each.size)
+        else f"{NAMES[each.part]} (however it changed)"
         for each in sensor.noticeable
-        if each.part not in named and each.size > BLIND_TIMES * limits[each.part].fail
+        if each.part not in (*named, Part.CLOCK)
+        and each.size > BLIND_TIMES * limits[each.part].fail
     ]
     if not hidden:
         return []
-    text = f"This drive says too little of {', '.join(hidden)}: such a change would not show."
+    text = f"This drive says too little of {', '.join(hidden)}: that would not show."
     return [Reason(Level.WARN, text)]
 
 

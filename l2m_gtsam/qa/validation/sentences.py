@@ -47,8 +47,6 @@ def limits_of(options: ValidationOptions) -> dict[Part, Limit]:
 def amount(part: Part, size: float) -> str:
     """Return a size with its unit."""
     factor, unit, _, _ = SHOWN[part]
-    if not np.isfinite(size):
-        return "any amount"
     return f"{factor * size:.2g}{'' if unit == '°' else ' '}{unit}"
 
 
