@@ -103,11 +103,13 @@ def recheck(
     """
     spread, basis = finite(covariance, options), changes_of(known.vector[3:12].reshape(3, 3))
     followed = _followed(drive, field_map, known, spread, options, chance)
-    used = followed.used & inside(drive, field_map, known)
-    if used.sum() < options.min_readings:
-        used = usable(drive, field_map, known, options)
-    told = _about(drive, field_map, known, known, used, options)
-    told = against_calibration(told, spread, basis)
+    told, used = followed.told, followed.used
+    if followed.parts:
+        used = used & inside(drive, field_map, known)
+        if used.sum() < options.min_readings:
+            used = usable(drive, field_map, known, options)
+        told = _about(drive, field_map, known, known, used, options)
+        told = against_calibration(told, spread, basis)
     open_ = int(np.sum(~np.isfinite(np.diag(covariance))))
     freedom = 3 * int(used.sum()) - open_, _determined(told) - open_
     return Recheck(told, freedom, followed.parts, followed.change, followed.covariance, used)
@@ -115,8 +117,9 @@ def recheck(
 
 @dataclass(frozen=True)
 class _Followed:
-    """Where a change was followed to: its parts and their coordinates, and readings there."""
+    """Where a change was followed to: its parts and their coordinates, and what is told there."""
 
+    told: Told
     parts: tuple[Part, ...]
     change: FloatArray
     covariance: FloatArray
@@ -133,20 +136,22 @@ def _followed(
 ) -> _Followed:
     basis = changes_of(known.vector[3:12].reshape(3, 3))
     used = usable(drive, field_map, known, options)
-    found, here = _Followed((), np.empty(0), np.empty((0, 0)), used), known
+    last, here = np.empty(0), known
+    parts: tuple[Part, ...] = ()
     for _ in range(ROUNDS):
-        told = _about(drive, field_map, here, known, found.used, options)
+        told = _about(drive, field_map, here, known, used, options)
         told = against_calibration(told, spread, basis)
-        last, parts = found, parts_changed(told, 3 * int(found.used.sum()), chance)
+        before, parts = parts, parts_changed(told, 3 * int(used.sum()), chance)
         columns = columns_of(parts)
-        found = _Followed(parts, *told.estimate(columns), found.used)
-        if parts == last.parts and _settled(found.change - last.change, found.covariance):
+        found = _Followed(told, parts, *told.estimate(columns), used)
+        if parts == before and _settled(found.change - last, found.covariance):
             break
+        last = found.change
         here = replace(known, vector=known.vector + limited(basis[:, columns] @ found.change))
-        used = usable(drive, field_map, here, options)
-        if used.sum() < options.min_readings:
+        seen = usable(drive, field_map, here, options)
+        if seen.sum() < options.min_readings:
             break
-        found = replace(found, used=used)
+        used = seen
     return found
 
 
@@ -178,7 +183,7 @@ def inside(drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration)
     """Return which readings lie inside the map, shape (N,)."""
     readings = drive.at(float(known.vector[15]))
     places = readings.R_map_lidar @ known.vector[:3] + readings.p_map_lidar
-    return field_map.query(places).inside.copy()
+    return field_map.query(places).inside
 
 
 def usable(
@@ -186,14 +191,18 @@ def usable(
 ) -> BoolArray:
     """Return the readings inside the map that one distortion explains beside the others, (N,)."""
     readings = drive.at(float(known.vector[15]))
-    within = inside(drive, field_map, known)
+    t = known.vector[None, :3]
+    sample = field_map.query(readings.R_map_lidar @ t[0] + readings.p_map_lidar)
+    within = sample.inside.copy()
     rows = np.flatnonzero(within)
-    own, t = readings[rows], known.vector[None, :3]
+    own = readings[rows]
     wrong = ~plausible(own, field_map, t, options.robust)
     if wrong.any():
-        variance = field_map.query(own.R_map_lidar @ t[0] + own.p_map_lidar).variance.mean(axis=1)
+        variance = sample.variance[rows].mean(axis=1)
         e = residuals(own, field_map, known.estimate())
-        wrong = grown(wrong, e, median_noise(e, variance), variance)
+        stretches = grown(wrong, e, median_noise(e, variance), variance)
+        # what would leave little to judge by is no stretch
+        wrong = stretches if 2 * (~stretches).sum() > (~wrong).sum() else wrong
     within[rows[wrong]] = False
     return within
 
