@@ -13,7 +13,7 @@ from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.validation_file import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.test_export_commands import C, H, calibrated, written
+from tests.end_to_end.test_export_commands import H, calibrated, written
 from tests.end_to_end.yard import NOISE, Yard, make_yard
 
 
@@ -84,7 +84,7 @@ def test_the_commands_of_the_page_run(
 def test_a_magnet_on_the_vehicle_is_named(
     calibration: Path, field_map: Path, tmp_path: Path
 ) -> None:
-    bag = written(tmp_path, "mcap", "moved", seed=7, offset=H + [3.0, 0.0, 0.0])
+    bag = written(tmp_path, "mcap", "moved", seed=7, offset=H + np.array([3.0, 0, 0]))
     arguments = ("validate", bag, "--calibration", calibration, "--map", field_map)
     out = l2m(*arguments, "--out", tmp_path / "out").out
     assert "verdict: FAIL" in out
@@ -99,11 +99,8 @@ def test_a_change_since_an_older_calibration(calibration: Path, tmp_path: Path) 
     shifted = (sensor.t_lidar_mag + np.array([0.3, 0.0, 0.0])).tolist()
     old = changed_file(calibration, tmp_path / "old.yaml", t_lidar_mag=shifted)
     out = l2m("validate", "--calibration", calibration, "--compare", old).out
-    assert "Since the old calibration its place t has changed by 300 mm" in out.replace(
-        "3e+02", "300"
-    )
+    assert "Since the old calibration its place t has changed by 300 mm" in out
     assert "verdict: FAIL" in out
-    assert C.shape == (3, 3)
 
 
 def test_bad_input(calibration: Path, field_map: Path, yard: Yard, tmp_path: Path) -> None:

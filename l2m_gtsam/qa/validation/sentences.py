@@ -47,7 +47,9 @@ def limits_of(options: ValidationOptions) -> dict[Part, Limit]:
 def amount(part: Part, size: float) -> str:
     """Return a size with its unit."""
     factor, unit, _, _ = SHOWN[part]
-    return f"{factor * size:.2g}{'' if unit == '°' else ' '}{unit}"
+    value = factor * size
+    number = f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    return f"{number}{'' if unit == '°' else ' '}{unit}"
 
 
 def by_how_much(change: Change) -> str:
