@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from l2m_gtsam.batch.validation import ValidationRequest, validate_calibration
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.qa.validation.tables import validation_lines
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.validation_file import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
@@ -85,12 +87,12 @@ def test_a_magnet_on_the_vehicle_is_named(
     calibration: Path, field_map: Path, tmp_path: Path
 ) -> None:
     bag = written(tmp_path, "mcap", "moved", seed=7, offset=H + np.array([3.0, 0, 0]))
-    arguments = ("validate", bag, "--calibration", calibration, "--map", field_map)
-    out = l2m(*arguments, "--out", tmp_path / "out").out
-    assert "verdict: FAIL" in out
-    assert "On this drive its offset H is not as calibrated, by 3 µT" in out
-    found = read_validation(tmp_path / "out" / "validation.json")
-    assert found.verdict.level == "fail"
+    asked = ValidationRequest(calibration, bag, field_map, out=tmp_path / "out")
+    found = validate_calibration(asked, silent)
+    told = "\n".join(validation_lines(found.verdict))
+    assert "verdict: FAIL" in told
+    assert "On this drive its offset H is not as calibrated, by 3 µT" in told
+    assert read_validation(tmp_path / "out" / "validation.json").verdict == found.verdict
     assert {each.role for each in found.sources} == {"calibration", "drive", "map"}
 
 
@@ -98,9 +100,14 @@ def test_a_change_since_an_older_calibration(calibration: Path, tmp_path: Path) 
     sensor = read_calibration(calibration)["mag"]
     shifted = (sensor.t_lidar_mag + np.array([0.3, 0.0, 0.0])).tolist()
     old = changed_file(calibration, tmp_path / "old.yaml", t_lidar_mag=shifted)
-    out = l2m("validate", "--calibration", calibration, "--compare", old).out
-    assert "Since the old calibration its place t has changed by 300 mm" in out
-    assert "verdict: FAIL" in out
+    found = validate_calibration(ValidationRequest(calibration, compare=old), silent)
+    told = "\n".join(validation_lines(found.verdict))
+    assert "Since the old calibration its place t has changed by 300 mm" in told
+    assert "verdict: FAIL" in told
+
+
+def silent(stage: str, fraction: float) -> None:
+    """Show no progress."""
 
 
 def test_bad_input(calibration: Path, field_map: Path, yard: Yard, tmp_path: Path) -> None:
