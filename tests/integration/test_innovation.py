@@ -90,8 +90,8 @@ def dense(
     J[:, :, :3], J[:, :, 12:] = CR @ G @ R, np.eye(3)
     for n in range(len(x)):
         J[n, :, 3:12] = np.kron(np.eye(3), b[n])
-    J = J.reshape(-1, 15)
-    return np.asarray(S + J @ P[:15, :15] @ J.T)
+    by_calibration = J.reshape(-1, 15)
+    return np.asarray(S + by_calibration @ P[:15, :15] @ by_calibration.T)
 
 
 @pytest.mark.parametrize("number_sigma", [0.0, 0.3])

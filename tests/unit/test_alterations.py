@@ -29,7 +29,7 @@ SIGMAS = np.append(SIGMA, 0.001)
 def readings(seed: int, rows: int = 90) -> FloatArray:
     """White derivatives of readings by the sixteen parameters, of useful size."""
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(rows, PARAMETERS)) / (10 * SIGMAS)
+    return np.asarray(rng.normal(size=(rows, PARAMETERS)) / (10 * SIGMAS))
 
 
 def spread(seed: int) -> FloatArray:
