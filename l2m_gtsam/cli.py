@@ -113,13 +113,20 @@ def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
 @app.command()
 def simulate(
     out: OutOption,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of world, drives and sensors.")] = 1,
+    options: Annotated[
+        Path | None, typer.Option("--options", help="YAML with the options of the simulation.")
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Of world, drives and sensors, instead of that in --options (1)."),
+    ] = None,
     kind: Annotated[
         list[str] | None, typer.Option(help="ros1, sqlite3 or mcap; all three if not given.")
     ] = None,
 ) -> None:
     """Simulate a warehouse, a mapping drive and a calibration drive, and write them as bags."""
     from l2m_gtsam.batch.simulation import simulate_bags
+    from l2m_gtsam.config import load_options
     from l2m_gtsam.errors import ConfigError
     from l2m_gtsam.simulate.bag_writer import BagKind
     from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -128,10 +135,11 @@ def simulate(
     if unknown := [each for each in kind or [] if each not in known]:
         msg = f"--kind: unknown bag kind {unknown[0]!r}; accepted: {', '.join(known)}"
         raise ConfigError(msg)
+    wanted = ScenarioOptions() if options is None else load_options(options, ScenarioOptions)
+    if seed is not None:
+        wanted = wanted.model_copy(update={"seed": seed})
     with shown_progress() as progress:
-        simulate_bags(
-            out, ScenarioOptions(seed=seed), [BagKind(k) for k in kind or known], progress
-        )
+        simulate_bags(out, wanted, [BagKind(k) for k in kind or known], progress)
     typer.echo(f"bags, suite.yaml, structure.ply and truth.yaml are in {out}")
 
 
