@@ -14,6 +14,7 @@ from l2m_gtsam.commands import exports
 from l2m_gtsam.commands.report import report
 from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
+from l2m_gtsam.commands.validate import validate
 from l2m_gtsam.errors import L2MError
 
 app = typer.Typer(
@@ -30,6 +31,7 @@ app.add_typer(map_app, name="map")
 app.command()(study)
 exports.register(app)
 app.command()(report)
+app.command()(validate)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
