@@ -153,7 +153,8 @@ def _clear(folder: Path) -> None:
     files = [folder / name for name in (OUTCOME_FILE, *RESULTS, PDF_FILE)]
     check_outputs(*files)
     try:
-        for file in files:
+        # What a killed run was about to write has a name of its own.
+        for file in [*files, *folder.glob(".*.part")]:
             file.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error

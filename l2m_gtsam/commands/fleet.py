@@ -66,7 +66,11 @@ def _summary(fleet: "Fleet") -> str:
 
     count = tally(fleet.rows)
     return (
-        f"{count.drives} drives of {count.vehicles} vehicles: {count.drives - count.failed} "
-        f"calibrated, {count.failed} not; sensors: {count.passed} pass, {count.warned} warn, "
+        f"{_counted(count.drives, 'drive')} of {_counted(count.vehicles, 'vehicle')}: "
+        f"{count.drives - count.failed} calibrated, {count.failed} not; sensors: {count.passed} pass, {count.warned} warn, "
         f"{count.rejected} fail, {count.outliers} outliers; {fleet.computed} computed now"
     )
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -5,7 +5,6 @@ from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import groupby
 from urllib.parse import quote
 
 import matplotlib as mpl
@@ -57,14 +56,6 @@ class Tally:
         return "warn" if self.warned or self.outliers else "pass"
 
 
-@dataclass(frozen=True)
-class VehicleSection:
-    """Trends of the sensors of one vehicle."""
-
-    vehicle: str
-    pictures: tuple[Picture, ...]
-
-
 def tally(rows: Sequence[FleetRow]) -> Tally:
     """Count drives and verdicts."""
     verdicts = [row.verdict for row in rows]
@@ -95,7 +86,7 @@ def fleet_page(rows: Sequence[FleetRow], options: FleetOptions) -> str:
     all_trends = trends(rows)
     drawn = _chosen(all_trends, options.pictures)
     with mpl.rc_context(SETTINGS):
-        sections = _sections(drawn)
+        pictures = [_picture(k, trend) for k, trend in enumerate(drawn)]
     script = _own("sort.js")
     return (
         _environment()
@@ -105,7 +96,7 @@ def fleet_page(rows: Sequence[FleetRow], options: FleetOptions) -> str:
             count=tally(rows),
             failed=[row for row in rows if row.verdict == ERROR],
             outlying=[row for row in rows if row.outliers],
-            sections=sections,
+            pictures=pictures,
             left_out=len(all_trends) - len(drawn),
             options=options,
             style=style() + _own("fleet.css"),
@@ -121,14 +112,6 @@ def _chosen(found: Sequence[Trend], most: int) -> list[Trend]:
     return [found[k] for k in sorted(first)]
 
 
-def _sections(drawn: Sequence[Trend]) -> list[VehicleSection]:
-    numbered = list(enumerate(drawn))
-    return [
-        VehicleSection(vehicle, tuple(_picture(k, trend) for k, trend in group))
-        for vehicle, group in groupby(numbered, key=lambda each: each[1].vehicle)
-    ]
-
-
 def _picture(k: int, trend: Trend) -> Picture:
     drives, marked = len(trend.days), trend.outliers
     alt = (
@@ -136,7 +119,8 @@ def _picture(k: int, trend: Trend) -> Picture:
         f"along x, y and z, and the length of H, with bars of {SIGMAS} sigma; {marked} marked."
     )
     caption = f"{drives} drives, {marked} marked." if marked else f"{drives} drives."
-    return Picture(trend.sensor, as_svg(trend_figure(trend), f"trend-{k}", alt), caption)
+    drawn = as_svg(trend_figure(trend), f"trend-{k}", alt)
+    return Picture(f"{trend.vehicle}: {trend.sensor}", drawn, caption)
 
 
 def _coordinates(sensor: SensorRow) -> list[tuple[str, str]]:

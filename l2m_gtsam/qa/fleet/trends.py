@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -127,8 +128,14 @@ def _draw(axes: Axes, trend: Trend, k: int) -> None:
     along = np.column_stack([bottom, top, np.full(len(days), np.nan)])[known].ravel()
     axes.plot(across, along, "-", color=colour, linewidth=1.2, alpha=0.6)
     good, bad = known & ~trend.failed, known & trend.failed
-    axes.plot(days[good], shown[good], marker, color=colour, markersize=4, linestyle="none")
-    axes.plot(days[bad], shown[bad], marker, color=colour, markersize=4, fillstyle="none")
+    marks: dict[str, Any] = {
+        "color": colour,
+        "markersize": 4,
+        "linestyle": "none",
+        "clip_on": False,
+    }
+    axes.plot(days[good], shown[good], marker, **marks)
+    axes.plot(days[bad], shown[bad], marker, fillstyle="none", **marks)
     axes.plot(
         days[outlying],
         shown[outlying],
