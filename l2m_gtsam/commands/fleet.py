@@ -67,8 +67,9 @@ def _summary(fleet: "Fleet") -> str:
     count = tally(fleet.rows)
     return (
         f"{_counted(count.drives, 'drive')} of {_counted(count.vehicles, 'vehicle')}: "
-        f"{count.drives - count.failed} calibrated, {count.failed} not; sensors: {count.passed} pass, {count.warned} warn, "
-        f"{count.rejected} fail, {count.outliers} outliers; {fleet.computed} computed now"
+        f"{count.drives - count.failed} calibrated, {count.failed} not; sensors: "
+        f"{count.passed} pass, {count.warned} warn, {count.rejected} fail, {count.outliers} "
+        f"outliers; {fleet.computed} computed now"
     )
 
 
