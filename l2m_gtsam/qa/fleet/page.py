@@ -1,6 +1,7 @@
 """The fleet's page: one file that needs nothing else."""
 
 import hashlib
+import re
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -119,8 +120,13 @@ def _picture(k: int, trend: Trend) -> Picture:
         f"along x, y and z, and the length of H, with bars of {SIGMAS} sigma; {marked} marked."
     )
     caption = f"{drives} drives, {marked} marked." if marked else f"{drives} drives."
-    drawn = as_svg(trend_figure(trend), f"trend-{k}", alt)
+    drawn = _small(as_svg(trend_figure(trend), f"trend-{k}", alt))
     return Picture(f"{trend.vehicle}: {trend.sensor}", drawn, caption)
+
+
+def _small(svg: Markup) -> Markup:
+    """Return SVG without its indentation: a page has many."""
+    return Markup(re.sub(r"\n\s*", "\n", svg))  # noqa: S704 - it is safe as it comes
 
 
 def _coordinates(sensor: SensorRow) -> list[tuple[str, str]]:

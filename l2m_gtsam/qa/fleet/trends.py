@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.fleet_results import FleetRow
 from l2m_gtsam.qa.fleet.outliers import by_sensor
-from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MARKERS, MUTED, plain_figure
+from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MUTED, dots, plain_figure
 
 SIGMAS = 2  # of the bars
 ROOM = 1.15  # around what is drawn
@@ -120,7 +120,7 @@ def _draw(axes: Axes, trend: Trend, k: int) -> None:
     outlying = known & trend.outlying[:, k]
     usual = known & ~outlying & ~trend.failed
     low, high = _limits(value, sigma, usual if usual.any() else known)
-    colour, marker = (*AXES, INK)[k], (*MARKERS, "D")[k]
+    colour = (*AXES, INK)[k]
     # Those beyond the picture stand at its edge.
     shown, days = np.clip(value, low, high), trend.days
     bottom, top = np.clip(value - sigma, low, high), np.clip(value + sigma, low, high)
@@ -128,14 +128,9 @@ def _draw(axes: Axes, trend: Trend, k: int) -> None:
     along = np.column_stack([bottom, top, np.full(len(days), np.nan)])[known].ravel()
     axes.plot(across, along, "-", color=colour, linewidth=1.2, alpha=0.6)
     good, bad = known & ~trend.failed, known & trend.failed
-    marks: dict[str, Any] = {
-        "color": colour,
-        "markersize": 4,
-        "linestyle": "none",
-        "clip_on": False,
-    }
-    axes.plot(days[good], shown[good], marker, **marks)
-    axes.plot(days[bad], shown[bad], marker, fillstyle="none", **marks)
+    dots(axes, days[good], shown[good], 4.5, color=colour, clip_on=False)
+    hollow: dict[str, Any] = {"fillstyle": "none", "linestyle": "none", "clip_on": False}
+    axes.plot(days[bad], shown[bad], "o", color=colour, markersize=4, **hollow)
     axes.plot(
         days[outlying],
         shown[outlying],
@@ -143,9 +138,9 @@ def _draw(axes: Axes, trend: Trend, k: int) -> None:
         color=BAD,
         markersize=10,
         markeredgewidth=1.6,
-        fillstyle="none",
-        clip_on=False,
+        **hollow,
     )
+    axes.tick_params(bottom=False, left=False)  # the grid says where
     axes.set_ylim(low, high)
 
 
