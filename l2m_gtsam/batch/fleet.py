@@ -86,10 +86,10 @@ def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) ->
         there is no cluster.
     """
     out = order.out.absolute()
-    drives = [_absolute(drive) for drive in fleet_drives(order)]
+    drives = fleet_drives(order)
     check_outputs(*(out / name for name in (PAGE_FILE, CSV_FILE, PARQUET_FILE)))
     fleet_options = load_config(order.config).fleet
-    tasks = _tasks(drives, out)
+    tasks = fleet_tasks(drives, out)
     tell = counter("fleet", progress)
     outcomes: dict[str, DriveOutcome] = {}
     for task in tasks:
@@ -105,11 +105,12 @@ def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) ->
     return _publish(out, rows, fleet_options, Fleet((), len(tasks), len(missing), ()))
 
 
-def _tasks(drives: Sequence[FleetDrive], out: Path) -> list[FleetTask]:
-    """Return what is to be done, drives of one map together.
+def fleet_tasks(listed: Sequence[FleetDrive], out: Path) -> list[FleetTask]:
+    """Return what is to be done, drives of one map together; an L2MError if that cannot begin.
 
     Maps and configurations are read here once: what is wrong with them concerns many drives.
     """
+    drives = [_absolute(drive) for drive in listed]
     maps = {path: _map_digest(path) for path in dict.fromkeys(each.map_path for each in drives)}
     configs = {path: load_config(path) for path in dict.fromkeys(each.config for each in drives)}
     digests = {path: config_digest(config) for path, config in configs.items()}

@@ -42,6 +42,9 @@ class FleetDrive:
         Files; no configuration for defaults.
     vehicle
         Name.
+    listed
+        What tells it from any other drive, wherever all of them are moved to: paths as seen from
+        the folder or the manifest.
     date
         When it was, UTC, ISO 8601, where the stamps are not to be asked; else empty.
     folder
@@ -52,6 +55,7 @@ class FleetDrive:
     map_path: Path
     config: Path | None
     vehicle: str
+    listed: str
     date: str = ""
     folder: str = ""
 
@@ -59,11 +63,6 @@ class FleetDrive:
     def name(self) -> str:
         """The bag's name for its folder."""
         return self.bag.stem if self.bag.suffix.lower() in FILES else self.bag.name
-
-    @property
-    def identity(self) -> str:
-        """What tells it from any other drive."""
-        return "\0".join(map(str, (self.bag, self.map_path, self.config)))
 
 
 def fleet_drives(order: FleetOrder) -> tuple[FleetDrive, ...]:
@@ -95,7 +94,13 @@ def _in_folder(order: FleetOrder) -> list[FleetDrive]:
     if order.map_path is None:
         raise ConfigError(f"{order.source}: a folder of bags needs a map; give it with --map")
     return [
-        FleetDrive(bag, order.map_path, order.config, bag.resolve().parent.name or "vehicle")
+        FleetDrive(
+            bag,
+            order.map_path,
+            order.config,
+            bag.resolve().parent.name or "vehicle",
+            _seen_from(order.source, bag),
+        )
         for bag in bags
     ]
 
@@ -108,7 +113,16 @@ def _listed(order: FleetOrder, entry: ManifestEntry) -> FleetDrive:
             "--map"
         )
     date = "" if entry.date is None else entry.date.strftime("%Y-%m-%dT%H:%M:%SZ")
-    return FleetDrive(entry.bag, map_path, entry.config or order.config, entry.vehicle, date)
+    folder = order.source.parent
+    listed = "\0".join(
+        _seen_from(folder, path) for path in (entry.bag, entry.map, entry.config) if path
+    )
+    config = entry.config or order.config
+    return FleetDrive(entry.bag, map_path, config, entry.vehicle, listed, date)
+
+
+def _seen_from(folder: Path, path: Path) -> str:
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
 
 def _with_folders(drives: Sequence[FleetDrive]) -> tuple[FleetDrive, ...]:
@@ -118,8 +132,8 @@ def _with_folders(drives: Sequence[FleetDrive]) -> tuple[FleetDrive, ...]:
     placed: list[FleetDrive] = []
     for vehicle, folder in zip(vehicles, folder_names(vehicles, vehicles, reserved), strict=True):
         own = [each for each in drives if each.vehicle == vehicle]
-        identities = [each.identity for each in own]
-        if twice := [each for each in own if identities.count(each.identity) > 1]:
+        identities = [each.listed for each in own]
+        if twice := [each for each in own if identities.count(each.listed) > 1]:
             raise ConfigError(f"{twice[0].bag}: listed twice for vehicle {vehicle!r}; remove one")
         names = folder_names([each.name for each in own], identities)
         placed += [

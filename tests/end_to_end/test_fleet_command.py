@@ -4,17 +4,20 @@ import csv
 import json
 import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import pyarrow.parquet as pq
 import pytest
 
 from l2m_gtsam.batch import fleet as batch_fleet
 from l2m_gtsam.batch.drives import calibrate_bag
-from l2m_gtsam.batch.fleet import run_fleet
-from l2m_gtsam.batch.fleet_drives import FleetOrder
+from l2m_gtsam.batch.fleet import fleet_tasks, run_fleet
+from l2m_gtsam.batch.fleet_drives import FleetOrder, fleet_drives
 from l2m_gtsam.batch.fleet_task import (
     OUTCOME_FILE,
     RESULTS,
@@ -27,6 +30,7 @@ from l2m_gtsam.batch.reports import report_folder
 from l2m_gtsam.cluster import ClusterOptions
 from l2m_gtsam.config import load_config
 from l2m_gtsam.fleet_results import DriveOutcome
+from l2m_gtsam.maps.field_map import FieldMap
 from tests.end_to_end.conftest import Finished, complaint_here, l2m
 from tests.fleets import Place, make_place, not_a_bag, truncated, vehicle
 
@@ -223,7 +227,7 @@ def test_results_of_an_earlier_bag_do_not_stay(run: Run, tmp_path: Path) -> None
     there = run.copied(tmp_path)
     bag = there.bags / "truck_1" / "day_0.bag"
     not_a_bag(bag)
-    tasks = batch_fleet._tasks(batch_fleet.fleet_drives(there.order), there.out)
+    tasks = fleet_tasks(fleet_drives(there.order), there.out)
     (task,) = (each for each in tasks if each.drive.folder == "truck_1/day_0")
     (task.out / ".report.html.12ab.part").write_text("of a run that was killed")
     outcome = calibrated_drive(task, open_map(there.place.map))
@@ -233,10 +237,11 @@ def test_results_of_an_earlier_bag_do_not_stay(run: Run, tmp_path: Path) -> None
 
 def test_what_nobody_expects_is_a_row_too(run: Run, tmp_path: Path) -> None:
     there = run.copied(tmp_path)
-    tasks = batch_fleet._tasks(batch_fleet.fleet_drives(there.order), there.out)
+    tasks = fleet_tasks(fleet_drives(there.order), there.out)
     shared = open_map(there.place.map)
     assert shared.opened is not None
-    none = replace(shared, opened=replace(shared.opened, field_map=None))
+    nothing_like_a_map = cast("FieldMap", object())
+    none = replace(shared, opened=replace(shared.opened, field_map=nothing_like_a_map))
     outcome = calibrated_drive(tasks[0], none)
     assert "unexpected AttributeError" in outcome.error
     assert not outcome.lasting
@@ -270,9 +275,6 @@ def test_wrong_input_is_one_line(
 
 def test_the_script_is_the_command(repository: Path, tmp_path: Path) -> None:
     """`scripts/calibrate_bags.py` takes the same options."""
-    import subprocess
-    import sys
-
     script = repository / "scripts" / "calibrate_bags.py"
     command = [sys.executable, str(script), str(tmp_path), "--out", str(tmp_path / "out")]
     ended = subprocess.run(

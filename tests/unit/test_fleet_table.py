@@ -6,6 +6,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -26,14 +27,11 @@ THREE = st.tuples(NUMBER, NUMBER, NUMBER)
 @st.composite
 def fleet_rows(draw: st.DrawFn) -> FleetRow:
     """Rows with any text and any numbers, infinite ones too; some drives failed."""
-    names = {"vehicle": draw(TEXT), "bag": draw(TEXT), "folder": draw(TEXT)}
-    if draw(st.booleans()):
-        return row(draw(st.integers(0, 999)), **names)
     sensor = sensor_row(draw(TEXT), reason=draw(TEXT), t=draw(THREE), H_sigma=draw(THREE))
-    made = row(draw(st.integers(0, 999)), sensor, **names)
-    if draw(st.booleans()):
-        return made
-    return FleetRow(**names, date="", duration=0.0, sensor=None, error=draw(TEXT))
+    made = row(draw(st.integers(0, 999)), sensor)
+    made = replace(made, vehicle=draw(TEXT), bag=draw(TEXT), folder=draw(TEXT))
+    failed = replace(made, date="", sensor=None, error=draw(TEXT))
+    return failed if draw(st.booleans()) else made
 
 
 @contextmanager
