@@ -153,6 +153,14 @@ def calibrate(
     models: Annotated[
         bool, typer.Option("--models", help="Show how models of each sensor compare.")
     ] = False,
+    view: Annotated[
+        Path | None,
+        typer.Option(
+            "--rerun",
+            metavar="FILE.rrd",
+            help="Write map, drive, sensors and misfits for Rerun's 3-D viewer, too.",
+        ),
+    ] = None,
 ) -> None:
     """Calibrate every magnetometer of a drive; write calibration.yaml, a picture and a report."""
     from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
@@ -165,7 +173,7 @@ def calibrate(
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with shown_progress() as progress:
-        result = calibrate_bag(bag, map_path, chosen, out, progress)
+        result = calibrate_bag(bag, map_path, chosen, out, progress, view=view)
         verdict = report_folder(out, config)
     print_table(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
@@ -178,8 +186,8 @@ def calibrate(
     for note in filter(None, map(model_note, result.sensors)):
         typer.echo(note)
     typer.echo("\n".join(verdict_lines(verdict)))
-    names = (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)
-    typer.echo(f"written: {', '.join(str(out / name) for name in names)}")
+    written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
+    typer.echo(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
 
 
 @app.command()

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from l2m_gtsam.appraise import appraise
+from l2m_gtsam.appraise import appraise, scene_of
 from l2m_gtsam.batch.opening import OpenMap, SavedMap, read_drive, read_drive_and_numbers
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.calibrate import calibrated
@@ -21,6 +21,7 @@ from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
 from l2m_gtsam.storage.metrics_file import write_metrics
+from l2m_gtsam.storage.rerun_file import require_rerun, write_scene
 
 CALIBRATION_FILE = "calibration.yaml"
 OVERVIEW_FILE = "overview.png"
@@ -39,6 +40,7 @@ def calibrate_bag(
     out: Path,
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
+    view: Path | None = None,
 ) -> CalibrationResult:
     """Calibrate all magnetometers of a bag; write `calibration.yaml`, metrics and a picture.
 
@@ -56,6 +58,8 @@ def calibrate_bag(
         Called with a stage and the fraction of it that is done.
     truth
         Sensors as they are, if that is known, to be drawn beside the estimate.
+    view
+        File for a three-dimensional view (.rrd), if one is wanted.
 
     Raises
     ------
@@ -63,10 +67,14 @@ def calibrate_bag(
         Whatever is wrong with the input, in one line; nothing is written then.
     """
     check_outputs(*(out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE)))
+    if view is not None:
+        require_rerun(view)
+        check_outputs(view)
     saved = SavedMap.read(map_path)
     recording = read_drive_and_numbers(bag, config, progress)
     field_map, source = saved.open(progress, [recording]), source_file(map_path)
-    return calibrate_drive(recording, OpenMap(field_map, source), config, out, progress, truth)
+    opened = OpenMap(field_map, source)
+    return calibrate_drive(recording, opened, config, out, progress, truth, view)
 
 
 def calibrate_drive(
@@ -76,6 +84,7 @@ def calibrate_drive(
     out: Path,
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
+    view: Path | None = None,
 ) -> CalibrationResult:
     """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bag`."""
     check_names([each.sensor for each in recording.series], config.qa)
@@ -87,6 +96,8 @@ def calibrate_drive(
     write_calibration(out / CALIBRATION_FILE, result)
     write_metrics(out / METRICS_FILE, metrics)
     save_figure(figure, out / OVERVIEW_FILE)
+    if view is not None:
+        write_scene(view, scene_of(recording, found))
     return result
 
 

@@ -23,6 +23,8 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.ridge import generalised_cross_validation, l_curve, ridge_path
 
+MIN_READINGS = 4  # non-coplanar: C has nine numbers, H three, a reading three
+
 
 class Method(StrEnum):
     """A closed form for C and H."""
@@ -130,8 +132,11 @@ def fit_distortion(
     CalibrationError
         Fewer than four readings: C and H cannot follow from them.
     """
-    if len(b_lidar) < 4:
-        msg = f"{len(b_lidar)} readings cannot determine a distortion, at least 4 are needed"
+    if len(b_lidar) < MIN_READINGS:
+        msg = (
+            f"{len(b_lidar)} readings cannot determine a distortion, "
+            f"at least {MIN_READINGS} are needed"
+        )
         raise CalibrationError(msg)
     C0 = np.eye(3) if C0 is None else C0
     method = options.method

@@ -6,7 +6,13 @@ from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions, alternate, start_estimate
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.view import QueryableMap
-from l2m_gtsam.solve.closed_form import ClosedFormOptions, Weighting, fit_distortion, row_weights
+from l2m_gtsam.solve.closed_form import (
+    MIN_READINGS,
+    ClosedFormOptions,
+    Weighting,
+    fit_distortion,
+    row_weights,
+)
 
 PUBLISHED = ClosedFormOptions(weighting=Weighting.PAPER)
 SETTLED_M = 1e-5
@@ -35,8 +41,8 @@ def two_step(
 
 def published(
     readings: Readings, field_map: QueryableMap, t_start: FloatArray, steps: int = 100
-) -> Estimate:
-    """Return where the paper's algorithm 1 ends: weights as printed, and none outside.
+) -> Estimate | None:
+    """Return where the paper's algorithm 1 ends, None if that is off the map.
 
     Weights of the closed form are the map's variance to the power -2, as the printed norm has
     them; the Gauss-Newton step for t knows no weights. Three slips of the print are mended, for
@@ -47,7 +53,7 @@ def published(
     Parameters
     ----------
     readings
-        Of one sensor; those outside of the map count as the map extends them.
+        Of one sensor; those that a step puts outside of the map are left out of the next.
     field_map
         The magnetic map.
     t_start
@@ -59,6 +65,8 @@ def published(
     for _ in range(steps):
         sample = field_map.query(R @ t + readings.p_map_lidar)
         keep = sample.inside
+        if keep.sum() < MIN_READINGS:
+            return None
         R_in, b_meas = R[keep], readings.field[keep]
         b_lidar = np.einsum("nji,nj->ni", R_in, sample.field[keep])
         weights = row_weights(sample.variance[keep].mean(axis=1), 0.0, PUBLISHED.weighting)

@@ -78,7 +78,10 @@ def test_optitrack_configuration_on_real_bags(
     l2m("map", "plot", map_path, "--out", tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 10_000
     run = bags / "optitrack_run1_ros1.bag"
-    l2m("calibrate", run, "--map", map_path, "--config", config, "--out", tmp_path / "result")
+    view = tmp_path / "view.rrd"
+    wanted = ("--config", config, "--out", tmp_path / "result", "--rerun", view)
+    assert str(view) in l2m("calibrate", run, "--map", map_path, *wanted).out
+    assert view.stat().st_size > 10_000
     result = read_calibration(tmp_path / "result" / "calibration.yaml")
     assert result["imu/mag"].status is SensorStatus.SOLVED
     assert result.bag is not None

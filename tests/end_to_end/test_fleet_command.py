@@ -278,7 +278,7 @@ def test_the_script_is_the_command(repository: Path, tmp_path: Path) -> None:
     script = repository / "scripts" / "calibrate_bags.py"
     command = [sys.executable, str(script), str(tmp_path), "--out", str(tmp_path / "out")]
     ended = subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=60, env=dict(os.environ)
+        command, capture_output=True, text=True, check=False, timeout=600, env=dict(os.environ)
     )
     assert ended.returncode == 2
     assert "no bags in it" in ended.stderr

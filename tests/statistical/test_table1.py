@@ -10,9 +10,17 @@ from pydantic import TypeAdapter
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.sensors import NoiseOptions
+from l2m_gtsam.studies.site import random_drive
 from l2m_gtsam.studies.table1 import report
 from l2m_gtsam.studies.table1.cells import Ends, Table1Cell, Table1Options, compute, prepare
-from l2m_gtsam.studies.table1.methods import HARMONIC, NAIVE, OTHERS, OURS, SLIDING
+from l2m_gtsam.studies.table1.methods import (
+    HARMONIC,
+    NAIVE,
+    OTHERS,
+    OURS,
+    SLIDING,
+    as_published,
+)
 from l2m_gtsam.studies.table1.paper import NOISES, Printed, printed
 from l2m_gtsam.studies.table1.study import TABLE1, keys
 from l2m_gtsam.studies.table1.summary import Table1Summary, summarise
@@ -58,6 +66,13 @@ def test_every_method_has_an_entry_on_its_maps(summary: Table1Summary) -> None:
     assert kinds == both | {(NAIVE, "thinned GP")}
     others = [each for each in summary.entries if each.map_kind == SLIDING]
     assert {each.calibrations for each in others} == {TINY.others * TINY.other_starts}
+
+
+def test_the_published_algorithm_off_the_map_has_no_result() -> None:
+    place = prepare(TINY)
+    drive = random_drive(place.site, TINY.site, np.random.default_rng(1))
+    away = np.array([500.0, 0.0, 0.0])
+    assert np.isnan(as_published(drive.readings, place.maps[HARMONIC], away)).all()
 
 
 def test_errors_are_near_their_bound(summary: Table1Summary) -> None:

@@ -54,8 +54,9 @@ def in_two_steps(method: Method) -> Solver:
 
 
 def as_published(readings: Readings, field_map: QueryableMap, t_start: FloatArray) -> FloatArray:
-    """Return where the paper's algorithm ends."""
-    return published(readings, field_map, t_start).vector(0)
+    """Return where the paper's algorithm ends; NaN if it leaves the map."""
+    end = published(readings, field_map, t_start)
+    return np.full(15, np.nan) if end is None else end.vector(0)
 
 
 OTHERS: dict[str, Solver] = {
