@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from l2m_gtsam.commands import exports
+from l2m_gtsam.commands.fleet import batch
 from l2m_gtsam.commands.report import report
 from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
@@ -29,6 +30,7 @@ map_app = typer.Typer(
 )
 app.add_typer(map_app, name="map")
 app.command()(study)
+app.command()(batch)
 exports.register(app)
 app.command()(report)
 app.command()(validate)

@@ -13,7 +13,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.threads import THREADS
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 Key = TypeVar("Key")
 Place = TypeVar("Place")
@@ -21,6 +21,7 @@ Value = TypeVar("Value")
 
 LOOPBACK = "127.0.0.1"
 CONNECT_S = 20  # a scheduler that is there answers at once
+DIED = "every worker that began it died; give the workers more memory"
 
 
 class ClusterOptions(Options):
@@ -44,11 +45,15 @@ class Work(Generic[Key, Place, Value]):
         Makes what is needed from its name, once for all tasks that need it.
     task
         The result from the key and what was prepared for it.
+    lost
+        What stands for the result of a task, from its key and a reason, when every worker that
+        began it died, also when it was alone; a ClusterError ends all work where it is absent.
     """
 
     place: Callable[[Key], Place]
     prepare: Callable[[Place], Any]
     task: Callable[[Key, Any], Value]
+    lost: Callable[[Key, str], Value] | None = None
 
 
 def computed(
@@ -73,26 +78,69 @@ def computed(
     if not keys:
         return
     with _client(options) as client:
-        from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
-        places = list(dict.fromkeys(map(work.place, keys)))
-        prepared = {place: client.submit(work.prepare, place, pure=False) for place in places}
-        names = {
-            client.submit(work.task, key, prepared[work.place(key)], pure=False): key
-            for key in keys
-        }
-        del prepared  # each is kept by the tasks that wait for it, and forgotten after the last
-        for future in as_completed(list(names)):
-            key = names[future]
+        alone: list[Key] = []
+        for key, future in _finished(client, work, keys):
             try:
                 value = future.result()
             except KilledWorker as error:
-                raise ClusterError(
-                    f"{key}: every worker that began it died; give the workers more memory"
-                ) from error
-            yield key, value
-            future.release()
+                if work.lost is None:
+                    raise ClusterError(f"{key}: {DIED}") from error
+                alone.append(key)
+            else:
+                yield key, value
+        yield from _one_by_one(client, work, alone)
+
+
+def _one_by_one(
+    client: "Client", work: Work[Key, Place, Value], keys: Sequence[Key]
+) -> Iterator[tuple[Key, Value]]:
+    """Yield results of tasks whose workers died; one that kills them alone, too, is lost.
+
+    A worker that dies takes along what waits on it, through no fault of its own.
+    """
+    hopeless: set[Place] = set()  # whose preparation kills workers
+    for key in keys:
+        if work.place(key) not in hopeless:
+            yield key, _alone(client, work, key, hopeless)
+        elif work.lost is not None:
+            yield key, work.lost(key, DIED)
+
+
+def _alone(
+    client: "Client", work: Work[Key, Place, Value], key: Key, hopeless: set[Place]
+) -> Value:
+    """Return the result of a task that has all workers to itself, or what stands for it."""
+    from distributed.scheduler import KilledWorker
+
+    _, future = next(_finished(client, work, [key]))
+    try:
+        value: Value = future.result()
+    except KilledWorker as error:
+        if work.lost is None:
+            raise ClusterError(f"{key}: {DIED}") from error
+        if error.task != future.key:
+            hopeless.add(work.place(key))
+        return work.lost(key, DIED)
+    return value
+
+
+def _finished(
+    client: "Client", work: Work[Key, Place, Value], keys: Sequence[Key]
+) -> "Iterator[tuple[Key, Future[Any]]]":
+    """Yield the futures of tasks as they end, well or not; each is released after its turn."""
+    from distributed import as_completed
+
+    places = list(dict.fromkeys(map(work.place, keys)))
+    prepared = {place: client.submit(work.prepare, place, pure=False) for place in places}
+    names = {
+        client.submit(work.task, key, prepared[work.place(key)], pure=False): key for key in keys
+    }
+    del prepared  # each is kept by the tasks that wait for it, and forgotten after the last
+    for future in as_completed(list(names)):
+        yield names[future], future
+        future.release()
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
 from l2m_gtsam.options import Options
+from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.regressors import ResampleOptions
 from l2m_gtsam.results import Uncertainty
@@ -84,6 +85,8 @@ class Config(Options):
     """`l2m plan`."""
     qa: QaOptions = QaOptions()
     """Verdicts of `l2m report`."""
+    fleet: FleetOptions = FleetOptions()
+    """Outliers and pictures of `l2m batch`."""
 
 
 def load_config(path: Path | None) -> Config:

@@ -5,11 +5,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from l2m_gtsam.appraise import appraise, scene_of
-from l2m_gtsam.batch.opening import SavedMap, read_drive, read_drive_and_numbers
+from l2m_gtsam.batch.opening import OpenMap, SavedMap, read_drive, read_drive_and_numbers
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.calibrate import calibrated
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.data import KnownSensor, Recording
 from l2m_gtsam.plan import assumed_recording, plan
 from l2m_gtsam.plan_results import DrivePlan
 from l2m_gtsam.progress import Progress, counter
@@ -73,11 +73,25 @@ def calibrate_bag(
     saved = SavedMap.read(map_path)
     recording = read_drive_and_numbers(bag, config, progress)
     field_map, source = saved.open(progress, [recording]), source_file(map_path)
+    opened = OpenMap(field_map, source)
+    return calibrate_drive(recording, opened, config, out, progress, truth, view)
+
+
+def calibrate_drive(
+    recording: Recording,
+    opened: OpenMap,
+    config: Config,
+    out: Path,
+    progress: Progress,
+    truth: tuple[KnownSensor, ...] = (),
+    view: Path | None = None,
+) -> CalibrationResult:
+    """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bag`."""
     check_names([each.sensor for each in recording.series], config.qa)
-    found = calibrated(recording, field_map, config.calibration, source, progress)
+    found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
     metrics = appraise(recording, found, config.calibration, config.qa, progress)
     result = replace(found.result, options=config.model_dump(mode="json"))
-    figure = calibration_figure(field_map, recording.trajectory, result, truth)
+    figure = calibration_figure(opened.field_map, recording.trajectory, result, truth)
     ensure_folder(out)
     write_calibration(out / CALIBRATION_FILE, result)
     write_metrics(out / METRICS_FILE, metrics)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import MapState, Recording
+from l2m_gtsam.data import MapState, Recording, SourceFile
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
@@ -26,6 +26,14 @@ def read_drive_and_numbers(bag: Path, config: Config, progress: Progress) -> Rec
     told = counter(f"reading numbers of {bag.name}", progress)
     scalars = read_scalars(bag, config.bag.regressors, config.bag.stamps, told)
     return replace(read_drive(bag, config, progress), scalars=scalars)
+
+
+@dataclass(frozen=True)
+class OpenMap:
+    """A map that is ready to be asked, and the file that it came from."""
+
+    field_map: FieldMap
+    source: SourceFile
 
 
 @dataclass(frozen=True)
@@ -77,13 +85,14 @@ class SavedMap:
             A drive is said to be in another frame, or the map is not sound.
         """
         for drive in drives:
-            self._check_frame(drive)
+            self.check_frame(drive)
         progress("loading the map", 0.0)
         field_map = map_from_state(self.state)
         progress("loading the map", 1.0)
         return field_map
 
-    def _check_frame(self, drive: Recording) -> None:
+    def check_frame(self, drive: Recording) -> None:
+        """Raise a MapError for a drive that is said to be in another frame."""
         frame = self.state.provenance.get("frame")
         if frame not in (None, drive.trajectory.frame):
             msg = (

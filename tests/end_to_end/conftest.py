@@ -22,7 +22,7 @@ class Finished:
     err: str
 
 
-def l2m(*arguments: str | Path, fails: bool = False) -> Finished:
+def l2m(*arguments: str | Path, fails: bool = False, timeout: float = 600) -> Finished:
     """Run ``l2m`` as a user would, in a process of its own."""
     command = [sys.executable, "-c", "from l2m_gtsam.cli import main; main()"]
     environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1"}
@@ -32,7 +32,7 @@ def l2m(*arguments: str | Path, fails: bool = False) -> Finished:
         text=True,
         env=environment,
         check=False,
-        timeout=600,
+        timeout=timeout,
     )
     if bool(run.returncode) != fails:
         pytest.fail(f"l2m {' '.join(map(str, arguments))}:\n{run.stdout}\n{run.stderr}")

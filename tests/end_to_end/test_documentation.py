@@ -22,6 +22,7 @@ NOT_RUN = {
     "docs/index.md": 2,
     "docs/tutorial.md": 1,
     "docs/basin.md": 1,
+    "docs/fleet.md": 1,
     "docs/report.md": 1,
     "docs/studies/README.md": 2,
 }

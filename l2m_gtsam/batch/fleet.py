@@ -1,0 +1,182 @@
+"""A fleet: all drives of all vehicles, going on where it was stopped."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from l2m_gtsam.batch.fleet_drives import (
+    CSV_FILE,
+    PAGE_FILE,
+    PARQUET_FILE,
+    FleetDrive,
+    FleetOrder,
+    fleet_drives,
+)
+from l2m_gtsam.batch.fleet_task import (
+    OUTCOME_FILE,
+    RESULTS,
+    FleetTask,
+    calibrated_drive,
+    lost_drive,
+    map_of,
+    open_map,
+)
+from l2m_gtsam.batch.opening import SavedMap
+from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.cluster import ClusterOptions, Work, computed
+from l2m_gtsam.config import Config, load_config
+from l2m_gtsam.errors import L2MError
+from l2m_gtsam.fleet_results import DriveOutcome, FleetRow
+from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.qa.fleet.options import FleetOptions
+from l2m_gtsam.qa.fleet.outliers import with_outliers
+from l2m_gtsam.qa.fleet.page import fleet_page
+from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.fleet_table import write_csv, write_parquet
+from l2m_gtsam.storage.folder_names import printable
+from l2m_gtsam.storage.outcome_file import read_outcome
+
+WORK = Work(map_of, open_map, calibrated_drive, lost_drive)
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """What became of a fleet.
+
+    Attributes
+    ----------
+    rows
+        In order of vehicle, date, bag and sensor.
+    drives
+        How many there are.
+    computed
+        How many of them were computed now; the others were there.
+    notes
+        What could not be written, and how it could be.
+    """
+
+    rows: tuple[FleetRow, ...]
+    drives: int
+    computed: int
+    notes: tuple[str, ...]
+
+
+def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) -> Fleet:
+    """Calibrate all drives of a fleet that are not there yet; write page and tables of all.
+
+    A drive that fails is a row with its reason. What is there from an earlier run is taken over
+    where bag, map and configuration are the same.
+
+    Parameters
+    ----------
+    order
+        What is wanted.
+    cluster
+        Who computes; all must see the same files.
+    progress
+        Told the share of the drives that is there.
+
+    Raises
+    ------
+    L2MError
+        Folder or manifest, a map or a configuration cannot be used, nothing can be written, or
+        there is no cluster.
+    """
+    out = order.out.absolute()
+    drives = fleet_drives(order)
+    check_outputs(*(out / name for name in (PAGE_FILE, CSV_FILE, PARQUET_FILE)))
+    fleet_options = load_config(order.config).fleet
+    tasks = fleet_tasks(drives, out)
+    tell = counter("fleet", progress)
+    outcomes: dict[str, DriveOutcome] = {}
+    for task in tasks:
+        if (there := _there(task)) is not None:
+            outcomes[task.drive.folder] = there
+            tell(len(outcomes), len(tasks))
+    missing = [task for task in tasks if task.drive.folder not in outcomes]
+    ensure_folder(out)
+    for task, outcome in computed(WORK, missing, cluster):
+        outcomes[task.drive.folder] = outcome
+        tell(len(outcomes), len(tasks))
+    rows = [row for task in tasks for row in _rows(task.drive, outcomes[task.drive.folder])]
+    return _publish(out, rows, fleet_options, Fleet((), len(tasks), len(missing), ()))
+
+
+def fleet_tasks(listed: Sequence[FleetDrive], out: Path) -> list[FleetTask]:
+    """Return what is to be done, drives of one map together; an L2MError if that cannot begin.
+
+    Maps and configurations are read here once: what is wrong with them concerns many drives.
+    """
+    drives = [_absolute(drive) for drive in listed]
+    maps = {path: _map_digest(path) for path in dict.fromkeys(each.map_path for each in drives)}
+    configs = {path: load_config(path) for path in dict.fromkeys(each.config for each in drives)}
+    digests = {path: config_digest(config) for path, config in configs.items()}
+    tasks = [
+        FleetTask(
+            drive,
+            configs[drive.config],
+            out / drive.folder,
+            maps[drive.map_path],
+            digests[drive.config],
+        )
+        for drive in drives
+    ]
+    places = list(maps)
+    return sorted(tasks, key=lambda each: places.index(each.drive.map_path))
+
+
+def _absolute(drive: FleetDrive) -> FleetDrive:
+    """Return a drive that workers in other folders find."""
+    return replace(drive, bag=drive.bag.absolute(), map_path=drive.map_path.absolute())
+
+
+def _map_digest(path: Path) -> str:
+    """Return the digest of a map; a MapError if it is missing or damaged."""
+    SavedMap.read(path)
+    return source_file(path).sha256
+
+
+def config_digest(config: Config) -> str:
+    """Return the digest of what a calibration depends on: not of how the fleet is shown."""
+    content = json.dumps(config.model_dump(mode="json", exclude={"fleet"}), sort_keys=True)
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def _there(task: FleetTask) -> DriveOutcome | None:
+    """Return the outcome of an earlier run if it would be the same now."""
+    found = read_outcome(task.out / OUTCOME_FILE)
+    if found is None or not found.lasting or found.key != task.key(found.key.bag):
+        return None
+    if not found.error and not all((task.out / name).is_file() for name in RESULTS):
+        return None
+    try:
+        return found if source_file(task.drive.bag).sha256 == found.key.bag else None
+    except L2MError:
+        return None
+
+
+def _rows(drive: FleetDrive, outcome: DriveOutcome) -> list[FleetRow]:
+    """Return the rows of a drive: one for each sensor, or one that says why there are none."""
+    vehicle, bag = printable(drive.vehicle), printable(drive.bag.name)
+    date, duration = drive.date or outcome.start, outcome.duration
+    return [
+        FleetRow(vehicle, bag, drive.folder, date, duration, sensor, outcome.error)
+        for sensor in outcome.sensors or (None,)
+    ]
+
+
+def _publish(out: Path, rows: Sequence[FleetRow], options: FleetOptions, fleet: Fleet) -> Fleet:
+    """Write page and tables; return the fleet with its rows."""
+    marked = with_outliers(sorted(rows, key=_order), options)
+    write_csv(out / CSV_FILE, marked)
+    notes = write_parquet(out / PARQUET_FILE, marked)
+    with atomic_path(out / PAGE_FILE) as temporary:
+        temporary.write_text(fleet_page(marked, options), encoding="utf-8", errors="replace")
+    return replace(fleet, rows=marked, notes=notes)
+
+
+def _order(row: FleetRow) -> tuple[str, str, str, str]:
+    return (row.vehicle, row.date, row.folder, "" if row.sensor is None else row.sensor.sensor)

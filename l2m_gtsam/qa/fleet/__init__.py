@@ -1,0 +1,1 @@
+"""What many drives of many vehicles say together."""

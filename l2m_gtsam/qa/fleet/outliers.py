@@ -1,0 +1,140 @@
+"""Drives on which a sensor is not where, or not as, the vehicle's other drives found it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import median_abs_deviation
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.fleet_results import FleetRow, Outlier, SensorRow
+from l2m_gtsam.qa.fleet.options import FleetOptions
+
+MEDIAN = np.pi / 2  # variance of a median beside that of a mean, of normal numbers
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a sensor over N drives.
+
+    Attributes
+    ----------
+    name
+        With its unit.
+    value, sigma
+        In that unit, shape (N,); not finite where a drive does not know it.
+    least
+        Deviations up to this are never marked.
+    """
+
+    name: str
+    value: FloatArray
+    sigma: FloatArray
+    least: float
+
+
+def with_outliers(rows: Sequence[FleetRow], options: FleetOptions) -> tuple[FleetRow, ...]:
+    """Return rows with their outliers marked, each among those of its vehicle and sensor."""
+    marked = list(rows)
+    for places in by_sensor(rows).values():
+        sensors = [each for k in places if (each := rows[k].sensor) is not None]
+        found: list[list[Outlier]] = [[] for _ in places]
+        for parameter in parameters(sensors, options):
+            for k, outlier in _outliers(parameter, options).items():
+                found[k].append(outlier)
+        for k, outliers in zip(places, found, strict=True):
+            worst_first = tuple(sorted(outliers, key=lambda each: -each.score))
+            marked[k] = replace(marked[k], outliers=worst_first)
+    return tuple(marked)
+
+
+def by_sensor(rows: Sequence[FleetRow]) -> dict[tuple[str, str], list[int]]:
+    """Return which rows belong to each vehicle and sensor, in order."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for k, row in enumerate(rows):
+        if row.sensor is not None:
+            groups.setdefault((row.vehicle, row.sensor.sensor), []).append(k)
+    return groups
+
+
+def parameters(sensors: Sequence[SensorRow], options: FleetOptions) -> list[Parameter]:
+    """Return what is compared from drive to drive: position, rotation and H."""
+    turned = rotations_apart(np.array([each.quaternion_xyzw for each in sensors]))
+    parts = (
+        (
+            "t",
+            "mm",
+            1e3 * _column(sensors, "t"),
+            1e3 * _column(sensors, "t_sigma"),
+            options.least_m,
+        ),
+        ("rotation", "deg", turned, _column(sensors, "rotation_sigma"), options.least_deg),
+        ("H", "uT", _column(sensors, "H"), _column(sensors, "H_sigma"), options.least_ut),
+    )
+    return [
+        Parameter(
+            f"{name}_{axis} ({unit})",
+            value[:, k],
+            sigma[:, k],
+            least * (1e3 if unit == "mm" else 1),
+        )
+        for name, unit, value, sigma, least in parts
+        for k, axis in enumerate("xyz")
+    ]
+
+
+def rotations_apart(quaternions: FloatArray) -> FloatArray:
+    """Return how rotations differ from the one that is nearest to all others.
+
+    Parameters
+    ----------
+    quaternions
+        R_lidar_mag as xyzw, NaN where there is none, shape (N, 4).
+
+    Returns
+    -------
+    FloatArray
+        Rotation vectors about the sensor's axes in degrees, shape (N, 3).
+    """
+    known = np.isfinite(quaternions).all(axis=1)
+    apart = np.full((len(quaternions), 3), np.nan)
+    if known.any():
+        R = Rotation.from_quat(quaternions[known])
+        # Angles between all of them, from the cosines of half of each.
+        q = R.as_quat()
+        angles = 2 * np.arccos(np.clip(np.abs(q @ q.T), 0, 1))
+        middle = R[int(np.argmin(angles.sum(axis=1)))]
+        apart[known] = np.rad2deg((middle.inv() * R).as_rotvec())
+    return apart
+
+
+def _column(sensors: Sequence[SensorRow], name: str) -> FloatArray:
+    return np.array([getattr(each, name) for each in sensors], dtype=float).reshape(-1, 3)
+
+
+def _outliers(parameter: Parameter, options: FleetOptions) -> dict[int, Outlier]:
+    """Return the drives on which a parameter is beyond both its uncertainty and the spread."""
+    known = np.flatnonzero(np.isfinite(parameter.value) & np.isfinite(parameter.sigma))
+    if len(known) < options.drives:
+        return {}
+    value, sigma = parameter.value[known], parameter.sigma[known]
+    d, expected = value - np.median(value), expected_deviation(value, sigma)
+    beyond = (np.abs(d) > options.outlier * expected) & (np.abs(d) > parameter.least)
+    return {
+        int(known[k]): Outlier(parameter.name, float(d[k]), float(abs(d[k]) / expected[k]))
+        for k in np.flatnonzero(beyond)
+    }
+
+
+def expected_deviation(value: FloatArray, sigma: FloatArray) -> FloatArray:
+    """Return how far each of N values may well be from their median, shape (N,).
+
+    The larger of the standard deviation of the difference, which holds where sigmas are true, and
+    of the values' spread, which is what drives differ by for reasons that no sigma knows. The
+    latter from the median absolute deviation, which half of all values cannot move.
+    """
+    of_median = MEDIAN * np.median(sigma) ** 2 / len(value)
+    spread = float(median_abs_deviation(value, scale="normal"))
+    smallest = np.finfo(float).tiny  # values that are exact and all alike
+    return np.asarray(np.maximum(np.sqrt(sigma**2 + of_median), max(spread, smallest)))

@@ -1,0 +1,178 @@
+"""The fleet's page: one file that needs nothing else."""
+
+import hashlib
+import re
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from urllib.parse import quote
+
+import matplotlib as mpl
+import numpy as np
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.fleet_results import ERROR, FleetRow, SensorRow
+from l2m_gtsam.qa.fleet.options import FleetOptions
+from l2m_gtsam.qa.fleet.trends import SIGMAS, Trend, trend_figure, trends
+from l2m_gtsam.qa.report.page import number, style
+from l2m_gtsam.qa.report.sections import Picture
+from l2m_gtsam.qa.report.svg import SETTINGS, as_svg
+from l2m_gtsam.qa.report.words import with_sigma
+
+REPORT = "report.html"  # in the folder of each drive
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How many there are of what, for the top of the page and the command line.
+
+    Attributes
+    ----------
+    drives, vehicles
+        Of the fleet.
+    failed
+        Drives that were not calibrated.
+    passed, warned, rejected
+        Sensors on drives with the verdict PASS, WARN and FAIL.
+    outliers
+        Sensors on drives that are marked.
+    """
+
+    drives: int
+    vehicles: int
+    failed: int
+    passed: int
+    warned: int
+    rejected: int
+    outliers: int
+
+    @property
+    def level(self) -> str:
+        """The worst that there is."""
+        if self.failed or self.rejected:
+            return "fail"
+        return "warn" if self.warned or self.outliers else "pass"
+
+
+def tally(rows: Sequence[FleetRow]) -> Tally:
+    """Count drives and verdicts."""
+    verdicts = [row.verdict for row in rows]
+    return Tally(
+        drives=len({row.folder for row in rows}),
+        vehicles=len({row.vehicle for row in rows}),
+        failed=verdicts.count(ERROR),
+        passed=verdicts.count("pass"),
+        warned=verdicts.count("warn"),
+        rejected=verdicts.count("fail"),
+        outliers=sum(bool(row.outliers) for row in rows),
+    )
+
+
+def fleet_page(rows: Sequence[FleetRow], options: FleetOptions) -> str:
+    """Return the page of a fleet as HTML.
+
+    Text from bags and names of files are escaped; nothing is loaded from anywhere, and no script
+    runs but the page's own, whose digest its policy names.
+
+    Parameters
+    ----------
+    rows
+        With their outliers, in the order in which they are shown.
+    options
+        Of the fleet.
+    """
+    all_trends = trends(rows)
+    drawn = _chosen(all_trends, options.pictures)
+    with mpl.rc_context(SETTINGS):
+        pictures = [_picture(k, trend) for k, trend in enumerate(drawn)]
+    script = _own("sort.js")
+    return (
+        _environment()
+        .get_template("fleet.html.j2")
+        .render(
+            rows=rows,
+            count=tally(rows),
+            failed=[row for row in rows if row.verdict == ERROR],
+            outlying=[row for row in rows if row.outliers],
+            pictures=pictures,
+            left_out=len(all_trends) - len(drawn),
+            options=options,
+            style=style() + _own("fleet.css"),
+            script=script,
+            digest=b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        )
+    )
+
+
+def _chosen(found: Sequence[Trend], most: int) -> list[Trend]:
+    """Return as many trends as are drawn, in their order; those with outliers go first."""
+    first = sorted(range(len(found)), key=lambda k: -found[k].outliers)[:most]
+    return [found[k] for k in sorted(first)]
+
+
+def _picture(k: int, trend: Trend) -> Picture:
+    drives, marked = len(trend.days), trend.outliers
+    alt = (
+        f"{trend.sensor} of {trend.vehicle} over {drives} drives: position less its weighted mean "
+        f"along x, y and z, and the length of H, with bars of {SIGMAS} sigma; {marked} marked."
+    )
+    caption = f"{drives} drives, {marked} marked." if marked else f"{drives} drives."
+    drawn = _small(as_svg(trend_figure(trend), f"trend-{k}", alt))
+    return Picture(f"{trend.vehicle}: {trend.sensor}", drawn, caption)
+
+
+def _small(svg: Markup) -> Markup:
+    """Return SVG without its indentation: a page has many."""
+    return Markup(re.sub(r"\n\s*", "\n", svg))  # noqa: S704 - it is safe as it comes
+
+
+def _coordinates(sensor: SensorRow) -> list[tuple[str, str]]:
+    """Return x, y and z in millimetres as a cell sorts, and as it reads."""
+    pairs = zip(sensor.t, sensor.t_sigma, strict=True)
+    return [(f"{1e3 * value:.3f}", with_sigma(1e3 * value, 1e3 * s, 1)) for value, s in pairs]
+
+
+def _turned(sensor: SensorRow) -> str:
+    """Return roll, pitch and yaw, and the largest sigma, in degrees."""
+    if not np.isfinite(sensor.quaternion_xyzw).all():
+        return "–"
+    # intrinsic z, y, x: what ROS calls yaw, pitch, roll
+    yaw, pitch, roll = Rotation.from_quat(sensor.quaternion_xyzw).as_euler("ZYX", degrees=True)
+    sigma = max(sensor.rotation_sigma)
+    known = f" ± {sigma:.2f}" if np.isfinite(sigma) else ", part of it not determined"
+    return f"{roll:.1f}, {pitch:.1f}, {yaw:.1f}{known}"
+
+
+def _link(row: FleetRow) -> str:
+    """Return where the report of a row is, as seen from the page."""
+    return quote(f"{row.folder}/{REPORT}")
+
+
+def _own(name: str) -> Markup:
+    """Return a file of ours as it is."""
+    environment = _environment()
+    text, _, _ = environment.loader.get_source(environment, name)  # type: ignore[union-attr]
+    return Markup(text)  # noqa: S704 - our own file
+
+
+@cache
+def _environment() -> Environment:
+    folders = ("l2m_gtsam.qa.fleet", "l2m_gtsam.qa.report")
+    environment = Environment(
+        loader=ChoiceLoader([PackageLoader(folder) for folder in folders]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "number": number,
+        "with_sigma": with_sigma,
+        "coordinates": _coordinates,
+        "turned": _turned,
+        "link": _link,
+    }
+    return environment

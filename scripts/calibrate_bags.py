@@ -1,0 +1,12 @@
+"""Calibrate a folder or a manifest of bags: the same as ``l2m batch``, with its options."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from l2m_gtsam.cli import main
+
+if __name__ == "__main__":
+    sys.argv[1:1] = ["batch"]
+    main()

@@ -1,0 +1,147 @@
+"""The fleet's page in a real browser: seen, sorted by keyboard, and no name of a file runs."""
+
+import json
+import os
+import subprocess
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.fleet_results import FleetRow
+from l2m_gtsam.qa.fleet.options import FleetOptions
+from l2m_gtsam.qa.fleet.outliers import with_outliers
+from l2m_gtsam.qa.fleet.page import fleet_page
+from tests.browser.conftest import HERE, TIMEOUT_S, Looked, look
+from tests.fleet_rows import row, sensor_row
+
+GRAVE = {"serious", "critical"}  # of axe-core
+SMALLEST_PX = 9.0  # text in figures; below it labels are not read on a phone
+MOST_BYTES = 3_000_000
+VEHICLES, DRIVES, SENSORS = 10, 20, 4
+HOSTILE = (
+    "<script>alert(1)</script>",
+    '"><img src=x onerror=alert(2)>$\\frac{',
+    "</style></svg><svg onload=alert(3)>{{ 7 * 7 }}",
+)
+BROKEN = "javascript:alert(4)//<b>cut</b>.bag"
+
+
+def hostile_rows() -> list[FleetRow]:
+    """A fleet of 200 drives with names that are markup; some sensors moved, some drives failed."""
+    rng = np.random.default_rng(4)
+    vehicles = [*HOSTILE, *(f"truck_{k}" for k in range(VEHICLES - len(HOSTILE)))]
+    sensors = [*HOSTILE, "mag"]
+    rows = []
+    for vehicle in vehicles:
+        for day in range(DRIVES):
+            for name in sensors:
+                t = np.array([0.3, -0.1, 0.2]) + rng.normal(0, 0.002, 3)
+                verdict = ("pass", "warn", "fail")[day % 3]
+                found = sensor_row(name, t=tuple(t), verdict=verdict, reason=HOSTILE[day % 3])
+                where = {"vehicle": vehicle, "bag": f"{HOSTILE[1]}_{day}", "folder": f"a b/{day}"}
+                rows.append(row(day, found, **where))
+    loose = rows[0].sensor
+    assert loose is not None
+    rows[0] = replace(rows[0], sensor=replace(loose, t=(0.9, -0.1, 0.2)))
+    failed = FleetRow(HOSTILE[0], BROKEN, "v/b", "", 0.0, None, f"{BROKEN}: {HOSTILE[2]}")
+    return [*rows, failed]
+
+
+@dataclass(frozen=True)
+class Sorted:
+    """What ``sort.js`` tells: of each press of Enter on a column, its state and its cells."""
+
+    presses: list[dict[str, Any]]
+    errors: list[str]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("fleet") / "index.html"
+    options = FleetOptions()
+    path.write_text(fleet_page(with_outliers(hostile_rows(), options), options), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def looked(browser: str, page: Path, tmp_path_factory: pytest.TempPathFactory) -> Looked:
+    return look(browser, page, tmp_path_factory.mktemp("screenshots"))
+
+
+@pytest.fixture(scope="module")
+def sorting(browser: str, page: Path) -> Sorted:
+    run = subprocess.run(
+        ["node", HERE / "sort.js", page, "bag", "x (mm)", "x (mm)", "verdict", "verdict"],  # noqa: S607
+        capture_output=True,
+        text=True,
+        env={**os.environ, "L2M_BROWSER": browser},
+        check=False,
+        timeout=TIMEOUT_S,
+    )
+    assert run.returncode == 0, run.stderr
+    told = json.loads(run.stdout)
+    return Sorted(told["presses"], told["errors"])
+
+
+def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:
+    for each in looked.looks:
+        assert each["errors"] == []
+        assert each["requests"] == []
+
+
+def test_every_trend_is_seen(looked: Looked) -> None:
+    for each in looked.looks:
+        assert len(each["figures"]) == VEHICLES * SENSORS
+        for figure in each["figures"]:
+            assert figure["alt"]
+            assert figure["visible"]
+            assert figure["inside"]
+            assert figure["drawn"] > 5
+            assert min(figure["width"], figure["height"]) > 100
+
+
+def test_it_fits_a_phone(looked: Looked) -> None:
+    for each in looked.looks:
+        assert not each["wider"]
+        assert each["smallest_text"] >= SMALLEST_PX
+
+
+def test_accessibility_has_no_grave_fault(looked: Looked) -> None:
+    for each in looked.looks:
+        assert [fault for fault in each["accessibility"] if fault["impact"] in GRAVE] == []
+
+
+def test_names_are_text(looked: Looked) -> None:
+    for each in looked.looks:
+        assert all(name in each["text"] for name in (*HOSTILE, BROKEN))
+
+
+def test_failures_stand_on_top(looked: Looked) -> None:
+    for each in looked.looks:
+        text = each["text"]
+        assert text.index(BROKEN) < text.index("Trends\n\n") < text.index("All drives\n\n")
+
+
+def test_it_is_small(page: Path) -> None:
+    assert page.stat().st_size < MOST_BYTES
+
+
+def test_columns_are_sorted_by_keyboard(sorting: Sorted) -> None:
+    assert sorting.errors == []
+    bags, rising, falling, good, bad = sorting.presses
+    assert [each["sort"] for each in sorting.presses] == [
+        *("ascending", "ascending", "descending", "ascending", "descending")
+    ]
+    assert all(each["others"] == 0 for each in sorting.presses)
+    assert all(len(each["cells"]) == VEHICLES * DRIVES * SENSORS + 1 for each in sorting.presses)
+    numbers = [int(cell.rpartition("_")[2]) for cell in bags["cells"] if cell != BROKEN]
+    assert numbers == sorted(numbers)  # day 2 before day 10
+    for press, turned in ((rising, 1), (falling, -1)):
+        assert press["cells"][-1] == ""  # blanks last either way
+        x = [turned * float(cell.split(" ")[0]) for cell in press["cells"][:-1]]
+        assert x == sorted(x)
+    assert "PASS" in good["cells"][0]
+    assert "ERROR" in bad["cells"][0]
