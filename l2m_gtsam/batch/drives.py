@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from l2m_gtsam.appraise import appraise
-from l2m_gtsam.batch.opening import SavedMap, read_drive, read_drive_and_numbers
+from l2m_gtsam.batch.opening import SavedMap, read_drive, read_drives
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.calibrate import calibrated
 from l2m_gtsam.config import Config
@@ -40,12 +40,24 @@ def calibrate_bag(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
 ) -> CalibrationResult:
-    """Calibrate all magnetometers of a bag; write `calibration.yaml`, metrics and a picture.
+    """Calibrate all magnetometers of a bag, as `calibrate_bags` does."""
+    return calibrate_bags([bag], map_path, config, out, progress, truth)
+
+
+def calibrate_bags(
+    bags: Sequence[Path],
+    map_path: Path,
+    config: Config,
+    out: Path,
+    progress: Progress,
+    truth: tuple[KnownSensor, ...] = (),
+) -> CalibrationResult:
+    """Calibrate all magnetometers; write `calibration.yaml`, metrics and a picture.
 
     Parameters
     ----------
-    bag
-        A drive through the mapped place.
+    bags
+        Drives of one vehicle through the mapped place, which are calibrated together.
     map_path
         Map file.
     config
@@ -64,13 +76,14 @@ def calibrate_bag(
     """
     check_outputs(*(out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE)))
     saved = SavedMap.read(map_path)
-    recording = read_drive_and_numbers(bag, config, progress)
-    field_map, source = saved.open(progress, [recording]), source_file(map_path)
+    recording = read_drives(bags, config, progress)
+    field_map, source = saved.open(progress, recording.parts), source_file(map_path)
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, field_map, config.calibration, source, progress)
     metrics = appraise(recording, found, config.calibration, config.qa, progress)
     result = replace(found.result, options=config.model_dump(mode="json"))
-    figure = calibration_figure(field_map, recording.trajectory, result, truth)
+    drives = [each.trajectory for each in recording.parts]
+    figure = calibration_figure(field_map, drives, result, truth)
     ensure_folder(out)
     write_calibration(out / CALIBRATION_FILE, result)
     write_metrics(out / METRICS_FILE, metrics)

@@ -10,6 +10,7 @@ from l2m_gtsam.metric_results import Halves
 from l2m_gtsam.qa.metrics.plain import row
 
 TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas
+SEVERAL = "several drives are compared with each other instead of halves of one"
 NOT_DONE = "halves of the drive were not calibrated by themselves (`qa.halves`)"
 
 
