@@ -29,7 +29,9 @@ from l2m_gtsam.errors import CalibrationError
 
 # Between drives. Longer than any pause that is looked for in readings, and than any time offset.
 PAUSE_NS = 60_000_000_000
-JUMP_NS = 1_000_000  # in the middle of the pause the lidar goes from where it ended to the next start
+JUMP_NS = (
+    1_000_000  # in the middle of the pause the lidar goes from where it ended to the next start
+)
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:

@@ -19,7 +19,6 @@ import numpy as np
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 
-
 ONE_DRIVE = (slice(None),)  # all rows
 
 

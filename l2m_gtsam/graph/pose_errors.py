@@ -59,9 +59,7 @@ class PoseKnots:
             count = max(int(np.ceil((last - first) / between)) + 1, 2)
             knots.append(np.linspace(first, last, count))
             spacing += [float(knots[-1][1] - knots[-1][0])] * (count - 1) + [np.inf]
-        return cls(
-            np.concatenate(knots), max(correlation_s, SHORTEST_S), np.array(spacing[:-1])
-        )
+        return cls(np.concatenate(knots), max(correlation_s, SHORTEST_S), np.array(spacing[:-1]))
 
     @property
     def correlation(self) -> FloatArray:

@@ -18,7 +18,9 @@ def repeat(case: Case) -> list[Reason]:
     if case.metrics is None or case.sensor.status not in JUDGED:
         return []
     drives = case.metrics.drives
-    notes = [] if drives is None else [_not_looked_at(each) for each in drives.drives if each.reason]
+    notes = (
+        [] if drives is None else [_not_looked_at(each) for each in drives.drives if each.reason]
+    )
     halves = differing(case.metrics, case.options)
     if halves is None:
         return notes
