@@ -8,7 +8,7 @@ ends where a drive ends, and no clock has to run on from one drive to the next.
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 
@@ -29,9 +29,8 @@ from l2m_gtsam.errors import CalibrationError
 
 # Between drives. Longer than any pause that is looked for in readings, and than any time offset.
 PAUSE_NS = 60_000_000_000
-JUMP_NS = (
-    1_000_000  # in the middle of the pause the lidar goes from where it ended to the next start
-)
+# In the middle of it the lidar goes from where a drive ended to where the next starts.
+JUMP_NS = 1_000_000
 
 
 def joined(recordings: Sequence[Recording]) -> Recording:
@@ -182,7 +181,7 @@ def _when(recording: Recording) -> tuple[int, str, str]:
 def _moved_ns(trajectories: Sequence[Trajectory]) -> tuple[int, ...]:
     """Return by how much each drive is moved so that it starts a pause after the last one's end."""
     moved = [0]
-    for last, following in zip(trajectories, trajectories[1:], strict=False):
+    for last, following in pairwise(trajectories):
         end = int(last.stamp_ns[-1]) + moved[-1]
         moved.append(end + PAUSE_NS - int(following.stamp_ns[0]))
     return tuple(moved)

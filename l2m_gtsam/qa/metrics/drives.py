@@ -115,9 +115,8 @@ def _repeat(bag: str, part: Part | str, parts: Sequence[Part]) -> DriveRepeat:
         against = compare_halves(common(others).part, part)
         if against.reason:
             against = no_halves(OPEN)
-    return DriveRepeat(
-        bag, row(vector), row(sigma), against, _largest(against.difference, against.sigma)
-    )
+    largest = _largest(against.difference, against.sigma)
+    return DriveRepeat(bag, row(vector), row(sigma), against, largest)
 
 
 def _largest(difference: Sequence[float], sigma: Sequence[float]) -> tuple[float, ...]:

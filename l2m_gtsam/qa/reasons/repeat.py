@@ -17,10 +17,7 @@ def repeat(case: Case) -> list[Reason]:
     """Return by how much parts differ, where they do, and which cannot be looked at."""
     if case.metrics is None or case.sensor.status not in JUDGED:
         return []
-    drives = case.metrics.drives
-    notes = (
-        [] if drives is None else [_not_looked_at(each) for each in drives.drives if each.reason]
-    )
+    notes = _not_looked_at(case.metrics)
     halves = differing(case.metrics, case.options)
     if halves is None:
         return notes
@@ -99,6 +96,14 @@ def _remedy(case: Case) -> str:
     return "fasten it and drive again"
 
 
-def _not_looked_at(drive: DriveRepeat) -> Reason:
-    text = f"{Path(drive.bag).name} is not compared with the other drives: {drive.reason}."
-    return Reason(Level.PASS, text)
+def _not_looked_at(metrics: SensorMetrics) -> list[Reason]:
+    """Return which of several drives say nothing by themselves, and why."""
+    drives = () if metrics.drives is None else metrics.drives.drives
+    return [
+        Reason(
+            Level.PASS,
+            f"{Path(each.bag).name} is not compared with the other drives: {each.reason}.",
+        )
+        for each in drives
+        if each.reason
+    ]
