@@ -54,7 +54,8 @@ def disagreement_note(stretch: Disagreement) -> str:
     where = f"{stretch.bag}: " if stretch.bag else ""
     return (
         f"{where}{', '.join(stretch.sensors)}: {stretch.readings} readings fit neither map nor "
-        f"distortion and do not count, {1e-9 * stretch.start_ns:.2f} to {1e-9 * stretch.end_ns:.2f} s, "
+        f"distortion and do not count, {1e-9 * stretch.start_ns:.2f} to "
+        f"{1e-9 * stretch.end_ns:.2f} s, "
         f"{stretch.length:.1f} m from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m, "
         f"{stretch.size:.2g} uT off; {meaning}"
     )

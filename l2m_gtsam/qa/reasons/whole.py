@@ -95,7 +95,8 @@ def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
     return (
         f"{HEADS[stretch.passed_again]}: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on "
         f"the map{drive}{when}, {stretch.length:.1f} m long, "
-        f"{count} sensor{'s' if count > 1 else ''} differ{'' if count > 1 else 's'} by {stretch.size:.2g} µT. "
+        f"{count} sensor{'s' if count > 1 else ''} differ{'' if count > 1 else 's'} by "
+        f"{stretch.size:.2g} µT. "
         f"{TAILS[stretch.passed_again]}. These {stretch.readings} readings do not count."
     )
 
