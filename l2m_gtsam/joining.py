@@ -160,12 +160,13 @@ def _same(one: Recording, other: Recording) -> bool:
     if one.source.sha256 and one.source.sha256 == other.source.sha256:
         return True
     theirs = {each.sensor: each for each in other.series}
-    return any(
-        len(each)
-        and np.array_equal(each.stamp_ns, theirs[each.sensor].stamp_ns)
-        and np.array_equal(each.field, theirs[each.sensor].field, equal_nan=True)
-        for each in one.series
-        if each.sensor in theirs
+    pairs = [(each, theirs[each.sensor]) for each in one.series if each.sensor in theirs]
+    return (
+        any(len(each) for each, _ in pairs)
+        and np.array_equal(one.trajectory.stamp_ns, other.trajectory.stamp_ns)
+        and np.array_equal(one.trajectory.p, other.trajectory.p)
+        and all(np.array_equal(a.stamp_ns, b.stamp_ns) for a, b in pairs)
+        and all(np.array_equal(a.field, b.field, equal_nan=True) for a, b in pairs)
     )
 
 

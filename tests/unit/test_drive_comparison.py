@@ -93,7 +93,9 @@ def test_shared_errors_that_are_alike_drop_out() -> None:
     own, G = np.diag((0.1 * SCALE) ** 2), np.diag(SCALE)
     error = G @ np.random.default_rng(1).normal(size=15)
     one, other = (Part(TRUE + error, own + G @ G.T, G) for _ in range(2))
-    np.testing.assert_allclose(compare_halves(one, other).sigma, np.sqrt(2) * 0.1 * SCALE, rtol=1e-3)
+    np.testing.assert_allclose(
+        compare_halves(one, other).sigma, np.sqrt(2) * 0.1 * SCALE, rtol=1e-3
+    )
 
 
 @pytest.mark.parametrize("moved", [0, 1, 2, 3])

@@ -102,19 +102,16 @@ def test_drives_follow_each_other_after_a_pause(drives: list[Recording]) -> None
     assert (np.diff(whole.trajectory.stamp_ns) > 0).all()
 
 
-@given(DRIVES, st.floats(-40, 40))
+@given(DRIVES, st.floats(-29, 29))
 @settings(max_examples=30, deadline=None)
 def test_no_pose_lies_between_two_drives(drives: list[Recording], offset: float) -> None:
-    """At any time offset a pose is one of the drive's own or that of its end."""
+    """At any time offset up to half a pause a pose is the drive's own or that of its end."""
     whole = joined(drives)
     readings = prepare(whole, CalibrationOptions()).readings
     moved = with_offsets(readings, whole.trajectory, np.full(2, offset))
-    x = moved.p_map_lidar[:, 0]
-    # exactly, as neighbours have the same x
-    assert np.isin(x, 100.0 * np.arange(len(drives))).all()
-    if abs(offset) < 29:  # half a pause away another drive starts
-        here = np.array([each.trajectory.p[0, 0] for each in whole.drives])
-        np.testing.assert_array_equal(x, here[readings.of_drive])
+    here = np.array([each.trajectory.p[0, 0] for each in whole.drives])
+    # exactly, as all poses of a drive have the same x
+    np.testing.assert_array_equal(moved.p_map_lidar[:, 0], here[readings.of_drive])
 
 
 @given(DRIVES)
@@ -224,9 +221,7 @@ def test_one_drive_with_uncertain_poses_leaves_the_other_exact() -> None:
         ([drive(0, 0), numbered(1, np.ones(40))], "1.bag: it has other recorded numbers"),
     ],
 )
-def test_drives_that_do_not_go_together_are_one_line(
-    drives: list[Recording], pattern: str
-) -> None:
+def test_drives_that_do_not_go_together_are_one_line(drives: list[Recording], pattern: str) -> None:
     with pytest.raises(CalibrationError, match=pattern) as error:
         joined(drives)
     assert "\n" not in str(error.value)
