@@ -1,6 +1,7 @@
 """Drives joined to one recording: every time comes back, and nothing reaches over a joint."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -97,7 +98,7 @@ def test_drives_follow_each_other_after_a_pause(drives: list[Recording]) -> None
         (int(each.trajectory.stamp_ns[0]) + by, int(each.trajectory.stamp_ns[-1]) + by)
         for each, by in zip(whole.drives, whole.moved_ns, strict=True)
     ]
-    pauses = [after[0] - before[1] for before, after in zip(ends, ends[1:], strict=False)]
+    pauses = [after[0] - before[1] for before, after in pairwise(ends)]
     assert all(2 * LATER_S * 1e9 < pause < 3600e9 for pause in pauses)
     assert (np.diff(whole.trajectory.stamp_ns) > 0).all()
 
