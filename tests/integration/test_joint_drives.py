@@ -194,8 +194,9 @@ def test_a_sensor_that_moved_between_drives_is_named(good: Made) -> None:
     assert found is not None
     assert found.drives is not None
     later = found.drives.drives[1].others
-    # 3 cm, to five times their sigmas of about a millimetre each
-    np.testing.assert_allclose(later.difference[:3], [0.03, 0, 0], atol=0.005)
+    # By the truth, to four of its sigmas: a day's 200 readings tell places to 5 mm only.
+    away = np.array(later.difference[:3]) - [0.03, 0, 0]
+    np.testing.assert_allclose(away / np.array(later.sigma[:3]), 0, atol=4)
     assert later.turned_deg == pytest.approx(np.rad2deg(0.05), abs=0.3)
     assert not bad.verdict.reasons
 
@@ -296,7 +297,7 @@ def test_files_of_one_drive_do_not_speak_of_several(tmp_path: Path) -> None:
     metrics = appraise(one, found, OPTIONS, QaOptions(halves=False))
     write_metrics(tmp_path / "m.json", metrics)
     text = (tmp_path / "c.yaml").read_text()
-    for name in ("bags", "missing_in"):
+    for name in ("\nbags:", "missing_in:"):
         assert name not in text
     json = (tmp_path / "m.json").read_text()
     for name in ('"bags"', '"drives"', '"drive":['):
