@@ -5,7 +5,7 @@ export MPLBACKEND := Agg
 # Blocks of a few hundred readings are too small for BLAS threads.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test study benchmark magyc lock clean
+.PHONY: demo test study benchmark docs docs-serve magyc lock clean
 
 demo: .venv/runtime.stamp
 	$(BIN)/l2m demo --out demo_out
@@ -22,6 +22,13 @@ study: .venv/dev.stamp
 
 benchmark: .venv/dev.stamp
 	$(BIN)/python scripts/benchmark.py
+
+# The site, to be opened as site/index.html; `make docs-serve` shows it while pages are written.
+docs: .venv/dev.stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+docs-serve: .venv/dev.stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve
 
 # A peer of the studies, in an environment of its own: its needs contradict ours.
 magyc: .venv-magyc/stamp
@@ -51,4 +58,4 @@ lock:
 	pip-compile --quiet --strip-extras --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --extra dev --extra cluster --extra studies --extra fleet --extra viewer --extra lidar --extra docs --constraint requirements.lock --output-file requirements-dev.lock pyproject.toml
 
 clean:
-	rm -rf .venv .venv-magyc demo_out
+	rm -rf .venv .venv-magyc demo_out site

@@ -1,4 +1,4 @@
-"""A calibration -> the figures that it is judged by. Pure: no files, no terminal."""
+"""A calibration -> the figures that it is judged by, and its view. Pure: no files, no terminal."""
 
 from l2m_gtsam.calibrate import Calibrated
 from l2m_gtsam.config import CalibrationOptions
@@ -8,8 +8,10 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.scene import calibration_scene
 from l2m_gtsam.repeat_results import Repeatability
 from l2m_gtsam.repeatability import compared_drives, compared_halves
+from l2m_gtsam.scene import Scene
 
 
 def appraise(
@@ -45,7 +47,29 @@ def appraise(
         else:
             halves = compared_halves(calibrated, options, qa.half_readings)
         tell(stage, 1.0)
-    solution = calibrated.solution
-    evidence = DriveEvidence(solution.readings, solution.inside, solution.rejected)
-    maps = MapForms(calibrated.field_map, calibrated.solver_map)
+    evidence, maps = _evidence(calibrated), _maps(calibrated)
     return metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
+
+
+def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
+    """Return what there is to see of a calibration in three dimensions.
+
+    Parameters
+    ----------
+    recording
+        That was calibrated.
+    calibrated
+        The calibration, with what it rests on.
+    """
+    evidence, maps = _evidence(calibrated), _maps(calibrated)
+    name = recording.source.sha256
+    return calibration_scene(calibrated.result, evidence, recording.trajectory, maps, name)
+
+
+def _evidence(calibrated: Calibrated) -> DriveEvidence:
+    solution = calibrated.solution
+    return DriveEvidence(solution.readings, solution.inside, solution.rejected)
+
+
+def _maps(calibrated: Calibrated) -> MapForms:
+    return MapForms(calibrated.field_map, calibrated.solver_map)

@@ -14,6 +14,7 @@ from l2m_gtsam.commands import exports
 from l2m_gtsam.commands.report import report
 from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
+from l2m_gtsam.commands.validate import validate
 from l2m_gtsam.errors import L2MError
 
 app = typer.Typer(
@@ -30,6 +31,7 @@ app.add_typer(map_app, name="map")
 app.command()(study)
 exports.register(app)
 app.command()(report)
+app.command()(validate)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
@@ -111,13 +113,20 @@ def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
 @app.command()
 def simulate(
     out: OutOption,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of world, drives and sensors.")] = 1,
+    options: Annotated[
+        Path | None, typer.Option("--options", help="YAML with the options of the simulation.")
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Of world, drives and sensors, instead of that in --options (1)."),
+    ] = None,
     kind: Annotated[
         list[str] | None, typer.Option(help="ros1, sqlite3 or mcap; all three if not given.")
     ] = None,
 ) -> None:
     """Simulate a warehouse, a mapping drive and a calibration drive, and write them as bags."""
     from l2m_gtsam.batch.simulation import simulate_bags
+    from l2m_gtsam.config import load_options
     from l2m_gtsam.errors import ConfigError
     from l2m_gtsam.simulate.bag_writer import BagKind
     from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -126,10 +135,11 @@ def simulate(
     if unknown := [each for each in kind or [] if each not in known]:
         msg = f"--kind: unknown bag kind {unknown[0]!r}; accepted: {', '.join(known)}"
         raise ConfigError(msg)
+    wanted = ScenarioOptions() if options is None else load_options(options, ScenarioOptions)
+    if seed is not None:
+        wanted = wanted.model_copy(update={"seed": seed})
     with shown_progress() as progress:
-        simulate_bags(
-            out, ScenarioOptions(seed=seed), [BagKind(k) for k in kind or known], progress
-        )
+        simulate_bags(out, wanted, [BagKind(k) for k in kind or known], progress)
     typer.echo(f"bags, suite.yaml, structure.ply and truth.yaml are in {out}")
 
 
@@ -161,6 +171,14 @@ def calibrate(
     models: Annotated[
         bool, typer.Option("--models", help="Show how models of each sensor compare.")
     ] = False,
+    view: Annotated[
+        Path | None,
+        typer.Option(
+            "--rerun",
+            metavar="FILE.rrd",
+            help="Write map, drive, sensors and misfits for Rerun's 3-D viewer, too.",
+        ),
+    ] = None,
 ) -> None:
     """Calibrate every magnetometer of one drive or several; write a picture and a report, too."""
     from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
@@ -178,7 +196,8 @@ def calibrate(
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with shown_progress() as progress:
-        result = calibrate_bags([*(bags or ()), *(more or ())], map_path, chosen, out, progress)
+        drives = [*(bags or ()), *(more or ())]
+        result = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
         verdict = report_folder(out, config)
     print_table(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
@@ -192,8 +211,8 @@ def calibrate(
     for note in filter(None, map(model_note, result.sensors)):
         typer.echo(note)
     typer.echo("\n".join(verdict_lines(verdict)))
-    names = (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)
-    typer.echo(f"written: {', '.join(str(out / name) for name in names)}")
+    written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
+    typer.echo(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
 
 
 @app.command()

@@ -16,7 +16,8 @@ class MotionOptions(Options):
     """Which extra motions are tried."""
 
     poses: int = Field(default=100, ge=10)
-    """Poses of each motion at which every sensor reads once."""
+    """The most poses of each motion; every sensor reads once at each. A motion along the path of a
+    drive has no more than the drive."""
     heave_m: float = Field(default=0.2, gt=0)
     """Up and down by so much."""
     tilt_deg: float = Field(default=5.0, gt=0, lt=45)
@@ -65,13 +66,15 @@ def extra_motions(drive: Motion, options: MotionOptions) -> tuple[Motion, ...]:
     Parameters
     ----------
     drive
-        The drive.
+        The drive, its times ascending.
     options
         How much of each.
     """
-    rows = np.linspace(0, len(drive.p) - 1, options.poses).round().astype(int)
+    # No pose twice: the vehicle has no velocity between a pose and itself.
+    rows = np.unique(np.linspace(0, len(drive.p) - 1, options.poses).round().astype(int))
     R, p, seconds = drive.R[rows], drive.p[rows], drive.seconds[rows]
-    swing = np.sin(2 * np.pi * SWINGS * np.linspace(0, 1, options.poses))
+    swings = min(SWINGS, len(rows) / 4)
+    swing = np.sin(2 * np.pi * swings * np.linspace(0, 1, len(rows)))
     up = np.array([0.0, 0.0, 1.0])
     tilt, round_ = np.deg2rad(options.tilt_deg) * swing, np.linspace(0, 2 * np.pi, len(swing))
     middle = len(p) // 2

@@ -223,10 +223,10 @@ def _motions(
     readings: Readings, field_map: QueryableMap, planning: PlanOptions
 ) -> tuple[Motion, ...]:
     """Return the motions to try on a drive."""
-    order = np.argsort(readings.stamp_ns, kind="stable")
-    seconds = (readings.stamp_ns - readings.stamp_ns.min()) / NANOSECONDS
-    R, p = readings.R_map_lidar[order], readings.p_map_lidar[order]
-    drive = Motion("drive", R, p, seconds[order])
+    # Sensors that share their stamps share their poses: each counts once.
+    stamps, first = np.unique(readings.stamp_ns, return_index=True)
+    seconds = (stamps - stamps[0]) / NANOSECONDS
+    drive = Motion("drive", readings.R_map_lidar[first], readings.p_map_lidar[first], seconds)
     motions = extra_motions(drive, planning.motion)
     places = places_around(drive, planning.motion)
     strong = strongest(places, field_map.query(places))

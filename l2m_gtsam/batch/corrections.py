@@ -54,12 +54,12 @@ class Reading:
             It does not say it in a way that is understood.
         """
         return cls(
-            _part(path, result.options, BagOptions, "bag"),
-            _part(path, result.options, ResampleOptions, "calibration", "regressors"),
+            saved_options(path, result.options, BagOptions, "bag"),
+            saved_options(path, result.options, ResampleOptions, "calibration", "regressors"),
         )
 
 
-def _part(path: Path, options: Any, model: type[Part], *names: str) -> Part:
+def saved_options(path: Path, options: Any, model: type[Part], *names: str) -> Part:
     """Return the options under some names of those that a calibration was made with."""
     for name in names:
         options = options.get(name, {}) if isinstance(options, dict) else options

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from l2m_gtsam.appraise import appraise
+from l2m_gtsam.appraise import appraise, scene_of
 from l2m_gtsam.batch.opening import SavedMap, read_drive, read_drives
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.calibrate import calibrated
@@ -21,6 +21,7 @@ from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
 from l2m_gtsam.storage.metrics_file import write_metrics
+from l2m_gtsam.storage.rerun_file import require_rerun, write_scene
 
 CALIBRATION_FILE = "calibration.yaml"
 OVERVIEW_FILE = "overview.png"
@@ -39,9 +40,10 @@ def calibrate_bag(
     out: Path,
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
+    view: Path | None = None,
 ) -> CalibrationResult:
     """Calibrate all magnetometers of a bag, as `calibrate_bags` does."""
-    return calibrate_bags([bag], map_path, config, out, progress, truth)
+    return calibrate_bags([bag], map_path, config, out, progress, truth, view)
 
 
 def calibrate_bags(
@@ -51,6 +53,7 @@ def calibrate_bags(
     out: Path,
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
+    view: Path | None = None,
 ) -> CalibrationResult:
     """Calibrate all magnetometers; write `calibration.yaml`, metrics and a picture.
 
@@ -68,6 +71,8 @@ def calibrate_bags(
         Called with a stage and the fraction of it that is done.
     truth
         Sensors as they are, if that is known, to be drawn beside the estimate.
+    view
+        File for a three-dimensional view (.rrd), if one is wanted.
 
     Raises
     ------
@@ -75,6 +80,9 @@ def calibrate_bags(
         Whatever is wrong with the input, in one line; nothing is written then.
     """
     check_outputs(*(out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE)))
+    if view is not None:
+        require_rerun(view)
+        check_outputs(view)
     saved = SavedMap.read(map_path)
     recording = read_drives(bags, config, progress)
     field_map, source = saved.open(progress, recording.parts), source_file(map_path)
@@ -88,6 +96,8 @@ def calibrate_bags(
     write_calibration(out / CALIBRATION_FILE, result)
     write_metrics(out / METRICS_FILE, metrics)
     save_figure(figure, out / OVERVIEW_FILE)
+    if view is not None:
+        write_scene(view, scene_of(recording, found))
     return result
 
 

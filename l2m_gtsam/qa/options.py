@@ -42,6 +42,31 @@ class Nominal(Options):
         return self
 
 
+class ValidationOptions(Options):
+    """Thresholds of the verdict of `l2m validate`.
+
+    It shares `qa.unexplained`, `qa.rejected` and `qa.outside_map` with the report.
+    """
+
+    chance: float = Field(default=1e-3, gt=0, lt=0.1)
+    """Share of unchanged sensors of which it may be said, by chance, that something changed."""
+    place_m: Limit = Limit(warn=0.01, fail=0.03)
+    """Change of a sensor's place, metres. A change counts if chance does not explain it."""
+    rotation_deg: Limit = Limit(warn=0.3, fail=1.0)
+    """Change of its rotation, degrees."""
+    gain: Limit = Limit(warn=0.01, fail=0.03)
+    """Largest change of the gain of one of its axes."""
+    angle_deg: Limit = Limit(warn=0.3, fail=1.0)
+    """Largest change of an angle between two of its axes, degrees."""
+    offset_ut: Limit = Limit(warn=0.5, fail=2.0)
+    """Change of its offset H, microtesla."""
+    clock_s: Limit = Limit(warn=0.005, fail=0.1)
+    """Change of its time offset, seconds."""
+    nis: Limit = Limit(warn=1.5, fail=4.0)
+    """Normalised innovation squared per degree of freedom, where no part of the calibration has
+    changed; 1 is consistent."""
+
+
 class QaOptions(Options):
     """Thresholds of the verdict in a report."""
 
@@ -101,3 +126,5 @@ class QaOptions(Options):
     """Whether both halves of a drive are calibrated by themselves."""
     half_readings: int = Field(default=50, ge=30)
     """Readings of each sensor that a half is calibrated on, spread evenly over it."""
+    validation: ValidationOptions = ValidationOptions()
+    """Thresholds of `l2m validate`."""

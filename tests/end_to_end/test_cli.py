@@ -12,7 +12,7 @@ from l2m_gtsam.results import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from tests.bags import Entry, ros, write
-from tests.end_to_end.conftest import Demo, complaint, l2m
+from tests.end_to_end.conftest import Demo, complaint, complaint_here, l2m
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -78,7 +78,10 @@ def test_optitrack_configuration_on_real_bags(
     l2m("map", "plot", map_path, "--out", tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 10_000
     run = bags / "optitrack_run1_ros1.bag"
-    l2m("calibrate", run, "--map", map_path, "--config", config, "--out", tmp_path / "result")
+    view = tmp_path / "view.rrd"
+    wanted = ("--config", config, "--out", tmp_path / "result", "--rerun", view)
+    assert str(view) in l2m("calibrate", run, "--map", map_path, *wanted).out
+    assert view.stat().st_size > 10_000
     result = read_calibration(tmp_path / "result" / "calibration.yaml")
     assert result["imu/mag"].status is SensorStatus.SOLVED
     assert result.bag is not None
@@ -186,6 +189,18 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     run = l2m("inspect", tmp_path / "nowhere.bag", "--debug", fails=True)
     assert "Traceback" in run.err
     assert "BagError" in run.err
+
+
+def test_options_of_a_simulation_that_are_not_understood(tmp_path: Path) -> None:
+    options, out = tmp_path / "hall.yaml", tmp_path / "s"
+    options.write_text("floor_plan: {racks: 2}")
+    line = complaint_here("simulate", "--out", out, "--options", options)
+    assert "unknown key 'floor_plan.racks'; accepted here: blocks, cross_aisle" in line
+    options.write_text("floor_plan: {width: 5}")
+    assert "6 rows of 2.4 m leave aisles of" in complaint_here(
+        "simulate", "--out", out, "--options", options
+    )
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("kind", ["ros3", ""])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.results import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.bags import Entry, ros, write
@@ -40,22 +41,24 @@ def drive(yard: Yard) -> Path:
     return written(yard.west.parent, "mcap")
 
 
-def written(folder: Path, kind: str) -> Path:
+def written(
+    folder: Path, kind: str, name: str = "drive", seed: int = 5, offset: FloatArray = H
+) -> Path:
     """Write a drive through the west with turns and tilts, and one distorted sensor."""
     make, entries = ros(kind), []
-    p, rng = route(-2.8, 0.2), np.random.default_rng(5)
+    p, rng = route(-2.8, 0.2), np.random.default_rng(seed)
     k = np.arange(len(p))
     angles = np.column_stack([0.05 * k, 0.3 * np.sin(0.31 * k), 0.3 * np.cos(0.43 * k)])
     R = Rotation.from_euler("ZYX", angles)
     field, _ = world().field_and_gradient(p + R.apply(T_LIDAR_MAG))
-    readings = R.inv().apply(field) @ C.T + H + rng.normal(0, NOISE, field.shape)
+    readings = R.inv().apply(field) @ C.T + offset + rng.normal(0, NOISE, field.shape)
     for n, q in enumerate(R.as_quat()):
         stamp = START + n * STEP
         pose = make.pose_stamped(stamp, p[n], q)
         entries.append(Entry("/pose", "geometry_msgs/PoseStamped", stamp, pose))
         magnetic = make.magnetic(stamp, readings[n] * 1e-6)
         entries.append(Entry("/mag", "sensor_msgs/MagneticField", stamp, magnetic))
-    return write(folder, kind, entries, "drive")
+    return write(folder, kind, entries, name)
 
 
 @pytest.fixture(scope="module")

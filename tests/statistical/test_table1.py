@@ -128,6 +128,15 @@ def test_errors_are_counted_and_squared() -> None:
     assert level.ratio == pytest.approx(np.sqrt((0.01**2 + 0.03**2 + 0.06**2) / 3) / 0.01)
 
 
+def test_all_paths_together_are_one_set_of_errors() -> None:
+    one, other = made_up([0.01, 0.03]), replace(made_up([0.06]), path=RouteShape.EIGHT)
+    (entry,) = summarise(TINY, {"a": one, "b": other}).together
+    assert entry.path is None
+    assert entry.calibrations == 3
+    assert entry.t is not None
+    assert (entry.t.mean, entry.t.median) == pytest.approx((0.1 / 3, 0.03))
+
+
 @pytest.mark.parametrize(("bound", "word"), [(0.001, "allows"), (0.1, "forbids")])
 def test_a_row_that_misses_its_aim_is_named_with_its_bound(bound: float, word: str) -> None:
     aim = printed("t", 0, NOISE)

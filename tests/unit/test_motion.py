@@ -29,7 +29,11 @@ def named(word: str) -> Motion:
 
 def turned(motion: Motion) -> FloatArray:
     """Rotation of each pose away from the drive's, in the lidar frame, degrees."""
-    return np.degrees(Rotation.from_matrix(drive().R[0].T @ motion.R).as_rotvec())
+    return turned_from(drive(), motion)
+
+
+def turned_from(one: Motion, other: Motion) -> FloatArray:
+    return np.degrees(Rotation.from_matrix(one.R[0].T @ other.R).as_rotvec())
 
 
 def test_each_has_as_many_poses_and_they_are_rotations() -> None:
@@ -117,3 +121,15 @@ def test_going_back_is_the_opposite_velocity_in_the_map() -> None:
     for each, sign in ((ahead, 1), (back, -1)):
         way = np.einsum("nij,nj->ni", each.R, each.twist[:, 3:])
         np.testing.assert_allclose(way, sign * np.tile([0.8, 0.4, 0.0], (len(way), 1)), atol=1e-9)
+
+
+def test_a_drive_with_fewer_poses_than_a_motion_may_have() -> None:
+    """No pose stands in a motion twice, which would have no velocity to speak of."""
+    few = drive()
+    few = Motion("drive", few.R[::8], few.p[::8], few.seconds[::8])
+    for each in extra_motions(few, OPTIONS):
+        assert len(each.p) == len(few.p)
+        # Seven swings of 0.2 m in five seconds are 1.8 m/s, the other motions are slower.
+        assert np.abs(each.twist).max() < 4.0
+    rolled = next(each for each in extra_motions(few, OPTIONS) if "roll" in each.name)
+    assert np.abs(turned_from(few, rolled)).max() > 0.9 * OPTIONS.tilt_deg

@@ -33,9 +33,9 @@ def correlation(series: FloatArray, lags: int, drive: IntArray | None = None) ->
     Values of different drives, shape (N,) and ascending, are not compared.
     """
     centred = series - series.mean(axis=0)
-    ends = [] if drive is None else np.flatnonzero(np.diff(drive)) + 1
+    of = np.zeros(len(series)) if drive is None else drive
     power = np.zeros(lags + 1)
-    for own in np.split(centred, ends):
+    for own in np.split(centred, np.flatnonzero(np.diff(of)) + 1):
         # Twice as long as both are, so that nothing wraps.
         spectrum = np.fft.rfft(own, 2 * max(len(own), lags + 1), axis=0)
         power += np.fft.irfft(np.abs(spectrum) ** 2, axis=0)[: lags + 1].sum(axis=1)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.repeat_results import DriveRepeat, Repeatability
@@ -49,8 +49,10 @@ def compare_drives(drives: Sequence[tuple[str, Part | str]]) -> Repeatability:
     if len(parts) < 2:
         return Repeatability(0.0, 0, 0.0, 0.0, repeats)
     whole = common(parts)
-    low, high = chi2.ppf([(1 - BAND) / 2, (1 + BAND) / 2], max(whole.freedom, 1))
-    return Repeatability(whole.squared, whole.freedom, float(low), float(high), repeats)
+    low, high = (
+        float(chi2.ppf(share, max(whole.freedom, 1))) for share in ((1 - BAND) / 2, (1 + BAND) / 2)
+    )
+    return Repeatability(whole.squared, whole.freedom, low, high, repeats)
 
 
 def common(parts: Sequence[Part]) -> Common:
@@ -82,7 +84,7 @@ def common(parts: Sequence[Part]) -> Common:
     return Common(Part(vector, covariance, root), float(left @ left), freedom)
 
 
-def _covariance(parts: Sequence[Part], kept: Sequence[FloatArray]) -> FloatArray:
+def _covariance(parts: Sequence[Part], kept: Sequence[IntArray]) -> FloatArray:
     """Return the covariance of what parts know, side by side."""
     blocks = [
         [

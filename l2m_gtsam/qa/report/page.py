@@ -42,7 +42,7 @@ def report_page(result: CalibrationResult, metrics: Metrics, options: QaOptions)
             for k, each in enumerate(result.sensors)
         ]
     return (
-        _environment()
+        environment()
         .get_template("report.html.j2")
         .render(
             result=result,
@@ -84,22 +84,23 @@ def fingerprint(result: CalibrationResult) -> str:
 
 def style() -> Markup:
     """Return the page's style."""
-    environment = _environment()
-    text, _, _ = environment.loader.get_source(environment, "style.css")  # type: ignore[union-attr]
+    found = environment()
+    text, _, _ = found.loader.get_source(found, "style.css")  # type: ignore[union-attr]
     return Markup(text)  # noqa: S704 - our own file
 
 
 @cache
-def _environment() -> Environment:
-    environment = Environment(
+def environment() -> Environment:
+    """Return what renders the templates."""
+    made = Environment(
         loader=PackageLoader("l2m_gtsam.qa.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "position": words.position, "vector": words.vector}
-    return environment
+    made.filters |= {"number": number, "position": words.position, "vector": words.vector}
+    return made
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -64,7 +64,7 @@ def overall_pictures(
         if np.isfinite(each.t_lidar_mag).all()
     )
     vehicle = tuple(
-        _picture(
+        picture(
             f"Sensors {view.name}",
             vehicle_figure(result, verdict, view),
             f"vehicle-{index}",
@@ -79,16 +79,16 @@ def overall_pictures(
     what = f"{count} drives" if count else "A drive"
     where = f"{what} of {drive.length:.0f} m in {drive.seconds:.0f} s"
     on_map = (
-        _picture(
+        picture(
             "Field and drive",
-            place.strength_figure(metrics, result),
+            place.strength_figure(metrics, result.disagreements),
             "map-strength",
             f"{where} over the map's field strength; {len(result.disagreements)} stretches where "
             "readings and map disagree.",
             "Position is told by how the field changes from place to place; a drive through even "
             "colour tells little. Thick marks: where readings and map disagree.",
         ),
-        _picture(
+        picture(
             "How well the map knows it",
             place.sigma_figure(metrics),
             "map-sigma",
@@ -142,7 +142,7 @@ def _pictures(anchor: str, sensor: SensorCalibration, found: SensorMetrics) -> t
 
 def _curves(anchor: str, name: str, found: SensorMetrics) -> Picture:
     before, after = found.curves.before**0.5, found.curves.after**0.5
-    return _picture(
+    return picture(
         "Before, after, map",
         course.curves_figure(found),
         f"{anchor}-curves",
@@ -156,7 +156,7 @@ def _curves(anchor: str, name: str, found: SensorMetrics) -> Picture:
 def _residuals(anchor: str, name: str, found: SensorMetrics) -> Picture:
     rms = ", ".join(f"{each:.2f}" for each in found.fit.rms)
     wrong = sum(found.series.rejected)
-    return _picture(
+    return picture(
         "Residuals over time",
         course.residuals_figure(found),
         f"{anchor}-residuals",
@@ -168,7 +168,7 @@ def _residuals(anchor: str, name: str, found: SensorMetrics) -> Picture:
 
 
 def _over_the_map(anchor: str, name: str, found: SensorMetrics) -> Picture:
-    return _picture(
+    return picture(
         "Residuals over the map",
         place.residual_figure(found),
         f"{anchor}-place",
@@ -179,7 +179,7 @@ def _over_the_map(anchor: str, name: str, found: SensorMetrics) -> Picture:
 
 def _halves(anchor: str, name: str, found: SensorMetrics) -> Picture:
     halves = found.halves
-    return _picture(
+    return picture(
         "Repeatability",
         statistics.halves_figure(found),
         f"{anchor}-halves",
@@ -192,7 +192,7 @@ def _halves(anchor: str, name: str, found: SensorMetrics) -> Picture:
 
 def _drives(anchor: str, sensor: SensorCalibration, found: Repeatability) -> Picture:
     names = drive_names([each.bag for each in found.drives])
-    return _picture(
+    return picture(
         "Repeatability between drives",
         drives_figure(sensor, found),
         f"{anchor}-drives",
@@ -205,7 +205,7 @@ def _drives(anchor: str, sensor: SensorCalibration, found: Repeatability) -> Pic
 
 def _chi_square(anchor: str, name: str, found: SensorMetrics) -> Picture:
     std = ", ".join(f"{each:.2f}" for each in found.normalised.std)
-    return _picture(
+    return picture(
         "Normalised residuals",
         statistics.chi_square_figure(found),
         f"{anchor}-chi2",
@@ -218,7 +218,7 @@ def _chi_square(anchor: str, name: str, found: SensorMetrics) -> Picture:
 
 def _autocorrelation(anchor: str, name: str, found: SensorMetrics) -> Picture:
     next_ = found.autocorrelation.next
-    return _picture(
+    return picture(
         "Autocorrelation",
         statistics.autocorrelation_figure(found),
         f"{anchor}-auto",
@@ -230,7 +230,7 @@ def _autocorrelation(anchor: str, name: str, found: SensorMetrics) -> Picture:
 
 def _directions(anchor: str, name: str, found: SensorMetrics) -> Picture:
     spread = ", ".join(f"{each:.1f}" for each in found.directions.spread)
-    return _picture(
+    return picture(
         "Directions of the field",
         directions_figure(found),
         f"{anchor}-directions",
@@ -243,7 +243,7 @@ def _directions(anchor: str, name: str, found: SensorMetrics) -> Picture:
 
 def _correlations(anchor: str, sensor: SensorCalibration) -> Picture:
     strongest = words.strongest(sensor)
-    return _picture(
+    return picture(
         "Correlations",
         correlation_figure(sensor),
         f"{anchor}-correlations",
@@ -252,5 +252,6 @@ def _correlations(anchor: str, sensor: SensorCalibration) -> Picture:
     )
 
 
-def _picture(title: str, figure: Figure, name: str, alt: str, caption: str) -> Picture:
+def picture(title: str, figure: Figure, name: str, alt: str, caption: str) -> Picture:
+    """Return a figure of the page; see ``Picture`` and ``as_svg``."""
     return Picture(title, as_svg(figure, name, alt), caption)

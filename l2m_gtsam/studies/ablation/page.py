@@ -4,6 +4,8 @@ from collections.abc import Sequence
 
 from l2m_gtsam.studies.ablation.cells import Solver
 from l2m_gtsam.studies.ablation.table import (
+    FAR_M,
+    FAR_UT,
     AblationTable,
     Combination,
     Comparison,
@@ -44,6 +46,7 @@ def ablation_page(table: AblationTable) -> str:
         parts += [f"### Fingerprints: {density_label(table, spacing)}", error_lines(rows)]
     parts += [
         ERROR_NOTE,
+        far_note(table),
         "## What the map does",
         gain_lines(table.map_gains, "method"),
         "## What the weights do",
@@ -95,6 +98,23 @@ def map_note(table: AblationTable) -> str:
         f"({table.maps[0].picture.z:.2f} m), the fingerprints of all heights as dots; grey: no "
         "data, or steel. Errors per axis where sensors pass; predicted: what the map itself says "
         "of them; inside: the share of the readings that lie in the map, the others do not count."
+    )
+
+
+def far_note(table: AblationTable) -> str:
+    """Return where calibrations ended in another minimum, which is seen in means alone."""
+    beyond = f"more than {FAR_M:g} m or {FAR_UT:g} uT off"
+    maps: dict[str, list[str]] = {}
+    for row in table.rows:
+        if row.far:
+            where = f"{kind_label(row.kind)}, {spacing_label(row.spacing)}"
+            maps.setdefault(where, []).append(f"{row.solver.value} {row.far}")
+    if not maps:
+        return f"No calibration ended {beyond}."
+    counts = "; ".join(f"{where} ({', '.join(each)})" for where, each in maps.items())
+    return (
+        f"In another minimum than the sensor's, {beyond}, ended, of {table.rows[0].calibrations} "
+        f"each: {counts}. Means and their intervals carry these few, medians do not."
     )
 
 

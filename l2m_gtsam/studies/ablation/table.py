@@ -12,6 +12,8 @@ from l2m_gtsam.studies.ablation.map_picture import MapPicture
 SURE = 1.96  # standard errors on each side of a mean that hold 95 %
 ROUNDING = 1e-6  # metres or microtesla; what differs by less is the same
 FEWEST = 2  # pairs of which a standard error can be told
+FAR_M, FAR_UT = 0.5, 5.0
+"""An error of t or H beyond is none of noise and map, but another minimum."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class Combination:
         Of the map.
     solver
         The method.
-    calibrations, failed
-        How many there are, and how many of them ended without a result.
+    calibrations, failed, far
+        How many there are, how many of them ended without a result, and how many far off.
     t, C, H
         Errors in metres, without unit, and in microtesla; absent if all failed.
     """
@@ -48,6 +50,7 @@ class Combination:
     solver: Solver
     calibrations: int
     failed: int
+    far: int
     t: Spread | None
     C: Spread | None
     H: Spread | None
@@ -176,8 +179,9 @@ def combination(place: Place, solver: Solver, errors: Batch) -> Combination:
     """Return the errors of one method on one map."""
     of = by(solver)
     failed = int(np.count_nonzero(~np.isfinite(of(errors.t))))
+    far = int(np.count_nonzero((of(errors.t) > FAR_M) | (of(errors.H) > FAR_UT)))
     spreads = (spread(of(errors.t)), spread(of(errors.C)), spread(of(errors.H)))
-    return Combination(*place, solver, len(errors.t), failed, *spreads)
+    return Combination(*place, solver, len(errors.t), failed, far, *spreads)
 
 
 def by(solver: Solver) -> Callable[[FloatArray], FloatArray]:

@@ -142,43 +142,31 @@ def method_table(summary: Table1Summary, noise: float) -> str:
         "| method | map | calibrations | lost | above 5 cm | e_t (mm) | e_C (1e-3) | e_H (uT) "
         "| s each |\n" + "|---" * 9 + "|"
     )
-    kinds = dict.fromkeys((each.method, each.map_kind) for each in summary.entries)
-    lines = [method_line(summary, noise, *kind) for kind in kinds]
+    lines = [method_line(each) for each in summary.together if each.noise == noise]
     return "\n".join([head, *lines])
 
 
-def method_line(summary: Table1Summary, noise: float, method: str, map_kind: str) -> str:
+def method_line(entry: Entry) -> str:
     """Return one method on one map over all paths."""
-    entries = [
-        each
-        for each in summary.entries
-        if (each.method, each.map_kind, each.noise) == (method, map_kind, noise)
-    ]
     cells = [
-        method,
-        map_kind,
-        f"{sum(each.calibrations for each in entries):,}",
-        str(sum(each.lost for each in entries)),
-        str(sum(each.far for each in entries)),
-        over_paths([each.t for each in entries], 1e3),
-        over_paths([each.C for each in entries], 1e3),
-        over_paths([each.H for each in entries], 1.0),
-        f"{np.mean([each.seconds for each in entries]):.2f}",
+        entry.method,
+        entry.map_kind,
+        f"{entry.calibrations:,}",
+        str(entry.lost),
+        str(entry.far),
+        plain(entry.t, 1e3),
+        plain(entry.C, 1e3),
+        plain(entry.H, 1.0),
+        f"{entry.seconds:.2f}",
     ]
     return f"| {' | '.join(cells)} |"
 
 
-def over_paths(spreads: list[Spread | None], unit: float) -> str:
-    """Return mean, mean of medians, largest 95 % and largest of several paths."""
-    there = [each for each in spreads if each is not None]
-    if not there:
+def plain(spread: Spread | None, unit: float) -> str:
+    """Return mean, median, 95 % and largest."""
+    if spread is None:
         return "-"
-    figures = (
-        np.mean([each.mean for each in there]),
-        np.mean([each.median for each in there]),
-        max(each.p95 for each in there),
-        max(each.max for each in there),
-    )
+    figures = (spread.mean, spread.median, spread.p95, spread.max)
     return " / ".join(f"{unit * value:.3g}" for value in figures)
 
 
@@ -237,7 +225,7 @@ def figures(summary: Table1Summary) -> dict[str, Figure]:
     for axes, noise in zip(panels, noises, strict=True):
         for row, kind in enumerate(kinds):
             own = [each for each in summary.entries if (each.method, each.map_kind) == kind]
-            draw_method(axes, row, own, noise)
+            draw_method(axes, row, [each for each in own if each.noise == noise])
         bound = 1e3 * next(each.bound for each in summary.efficiency if each.noise == noise)
         axes.axvline(bound, color="0.4", linewidth=1, linestyle=":", label="bound (rms)")
         axes.set(title=f"noise {noise:g} uT", xscale="log", xlabel="error of t (mm)")
@@ -250,16 +238,14 @@ def figures(summary: Table1Summary) -> dict[str, Figure]:
     return {"table1": figure}
 
 
-def draw_method(axes: Axes, row: int, entries: list[Entry], noise: float) -> None:
+def draw_method(axes: Axes, row: int, entries: list[Entry]) -> None:
     """Draw median, 95 % and largest error of one method, a line for each path."""
-    there = [each for each in entries if each.noise == noise and each.t is not None]
-    for index, entry in enumerate(there):
-        spread = entry.t
-        if spread is None:
+    for index, entry in enumerate(entries):
+        if entry.t is None:
             continue
-        y = row + BESIDE * (index - (len(there) - 1) / 2)
+        y = row + BESIDE * (index - (len(entries) - 1) / 2)
         colour = COLOURS[index % len(COLOURS)]
-        ends = 1e3 * np.array([spread.median, spread.p95, spread.max])
+        ends = 1e3 * np.array([entry.t.median, entry.t.p95, entry.t.max])
         axes.plot(ends[:2], [y, y], color=colour, linewidth=2, label=str(entry.path))
         axes.plot(ends[0], y, "o", color=colour, markersize=4)
         axes.plot(ends[2], y, "|", color=colour, markersize=5)

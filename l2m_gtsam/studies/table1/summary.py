@@ -38,12 +38,12 @@ class Spread:
 
 @dataclass(frozen=True)
 class Entry:
-    """One method on one map over all drives of one path at one noise level.
+    """One method on one map over all drives of one path, or of all, at one noise level.
 
     Attributes
     ----------
     method, map_kind, path, noise
-        Which.
+        Which; no path stands for all of them together.
     calibrations, lost, far
         Tried, without a result, and with one beyond 5 cm.
     t, t2, C, H, H2
@@ -54,7 +54,7 @@ class Entry:
 
     method: str
     map_kind: str
-    path: RouteShape
+    path: RouteShape | None
     noise: float
     calibrations: int
     lost: int
@@ -119,6 +119,8 @@ class Table1Summary:
         The study.
     entries
         All methods, maps, paths and noise levels.
+    together
+        All methods, maps and noise levels, over all paths.
     bounds
         Of all paths and noise levels.
     efficiency
@@ -130,6 +132,7 @@ class Table1Summary:
 
     options: Table1Options
     entries: tuple[Entry, ...]
+    together: tuple[Entry, ...]
     bounds: tuple[Bound, ...]
     efficiency: tuple[Efficiency, ...]
     solves: int
@@ -146,38 +149,39 @@ class Table1Summary:
 
 def summarise(options: Table1Options, cells: Mapping[str, Table1Cell]) -> Table1Summary:
     """Return what all cells say together."""
-    groups: dict[tuple[float, RouteShape], list[Table1Cell]] = defaultdict(list)
+    paths: dict[tuple[float, RouteShape], list[Table1Cell]] = defaultdict(list)
+    levels: dict[float, list[Table1Cell]] = defaultdict(list)
     for cell in cells.values():
-        groups[cell.noise, cell.path].append(cell)
-    entries = [entry for group in groups.values() for entry in entries_of(group)]
-    bounds = [bound_of(group) for group in groups.values()]
-    levels = dict.fromkeys(bound.noise for bound in bounds)
+        paths[cell.noise, cell.path].append(cell)
+        levels[cell.noise].append(cell)
+    bounds = [bound_of(group) for group in paths.values()]
     return Table1Summary(
         options,
-        tuple(entries),
+        tuple(entry for (_, path), group in paths.items() for entry in entries_of(group, path)),
+        tuple(entry for group in levels.values() for entry in entries_of(group, None)),
         tuple(bounds),
         tuple(efficiency([bound for bound in bounds if bound.noise == level]) for level in levels),
         sum(cell.places for cell in cells.values()),
     )
 
 
-def entries_of(cells: Sequence[Table1Cell]) -> list[Entry]:
-    """Return an entry for each method on each map; the cells are of one path and noise."""
+def entries_of(cells: Sequence[Table1Cell], path: RouteShape | None) -> list[Entry]:
+    """Return an entry for each method on each map; the cells are of one noise."""
     ends: dict[tuple[str, str], list[Ends]] = defaultdict(list)
     for cell in cells:
         for each in cell.ends:
             ends[each.method, each.map_kind].append(each)
-    return [entry_of(cells[0], group) for group in ends.values()]
+    return [entry_of(group, path, cells[0].noise) for group in ends.values()]
 
 
-def entry_of(cell: Table1Cell, ends: Sequence[Ends]) -> Entry:
+def entry_of(ends: Sequence[Ends], path: RouteShape | None, noise: float) -> Entry:
     """Return the figures of one method on one map."""
     t, C, H = (np.concatenate(each) for each in zip(*((e.t, e.C, e.H) for e in ends), strict=True))
     return Entry(
         method=ends[0].method,
         map_kind=ends[0].map_kind,
-        path=cell.path,
-        noise=cell.noise,
+        path=path,
+        noise=noise,
         calibrations=len(t),
         lost=int(np.count_nonzero(~np.isfinite(H))),  # which every method has an answer for
         far=int(np.count_nonzero(t > FAR)),

@@ -1,11 +1,13 @@
 """What a sensor read along the drive."""
 
+from typing import Protocol
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.metric_results import SensorMetrics, Series
+from l2m_gtsam.metric_results import Series
 from l2m_gtsam.qa.report.svg import (
     AXES,
     BAD,
@@ -23,7 +25,16 @@ from l2m_gtsam.qa.report.svg import (
 BETWEEN = 0.04  # of all drives' time, between two drives in a figure
 
 
-def residuals_figure(sensor: SensorMetrics) -> Figure:
+class WithSeries(Protocol):
+    """Figures of a sensor with the course of its drive."""
+
+    @property
+    def series(self) -> Series:
+        """The course, thinned."""
+        ...
+
+
+def residuals_figure(sensor: WithSeries) -> Figure:
     """Draw residuals over time, an axis each, with rejected readings marked."""
     figure = plain_figure(3.8)
     parts = figure.subplots(3, 1, sharex=True, sharey=True)
@@ -43,7 +54,7 @@ def residuals_figure(sensor: SensorMetrics) -> Figure:
     return figure
 
 
-def curves_figure(sensor: SensorMetrics) -> Figure:
+def curves_figure(sensor: WithSeries) -> Figure:
     """Draw readings before and after the calibration beside those of the map, an axis each."""
     figure = plain_figure(4.6)
     parts = figure.subplots(3, 1, sharex=True)

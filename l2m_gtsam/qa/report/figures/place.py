@@ -1,5 +1,6 @@
 """The map and the drive through it, and what a sensor's readings leave over it."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,19 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import Metrics, Rows, SensorMetrics
+from l2m_gtsam.metric_results import Metrics, Rows
+from l2m_gtsam.qa.report.figures.course import WithSeries
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
-from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.results import Disagreement
 
 # Of colour bars: a drive is wider than high more often than not.
 BELOW: Any = {"location": "bottom", "shrink": 0.7, "aspect": 40, "pad": 0.02}
 
 
-def strength_figure(metrics: Metrics, result: CalibrationResult) -> Figure:
+def strength_figure(metrics: Metrics, stretches: Sequence[Disagreement]) -> Figure:
     """Draw the field of the map, the drive, and where the place has changed."""
     figure, axes = _map(metrics, metrics.map.strength, "field strength (µT)", "viridis")
     _drive(axes, metrics)
-    for stretch in result.disagreements:
+    for stretch in stretches:
         axes.plot(
             *zip(stretch.p_from[:2], stretch.p_to[:2], strict=True),
             "-X",
@@ -38,7 +40,7 @@ def sigma_figure(metrics: Metrics) -> Figure:
     return figure
 
 
-def residual_figure(sensor: SensorMetrics) -> Figure:
+def residual_figure(sensor: WithSeries) -> Figure:
     """Draw the length of a sensor's residuals where they were read."""
     place, residual = np.array(sensor.series.place), np.array(sensor.series.residual)
     wrong = np.array(sensor.series.rejected)

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from l2m_gtsam.metric_results import SensorMetrics
+from l2m_gtsam.metric_results import Row, SensorMetrics
 from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, SMALL, X, Y, plain_figure
 
 CUT = 7.81  # 95 % of chi-square of three
@@ -54,11 +54,17 @@ def autocorrelation_figure(sensor: SensorMetrics) -> Figure:
 
 def halves_figure(sensor: SensorMetrics) -> Figure:
     """Draw by how many sigmas both halves of the drive differ, parameter by parameter."""
+    label = "second less first half (sigmas)"
+    return sigmas_figure(sensor.halves.difference, sensor.halves.sigma, label)
+
+
+def sigmas_figure(difference: Row, sigma_of: Row, label: str) -> Figure:
+    """Draw differences of the 15 parameters in sigmas; what is open stays blank."""
     figure = plain_figure(2.9)
     axes = figure.add_subplot()
-    d, sigma = np.array(sensor.halves.difference), np.array(sensor.halves.sigma)
+    d, sigma = np.array(difference), np.array(sigma_of)
     known = np.isfinite(sigma) & (sigma > 0)
-    ratio = np.where(known, d / np.where(known, sigma, 1), 0)
+    ratio = np.where(known, d, 0) / np.where(known, sigma, 1)
     names = ["tx", "ty", "tz", *(f"C{r}{c}" for r in "xyz" for c in "xyz"), "Hx", "Hy", "Hz"]
     place = np.arange(15)
     axes.axhspan(-ALIKE, ALIKE, color=GRID, label=f"± {ALIKE:g} sigmas")
@@ -69,7 +75,7 @@ def halves_figure(sensor: SensorMetrics) -> Figure:
     figure.subplots_adjust(bottom=0.17)
     axes.set_xticks(place, names, rotation=60, fontsize=SMALL)
     high = max(1.4 * ALIKE, 1.15 * float(np.abs(ratio).max()))
-    axes.set(ylabel="second less first half (sigmas)", ylim=(-high, high))
+    axes.set(ylabel=label, ylim=(-high, high))
     axes.grid(visible=False, axis="x")
     axes.legend(loc="upper right")
     return figure

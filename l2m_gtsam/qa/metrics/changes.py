@@ -1,0 +1,232 @@
+"""Two calibrations of one sensor beside each other: what has changed beyond both uncertainties."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.qa.metrics.mounting import PAIRS, gains, sensor_axes, skews_deg
+from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.validation_results import (
+    CalibrationComparison,
+    Change,
+    ChangeTest,
+    ComparedSensor,
+    NotValidated,
+    Part,
+)
+
+TINY = 1e-12  # of the largest variance, in units of sigmas: a direction that both share exactly
+INDEPENDENT = (
+    "The errors of both calibrations count as independent: the covariance of their difference is "
+    "the sum of both."
+)
+SHARED_MAP = (
+    " Both rest on one map. Its errors, where both drives passed, are alike in both and cancel, so "
+    "that true sigmas of the difference are smaller than these: what is called a change is one, "
+    "but a small change may be missed."
+)
+SHARED_BAG = (
+    " Both come from one drive: their errors are not independent, and no vehicle changes on it."
+)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A difference of two vectors and its covariance; infinite variances for what is open."""
+
+    value: FloatArray
+    covariance: FloatArray
+
+    @property
+    def known(self) -> BoolArray:
+        """Which entries both determine."""
+        finite = np.isfinite(np.diag(self.covariance)) & np.isfinite(self.value)
+        return np.asarray(finite)
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations; infinite for what is open."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        return np.asarray(np.where(self.known, sigma, np.inf))
+
+    def part(self, at: slice) -> "Difference":
+        """Return some of its entries."""
+        return Difference(self.value[at], self.covariance[at, at])
+
+    def tested(self, name: str) -> ChangeTest:
+        """Return the chi-square test of all entries that are known."""
+        known = self.known
+        if not known.any():
+            return ChangeTest(name, 0.0, 0, 1.0)
+        sigma = self.sigma[known]
+        if not sigma.all():
+            same = not self.value[known][sigma == 0].any()
+            return ChangeTest(name, 0.0, 0, 1.0) if same else ChangeTest(name, np.inf, 1, 0.0)
+        d = self.value[known] / sigma
+        S = self.covariance[np.ix_(known, known)] / np.outer(sigma, sigma)
+        values, axes = np.linalg.eigh(S)
+        sound = values > TINY * values[-1]
+        squared = float(np.sum((axes.T @ d)[sound] ** 2 / values[sound]))
+        freedom = int(sound.sum())
+        return ChangeTest(name, squared, freedom, float(chi2.sf(squared, freedom)))
+
+
+def compare_calibrations(
+    new: CalibrationResult, old: CalibrationResult, chance: float
+) -> CalibrationComparison:
+    """Return what has changed from an old calibration to a new one.
+
+    Parameters
+    ----------
+    new, old
+        The calibrations.
+    chance
+        A change is named where chance alone makes as much in a smaller share of all sensors.
+    """
+    before = {each.sensor: each for each in old.sensors}
+    sensors, missing = [], []
+    for sensor in new.sensors:
+        reason = _why_not(sensor, before.get(sensor.sensor))
+        if reason:
+            missing.append(NotValidated(sensor.sensor, reason, faulty=False))
+        else:
+            sensors.append(compare_sensor(sensor, before[sensor.sensor], chance))
+    names = {each.sensor for each in new.sensors}
+    missing += [
+        NotValidated(each.sensor, "It is in the old calibration only.", faulty=False)
+        for each in old.sensors
+        if each.sensor not in names
+    ]
+    same_bag = _same(new.bag, old.bag)
+    assumption = INDEPENDENT + (SHARED_BAG if same_bag else "")
+    if _same(new.map, old.map) and not same_bag:
+        assumption += SHARED_MAP
+    return CalibrationComparison(tuple(sensors), tuple(missing), assumption, same_bag)
+
+
+def _same(one: object, other: object) -> bool:
+    digests = [getattr(each, "sha256", None) for each in (one, other)]
+    return digests[0] is not None and digests[0] == digests[1]
+
+
+def _why_not(new: SensorCalibration, old: SensorCalibration | None) -> str:
+    if old is None:
+        return "It is in the new calibration only."
+    for name, each in (("new", new), ("old", old)):
+        if not is_calibrated(each):
+            return f"The {name} calibration does not know it: {each.message}."
+    return ""
+
+
+def is_calibrated(sensor: SensorCalibration) -> bool:
+    """Return whether anything is known of a sensor."""
+    values = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])
+    return bool(np.isfinite(values).all() and np.isfinite(np.diag(sensor.covariance)).any())
+
+
+def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float) -> ComparedSensor:
+    """Return what has changed of one sensor."""
+    vectors = [np.concatenate([s.t_lidar_mag, s.distortion.vector()]) for s in (new, old)]
+    whole = Difference(vectors[0] - vectors[1], new.covariance + old.covariance)
+    parts = differences(new, old, whole)
+    tests = {part.value: each.tested(part.value) for part, each in parts.items()}
+    tests["C"] = whole.part(slice(3, 12)).tested("C")
+    tests["all"] = whole.tested("all")
+    return ComparedSensor(
+        sensor=new.sensor,
+        difference=row(np.where(whole.known, whole.value, np.nan), 9),
+        sigma=row(whole.sigma, 9),
+        tests=tuple(tests.values()),
+        changes=_changes(parts, tests, chance),
+    )
+
+
+def differences(
+    new: SensorCalibration, old: SensorCalibration, whole: Difference
+) -> dict[Part, Difference]:
+    """Return the differences of the parts of a calibration, in the units of ``Change``."""
+    jacobians = [shape_derivatives(s.distortion.C) for s in (new, old)]
+    shapes = [
+        np.concatenate([gains(s.distortion.C), skews_deg(s.distortion.C)]) for s in (new, old)
+    ]
+    spread = sum(
+        (through(J, s.covariance[3:12, 3:12]) for J, s in zip(jacobians, (new, old), strict=True)),
+        np.zeros((6, 6)),
+    )
+    shape = Difference(shapes[0] - shapes[1], spread)
+    return {
+        Part.PLACE: whole.part(slice(0, 3)),
+        Part.ROTATION: rotation_difference(new, old),
+        Part.GAINS: shape.part(slice(0, 3)),
+        Part.ANGLES: shape.part(slice(3, 6)),
+        Part.OFFSET: whole.part(slice(12, 15)),
+    }
+
+
+def rotation_difference(new: SensorCalibration, old: SensorCalibration) -> Difference:
+    """Return how a sensor has turned about its own axes, in degrees."""
+    turn = new.R_lidar_mag.T @ old.R_lidar_mag  # exp(d) with R_mag_lidar = exp(d) @ the old one
+    if not np.isfinite(turn).all():
+        return Difference(np.full(3, np.nan), np.diag(np.full(3, np.inf)))
+    d = Rotation.from_matrix(turn).as_rotvec()
+    spread = new.rotation_covariance + through(turn, old.rotation_covariance)
+    degree = np.rad2deg(1.0)
+    return Difference(degree * d, degree**2 * spread)
+
+
+def through(J: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return ``J covariance J^T``; what rests on an infinite variance is infinite itself."""
+    unknown = ~np.isfinite(np.diag(covariance))
+    finite = np.where(unknown[:, None] | unknown, 0.0, covariance)
+    result = J @ finite @ J.T
+    open_ = np.abs(J[:, unknown]).max(axis=1, initial=0.0) > 1e-9  # zero but for rounding
+    result[open_, :] = result[:, open_] = 0.0
+    result[open_, open_] = np.inf
+    return np.asarray(result)
+
+
+def shape_derivatives(C: FloatArray) -> FloatArray:
+    """Return derivatives of gains and of angles short of 90 degrees by C row by row, (6, 9)."""
+    length, axes = gains(C), sensor_axes(C)
+    J = np.zeros((6, 9))
+    if not length.all():
+        return J  # a dead axis has no direction
+    for k in range(3):
+        J[k, 3 * k : 3 * k + 3] = axes[k]
+    for k, (i, j) in enumerate(PAIRS):
+        cosine = float(axes[i] @ axes[j])
+        steep = np.rad2deg(1 / np.sqrt(max(1 - cosine**2, 1e-12)))
+        J[3 + k, 3 * i : 3 * i + 3] = steep * (axes[j] - cosine * axes[i]) / length[i]
+        J[3 + k, 3 * j : 3 * j + 3] = steep * (axes[i] - cosine * axes[j]) / length[j]
+    return J
+
+
+def _changes(
+    parts: Mapping[Part, Difference], tests: Mapping[str, ChangeTest], chance: float
+) -> tuple[Change, ...]:
+    """Return the parts that chance does not explain, the surest first.
+
+    All parts and the whole are tested: each gets its share of the chance to be wrong.
+    """
+    least = chance / (len(parts) + 1)
+    named = [part for part in parts if tests[part.value].chance < least]
+    named.sort(key=lambda part: -tests[part.value].chi_square / max(tests[part.value].freedom, 1))
+    return tuple(
+        change_of(part, parts[part].value, parts[part].sigma, tests[part.value].chance)
+        for part in named
+    )
+
+
+def change_of(part: Part, value: FloatArray, sigma: FloatArray, chance: float) -> Change:
+    """Return a change of a part; entries that are open do not count for its size."""
+    known = np.isfinite(sigma) & np.isfinite(value)
+    seen = np.abs(value[known])
+    longest = part in (Part.GAINS, Part.ANGLES)
+    size = seen.max(initial=0.0) if longest else np.linalg.norm(seen)
+    shown = np.where(known, value, np.nan)
+    return Change(part, row(shown), row(sigma), float(size), chance)

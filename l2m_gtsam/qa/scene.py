@@ -1,0 +1,76 @@
+"""A calibration as it is seen in three dimensions: map, drive, sensors and what does not fit."""
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.qa.metrics.assemble import MapForms
+from l2m_gtsam.qa.metrics.curves import curves
+from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, sensor_evidence
+from l2m_gtsam.qa.metrics.plain import evenly
+from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.scene import DriveView, MapView, Scene, SensorView
+
+AROUND = 1.5  # metres of the map on each side of a drive
+LATTICE = 4000  # places of the map, about
+POSES, READINGS = 2000, 2000  # of the drive, and of each sensor, at most
+
+
+def calibration_scene(
+    result: CalibrationResult,
+    evidence: DriveEvidence,
+    trajectory: Trajectory,
+    maps: MapForms,
+    name: str,
+) -> Scene:
+    """Return what there is to see of the sensors that were solved.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    evidence
+        Its readings.
+    trajectory
+        Poses of the lidar in the map.
+    maps
+        The map.
+    name
+        Of the drive.
+    """
+    solved = [each for each in result.sensors if each.residuals is not None]
+    sensors = tuple(_sensor(each, evidence, maps.along_drive) for each in solved)
+    places = np.concatenate([each.place for each in sensors])
+    return Scene(name, map_view(maps.anywhere, places), _drive(trajectory), sensors)
+
+
+def map_view(field_map: Queryable, places: FloatArray) -> MapView:
+    """Return a map on a level lattice through the middle of places, shape (N, 3), around them."""
+    low, high = places[:, :2].min(axis=0) - AROUND, places[:, :2].max(axis=0) + AROUND
+    cell = float(np.sqrt(np.prod(high - low) / LATTICE))
+    x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
+    lattice = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    level = np.full(len(lattice), np.median(places[:, 2]))
+    place = np.column_stack([lattice, level])
+    sample = field_map.query(place)
+    return MapView(place[sample.inside], sample.field[sample.inside], cell)
+
+
+def _drive(trajectory: Trajectory) -> DriveView:
+    keep = evenly(len(trajectory), POSES)
+    seconds = 1e-9 * (trajectory.stamp_ns[keep] - trajectory.stamp_ns[0])
+    return DriveView(seconds, trajectory.R[keep], trajectory.p[keep])
+
+
+def _sensor(sensor: SensorCalibration, drive: DriveEvidence, field_map: Queryable) -> SensorView:
+    evidence = sensor_evidence(drive, sensor, field_map)
+    found = curves(evidence, sensor)
+    keep = evenly(len(evidence.used), READINGS)
+    R = evidence.readings.R_map_lidar[keep]
+    return SensorView(
+        sensor=sensor.sensor,
+        t_lidar_mag=sensor.t_lidar_mag,
+        covariance=sensor.covariance[:3, :3],
+        place=evidence.place[keep],
+        misfit=np.einsum("nij,nj->ni", R, (found.after - found.map)[keep]),
+        rejected=~evidence.used[keep],
+    )

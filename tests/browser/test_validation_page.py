@@ -1,0 +1,82 @@
+"""The page of a validation in a real browser: seen, read, and nothing of a bag runs in it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.qa.metrics.changes import compare_calibrations
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.report.validation_page import validation_page
+from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
+from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.validate import validate
+from l2m_gtsam.validation_results import NamedSource, Validation
+from tests.browser.conftest import BAG, HOSTILE, Looked, look
+from tests.browser.test_report_page import GRAVE, SMALLEST_PX
+from tests.degenerate_drives import STRONG
+from tests.validation_drives import OPTIONS, calibrated, changed, other_drive
+
+FIGURES = 4 + 3 * 4  # of all sensors and map, and of each sensor
+
+
+def hostile(calibration: CalibrationResult) -> CalibrationResult:
+    """The calibration with names that are markup."""
+    sensors = tuple(replace(each, sensor=HOSTILE[each.sensor]) for each in calibration.sensors)
+    return replace(calibration, sensors=sensors)
+
+
+@pytest.fixture(scope="module")
+def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
+    """A validation of such sensors, one with a new magnet, beside an older calibration."""
+    recording, calibration = other_drive(changed(1, H=np.array([3.0, 0, 0]))), calibrated()
+    series = tuple(replace(each, sensor=HOSTILE[each.sensor]) for each in recording.series)
+    drive = validate(replace(recording, series=series), STRONG, hostile(calibration), OPTIONS, 1e-3)
+    comparison = compare_calibrations(hostile(calibration), hostile(calibration), 1e-3)
+    options = QaOptions()
+    found = Validation(
+        judge_validation(drive, comparison, options),
+        drive,
+        comparison,
+        thresholds(options),
+        (NamedSource("drive", BAG, "ab12"),),
+        {"l2m-gtsam": "0"},
+    )
+    folder: Path = tmp_path_factory.mktemp("validation")
+    page = folder / "validation.html"
+    page.write_text(validation_page(found), encoding="utf-8")
+    return look(browser, page, folder)
+
+
+def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:
+    assert len(looked.looks) == 4
+    for each in looked.looks:
+        assert each["errors"] == []
+        assert each["requests"] == []
+
+
+def test_every_figure_is_seen_on_a_desk_and_on_a_phone(looked: Looked) -> None:
+    for each in looked.looks:
+        assert len(each["figures"]) == FIGURES
+        for figure in each["figures"]:
+            assert figure["alt"]
+            assert figure["visible"]
+            assert figure["inside"]
+            assert figure["drawn"] > 5
+        assert not each["wider"]
+        assert each["smallest_text"] >= SMALLEST_PX
+
+
+def test_accessibility_has_no_grave_fault(looked: Looked) -> None:
+    for each in looked.looks:
+        assert [fault for fault in each["accessibility"] if fault["impact"] in GRAVE] == []
+    names = [stop["name"] for stop in looked.tabbed]
+    assert names[0] == "Skip to the report"
+    assert all(stop["outline"] != "none" for stop in looked.tabbed)
+
+
+def test_names_from_a_bag_are_text(looked: Looked) -> None:
+    for each in looked.looks:
+        assert all(name in each["text"] for name in (*HOSTILE.values(), BAG))
+        assert each["title"] == "FAIL: validation of 3 magnetometers"

@@ -1,0 +1,125 @@
+"""The documentation: every block of every page runs, every message is a real one."""
+
+import ast
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from l2m_gtsam.batch.simulation import simulate_bags
+from l2m_gtsam.config import load_options
+from l2m_gtsam.simulate.bag_writer import BagKind
+from l2m_gtsam.simulate.scenario import ScenarioOptions
+from tests.conftest import REPOSITORY
+from tests.end_to_end.pages import blocks, run_page, words
+
+DOCS = REPOSITORY / "docs"
+PAGES = [REPOSITORY / "README.md", *sorted(DOCS.rglob("*.md"))]
+# How many blocks of a page are not run; each says why.
+NOT_RUN = {
+    "README.md": 2,
+    "docs/index.md": 2,
+    "docs/tutorial.md": 1,
+    "docs/basin.md": 1,
+    "docs/report.md": 1,
+    "docs/studies/README.md": 2,
+}
+MESSAGE = re.compile(r"\*\*`` (.+?) ``\*\*", re.DOTALL)
+LEAST_QUOTED = 60  # messages of the page; fewer would be a test that has lost its object
+
+
+def named(page: Path) -> str:
+    return page.relative_to(REPOSITORY).as_posix()
+
+
+@pytest.fixture(scope="module")
+def tutorial(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which the tutorial has run, once for all pages."""
+    folder = tmp_path_factory.mktemp("tutorial")
+    run_page(DOCS / "tutorial.md", folder)
+    return folder
+
+
+@pytest.fixture
+def workplace(tutorial: Path, tmp_path: Path) -> Path:
+    """A folder with what the other pages take for granted, under the names that they use."""
+    sim = tutorial / "sim"
+    for source, name in (
+        (sim / "calibration_ros1.bag", "drive.bag"),
+        (sim / "mapping_ros1.bag", "mapping.bag"),
+        (sim / "suite.yaml", "suite.yaml"),
+        (sim / "structure.ply", "cloud.ply"),
+        (tutorial / "map.npz", "map.npz"),
+        (tutorial / "result" / "calibration.yaml", "calibration.yaml"),
+        (tutorial / "result" / "calibration.yaml", "old.yaml"),
+    ):
+        shutil.copy(source, tmp_path / name)
+    robot = '<robot name="r"><link name="velodyne"/></robot>'
+    (tmp_path / "robot.urdf").write_text(robot)
+    return tmp_path
+
+
+def test_the_tutorial(tutorial: Path) -> None:
+    """Its blocks ran when the fixture was made; what it promises is there."""
+    for name in ("map.npz", "result/report.html", "corrected.bag", "magnetometers.launch.py"):
+        assert (tutorial / name).is_file()
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name != "tutorial.md"], ids=named)
+def test_every_block_of_a_page(page: Path, workplace: Path) -> None:
+    if page.name == "README.md" and page.parent == REPOSITORY:
+        more_readings(workplace)
+    run_page(page, workplace)
+
+
+def more_readings(folder: Path) -> None:
+    """Write another survey of the hall of the tutorial as `more.bag`."""
+    path = folder / "again"
+    (yaml,) = (b for b in blocks(DOCS / "tutorial.md") if b.title == "hall.yaml")
+    options = folder / "hall.yaml"
+    options.write_text(yaml.text)
+    wanted = load_options(options, ScenarioOptions).model_copy(update={"survey_seed": 2})
+    simulate_bags(path, wanted, [BagKind.ROS1], lambda stage, share: None)
+    shutil.move(path / "mapping_ros1.bag", folder / "more.bag")
+
+
+def test_blocks_that_do_not_run_are_counted() -> None:
+    counts = {named(page): sum(bool(b.not_run) for b in blocks(page)) for page in PAGES}
+    assert {page: count for page, count in counts.items() if count} == NOT_RUN
+
+
+def said_by_the_program() -> list[str]:
+    """Return every string of the program but docstrings, with … where something is put in."""
+    found = []
+    for path in sorted((REPOSITORY / "l2m_gtsam").rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.JoinedStr):
+                parts = (n.value if isinstance(n, ast.Constant) else "…" for n in node.values)
+                found.append("".join(map(str, parts)))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                found += [node.value] if id(node) not in docs else []
+    return found
+
+
+def test_messages_are_quoted_as_they_are_raised() -> None:
+    """Their fixed words stand in one string of the program, in the order of the page."""
+    page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    said, quoted = said_by_the_program(), MESSAGE.findall(page)
+    assert len(quoted) >= LEAST_QUOTED
+    strange = [each for each in quoted if not any(fits(each, text) for text in said)]
+    assert not strange, "\n".join(strange)
+
+
+def fits(message: str, text: str) -> bool:
+    """Whether the words of a message stand in a text, with anything where it has …."""
+    parts = [part.strip() for part in " ".join(message.split()).split("…")]
+    fixed = [re.escape(part) for part in parts if len(words(part)) > 0]
+    return bool(fixed) and re.search(".*".join(fixed), " ".join(text.split())) is not None
+
+
+def test_a_message_that_nobody_raises_is_noticed() -> None:
+    said = said_by_the_program()
+    assert not any(fits("the map of … is upside down", text) for text in said)

@@ -1,0 +1,142 @@
+"""`l2m validate` on what `l2m calibrate` wrote."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.batch.validation import ValidationRequest, validate_calibration
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.qa.validation.tables import validation_lines
+from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.validation_file import read_validation
+from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
+from tests.end_to_end.conftest import complaint_here, l2m
+from tests.end_to_end.test_export_commands import H, calibrated, written
+from tests.end_to_end.yard import NOISE, Yard, make_yard
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
+    return make_yard(tmp_path_factory.mktemp("yard"))
+
+
+@pytest.fixture(scope="module")
+def field_map(yard: Yard) -> Path:
+    path = yard.west.parent / "map.npz"
+    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibration(yard: Yard, field_map: Path) -> Path:
+    folder = yard.west.parent
+    bag = written(folder, "mcap", "first")
+    return calibrated(folder / "first_out", yard, field_map, bag, "mag")
+
+
+def changed_file(calibration: Path, path: Path, **changes: object) -> Path:
+    """Write a calibration in which some entries of the sensor are others; None leaves one out."""
+    content = read_yaml(calibration, CalibrationError)
+    content["sensors"]["mag"] |= changes
+    for key in [key for key, value in changes.items() if value is None]:
+        del content["sensors"]["mag"][key]
+    write_yaml(path, content, "")
+    return path
+
+
+def test_the_commands_of_the_page_run(
+    calibration: Path,
+    field_map: Path,
+    tmp_path: Path,
+    repository: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On another drive, with noise of its own; and they say that nothing has changed."""
+    page = (repository / "docs" / "validate.md").read_text()
+    (block,) = re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
+    shutil.copy(calibration, tmp_path / "calibration.yaml")
+    shutil.copy(calibration, tmp_path / "old.yaml")
+    shutil.copy(field_map, tmp_path / "map.npz")
+    written(tmp_path, "ros1", seed=6)
+    monkeypatch.chdir(tmp_path)
+    outs = []
+    for command in block.splitlines():
+        name, *arguments = shlex.split(command)
+        assert name == "l2m"
+        outs.append(l2m(*arguments).out)
+    on_drive, compared, both = outs
+    assert "e_B before" in on_drive
+    assert "verdict: FAIL" not in on_drive
+    assert "offset H is not as calibrated" not in on_drive
+    assert "No change since the old calibration" in compared
+    assert "No change since the old calibration" in both
+    found = read_validation(Path("validated/validation.json"))
+    assert found.drive is not None
+    assert found.comparison is None
+    (sensor,) = found.drive.sensors
+    # three axes of noise, corrected by C, and what the quick map does not know
+    assert 2 * NOISE**2 < sensor.after.squared < 12 * NOISE**2
+    assert "<figure>" in Path("both/validation.html").read_text()
+
+
+def test_a_magnet_on_the_vehicle_is_named(
+    calibration: Path, field_map: Path, tmp_path: Path
+) -> None:
+    bag = written(tmp_path, "mcap", "moved", seed=7, offset=H + np.array([3.0, 0, 0]))
+    asked = ValidationRequest(calibration, bag, field_map, out=tmp_path / "out")
+    found = validate_calibration(asked, silent)
+    told = "\n".join(validation_lines(found.verdict))
+    assert "verdict: FAIL" in told
+    assert "On this drive its offset H is not as calibrated, by 3 µT" in told
+    assert read_validation(tmp_path / "out" / "validation.json").verdict == found.verdict
+    assert {each.role for each in found.sources} == {"calibration", "drive", "map"}
+
+
+def test_a_change_since_an_older_calibration(calibration: Path, tmp_path: Path) -> None:
+    sensor = read_calibration(calibration)["mag"]
+    shifted = (sensor.t_lidar_mag + np.array([0.3, 0.0, 0.0])).tolist()
+    old = changed_file(calibration, tmp_path / "old.yaml", t_lidar_mag=shifted)
+    found = validate_calibration(ValidationRequest(calibration, compare=old), silent)
+    told = "\n".join(validation_lines(found.verdict))
+    assert "Since the old calibration its place t has changed by 300 mm" in told
+    assert "verdict: FAIL" in told
+
+
+def silent(stage: str, fraction: float) -> None:
+    """Show no progress."""
+
+
+def test_bad_input(calibration: Path, field_map: Path, yard: Yard, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+
+    def line(*arguments: str | Path) -> str:
+        return complaint_here("validate", *arguments, "--out", out)
+
+    own = ("--calibration", calibration)
+    assert "give a BAG with --map, or --compare" in line(*own)
+    assert "needs --map" in line(yard.west, *own)
+    assert "--map: goes with a BAG" in line(*own, "--map", field_map)
+    assert "no such file" in line("--calibration", tmp_path / "no.yaml", "--compare", calibration)
+    assert "no such file" in line(*own, "--compare", tmp_path / "no.yaml")
+    assert "none of its sensors (points)" not in line(yard.west, *own, "--map", tmp_path / "no.npz")
+    without = changed_file(calibration, tmp_path / "without.yaml", covariance=None)
+    assert "sensors.mag.covariance" in line("--calibration", without, "--compare", calibration)
+    matrix = read_calibration(calibration)["mag"].covariance
+    matrix[0, 0] = -1.0
+    negative = changed_file(calibration, tmp_path / "negative.yaml", covariance=matrix.tolist())
+    assert "variances must be positive" in line(*own, "--compare", negative)
+    matrix[0, 0], matrix[0, 1] = 1e-6, 1.0
+    crooked = changed_file(calibration, tmp_path / "crooked.yaml", covariance=matrix.tolist())
+    assert "is no covariance matrix" in line(*own, "--compare", crooked)
+    content = read_yaml(calibration, CalibrationError)
+    content["sensors"] = {"front": content["sensors"]["mag"]}
+    write_yaml(tmp_path / "front.yaml", content, "")
+    shared = line(*own, "--compare", tmp_path / "front.yaml")
+    assert "no sensor that both calibrations know: there are front" in shared
+    stranger = line(yard.west, "--calibration", tmp_path / "front.yaml", "--map", field_map)
+    assert "none of its sensors (mag) is in the calibration (front)" in stranger
+    assert not out.exists()
