@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from l2m_gtsam.appraise import appraise, scene_of
-from l2m_gtsam.batch.opening import SavedMap, read_drive, read_drives
+from l2m_gtsam.batch.opening import SavedMap, check_bags, read_drive, read_drives
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.calibrate import calibrated
 from l2m_gtsam.config import Config
@@ -79,6 +79,7 @@ def calibrate_bags(
     L2MError
         Whatever is wrong with the input, in one line; nothing is written then.
     """
+    check_bags(bags)
     check_outputs(*(out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE)))
     if view is not None:
         require_rerun(view)

@@ -34,17 +34,19 @@ def read_drives(bags: Sequence[Path], config: Config, progress: Progress) -> Rec
 
     Raises
     ------
-    BagError
-        There is no bag, or one twice.
     CalibrationError
         Bags do not go together.
     """
+    return joined([read_drive_and_numbers(bag, config, progress) for bag in bags])
+
+
+def check_bags(bags: Sequence[Path]) -> None:
+    """Raise a BagError, before any is read, if there is no bag or one is given twice."""
     if not bags:
         raise BagError("no bag is given: name one or several")
     places = [bag.resolve() for bag in bags]
     if twice := [str(bag) for k, bag in enumerate(bags) if places[k] in places[:k]]:
         raise BagError(f"{twice[0]} is given twice; it cannot be its own witness, give it once")
-    return joined([read_drive_and_numbers(bag, config, progress) for bag in bags])
 
 
 @dataclass(frozen=True)
