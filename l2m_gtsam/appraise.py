@@ -5,11 +5,12 @@ from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import Recording
 from l2m_gtsam.metric_results import Halves, Metrics
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.metrics.assemble import MapForms, metrics_of
+from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.scene import calibration_scene
-from l2m_gtsam.repeatability import compared_halves
+from l2m_gtsam.repeat_results import Repeatability
+from l2m_gtsam.repeatability import compared_drives, compared_halves
 from l2m_gtsam.scene import Scene
 
 
@@ -31,18 +32,23 @@ def appraise(
     options
         That it was computed with.
     qa
-        Whether halves are calibrated, and on how many readings.
+        Whether parts are calibrated by themselves, and on how many readings.
     progress
         Called with a stage and the fraction of it that is done.
     """
     tell = progress or (lambda stage, fraction: None)
     halves: dict[str, Halves] = {}
+    drives: dict[str, Repeatability] = {}
     if qa.halves:
-        tell("halves of the drive", 0.0)
-        halves = compared_halves(calibrated, options, qa.half_readings)
-        tell("halves of the drive", 1.0)
+        stage = "drives by themselves" if recording.drives else "halves of the drive"
+        tell(stage, 0.0)
+        if recording.drives:
+            drives = compared_drives(calibrated, recording, options, qa.half_readings)
+        else:
+            halves = compared_halves(calibrated, options, qa.half_readings)
+        tell(stage, 1.0)
     evidence, maps = _evidence(calibrated), _maps(calibrated)
-    return metrics_of(calibrated.result, evidence, recording.trajectory, maps, halves)
+    return metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
 
 
 def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:

@@ -1,6 +1,6 @@
 """Recording + map + options -> calibration. Pure: no files, no terminal."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 
 import numpy as np
@@ -22,17 +22,19 @@ from l2m_gtsam.graph.one_key import OneKeySolution
 from l2m_gtsam.graph.priors import Priors
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
+from l2m_gtsam.joining import drive_at, own_ns
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.prepare import prepare
 from l2m_gtsam.results import (
     CalibrationResult,
+    Disagreement,
     FoundStart,
     SensorCalibration,
     SensorStatus,
 )
 from l2m_gtsam.solve.disagreement import disagreements
 from l2m_gtsam.solve.explain import movement
-from l2m_gtsam.sync import stuck_sensors
+from l2m_gtsam.sync import stuck_readings
 from l2m_gtsam.verdicts import SolvedDrive, sensor_verdicts
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
@@ -70,7 +72,8 @@ def calibrate(
     Parameters
     ----------
     recording
-        A drive through the mapped place.
+        A drive through the mapped place, or several of one vehicle (``joining.joined``): sensors
+        then have one t, C, H and time offset over all of them.
     field_map
         The magnetic map, in the frame of the recording's poses.
     options
@@ -100,8 +103,7 @@ def calibrated(
 ) -> Calibrated:
     """Calibrate as ``calibrate`` does, and keep what the result rests on, to judge it by."""
     synchronised = prepare(recording, options)
-    stuck = stuck_sensors(synchronised.readings)
-    alive = synchronised.readings.select(~np.isin(synchronised.readings.sensor, stuck))
+    alive = synchronised.readings.select(~stuck_readings(synchronised.readings))
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     priors = priors_of(options.priors, alive.sensors)
     found = _starts(alive, solver_map, options, priors, progress)
@@ -132,15 +134,16 @@ def calibrated(
         raise CalibrationError(_nothing_solved(recording, map_source, sensors))
     verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
     result = CalibrationResult(
-        sensors=sensors,
+        sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
-        disagreements=disagreements(verdicts),
-        bag=recording.source,
+        disagreements=tuple(_in_own_time(each, recording) for each in disagreements(verdicts)),
+        bag=None if recording.drives else recording.source,
         map=map_source,
         options=options.model_dump(mode="json"),
         versions={name: version(name) for name in VERSIONED},
+        bags=tuple(drive.source for drive in recording.drives),
     )
     return Calibrated(result, solution, field_map, solver_map)
 
@@ -184,6 +187,30 @@ def _start_places(
             for name, each in zip(sensors, found, strict=True)
         ]
     )
+
+
+def _with_missing(
+    sensor: SensorCalibration, readings: Readings, recording: Recording
+) -> SensorCalibration:
+    """Return the same with the drives in which nothing usable was read of it."""
+    own = (
+        readings.drive
+        if readings.drive is None
+        else readings.drive[readings.rows_of(readings.sensors.index(sensor.sensor))]
+    )
+    missing = [
+        drive.source.path for k, drive in enumerate(recording.drives) if not np.any(own == k)
+    ]
+    return replace(sensor, missing_in=tuple(missing)) if missing else sensor
+
+
+def _in_own_time(stretch: Disagreement, recording: Recording) -> Disagreement:
+    """Return a stretch with the name of its drive, in that one's time."""
+    if not recording.drives:
+        return stretch
+    drive = recording.drives[drive_at(recording, stretch.start_ns)]
+    start, end = (own_ns(recording, each) for each in (stretch.start_ns, stretch.end_ns))
+    return replace(stretch, start_ns=start, end_ns=end, bag=drive.source.path)
 
 
 def _nothing_solved(

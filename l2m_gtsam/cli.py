@@ -147,9 +147,19 @@ def simulate(
 
 @app.command()
 def calibrate(
-    bag: BagArgument,
     map_path: MapOption,
     out: OutOption,
+    bags: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="BAG...",
+            help="ROS1 .bag, ROS2 folder, .db3 or .mcap; several of one vehicle are calibrated "
+            "together and compared.",
+        ),
+    ] = None,
+    more: Annotated[
+        list[Path] | None, typer.Option("--bag", metavar="BAG", help="The same; may be repeated.")
+    ] = None,
     config: ConfigOption = None,
     uncertainty: Annotated[
         str | None,
@@ -172,22 +182,29 @@ def calibrate(
         ),
     ] = None,
 ) -> None:
-    """Calibrate every magnetometer of a drive; write calibration.yaml, a picture and a report."""
-    from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bag
+    """Calibrate every magnetometer of one drive or several; write a picture and a report, too."""
+    from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
     from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
     from l2m_gtsam.config import load_config, with_uncertainty
     from l2m_gtsam.qa.model_table import model_note, model_tables
-    from l2m_gtsam.qa.tables import calibration_table, disagreement_note, held_clocks_note
+    from l2m_gtsam.qa.tables import (
+        calibration_table,
+        disagreement_note,
+        held_clocks_note,
+        missing_note,
+    )
     from l2m_gtsam.qa.verdict_text import verdict_lines
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with shown_progress() as progress:
-        result = calibrate_bag(bag, map_path, chosen, out, progress, view=view)
+        drives = [*(bags or ()), *(more or ())]
+        result = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
         verdict = report_folder(out, config)
     print_table(calibration_table(result))
     typer.echo(UNCERTAINTY[result.uncertainty])
     warn(result.doubts)
+    warn(missing_note(result))
     warn([disagreement_note(each) for each in result.disagreements])
     if held := held_clocks_note(result):
         typer.echo(held)

@@ -130,12 +130,35 @@ class SourceFile:
 
 @dataclass(frozen=True)
 class Recording:
-    """One drive: the lidar's poses in the map, the readings of every magnetometer, and numbers."""
+    """One drive, or several joined by ``joining.joined``.
+
+    Attributes
+    ----------
+    trajectory
+        The lidar's poses in the map.
+    series
+        Readings of every magnetometer.
+    source
+        Where it came from.
+    scalars
+        Numbers that were recorded.
+    drives
+        What it was joined from, each in its own time, in order of time; empty for one drive.
+    moved_ns
+        What was added to the stamps of each drive so that none overlaps another, nanoseconds.
+    """
 
     trajectory: Trajectory
     series: tuple[FieldSeries, ...]
     source: SourceFile
     scalars: tuple[ScalarSeries, ...] = ()
+    drives: tuple["Recording", ...] = ()
+    moved_ns: tuple[int, ...] = ()
+
+    @property
+    def parts(self) -> tuple["Recording", ...]:
+        """Its drives; itself if it is one."""
+        return self.drives or (self,)
 
 
 @dataclass(frozen=True)
@@ -183,6 +206,8 @@ class Readings:
     regressors
         Recorded numbers whose field may be part of the readings, each in its own unit, shape
         (N, K); zero where a sensor does not feel them, absent where none were recorded.
+    drive
+        Which drive each is of, ascending for each sensor, shape (N,); absent where there is one.
     """
 
     sensors: tuple[str, ...]
@@ -194,6 +219,7 @@ class Readings:
     motion: PoseMotion | None = None
     pose_root: FloatArray | None = None
     regressors: FloatArray | None = None
+    drive: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.sensor)
@@ -209,7 +235,13 @@ class Readings:
             None if self.motion is None else self.motion[rows],
             None if self.pose_root is None else self.pose_root[rows],
             None if self.regressors is None else self.regressors[rows],
+            None if self.drive is None else self.drive[rows],
         )
+
+    @property
+    def of_drive(self) -> IntArray:
+        """Which drive each is of, shape (N,); 0 where there is one."""
+        return np.zeros(len(self), dtype=np.int64) if self.drive is None else self.drive
 
     def select(self, keep: BoolArray) -> "Readings":
         """Return the readings where ``keep``, shape (N,), is true."""

@@ -5,19 +5,12 @@ does not exist is NaN. Rows of axes are in the order x, y, z.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
 
-from pydantic import ConfigDict
-
-Row = tuple[float, ...]
-Rows = tuple[Row, ...]
-
-
-@dataclass(frozen=True)
-class Record:
-    """A part of `metrics.json`."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(ser_json_inf_nan="strings")
+from l2m_gtsam.metric_records import Record as Record
+from l2m_gtsam.metric_records import Row as Row
+from l2m_gtsam.metric_records import Rows as Rows
+from l2m_gtsam.repeat_results import Halves as Halves
+from l2m_gtsam.repeat_results import Repeatability
 
 
 @dataclass(frozen=True)
@@ -203,42 +196,13 @@ class CurveErrors(Record):
 
 
 @dataclass(frozen=True)
-class Halves(Record):
-    """One sensor calibrated on the first and on the second half of the drive.
-
-    Attributes
-    ----------
-    difference
-        Second less first: t in metres, C row by row, H; shape (15,).
-    sigma
-        Standard deviation of each difference; infinite for what a half leaves open.
-    distance
-        Of both, root mean square over all directions that both halves determine, in sigmas: 1 is
-        consistent.
-    determined
-        Number of those directions.
-    turned_deg
-        Angle between the rotations.
-    reason
-        Why there is no comparison; empty if there is one.
-    """
-
-    difference: Row
-    sigma: Row
-    distance: float
-    determined: int
-    turned_deg: float
-    reason: str = ""
-
-
-@dataclass(frozen=True)
 class Series(Record):
     """A thinned course of the drive as one sensor saw it, to be drawn.
 
     Attributes
     ----------
     seconds
-        Since the first reading of any sensor, length N.
+        Since the first reading of any sensor in its drive, length N.
     place
         Of the sensor in the map, (N, 3).
     residual, normalised
@@ -247,6 +211,8 @@ class Series(Record):
         Whether it does not count.
     before, after, map
         Readings along the lidar's axes: as read, corrected, and as the map has it, (N, 3).
+    drive
+        Which drive each is of, from 0, length N; absent where there is one.
     """
 
     seconds: Row
@@ -257,11 +223,15 @@ class Series(Record):
     before: Rows
     after: Rows
     map: Rows
+    drive: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
 class SensorMetrics(Record):
-    """All figures of one sensor that was solved."""
+    """All figures of one sensor that was solved.
+
+    Of several drives there are comparisons of these in place of halves of a single one.
+    """
 
     sensor: str
     mounting: Mounting
@@ -272,6 +242,7 @@ class SensorMetrics(Record):
     curves: CurveErrors
     halves: Halves
     series: Series
+    drives: Repeatability | None = None
 
 
 @dataclass(frozen=True)
@@ -296,14 +267,14 @@ class MapPicture(Record):
 
 @dataclass(frozen=True)
 class DriveMetrics(Record):
-    """How the vehicle moved.
+    """How the vehicle moved, in all drives together.
 
     Attributes
     ----------
     path
-        Places of the lidar in the map, thinned, (N, 3).
+        Places of the lidar in the map, thinned, (N, 3); NaN between two drives.
     seconds, length
-        How long the drive was.
+        How long the drives were.
     heave
         Between the lowest and the highest place of the lidar.
     tilt_deg
@@ -322,11 +293,24 @@ class DriveMetrics(Record):
 
 @dataclass(frozen=True)
 class Metrics(Record):
-    """All figures of one calibration."""
+    """All figures of one calibration.
+
+    Attributes
+    ----------
+    sensors
+        Those that were solved.
+    drive
+        How the vehicle moved.
+    map
+        Around it.
+    bags
+        Paths of several drives, in the order in which series count them.
+    """
 
     sensors: tuple[SensorMetrics, ...]
     drive: DriveMetrics
     map: MapPicture
+    bags: tuple[str, ...] | None = None
 
     def get(self, sensor: str) -> SensorMetrics | None:
         """Return the figures of a sensor; none if it was not solved."""

@@ -12,11 +12,14 @@ by tau gives E = tau C: the last term holds a time offset, too.
 
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+
+ONE_DRIVE = (slice(None),)  # all rows
 
 
 class Model(StrEnum):
@@ -58,6 +61,8 @@ class Samples:
         One over the variance of each reading in 1/uT^2, shape (N,).
     names
         Of the K numbers.
+    drive
+        Which drive each reading is of, ascending, shape (N,); absent if all are of one.
     """
 
     z: FloatArray
@@ -66,6 +71,7 @@ class Samples:
     q: FloatArray
     weights: FloatArray
     names: tuple[str, ...]
+    drive: IntArray | None = None
 
     def __len__(self) -> int:
         return len(self.z)
@@ -78,7 +84,14 @@ class Samples:
             self.q[rows],
             self.weights[rows],
             self.names,
+            None if self.drive is None else self.drive[rows],
         )
+
+    @property
+    def drives(self) -> tuple[slice, ...]:
+        """The rows of each drive."""
+        ends = [] if self.drive is None else (np.flatnonzero(np.diff(self.drive)) + 1).tolist()
+        return tuple(slice(a, b) for a, b in pairwise([0, *ends, len(self)]))
 
     def columns(self) -> FloatArray:
         """Return b, q and db/dt side by side, shape (N, 3 + K + 3)."""

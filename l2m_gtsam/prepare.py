@@ -4,8 +4,9 @@ from dataclasses import replace
 
 from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import Recording, Synchronised
+from l2m_gtsam.joining import joined_readings
 from l2m_gtsam.pose_noise import pose_roots
-from l2m_gtsam.regressors import with_regressors
+from l2m_gtsam.regressors import check_changes, with_regressors
 from l2m_gtsam.solve.explain import movement
 from l2m_gtsam.sync import synchronise
 
@@ -14,13 +15,22 @@ def prepare(recording: Recording, options: CalibrationOptions) -> Synchronised:
     """Return the readings that take part, their poses, how these move and how wrong they are.
 
     Of a vehicle that stands still, velocities are the noise of its poses: they are left out, as
-    they are where clocks are known to agree.
+    they are where clocks are known to agree. Drives that were joined are prepared one by one: a
+    place that was read in one drive is read anew in the next.
 
     Raises
     ------
     SyncError
-        Readings and poses or recorded numbers do not overlap, or a number never changes.
+        Readings and poses or recorded numbers of a drive do not overlap, or a number never changes.
     """
+    parts = [_prepared(drive, options) for drive in recording.parts]
+    whole = joined_readings(parts, recording)
+    check_changes(whole.readings, recording.scalars)
+    return whole
+
+
+def _prepared(recording: Recording, options: CalibrationOptions) -> Synchronised:
+    """Return the same for a single drive."""
     largest, poses = options.solve.largest_offset_s, recording.trajectory
     synchronised = synchronise(recording, options.sync, largest)
     synchronised = with_regressors(synchronised, recording.scalars, options.regressors)

@@ -10,6 +10,7 @@ from l2m_gtsam.data import (
     BoolArray,
     FloatArray,
     IntArray,
+    Readings,
     ScalarSeries,
     Synchronised,
 )
@@ -105,7 +106,7 @@ def with_regressors(
     Raises
     ------
     SyncError
-        No reading is left, or a number never changes.
+        No reading is left.
     """
     if not series:
         return synchronised
@@ -113,7 +114,6 @@ def with_regressors(
     found = resampled(series, readings.stamp_ns, options)
     if not found.known.any():
         raise SyncError(_none_known(readings.stamp_ns, series, options))
-    _check_changes(found)
     dropped = np.bincount(readings.sensor[~found.known], minlength=len(readings.sensors))
     counts = tuple(
         replace(count, kept=count.kept - int(without), without_regressor=int(without))
@@ -123,13 +123,15 @@ def with_regressors(
     return Synchronised(readings.select(found.known), counts)
 
 
-def _check_changes(found: Resampled) -> None:
+def check_changes(readings: Readings, series: Sequence[ScalarSeries]) -> None:
     """Raise a SyncError for a number that is the same at all readings."""
-    for name, values in zip(found.names, found.values[found.known].T, strict=True):
+    if readings.regressors is None:
+        return
+    for each, values in zip(series, readings.regressors.T, strict=True):
         if np.ptp(values) <= STILL * np.abs(values).max():
             raise SyncError(
-                f"regressor {name!r}: it is {values[0]:g} at all readings, which nothing tells "
-                "from the offset H; leave it out of `bag.regressors`"
+                f"regressor {each.name!r}: it is {values[0]:g} at all readings, which nothing "
+                "tells from the offset H; leave it out of `bag.regressors`"
             )
 
 

@@ -1,4 +1,7 @@
-"""Both halves of a drive calibrated by themselves. Pure: no files, no terminal."""
+"""Parts of what was driven calibrated by themselves. Pure: no files, no terminal.
+
+Of one drive both halves, of several each drive.
+"""
 
 from dataclasses import replace
 
@@ -6,14 +9,17 @@ import numpy as np
 
 from l2m_gtsam.calibrate import Calibrated
 from l2m_gtsam.config import CalibrationOptions
-from l2m_gtsam.data import Readings
+from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import spread
 from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.metric_results import Halves
-from l2m_gtsam.qa.metrics.halves import Half, compare_halves, no_halves
+from l2m_gtsam.qa.metrics.drives import compare_drives
+from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
+from l2m_gtsam.repeat_results import Repeatability
 
 STEPS = 3  # alternations from where the whole was found; the joint graph does the rest
+MORE = 4  # times as many readings of a drive as of a half
 
 
 def compared_halves(
@@ -34,15 +40,13 @@ def compared_halves(
     each_half
         Readings of each sensor that a half is calibrated on, at the most.
     """
-    solution = calibrated.solution
-    readings = replace(solution.readings, motion=None)
-    solved = [found.sensor for found in solution.solved]
-    usable = solution.inside & np.isin(readings.sensor, solved)
-    middle = np.median(readings.stamp_ns[usable])
+    readings, t = _usable(calibrated), calibrated.solution.estimate.t
+    solved = [found.sensor for found in calibrated.solution.solved]
+    middle = np.median(readings.stamp_ns)
     parts = (readings.stamp_ns < middle, readings.stamp_ns >= middle)
     try:
         first, second = (
-            _half(calibrated, readings.select(usable & part), options, each_half) for part in parts
+            _parts(calibrated, readings.select(part), t, options, each_half) for part in parts
         )
     except (CalibrationError, np.linalg.LinAlgError) as error:
         # The whole is calibrated: that a half is not is no reason to lose it.
@@ -51,21 +55,96 @@ def compared_halves(
     return {readings.sensors[index]: _compared(first, second, index) for index in solved}
 
 
-def _half(
-    calibrated: Calibrated, readings: Readings, options: CalibrationOptions, most: int
-) -> dict[int, Half]:
+def compared_drives(
+    calibrated: Calibrated, recording: Recording, options: CalibrationOptions, each_half: int
+) -> dict[str, Repeatability]:
+    """Calibrate each drive of a recording by itself, and compare them sensor by sensor.
+
+    They start as halves do. All are one graph, in which every drive has a place and a distortion
+    of its own for each sensor, but there is one map: its errors, which drives through the same
+    places share, are known to be shared and do not count as a difference.
+
+    Parameters
+    ----------
+    calibrated
+        The calibration of all drives together.
+    recording
+        The drives.
+    options
+        That it was computed with.
+    each_half
+        Readings of each sensor that half a drive would be calibrated on, a fourth of those here.
+    """
+    readings, count = _usable(calibrated), len(recording.drives)
+    solved = [found.sensor for found in calibrated.solution.solved]
+    own = by_drive(readings, count)
+    t = np.repeat(calibrated.solution.estimate.t, count, axis=0)
+    try:
+        found = _parts(calibrated, own, t, options, MORE * each_half)
+    except (CalibrationError, np.linalg.LinAlgError) as error:
+        found, failed = {}, f"the drives cannot be calibrated by themselves: {error}"
+    else:
+        failed = ""
+    paths = [drive.source.path for drive in recording.drives]
+    return {
+        readings.sensors[index]: compare_drives(
+            [
+                (path, found.get(index * count + k) or failed or _too_few(own, index * count + k))
+                for k, path in enumerate(paths)
+            ]
+        )
+        for index in solved
+    }
+
+
+def by_drive(readings: Readings, count: int) -> Readings:
+    """Return readings as if each of so many drives had sensors of its own.
+
+    Sensor s of drive k then counts as ``s * count + k``.
+    """
+    names = tuple(f"{name} of drive {k + 1}" for name in readings.sensors for k in range(count))
+    return replace(readings, sensors=names, sensor=readings.sensor * count + readings.of_drive)
+
+
+def _too_few(readings: Readings, sensor: int) -> str:
+    rows = readings.rows_of(sensor)
+    read = rows.stop - rows.start
+    if not read:
+        return "nothing usable was read of it in this drive"
+    return f"its {read} usable readings in this drive are too few to calibrate on"
+
+
+def _usable(calibrated: Calibrated) -> Readings:
+    """Return the readings of solved sensors inside the map, at fixed time offsets."""
+    solution = calibrated.solution
+    solved = [found.sensor for found in solution.solved]
+    usable = solution.inside & np.isin(solution.readings.sensor, solved)
+    return replace(solution.readings, motion=None).select(usable)
+
+
+def _parts(
+    calibrated: Calibrated,
+    readings: Readings,
+    t: FloatArray,
+    options: CalibrationOptions,
+    most: int,
+) -> dict[int, Part]:
     """Return what some of the readings say of each sensor that they are enough for."""
     few = spread(readings, max(most, options.solve.min_readings))
     near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
-    solution = solve_one_key(few, calibrated.solver_map, calibrated.solution.estimate.t, near)
+    solution = solve_one_key(few, calibrated.solver_map, t, near)
     return {
-        found.sensor: Half(solution.estimate.vector(found.sensor), found.covariance)
+        found.sensor: Part(
+            solution.estimate.vector(found.sensor), found.covariance, found.shared_root
+        )
         for found in solution.solved
     }
 
 
-def _compared(first: dict[int, Half], second: dict[int, Half], sensor: int) -> Halves:
+def _compared(first: dict[int, Part], second: dict[int, Part], sensor: int) -> Halves:
     for name, half in (("first", first), ("second", second)):
         if sensor not in half:
             return no_halves(f"the {name} half of the drive has too few readings to calibrate on")
-    return compare_halves(first[sensor], second[sensor])
+    # Each half was solved by itself: nothing is known of what their errors share.
+    one, other = (replace(half[sensor], shared_root=None) for half in (first, second))
+    return compare_halves(one, other)

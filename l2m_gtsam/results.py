@@ -124,7 +124,7 @@ class Disagreement:
     sensors
         Names of those that disagree.
     start_ns, end_ns
-        When, in nanoseconds.
+        When, in nanoseconds, in its drive's own time.
     p_from, p_to
         Where the lidar was at the first and the last of these readings, metres, map frame, (3,).
     length
@@ -134,7 +134,9 @@ class Disagreement:
     size
         Median length of their residuals in uT.
     passed_again
-        What was read at the same place at another time.
+        What was read at the same place at another time, in any drive.
+    bag
+        Path of its drive, where there are several.
     """
 
     sensors: tuple[str, ...]
@@ -146,6 +148,7 @@ class Disagreement:
     readings: int
     size: float
     passed_again: Return
+    bag: str = ""
 
 
 @dataclass(frozen=True)
@@ -196,6 +199,8 @@ class SensorCalibration:
     moving
         What recorded numbers add to the readings; H is the offset where they are zero. Empty for a
         sensor to which no model with them is recommended.
+    missing_in
+        Paths of those of several drives in which nothing usable was read.
     """
 
     sensor: str
@@ -218,6 +223,7 @@ class SensorCalibration:
     models: ModelComparison | None = None
     not_compared: str = ""
     moving: tuple[MovingField, ...] = ()
+    missing_in: tuple[str, ...] = ()
 
     @property
     def offset_correlation(self) -> FloatArray:
@@ -260,11 +266,14 @@ class CalibrationResult:
     disagreements
         Stretches of the drive over which readings were rejected, in order of time.
     bag, map
-        Sources with hashes; absent when the data did not come from files.
+        Sources with hashes; absent when the data did not come from files. There is no one bag where
+        several drives were calibrated together.
     options
         The effective options, plain values.
     versions
         Versions of the packages that computed it.
+    bags
+        The drives that were calibrated together, in order of time; empty for a single one.
     """
 
     sensors: tuple[SensorCalibration, ...]
@@ -276,6 +285,12 @@ class CalibrationResult:
     map: SourceFile | None
     options: dict[str, Any]
     versions: dict[str, str]
+    bags: tuple[SourceFile, ...] = ()
+
+    @property
+    def drives(self) -> tuple[SourceFile, ...]:
+        """All drives with hashes; none if the data did not come from files."""
+        return self.bags or (() if self.bag is None else (self.bag,))
 
     def __getitem__(self, sensor: str) -> SensorCalibration:
         for entry in self.sensors:

@@ -112,6 +112,15 @@ def stuck_sensors(readings: Readings) -> list[int]:
     return [index for index, spread in enumerate(spreads) if spread < STUCK_UT]
 
 
+def stuck_readings(readings: Readings) -> BoolArray:
+    """Mark the readings of sensors that report one constant value for a whole drive."""
+    stuck = np.zeros(len(readings), dtype=np.bool_)
+    for drive in np.unique(readings.of_drive):
+        own = readings.of_drive == drive
+        stuck |= own & np.isin(readings.sensor, stuck_sensors(readings.select(own)))
+    return stuck
+
+
 def _spanned(pose_ns: IntArray, stamp_ns: IntArray, around_ns: int) -> BoolArray:
     if len(pose_ns) < 2:
         return np.zeros(len(stamp_ns), dtype=np.bool_)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.stats import chi2, f
 
 from l2m_gtsam.config import CalibrationOptions
-from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
+from l2m_gtsam.data import FloatArray, IntArray, Readings, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.graph.innovation import KnownCalibration, knows_its_errors
 from l2m_gtsam.graph.recheck import Recheck, SensorDrive, recheck
@@ -103,7 +103,7 @@ def validate(
     asked = field_map.compile() if isinstance(field_map, Compilable) else field_map
     readings = synchronised.readings
     stuck = {readings.sensors[k] for k in stuck_sensors(readings)}
-    start_ns = int(readings.stamp_ns.min())
+    start_ns = readings.stamp_ns.min(keepdims=True)
     drawn = int(np.clip(DRAWN // len(known), FEWEST, MOST))
     sensors: list[ValidatedSensor] = []
     for index, sensor in enumerate(known):
@@ -122,7 +122,7 @@ def validate(
     return DriveValidation(
         sensors=tuple(sensors),
         missing=tuple(missing),
-        drive=drive_metrics(recording.trajectory),
+        drive=drive_metrics(recording),
         picture=map_picture(field_map, places),
         doubts=doubts,
         notes=notes,
@@ -176,9 +176,9 @@ def joint_covariance(sensor: SensorCalibration) -> FloatArray:
 
 @dataclass(frozen=True)
 class Course:
-    """How the course of a drive is kept: since when, and in how many readings at most."""
+    """How a drive is kept: since when, shape (1,), and in how many readings at most."""
 
-    start_ns: int
+    start_ns: IntArray
     most: int
 
 
@@ -342,7 +342,7 @@ def _remarks(
     """Return what speaks against the outcome, and what is worth knowing."""
     of_map = field_map.summary.doubts if isinstance(field_map, Summarised) else ()
     doubts, notes = [f"Of the map: {each}." for each in of_map], list[str]()
-    if calibration.bag is not None and calibration.bag.sha256 == recording.source.sha256:
+    if any(_same(drive, recording.source) for drive in calibration.drives):
         doubts.append(SAME_BAG)
     elif _same(calibration.map, map_source):
         notes.append(SAME_MAP)

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from l2m_gtsam.appraise import appraise, scene_of
-from l2m_gtsam.batch.opening import OpenMap, SavedMap, read_drive, read_drive_and_numbers
+from l2m_gtsam.batch.opening import OpenMap, SavedMap, check_bags, read_drive, read_drives
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.calibrate import calibrated
 from l2m_gtsam.config import Config
@@ -42,12 +42,25 @@ def calibrate_bag(
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
 ) -> CalibrationResult:
-    """Calibrate all magnetometers of a bag; write `calibration.yaml`, metrics and a picture.
+    """Calibrate all magnetometers of a bag, as `calibrate_bags` does."""
+    return calibrate_bags([bag], map_path, config, out, progress, truth, view)
+
+
+def calibrate_bags(
+    bags: Sequence[Path],
+    map_path: Path,
+    config: Config,
+    out: Path,
+    progress: Progress,
+    truth: tuple[KnownSensor, ...] = (),
+    view: Path | None = None,
+) -> CalibrationResult:
+    """Calibrate all magnetometers; write `calibration.yaml`, metrics and a picture.
 
     Parameters
     ----------
-    bag
-        A drive through the mapped place.
+    bags
+        Drives of one vehicle through the mapped place, which are calibrated together.
     map_path
         Map file.
     config
@@ -66,13 +79,14 @@ def calibrate_bag(
     L2MError
         Whatever is wrong with the input, in one line; nothing is written then.
     """
+    check_bags(bags)
     check_outputs(*(out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE)))
     if view is not None:
         require_rerun(view)
         check_outputs(view)
     saved = SavedMap.read(map_path)
-    recording = read_drive_and_numbers(bag, config, progress)
-    field_map, source = saved.open(progress, [recording]), source_file(map_path)
+    recording = read_drives(bags, config, progress)
+    field_map, source = saved.open(progress, recording.parts), source_file(map_path)
     opened = OpenMap(field_map, source)
     return calibrate_drive(recording, opened, config, out, progress, truth, view)
 
@@ -86,12 +100,13 @@ def calibrate_drive(
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
 ) -> CalibrationResult:
-    """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bag`."""
+    """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bags`."""
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
     metrics = appraise(recording, found, config.calibration, config.qa, progress)
     result = replace(found.result, options=config.model_dump(mode="json"))
-    figure = calibration_figure(opened.field_map, recording.trajectory, result, truth)
+    drives = [each.trajectory for each in recording.parts]
+    figure = calibration_figure(opened.field_map, drives, result, truth)
     ensure_folder(out)
     write_calibration(out / CALIBRATION_FILE, result)
     write_metrics(out / METRICS_FILE, metrics)

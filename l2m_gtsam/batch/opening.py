@@ -7,7 +7,8 @@ from typing import Any
 
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import MapState, Recording, SourceFile
-from l2m_gtsam.errors import MapError
+from l2m_gtsam.errors import BagError, MapError
+from l2m_gtsam.joining import joined
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, counter
@@ -26,6 +27,26 @@ def read_drive_and_numbers(bag: Path, config: Config, progress: Progress) -> Rec
     told = counter(f"reading numbers of {bag.name}", progress)
     scalars = read_scalars(bag, config.bag.regressors, config.bag.stamps, told)
     return replace(read_drive(bag, config, progress), scalars=scalars)
+
+
+def read_drives(bags: Sequence[Path], config: Config, progress: Progress) -> Recording:
+    """Return what one bag or several recorded, with numbers, as one recording.
+
+    Raises
+    ------
+    CalibrationError
+        Bags do not go together.
+    """
+    return joined([read_drive_and_numbers(bag, config, progress) for bag in bags])
+
+
+def check_bags(bags: Sequence[Path]) -> None:
+    """Raise a BagError, before any is read, if there is no bag or one is given twice."""
+    if not bags:
+        raise BagError("no bag is given: name one or several")
+    places = [bag.resolve() for bag in bags]
+    if twice := [str(bag) for k, bag in enumerate(bags) if places[k] in places[:k]]:
+        raise BagError(f"{twice[0]} is given twice; it cannot be its own witness, give it once")
 
 
 @dataclass(frozen=True)

@@ -149,7 +149,7 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
     x = np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar
     seconds, knots = pose_seconds(readings), None
     if readings.pose_root is not None:
-        knots = PoseKnots.over(seconds, correlation_s)
+        knots = PoseKnots.over(seconds, correlation_s, readings.drive)
     segment = np.zeros(len(x), dtype=np.int64) if knots is None else knots.segment(seconds)
     told = errors.errors_over(x)
     owner, rest, groups = told.owner(x), np.empty_like(x), []

@@ -106,6 +106,15 @@ class Eliminated:
         whole = solve_triangular(R, solve_triangular(R, self._spread(cluster)).T)
         return np.asarray(whole[np.ix_(at, at)])
 
+    def shared_root(self, sensor: int) -> FloatArray:
+        """Return a root of what shared weights contribute to a sensor's covariance, (16, K).
+
+        Sensors of different clusters have the covariance ``root_a @ root_b.T`` in common.
+        """
+        cluster = self._of[sensor]
+        root = solve_triangular(cluster.R, self._half(cluster.S).T)
+        return np.asarray(root[rows_in(cluster.sensors, sensor)])
+
     def step(self, sensor: int) -> FloatArray:
         """Return the step of a sensor's parameters, shape (16,)."""
         cluster = self._of[sensor]

@@ -60,6 +60,10 @@ class SensorSolution:
     moving
         What recorded numbers add to the readings, beyond what was taken off them; absent where it
         is no variable of the graph.
+    shared_root
+        A root of what errors that sensors share, of map and poses, contribute to the covariance of
+        (t, C row by row, H), shape (15, K): two sensors that no factor connects have the covariance
+        ``root_a @ root_b.T`` in common. Absent where errors are not shared.
     """
 
     sensor: int
@@ -69,6 +73,7 @@ class SensorSolution:
     remaining_sigmas: float
     contradictions: tuple[Contradiction, ...] = ()
     moving: Correction | None = None
+    shared_root: FloatArray | None = None
 
     @property
     def covariance(self) -> FloatArray:

@@ -44,6 +44,7 @@ def model_samples(
         q=q,
         weights=1 / (noise**2 + sample.variance[inside].mean(axis=1)),
         names=names,
+        drive=readings.drive,
     )
 
 

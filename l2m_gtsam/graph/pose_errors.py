@@ -29,53 +29,69 @@ class PoseKnots:
     Attributes
     ----------
     seconds
-        Times, shape (K,), K at least 2.
+        Times, drive by drive, shape (K,); each drive has two at least, evenly spread over it.
     correlation_s
-        Time over which the correlation falls to 1/e.
+        Time over which the correlation falls to 1/e. Errors of two drives have nothing in common.
+    spacing
+        Time between each knot and the next in seconds, infinite from one drive to the next, shape
+        (K - 1,).
     """
 
     seconds: FloatArray
     correlation_s: float
+    spacing: FloatArray
 
     @classmethod
-    def over(cls, seconds: FloatArray, correlation_s: float) -> "PoseKnots":
-        """Return knots for times, shape (N,): two for as long as an error lasts, if not fewer."""
-        first, last = seconds.min(), max(seconds.max(), seconds.min() + SHORTEST_S)
-        spacing = max(correlation_s / 2, (last - first) / SEGMENTS)
-        count = int(np.ceil((last - first) / spacing)) + 1
-        return cls(np.linspace(first, last, max(count, 2)), max(correlation_s, SHORTEST_S))
+    def over(
+        cls, seconds: FloatArray, correlation_s: float, drive: IntArray | None = None
+    ) -> "PoseKnots":
+        """Return knots for times, shape (N,): two for as long as an error lasts, if not fewer.
 
-    @property
-    def spacing(self) -> float:
-        """Time between two knots in seconds."""
-        return float(self.seconds[1] - self.seconds[0])
+        ``drive`` says which drive each time is of, shape (N,); absent if all are of one.
+        """
+        of = np.zeros(len(seconds), dtype=np.int64) if drive is None else drive
+        drives = [seconds[of == each] for each in np.unique(of)]
+        ends = [(own.min(), max(own.max(), own.min() + SHORTEST_S)) for own in drives]
+        whole = float(sum(last - first for first, last in ends))
+        between = max(correlation_s / 2, whole / SEGMENTS)
+        knots, spacing = [], []
+        for first, last in ends:
+            count = max(int(np.ceil((last - first) / between)) + 1, 2)
+            knots.append(np.linspace(first, last, count))
+            spacing += [float(knots[-1][1] - knots[-1][0])] * (count - 1) + [np.inf]
+        return cls(np.concatenate(knots), max(correlation_s, SHORTEST_S), np.array(spacing[:-1]))
 
     @property
     def correlation(self) -> FloatArray:
         """Of the errors at each knot and the next, shape (K - 1,)."""
-        return np.full(len(self.seconds) - 1, self._like(np.array(self.spacing)))
+        return self._like(self.spacing)
 
     def segment(self, seconds: FloatArray) -> IntArray:
         """Return the knot before each time, shape (N,)."""
         before = np.searchsorted(self.seconds, seconds, side="right") - 1
-        return np.clip(before, 0, len(self.seconds) - 2)
+        before = np.clip(before, 0, len(self.seconds) - 2)
+        # At the very end of a drive the knot before is not the drive's last.
+        return np.asarray(before - np.isinf(self.spacing[before]))
 
     def weights(self, seconds: FloatArray) -> FloatArray:
         """Return what the knots before and after say of the error at each time, shape (N, 2)."""
-        after = np.clip(seconds - self.seconds[self.segment(seconds)], 0.0, self.spacing)
-        whole = -np.expm1(-2 * self.spacing / self.correlation_s)
+        segment = self.segment(seconds)
+        spacing = self.spacing[segment]
+        after = np.clip(seconds - self.seconds[segment], 0.0, spacing)
+        whole = -np.expm1(-2 * spacing / self.correlation_s)
         return np.column_stack(
             [
-                (self._like(gap) - self._like(2 * self.spacing - gap)) / whole
-                for gap in (after, self.spacing - after)
+                (self._like(gap) - self._like(2 * spacing - gap)) / whole
+                for gap in (after, spacing - after)
             ]
         )
 
     def bridge(self, seconds: FloatArray) -> FloatArray:
         """Return the covariance of what the knots leave open at times of one segment, (n, n)."""
-        start = self.seconds[self.segment(seconds)]
-        after = np.clip(seconds - start, 0.0, self.spacing)
-        at_knots = np.column_stack([self._like(after), self._like(self.spacing - after)])
+        segment = self.segment(seconds)
+        spacing = self.spacing[segment]
+        after = np.clip(seconds - self.seconds[segment], 0.0, spacing)
+        at_knots = np.column_stack([self._like(after), self._like(spacing - after)])
         apart = np.abs(seconds[:, None] - seconds)
         return np.asarray(self._like(apart) - self.weights(seconds) @ at_knots.T)
 

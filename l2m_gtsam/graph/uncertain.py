@@ -187,6 +187,7 @@ class UncertainProblem:
                     remaining_sigmas=system.sigmas(s),
                     contradictions=tuple(each for each in missed if s in each.sensors),
                     moving=self._correction(s, system, values),
+                    shared_root=system.shared_root(s)[:-1],
                 )
             )
         return tuple(solutions)

@@ -1,5 +1,6 @@
 """Pictures: the map, the drive through it, and the sensors on the vehicle."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,7 +94,7 @@ def map_figure(field_map: FieldMap, height: float | None) -> Figure:
 
 def calibration_figure(
     field_map: FieldMap,
-    trajectory: Trajectory,
+    drives: Sequence[Trajectory],
     result: CalibrationResult,
     truth: tuple[KnownSensor, ...],
 ) -> Figure:
@@ -103,8 +104,8 @@ def calibration_figure(
     ----------
     field_map
         The map.
-    trajectory
-        Poses of the lidar in the map.
+    drives
+        Poses of the lidar in the map, drive by drive.
     result
         The calibration; sensors that were not solved are left out.
     truth
@@ -115,10 +116,12 @@ def calibration_figure(
     place, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     side = figure.add_subplot(grid[1, 1])
     height = _middle(field_map)
-    cut = slice_map(field_map, height, trajectory.p)
+    cut = slice_map(field_map, height, np.concatenate([each.p for each in drives]))
     _draw_slice(figure, place, cut.strength, cut.extent, "field strength (uT)", "viridis")
-    place.plot(*trajectory.p[:, :2].T, color="white", linewidth=2.2)
-    place.plot(*trajectory.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label="drive of the lidar")
+    for k, drive in enumerate(drives):
+        label = "_" if k else "drive of the lidar"  # one entry in the legend
+        place.plot(*drive.p[:, :2].T, color="white", linewidth=2.2)
+        place.plot(*drive.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label=label)
     place.set_title(f"map at z = {height:.2f} m and drive")
     place.legend(loc="upper right")
     solved = [s for s in result.sensors if s.residuals is not None]

@@ -51,11 +51,23 @@ def disagreement_note(stretch: Disagreement) -> str:
         Return.AS_MAPPED: "passed again it was as mapped: something moved by",
         Return.DIFFERS: "passed again it differed too: the field has changed there",
     }[stretch.passed_again]
+    where = f"{stretch.bag}: " if stretch.bag else ""
     return (
-        f"{', '.join(stretch.sensors)}: {stretch.readings} readings fit neither map nor distortion "
-        f"and do not count, {1e-9 * stretch.start_ns:.2f} to {1e-9 * stretch.end_ns:.2f} s, "
+        f"{where}{', '.join(stretch.sensors)}: {stretch.readings} readings fit neither map nor "
+        f"distortion and do not count, {1e-9 * stretch.start_ns:.2f} to "
+        f"{1e-9 * stretch.end_ns:.2f} s, "
         f"{stretch.length:.1f} m from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m, "
         f"{stretch.size:.2g} uT off; {meaning}"
+    )
+
+
+def missing_note(result: CalibrationResult) -> tuple[str, ...]:
+    """Return which sensors are calibrated from some of several drives only, a sentence each."""
+    return tuple(
+        f"{sensor.sensor}: nothing usable was read in {', '.join(sensor.missing_in)}; it is "
+        "calibrated from the rest"
+        for sensor in result.sensors
+        if sensor.missing_in and len(sensor.missing_in) < len(result.bags)
     )
 
 

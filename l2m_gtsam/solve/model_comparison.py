@@ -18,13 +18,15 @@ taken together.
 ``model_choice`` says how the two decide.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.model_results import ModelComparison, ModelFigures
-from l2m_gtsam.models import Model, Samples
+from l2m_gtsam.models import ONE_DRIVE, Model, Samples
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.model_choice import Choice, HeldOut, Trial, choose, reason_of, standard_error
 from l2m_gtsam.solve.model_fits import Fit, Spread, compress, fit_model, inflation, spread_of
@@ -63,9 +65,10 @@ def compare_models(samples: Samples, options: ModelOptions) -> ModelComparison:
     whole = compress(samples)
     fits = {model: fit_model(model, whole) for model in models}
     left = fits[models[-1]].coefficients.residual(samples)
-    correlation = correlation_of(np.sqrt(samples.weights)[:, None] * left)
-    root = inflation(whole, correlation)
-    held_out = predicted(samples, options.segments, models)
+    correlation = correlation_of(np.sqrt(samples.weights)[:, None] * left, samples.drives)
+    root = inflation(whole, correlation, samples.drives)
+    segment = segments_of(samples, options.segments)
+    held_out = predicted(samples, segment, models)
     trials = [
         trial_of(samples, model, fit, spread_of(fit, whole, root), held_out[model])
         for model, fit in fits.items()
@@ -76,7 +79,7 @@ def compare_models(samples: Samples, options: ModelOptions) -> ModelComparison:
         regressors=samples.names,
         readings=len(samples),
         independent=len(samples) / float(2 * correlation.sum() - 1),
-        segments=options.segments,
+        segments=int(segment[-1]) + 1,
         recommended=choice.chosen.model,
         reason=reason_of(choice, trials),
         coefficients=choice.chosen.fit.coefficients,
@@ -126,7 +129,7 @@ def check_samples(samples: Samples, options: ModelOptions) -> None:
         )
 
 
-def correlation_of(residual: FloatArray) -> FloatArray:
+def correlation_of(residual: FloatArray, drives: Sequence[slice] = ONE_DRIVE) -> FloatArray:
     """Return the correlation of residuals no, one, two, ... readings apart, shape (N,).
 
     It is zero from the first that is not positive: after that there is only noise in them.
@@ -135,18 +138,34 @@ def correlation_of(residual: FloatArray) -> FloatArray:
     ----------
     residual
         Weighted, in order of time, shape (N, 3).
+    drives
+        Rows of each drive: nothing is said of readings of two drives.
     """
-    N = len(residual)
-    power = np.abs(np.fft.rfft(residual, 2 * N, axis=0)) ** 2
-    covariance = np.fft.irfft(power, 2 * N, axis=0)[:N].sum(axis=1)
+    covariance = np.zeros(len(residual))
+    for rows in drives:
+        own = residual[rows]
+        n = len(own)
+        power = np.abs(np.fft.rfft(own, 2 * n, axis=0)) ** 2
+        covariance[:n] += np.fft.irfft(power, 2 * n, axis=0)[:n].sum(axis=1)
     covariance[np.cumsum(covariance <= 0) > 0] = 0.0
     covariance[0] = max(covariance[0], np.finfo(float).tiny)
     return np.asarray(covariance / covariance[0])
 
 
-def predicted(samples: Samples, segments: int, models: list[Model]) -> dict[Model, HeldOut]:
+def segments_of(samples: Samples, segments: int) -> IntArray:
+    """Return the segment of each reading, shape (N,): each of one drive, each drive with one."""
+    segment, first = np.empty(len(samples), dtype=np.int64), 0
+    for rows in samples.drives:
+        n = rows.stop - rows.start
+        own = max(round(segments * n / len(samples)), 1)
+        segment[rows] = first + np.arange(n) * own // n
+        first = int(segment[rows.stop - 1]) + 1
+    return segment
+
+
+def predicted(samples: Samples, segment: IntArray, models: list[Model]) -> dict[Model, HeldOut]:
     """Return how each model, fitted to the other segments, predicts each segment."""
-    segment = np.arange(len(samples)) * segments // len(samples)
+    segments = int(segment[-1]) + 1
     residual = {model: np.empty_like(samples.z) for model in models}
     scores = {model: np.empty(segments) for model in models}
     for k in range(segments):

@@ -4,6 +4,7 @@ One QR of the weighted columns 1, b, q and db/dt serves every model: the rest wo
 triangular factor. All but the one are centred, so that directions without data are seen.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.linalg import matmul_toeplitz
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.models import Coefficients, Model, Samples
+from l2m_gtsam.models import ONE_DRIVE, Coefficients, Model, Samples
 
 ROUNDING = 1e-10  # of the largest: directions in which columns vary less follow from rounding
 EXACT = 1e-9  # of the readings' spread: what is left of them is never taken to be less
@@ -246,7 +247,9 @@ def _scaled(compressed: Compressed) -> Solution:
     return _restricted(state.C, state.derivatives(), compressed)
 
 
-def inflation(compressed: Compressed, correlation: FloatArray) -> FloatArray:
+def inflation(
+    compressed: Compressed, correlation: FloatArray, drives: Sequence[slice] = ONE_DRIVE
+) -> FloatArray:
     r"""Return by how much correlated residuals spread what the columns tell, a root, shape (P, P).
 
     Residuals with the correlation matrix :math:`\rho` have a covariance :math:`Q^T \rho Q` along
@@ -258,8 +261,11 @@ def inflation(compressed: Compressed, correlation: FloatArray) -> FloatArray:
         The columns.
     correlation
         Of weighted residuals no, one, two, ... readings apart, shape (N,).
+    drives
+        Rows of each drive: residuals of two drives are independent.
     """
-    along = compressed.Q.T @ matmul_toeplitz(correlation, compressed.Q)
+    parts = [compressed.Q[rows] for rows in drives]
+    along = np.sum([Q.T @ matmul_toeplitz(correlation[: len(Q)], Q) for Q in parts], axis=0)
     value, vector = np.linalg.eigh(along)
     return np.asarray(np.sqrt(np.maximum(value, 1.0))[:, None] * vector.T)
 

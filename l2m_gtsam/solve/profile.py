@@ -83,7 +83,7 @@ def snapshots_of(readings: Readings, most: int) -> Snapshots:
 def interpolated(own: Readings, at: Readings) -> FloatArray:
     """Return a sensor's readings at the times of others in uT, shape (K, 3).
 
-    They are NaN where the sensor read nothing near, in time or place.
+    They are NaN where the sensor read nothing near, in time or place, or not in the same drive.
     """
     field = np.full((len(at), 3), np.nan)
     if len(own) < 2:
@@ -94,6 +94,7 @@ def interpolated(own: Readings, at: Readings) -> FloatArray:
     # At the very time of a reading the other one does not matter.
     near = (close(a, at) | (share == 1)) & (close(b, at) | (share == 0))
     near &= (share >= 0) & (share <= 1)
+    near &= (a.of_drive == at.of_drive) & (b.of_drive == at.of_drive)
     field[near] = (a.field + share[:, None] * (b.field - a.field))[near]
     return field
 

@@ -95,6 +95,7 @@ class _Sensor(Lenient):
     models: ModelsEntry | None = None
     not_compared: str = ""
     moving: dict[str, MovingEntry] = Field(default_factory=dict)
+    missing_in: tuple[str, ...] = ()
 
 
 class _Disagreement(Lenient):
@@ -107,6 +108,7 @@ class _Disagreement(Lenient):
     readings: int
     size: float
     passed_again: Return
+    bag: str = ""
 
 
 class _Source(Lenient):
@@ -123,6 +125,8 @@ class _CalibrationFile(Lenient):
     doubts: tuple[str, ...] = ()
     disagreements: tuple[_Disagreement, ...] = ()
     bag: _Source | None
+    # Of several drives together; files of one do not have it.
+    bags: tuple[_Source, ...] = ()
     map: _Source | None
     options: dict[str, Any]
     versions: dict[str, str]
@@ -138,7 +142,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "uncertainty": str(result.uncertainty),
         "doubts": list(result.doubts),
         "disagreements": [_disagreement_entry(each) for each in result.disagreements],
-        "bag": source_entry(result.bag),
+        **bag_entries(result),
         "map": source_entry(result.map),
         "versions": result.versions,
         "iterations": result.iterations,
@@ -167,11 +171,13 @@ def read_calibration(path: Path) -> CalibrationResult:
         map=SourceFile(parsed.map.path, parsed.map.sha256) if parsed.map else None,
         options=parsed.options,
         versions=parsed.versions,
+        bags=tuple(SourceFile(each.path, each.sha256) for each in parsed.bags),
     )
 
 
 def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
     """Return all that is known of a sensor as plain values."""
+    missing = {"missing_in": list(sensor.missing_in)} if sensor.missing_in else {}
     return {
         "status": sensor.status.value,
         "message": sensor.message,
@@ -197,6 +203,7 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
         "moving": moving_entry(sensor.moving),
         "models": None if sensor.models is None else models_entry(sensor.models),
         "not_compared": sensor.not_compared,
+        **missing,
         "covariance": sensor.covariance.tolist(),
     }
 
@@ -226,8 +233,9 @@ def _start_entry(start: FoundStart | None) -> dict[str, Any] | None:
 
 
 def _disagreement_entry(stretch: Disagreement) -> dict[str, Any]:
+    fields = {name: value for name, value in vars(stretch).items() if name != "bag" or value}
     return {
-        **vars(stretch),
+        **fields,
         "sensors": list(stretch.sensors),
         "p_from": stretch.p_from.tolist(),
         "p_to": stretch.p_to.tolist(),
@@ -244,6 +252,12 @@ def _residuals_entry(figures: ResidualFigures | None) -> dict[str, Any] | None:
     if figures is None:
         return None
     return {**vars(figures), "rms_axes": figures.rms_axes.tolist()}
+
+
+def bag_entries(result: CalibrationResult) -> dict[str, Any]:
+    """Return which drives were calibrated: one under `bag`, several under `bags`."""
+    bag = {"bag": source_entry(result.bag)}
+    return bag | {"bags": [source_entry(each) for each in result.bags]} if result.bags else bag
 
 
 def source_entry(source: SourceFile | None) -> dict[str, str] | None:
@@ -289,4 +303,5 @@ def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
         models=None if entry.models is None else models_of(entry.models),
         not_compared=entry.not_compared,
         moving=moving_of(entry.moving),
+        missing_in=entry.missing_in,
     )

@@ -26,7 +26,8 @@ _ADAPTER = TypeAdapter(_MetricsFile)
 
 def write_metrics(path: Path, metrics: Metrics) -> None:
     """Write metrics; `read_metrics` gives them back equal."""
-    content = _ADAPTER.dump_json(_MetricsFile("l2m-metrics", 1, metrics))
+    # What only several drives have is left out of files of one.
+    content = _ADAPTER.dump_json(_MetricsFile("l2m-metrics", 1, metrics), exclude_none=True)
     with atomic_path(path) as temporary:
         temporary.write_bytes(content + b"\n")
 

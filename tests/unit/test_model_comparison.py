@@ -20,6 +20,7 @@ from l2m_gtsam.solve.model_comparison import (
     compare_models,
     correlation_of,
     predicted,
+    segments_of,
 )
 from l2m_gtsam.solve.model_fits import Fit, Solution, Spread, compress, fit_model
 from tests.model_drives import NOISE, Setting, drawn
@@ -111,7 +112,7 @@ def test_counting_correlated_readings_as_independent_finds_what_is_not_there() -
 def test_held_out_segments_are_predicted_from_the_others() -> None:
     """Against numpy's least squares on each training set, without weights."""
     samples = drawn(Model.FULL, 1, Setting(readings=90)).samples
-    held_out = predicted(samples, 3, [Model.FULL])[Model.FULL]
+    held_out = predicted(samples, segments_of(samples, 3), [Model.FULL])[Model.FULL]
     X = np.column_stack([np.ones(90), samples.b])
     errors, means = [], []
     for k in range(3):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.data import FloatArray, IntArray, Recording
 from l2m_gtsam.metric_results import Halves, MapPicture, Metrics, SensorMetrics
 from l2m_gtsam.qa.metrics.autocorrelation import autocorrelation
 from l2m_gtsam.qa.metrics.coverage import directions, drive_metrics
@@ -17,9 +17,10 @@ from l2m_gtsam.qa.metrics.evidence import (
     sensor_evidence,
 )
 from l2m_gtsam.qa.metrics.fit import fit_figures, normalised_figures
-from l2m_gtsam.qa.metrics.halves import NOT_DONE, no_halves
+from l2m_gtsam.qa.metrics.halves import NOT_DONE, SEVERAL, no_halves
 from l2m_gtsam.qa.metrics.mounting import mounting
 from l2m_gtsam.qa.metrics.plain import row, rows
+from l2m_gtsam.repeat_results import Repeatability
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
@@ -36,12 +37,20 @@ class MapForms:
     along_drive: Queryable
 
 
+@dataclass(frozen=True)
+class Repeats:
+    """Comparisons of parts by sensor: halves of one drive, or several drives."""
+
+    halves: Mapping[str, Halves]
+    drives: Mapping[str, Repeatability]
+
+
 def metrics_of(
     result: CalibrationResult,
     evidence: DriveEvidence,
-    trajectory: Trajectory,
+    recording: Recording,
     maps: MapForms,
-    halves: Mapping[str, Halves],
+    repeats: Repeats,
 ) -> Metrics:
     """Return the figures of all sensors that were solved, and of the drive.
 
@@ -51,22 +60,22 @@ def metrics_of(
         The calibration.
     evidence
         Its readings.
-    trajectory
-        Poses of the lidar in the map.
+    recording
+        What was calibrated.
     maps
         The map.
-    halves
-        Comparison of both halves of the drive by sensor, as far as there is one.
+    repeats
+        Comparisons of parts, as far as there are some.
     """
     solved = [each for each in result.sensors if each.residuals is not None]
     most = int(np.clip(DRAWN // max(len(solved), 1), FEWEST, MOST))
-    start_ns = int(evidence.readings.stamp_ns.min())
+    start_ns = starts_of(evidence)
     seen = {each.sensor: sensor_evidence(evidence, each, maps.along_drive) for each in solved}
     sensors = tuple(
         _sensor(
             each,
             seen[each.sensor],
-            halves.get(each.sensor, no_halves(NOT_DONE)),
+            repeats,
             start_ns,
             most,
         )
@@ -74,13 +83,27 @@ def metrics_of(
     )
     places = np.concatenate([each.place for each in seen.values()])
     picture = map_picture(maps.anywhere, places)
-    return Metrics(sensors, drive_metrics(trajectory), picture)
+    bags = tuple(each.source.path for each in recording.drives) or None
+    return Metrics(sensors, drive_metrics(recording), picture, bags)
+
+
+def starts_of(evidence: DriveEvidence) -> IntArray:
+    """Return the time of the first reading of each drive in nanoseconds, by their number."""
+    stamps, drive = evidence.readings.stamp_ns, evidence.readings.of_drive
+    start = np.full(int(drive.max()) + 1, np.iinfo(np.int64).max)
+    np.minimum.at(start, drive, stamps)
+    return start
 
 
 def _sensor(
-    sensor: SensorCalibration, evidence: SensorEvidence, halves: Halves, start_ns: int, most: int
+    sensor: SensorCalibration,
+    evidence: SensorEvidence,
+    repeats: Repeats,
+    start_ns: IntArray,
+    most: int,
 ) -> SensorMetrics:
-    found = curves(evidence, sensor)
+    found, drives = curves(evidence, sensor), repeats.drives.get(sensor.sensor)
+    halves = repeats.halves.get(sensor.sensor, no_halves(SEVERAL if drives else NOT_DONE))
     return SensorMetrics(
         sensor=sensor.sensor,
         mounting=mounting(sensor),
@@ -91,6 +114,7 @@ def _sensor(
         curves=curve_errors(found, evidence),
         halves=halves,
         series=series(found, evidence, start_ns, most),
+        drives=drives,
     )
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.data import FloatArray, Recording, Trajectory
 from l2m_gtsam.metric_results import Directions, DriveMetrics
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import evenly, row, rows
@@ -36,18 +36,28 @@ def sphere(count: int) -> FloatArray:
     return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
 
 
-def drive_metrics(trajectory: Trajectory) -> DriveMetrics:
-    """Return how the vehicle moved."""
-    p, up = trajectory.p, trajectory.R[:, :, 2]
+def drive_metrics(recording: Recording) -> DriveMetrics:
+    """Return how the vehicle moved, in all drives of a recording together."""
+    drives = [each.trajectory for each in recording.parts]
+    p, R = (np.concatenate(each) for each in ([d.p for d in drives], [d.R for d in drives]))
+    up = R[:, :, 2]
     mean = up.mean(axis=0) / np.linalg.norm(up.mean(axis=0))
     tilt = np.arccos(np.clip(up @ mean, -1, 1))
-    heading = np.arctan2(trajectory.R[:, 1, 0], trajectory.R[:, 0, 0])
+    heading = np.arctan2(R[:, 1, 0], R[:, 0, 0])
     sector = np.floor(np.rad2deg(heading) % 360 / HEADING_DEG)
     return DriveMetrics(
-        path=rows(p[evenly(len(p), PATH)], 3),
-        seconds=float(1e-9 * (trajectory.stamp_ns[-1] - trajectory.stamp_ns[0])),
-        length=float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()),
+        path=rows(_path(drives), 3),
+        seconds=float(sum(1e-9 * (d.stamp_ns[-1] - d.stamp_ns[0]) for d in drives)),
+        length=float(sum(np.linalg.norm(np.diff(d.p, axis=0), axis=1).sum() for d in drives)),
         heave=float(np.ptp(p[:, 2])),
         tilt_deg=float(np.rad2deg(tilt.max())),
         heading=float(len(np.unique(sector)) / (360 / HEADING_DEG)),
     )
+
+
+def _path(drives: list[Trajectory]) -> FloatArray:
+    """Return places of the lidar, thinned, with a row of NaN between two drives."""
+    most, parts = PATH // len(drives), []
+    for drive in drives:
+        parts += [np.full((1, 3), np.nan), drive.p[evenly(len(drive), most)]]
+    return np.concatenate(parts[1:])

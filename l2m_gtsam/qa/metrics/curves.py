@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.metric_results import CurveErrors, Series
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import evenly, row, rows
@@ -52,11 +52,15 @@ def curve_errors(found: Curves, evidence: SensorEvidence) -> CurveErrors:
     )
 
 
-def series(found: Curves, evidence: SensorEvidence, start_ns: int, most: int) -> Series:
-    """Return the course of a drive in at most so many readings, evenly spread."""
+def series(found: Curves, evidence: SensorEvidence, start_ns: IntArray, most: int) -> Series:
+    """Return the course of all drives in at most so many readings, evenly spread.
+
+    ``start_ns`` is when each drive starts, by its number.
+    """
     keep = evenly(len(evidence.used), most)
+    own = evidence.readings.of_drive[keep]
     return Series(
-        seconds=row(1e-9 * (evidence.readings.stamp_ns[keep] - start_ns), 2),
+        seconds=row(1e-9 * (evidence.readings.stamp_ns[keep] - start_ns[own]), 2),
         place=rows(evidence.place[keep], 2),
         residual=rows(evidence.residual[keep], 3),
         normalised=rows(evidence.white[keep], 2),
@@ -64,4 +68,5 @@ def series(found: Curves, evidence: SensorEvidence, start_ns: int, most: int) ->
         before=rows(found.before[keep], 2),
         after=rows(found.after[keep], 2),
         map=rows(found.map[keep], 2),
+        drive=None if evidence.readings.drive is None else tuple(own.tolist()),
     )

@@ -1,27 +1,48 @@
-"""Two calibrations of one sensor beside each other."""
+"""Two calibrations of one sensor on different readings beside each other."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, FloatArray
+from l2m_gtsam.data import BoolArray, Distortion, FloatArray
 from l2m_gtsam.metric_results import Halves
 from l2m_gtsam.qa.metrics.plain import row
 
 TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas
+SEVERAL = "several drives are compared with each other instead of halves of one"
 NOT_DONE = "halves of the drive were not calibrated by themselves (`qa.halves`)"
 
 
 @dataclass(frozen=True)
-class Half:
-    """What one half of a drive says of a sensor: (t, C row by row, H), (15,), and its covariance.
+class Part:
+    """What a part of the readings says of a sensor.
 
-    Variances of what it leaves open are infinite.
+    Attributes
+    ----------
+    vector
+        (t, C row by row, H) in m and uT, shape (15,).
+    covariance
+        Its covariance, shape (15, 15); variances of what it leaves open are infinite.
+    shared_root
+        Two parts have ``root_a @ root_b.T`` of their covariances in common, shape (15, K); absent
+        where that is not known.
     """
 
     vector: FloatArray
     covariance: FloatArray
+    shared_root: FloatArray | None = None
+
+    @property
+    def known(self) -> BoolArray:
+        """What it determines, shape (15,)."""
+        return np.isfinite(np.diag(self.covariance))
+
+    def shared(self, other: "Part") -> FloatArray:
+        """Return the covariance with another part, shape (15, 15); zero where it is not known."""
+        if self.shared_root is None or other.shared_root is None:
+            return np.zeros_like(self.covariance)
+        return np.asarray(self.shared_root @ other.shared_root.T)
 
 
 def no_halves(reason: str) -> Halves:
@@ -30,14 +51,17 @@ def no_halves(reason: str) -> Halves:
     return Halves((nothing,) * 15, (nothing,) * 15, nothing, 0, nothing, reason)
 
 
-def compare_halves(first: Half, second: Half) -> Halves:
+def compare_halves(first: Part, second: Part) -> Halves:
     """Return by how much two calibrations differ, in units and in sigmas.
 
-    Errors that both share, of the same places of the map, count as if each had its own: the
-    distance is too small rather than too large.
+    Errors that both share, of the same places of the map, drop out as far as they are known to be
+    shared. Else they count as if each had its own: the distance is then too small rather than too
+    large.
     """
     difference = second.vector - first.vector
     covariance = first.covariance + second.covariance
+    if first.shared_root is not None and second.shared_root is not None:
+        covariance -= first.shared(second) + second.shared(first)
     known = np.isfinite(np.diag(covariance))
     sigma = np.sqrt(np.diag(covariance))
     if not known.any():

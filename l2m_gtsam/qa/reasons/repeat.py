@@ -1,8 +1,12 @@
-"""Whether both halves of a drive tell the same."""
+"""Whether parts of what was driven tell the same: halves of a drive, or several drives."""
 
-from l2m_gtsam.metric_results import Halves
+from pathlib import Path
+
+from l2m_gtsam.metric_results import Halves, SensorMetrics
 from l2m_gtsam.qa.metrics.misfit import halves_agree
+from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason, level_of
+from l2m_gtsam.repeat_results import DriveRepeat, Repeatability
 from l2m_gtsam.results import SensorStatus
 
 # What a solve that ended otherwise says of its halves says nothing of the mounting.
@@ -10,21 +14,59 @@ JUDGED = (SensorStatus.SOLVED, SensorStatus.CONTRADICTED, SensorStatus.NOT_CONVE
 
 
 def repeat(case: Case) -> list[Reason]:
-    """Return by how much both halves differ, where they do."""
+    """Return by how much parts differ, where they do, and which cannot be looked at."""
     if case.metrics is None or case.sensor.status not in JUDGED:
         return []
-    halves, options = case.metrics.halves, case.options
-    if halves_agree(halves, options):
-        return []
-    level = level_of(halves.distance, options.halves_sigmas)
-    return [Reason(*_meaning(case, level, _difference(halves)))]
+    notes = _not_looked_at(case.metrics)
+    halves = differing(case.metrics, case.options)
+    if halves is None:
+        return notes
+    level = level_of(halves.distance, case.options.halves_sigmas)
+    difference = _difference(halves, _where(case.metrics, case.options))
+    return [Reason(*_meaning(case, level, difference)), *notes]
 
 
-def _difference(halves: Halves) -> str:
+def differing(metrics: SensorMetrics, options: QaOptions) -> Halves | None:
+    """Return the comparison of parts that do not agree: of several drives the furthest one."""
+    if metrics.drives is None:
+        return None if halves_agree(metrics.halves, options) else metrics.halves
+    furthest = _furthest(metrics.drives, options)
+    return None if furthest is None else furthest.others
+
+
+def _furthest(drives: Repeatability, options: QaOptions) -> DriveRepeat | None:
+    """Return the drive that is furthest from the others; of two the later one."""
+    off = [each for each in drives.compared if not halves_agree(each.others, options)]
+    # Both of two drives are equally far from each other, to rounding.
+    return max(reversed(off), key=lambda each: round(each.others.distance, 6), default=None)
+
+
+def _compared(metrics: SensorMetrics) -> bool:
+    if metrics.drives is None:
+        return not metrics.halves.reason
+    return len(metrics.drives.compared) > 1
+
+
+def _where(metrics: SensorMetrics, options: QaOptions) -> str:
+    """Return where it differs, as the beginning of a clause."""
+    furthest = None if metrics.drives is None else _furthest(metrics.drives, options)
+    if metrics.drives is None or furthest is None:
+        return "calibrated on both halves of the drive it differs by"
+    name = Path(furthest.bag).name
+    others = [each for each in metrics.drives.compared if each is not furthest]
+    if len(others) == 1:
+        return (
+            "calibrated on each drive by itself it differs between "
+            f"{Path(others[0].bag).name} and {name} by"
+        )
+    return f"calibrated on each drive by itself it differs in {name} from the other drives by"
+
+
+def _difference(halves: Halves, where: str) -> str:
     t = ", ".join(f"{1e3 * each:.0f}" for each in halves.difference[:3])
     H = ", ".join(f"{each:.1f}" for each in halves.difference[12:])
     return (
-        f"calibrated on both halves of the drive it differs by ({t}) mm in place, "
+        f"{where} ({t}) mm in place, "
         f"{halves.turned_deg:.1f}° in rotation and ({H}) µT in H: {halves.distance:.1f} times as "
         "much as the sigmas allow"
     )
@@ -32,17 +74,36 @@ def _difference(halves: Halves) -> str:
 
 def _meaning(case: Case, level: Level, difference: str) -> tuple[Level, str]:
     """Return what it means: other sensors saw the same map from the same poses."""
-    others = [each.halves for each in case.others if not each.halves.reason]
-    same = [halves_agree(each, case.options) for each in others]
+    others = [each for each in case.others if _compared(each)]
+    same = [differing(each, case.options) is None for each in others]
     disturbed = any(case.sensor.sensor in each.sensors for each in case.result.disagreements)
     if same and sum(same) > len(same) / 2 and level is Level.FAIL:
         return level, (
             f"It does not hold still: {difference}, while other sensors repeat. It moved on its "
-            "mount, or something magnetic near it did; fasten it and drive again."
+            f"mount, or something magnetic near it did; {_remedy(case)}."
         )
-    if disturbed:
+    if disturbed and not case.result.bags:
         return Level.WARN, (
             f"It repeats less well than its sigmas say: {difference}. Readings where the place has "
             "changed since it was mapped were rejected; near them others may be a little off."
         )
     return level, f"It does not repeat: {difference}."
+
+
+def _remedy(case: Case) -> str:
+    if case.result.bags:
+        return "fasten it, and calibrate drives from before and after apart"
+    return "fasten it and drive again"
+
+
+def _not_looked_at(metrics: SensorMetrics) -> list[Reason]:
+    """Return which of several drives say nothing by themselves, and why."""
+    drives = () if metrics.drives is None else metrics.drives.drives
+    return [
+        Reason(
+            Level.PASS,
+            f"{Path(each.bag).name} is not compared with the other drives: {each.reason}.",
+        )
+        for each in drives
+        if each.reason
+    ]

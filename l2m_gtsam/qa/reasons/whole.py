@@ -1,5 +1,7 @@
 """What concerns all sensors: the map, the place, the drive."""
 
+from pathlib import Path
+
 import numpy as np
 
 from l2m_gtsam.qa.reasons.fit import misfit
@@ -86,13 +88,15 @@ def _shared(stretch: Disagreement, result: CalibrationResult) -> bool:
 def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
     (x0, y0), (x1, y1) = stretch.p_from[:2], stretch.p_to[:2]
     count = len(stretch.sensors)
-    start = min(each.start_ns for each in result.disagreements)
+    start = min(each.start_ns for each in result.disagreements if each.bag == stretch.bag)
     after = 1e-9 * (stretch.start_ns - start)
     when = f", {after:.0f} s after the first" if after >= 1 else ""
+    drive = f" in {Path(stretch.bag).name}" if stretch.bag else ""
     return (
         f"{HEADS[stretch.passed_again]}: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on "
-        f"the map{when}, {stretch.length:.1f} m long, {count} sensor{'s' if count > 1 else ''} "
-        f"differ{'' if count > 1 else 's'} by {stretch.size:.2g} µT. "
+        f"the map{drive}{when}, {stretch.length:.1f} m long, "
+        f"{count} sensor{'s' if count > 1 else ''} differ{'' if count > 1 else 's'} by "
+        f"{stretch.size:.2g} µT. "
         f"{TAILS[stretch.passed_again]}. These {stretch.readings} readings do not count."
     )
 

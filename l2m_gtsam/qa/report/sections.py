@@ -12,8 +12,10 @@ from l2m_gtsam.qa.report import words
 from l2m_gtsam.qa.report.figures import course, place, statistics
 from l2m_gtsam.qa.report.figures.correlations import correlation_figure
 from l2m_gtsam.qa.report.figures.directions import directions_figure
+from l2m_gtsam.qa.report.figures.drives import drive_names, drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.svg import as_svg
+from l2m_gtsam.repeat_results import Repeatability
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 
 
@@ -73,7 +75,9 @@ def overall_pictures(
         for index, view in enumerate((TOP, SIDE))
     )
     drive = metrics.drive
-    where = f"A drive of {drive.length:.0f} m in {drive.seconds:.0f} s"
+    count = len(metrics.bags or ())
+    what = f"{count} drives" if count else "A drive"
+    where = f"{what} of {drive.length:.0f} m in {drive.seconds:.0f} s"
     on_map = (
         picture(
             "Field and drive",
@@ -131,6 +135,8 @@ def _pictures(anchor: str, sensor: SensorCalibration, found: SensorMetrics) -> t
     ]
     if not found.halves.reason:
         pictures.insert(3, _halves(anchor, name, found))
+    if found.drives is not None and found.drives.compared:
+        pictures.insert(3, _drives(anchor, sensor, found.drives))
     return tuple(pictures)
 
 
@@ -181,6 +187,19 @@ def _halves(anchor: str, name: str, found: SensorMetrics) -> Picture:
         f"Each half of the drive by itself: {halves.distance:.1f} times as far apart as expected "
         f"(1 is consistent), by {1e3 * np.linalg.norm(halves.difference[:3]):.0f} mm and "
         f"{halves.turned_deg:.1f}°.",
+    )
+
+
+def _drives(anchor: str, sensor: SensorCalibration, found: Repeatability) -> Picture:
+    names = drive_names([each.bag for each in found.drives])
+    return picture(
+        "Repeatability between drives",
+        drives_figure(sensor, found),
+        f"{anchor}-drives",
+        f"{sensor.sensor} calibrated on each drive by itself, less all together, with standard "
+        f"deviations: {words.drives(found)}.",
+        f"Each drive by itself less all together (grey: its sigma), ± 1 sigma; a cross is a drive "
+        f"that does not tell. {words.drives(found)}. Drives: {names}.",
     )
 
 

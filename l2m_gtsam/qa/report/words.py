@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.metric_results import SensorMetrics
 from l2m_gtsam.qa.report.figures.correlations import NAMES, correlations
+from l2m_gtsam.repeat_results import Repeatability
 from l2m_gtsam.results import CalibrationResult, SensorCalibration, Uncertainty
 from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
@@ -73,7 +74,9 @@ def rests_on(metrics: SensorMetrics, result: CalibrationResult) -> list[str]:
     if fit.pose_noise > 0:
         parts += f", poses {fit.pose_noise:.2f} µT"
     worth = metrics.autocorrelation.independent
-    sentences = [
+    missing = next(each.missing_in for each in result.sensors if each.sensor == metrics.sensor)
+    sentences = [f"Nothing usable was read of it in {', '.join(missing)}."] if missing else []
+    sentences += [
         f"{fit.readings:,} readings, as correlated in time as {worth:,.0f} independent ones.",
         f"Noise of each, per axis: {parts}.",
         f"How the map's errors count: {UNCERTAINTY[result.uncertainty]}.",
@@ -81,6 +84,17 @@ def rests_on(metrics: SensorMetrics, result: CalibrationResult) -> list[str]:
     if result.uncertainty is Uncertainty.INDEPENDENT:
         sentences.append("Sigmas of this kind are lower bounds.")
     return sentences
+
+
+def drives(found: Repeatability) -> str:
+    """Return how far drives are apart beside what chance allows, as a sentence without its end."""
+    if not found.freedom:
+        return "Too few drives tell the same parameters to compare them"
+    ratio, low, high = (each / found.freedom for each in (found.squared, found.low, found.high))
+    return (
+        f"Normalised square of what they differ by, per degree of freedom: {ratio:.2f} (1 is "
+        f"consistent, {low:.2f} to {high:.2f} in 95 % of cases)"
+    )
 
 
 def strongest(sensor: SensorCalibration) -> str:

@@ -61,9 +61,10 @@ class Export:
         """Where the file comes from and what is not in it, a printable line each."""
         made_by = self.result.versions.get("l2m-gtsam", "")
         lines = [f"Magnetometers calibrated against a LiDAR by l2m_gtsam {made_by}".rstrip()]
-        for name, source in (("drive", self.result.bag), ("map", self.result.map)):
-            if source is not None:
-                lines.append(f"{name}: {Path(source.path).name}, sha256 {source.sha256}")
+        sources = [("drive", each) for each in self.result.drives]
+        sources += [("map", self.result.map)] if self.result.map else []
+        for name, source in sources:
+            lines.append(f"{name}: {Path(source.path).name}, sha256 {source.sha256}")
         lines += [f"left out: {name}: {reason}" for name, reason in self.left_out.items()]
         return tuple(_printable(line) for line in lines)
 

@@ -4,7 +4,7 @@ import json
 import math
 from typing import Any
 
-from l2m_gtsam.storage.calibration_file import sensor_entry, source_entry
+from l2m_gtsam.storage.calibration_file import bag_entries, sensor_entry, source_entry
 from l2m_gtsam.storage.calibration_legend import MODEL, UNCERTAINTY
 from l2m_gtsam.storage.exports.export import Export
 
@@ -22,7 +22,7 @@ def json_text(export: Export) -> str:
         "version": 1,
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL, "infinite": UNKNOWN},
         "lidar_frame": export.lidar_frame,
-        "bag": source_entry(result.bag),
+        **bag_entries(result),
         "map": source_entry(result.map),
         "versions": result.versions,
         "doubts": list(result.doubts),

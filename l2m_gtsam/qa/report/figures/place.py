@@ -86,10 +86,17 @@ def _drive(axes: Axes, metrics: Metrics) -> None:
     path = np.array(metrics.drive.path)[:, :2].T
     axes.plot(*path, color="white", linewidth=2.4)
     axes.plot(*path, color="black", linewidth=0.9)
-    axes.plot(*path[:, 0], "o", color="white", markeredgecolor="black", markersize=6)
+    starts = [0, *(np.flatnonzero(np.isnan(path[0])) + 1)]
+    for k, first in enumerate(starts):
+        name = "start" if len(starts) == 1 else f"start {k + 1}"
+        _start(axes, path[:, first], name)
+
+
+def _start(axes: Axes, place: FloatArray, name: str) -> None:
+    axes.plot(*place, "o", color="white", markeredgecolor="black", markersize=6)
     axes.annotate(
-        "start",
-        tuple(path[:, 0]),
+        name,
+        tuple(place),
         xytext=(6, 6),
         textcoords="offset points",
         fontsize=SMALL,

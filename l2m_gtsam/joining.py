@@ -1,0 +1,292 @@
+"""Several drives of one vehicle as one recording.
+
+Each drive keeps its own time; beside it stands a time in which drives follow each other, a minute
+apart. Whatever belongs to a stretch of time (poses, their errors, runs of rejected readings) then
+ends where a drive ends, and no clock has to run on from one drive to the next.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations, pairwise
+
+import numpy as np
+
+from l2m_gtsam.data import (
+    FieldSeries,
+    FloatArray,
+    IntArray,
+    PoseMotion,
+    Readings,
+    Recording,
+    ScalarSeries,
+    SourceFile,
+    SyncCounts,
+    Synchronised,
+    Trajectory,
+)
+from l2m_gtsam.errors import CalibrationError
+
+# Between drives. Longer than any pause that is looked for in readings, and than any time offset.
+PAUSE_NS = 60_000_000_000
+# In the middle of it the lidar goes from where a drive ended to where the next starts.
+JUMP_NS = 1_000_000
+
+
+def joined(recordings: Sequence[Recording]) -> Recording:
+    """Return drives as one recording, in order of time; a single one as it is.
+
+    A drive's own time is kept in ``Recording.drives``. Where the drives of a result come in which
+    order does not depend on the order in which they are given.
+
+    Parameters
+    ----------
+    recordings
+        Drives of one vehicle whose poses are in one map frame. Sensors are the same if their names
+        are; one may be missing in some drives.
+
+    Raises
+    ------
+    CalibrationError
+        There is no drive, one of them twice, or drives have frames, recorded numbers or sensors
+        that do not go together.
+    """
+    if not recordings:
+        raise CalibrationError("no drive is given; give one bag or several")
+    if len(recordings) == 1:
+        return recordings[0]
+    _check(recordings)
+    drives = tuple(sorted(recordings, key=_when))
+    moved = _moved_ns([each.trajectory for each in drives])
+    return Recording(
+        trajectory=_trajectory(drives, moved),
+        series=tuple(_series(name, drives, moved) for name in _sensors(drives)),
+        source=_source(drives),
+        scalars=tuple(_scalar(each.name, drives, moved) for each in drives[0].scalars),
+        drives=drives,
+        moved_ns=moved,
+    )
+
+
+def joined_readings(parts: Sequence[Synchronised], recording: Recording) -> Synchronised:
+    """Return the readings of all drives of a recording as one batch; of a single one as they are.
+
+    A drive without motion of its own counts as standing still, one without pose errors as exact.
+
+    Parameters
+    ----------
+    parts
+        Of each drive, in its own time.
+    recording
+        What they are of.
+    """
+    if not recording.drives:
+        return parts[0]
+    names = tuple(each.sensor for each in recording.series)
+    readings = [each.readings for each in parts]
+    sensor = np.concatenate(
+        [np.array([names.index(n) for n in r.sensors], dtype=np.int64)[r.sensor] for r in readings]
+    )
+    drive = np.repeat(np.arange(len(readings)), [len(each) for each in readings])
+    stamps = [r.stamp_ns + by for r, by in zip(readings, recording.moved_ns, strict=True)]
+    whole = Readings(
+        sensors=names,
+        sensor=sensor,
+        stamp_ns=np.concatenate(stamps),
+        R_map_lidar=np.concatenate([each.R_map_lidar for each in readings]),
+        p_map_lidar=np.concatenate([each.p_map_lidar for each in readings]),
+        field=np.concatenate([each.field for each in readings]),
+        motion=_motion(readings),
+        pose_root=_pose_root(readings),
+        regressors=_regressors(readings),
+        drive=drive,
+    )
+    counts = tuple(_counts(name, parts) for name in names)
+    return Synchronised(whole[np.argsort(sensor, kind="stable")], counts)
+
+
+def drive_at(recording: Recording, stamp_ns: int) -> int:
+    """Return which drive of a recording a time of its readings, in nanoseconds, belongs to."""
+    starts = [
+        drive.trajectory.stamp_ns[0] + by - PAUSE_NS // 2
+        for drive, by in zip(recording.drives, recording.moved_ns, strict=True)
+    ]
+    return max(int(np.searchsorted(starts, stamp_ns, side="right")) - 1, 0)
+
+
+def own_ns(recording: Recording, stamp_ns: int) -> int:
+    """Return a time of a recording's readings as its drive counts it, nanoseconds."""
+    moved = recording.moved_ns
+    return stamp_ns - moved[drive_at(recording, stamp_ns)] if moved else stamp_ns
+
+
+def _check(recordings: Sequence[Recording]) -> None:
+    for one, other in combinations(recordings, 2):
+        if _same(one, other):
+            raise CalibrationError(
+                f"{one.source.path} and {other.source.path} are the same drive, which cannot be "
+                "its own witness; give each drive once"
+            )
+    first = recordings[0]
+    for each in recordings:
+        path, poses = each.source.path, each.trajectory
+        if not len(poses):
+            raise CalibrationError(f"{path}: it has no poses; leave it out")
+        for what, mine, theirs in (
+            ("its poses are in frame", first.trajectory.frame, poses.frame),
+            ("its poses are those of", first.trajectory.child_frame, poses.child_frame),
+        ):
+            if mine != theirs:
+                raise CalibrationError(
+                    f"{path}: {what} {theirs!r}, those of {first.source.path} {mine!r}; drives can "
+                    "be joined if both are the same (a map frame of another name: `bag.frame`)"
+                )
+        if {s.name for s in each.scalars} != {s.name for s in first.scalars}:
+            raise CalibrationError(
+                f"{path}: it has other recorded numbers than {first.source.path}; both need those "
+                "of `bag.regressors`"
+            )
+        others = {s.sensor for r in recordings if r is not each for s in r.series}
+        own = [s.sensor for s in each.series]
+        if others.isdisjoint(own):
+            raise CalibrationError(
+                f"{path}: none of its sensors ({', '.join(own)}) is in another drive, which have "
+                f"{', '.join(sorted(others))}; calibrate it by itself"
+            )
+
+
+def _same(one: Recording, other: Recording) -> bool:
+    """Whether two recordings hold the same drive, in whatever kind of file."""
+    if one.source.sha256 and one.source.sha256 == other.source.sha256:
+        return True
+    theirs = {each.sensor: each for each in other.series}
+    pairs = [(each, theirs[each.sensor]) for each in one.series if each.sensor in theirs]
+    return (
+        any(len(each) for each, _ in pairs)
+        and np.array_equal(one.trajectory.stamp_ns, other.trajectory.stamp_ns)
+        and np.array_equal(one.trajectory.p, other.trajectory.p)
+        and all(np.array_equal(a.stamp_ns, b.stamp_ns) for a, b in pairs)
+        and all(np.array_equal(a.field, b.field, equal_nan=True) for a, b in pairs)
+    )
+
+
+def _when(recording: Recording) -> tuple[int, str, str]:
+    """Return what orders drives: their start; of clocks that start alike anything that is fixed."""
+    return (
+        int(recording.trajectory.stamp_ns[0]),
+        recording.source.sha256,
+        recording.source.path,
+    )
+
+
+def _moved_ns(trajectories: Sequence[Trajectory]) -> tuple[int, ...]:
+    """Return by how much each drive is moved so that it starts a pause after the last one's end."""
+    moved = [0]
+    for last, following in pairwise(trajectories):
+        end = int(last.stamp_ns[-1]) + moved[-1]
+        moved.append(end + PAUSE_NS - int(following.stamp_ns[0]))
+    return tuple(moved)
+
+
+def _trajectory(drives: Sequence[Recording], moved: Sequence[int]) -> Trajectory:
+    """Return all poses; in the pauses the lidar stands where a drive ended, then where one starts.
+
+    So a pose beyond a drive's end is that of its end, as it is for a single drive.
+    """
+    stamps: list[IntArray] = []
+    rows: list[tuple[int, IntArray]] = []
+    for k, (drive, by) in enumerate(zip(drives, moved, strict=True)):
+        own = drive.trajectory.stamp_ns + by
+        before = [own[0] - PAUSE_NS // 2 + JUMP_NS] if k > 0 else []
+        after = [own[-1] + PAUSE_NS // 2] if k + 1 < len(drives) else []
+        stamps.append(np.concatenate([before, own, after]).astype(np.int64))
+        first, last = [0] * len(before), [len(own) - 1] * len(after)
+        rows.append((k, np.concatenate([first, np.arange(len(own)), last]).astype(np.int64)))
+    poses = [drive.trajectory for drive in drives]
+    covariances = [each.covariance for each in poses]
+    known = [each for each in covariances if each is not None]
+    return Trajectory(
+        stamp_ns=np.concatenate(stamps),
+        R=np.concatenate([poses[k].R[at] for k, at in rows]),
+        p=np.concatenate([poses[k].p[at] for k, at in rows]),
+        frame=poses[0].frame,
+        child_frame=poses[0].child_frame,
+        covariance=np.concatenate([known[k][at] for k, at in rows])
+        if len(known) == len(poses)
+        else None,
+    )
+
+
+def _sensors(drives: Sequence[Recording]) -> list[str]:
+    return list(dict.fromkeys(each.sensor for drive in drives for each in drive.series))
+
+
+def _series(name: str, drives: Sequence[Recording], moved: Sequence[int]) -> FieldSeries:
+    """Return a sensor's readings of all drives, in order of time."""
+    found = [
+        (each, by)
+        for drive, by in zip(drives, moved, strict=True)
+        for each in drive.series
+        if each.sensor == name
+    ]
+    stamps = np.concatenate([each.stamp_ns + by for each, by in found])
+    order = np.argsort(stamps, kind="stable")
+    field = np.concatenate([each.field for each, _ in found])
+    return replace(found[0][0], stamp_ns=stamps[order], field=field[order])
+
+
+def _scalar(name: str, drives: Sequence[Recording], moved: Sequence[int]) -> ScalarSeries:
+    """Return a recorded number of all drives, in order of time."""
+    found = [next(each for each in drive.scalars if each.name == name) for drive in drives]
+    stamps = np.concatenate([s.stamp_ns + by for s, by in zip(found, moved, strict=True)])
+    unique, first = np.unique(stamps, return_index=True)
+    value = np.concatenate([each.value for each in found])
+    return replace(found[0], stamp_ns=unique, value=value[first])
+
+
+def _source(drives: Sequence[Recording]) -> SourceFile:
+    """Return all files together, for messages."""
+    digests = "\0".join(each.source.sha256 for each in drives)
+    paths = ", ".join(each.source.path for each in drives)
+    return SourceFile(paths, hashlib.sha256(digests.encode()).hexdigest())
+
+
+def _motion(readings: Sequence[Readings]) -> PoseMotion | None:
+    if all(each.motion is None for each in readings):
+        return None
+    motions = [
+        PoseMotion(np.zeros((len(each), 6)), np.zeros(len(each)))
+        if each.motion is None
+        else each.motion
+        for each in readings
+    ]
+    return PoseMotion(
+        np.concatenate([each.twist_lidar for each in motions]),
+        np.concatenate([each.offset for each in motions]),
+    )
+
+
+def _pose_root(readings: Sequence[Readings]) -> FloatArray | None:
+    if all(each.pose_root is None for each in readings):
+        return None
+    return np.concatenate(
+        [
+            np.zeros((len(each), 6, 6)) if each.pose_root is None else each.pose_root
+            for each in readings
+        ]
+    )
+
+
+def _regressors(readings: Sequence[Readings]) -> FloatArray | None:
+    found = [each.regressors for each in readings if each.regressors is not None]
+    return np.concatenate(found) if found else None
+
+
+def _counts(name: str, parts: Sequence[Synchronised]) -> SyncCounts:
+    """Return the account of a sensor's readings in all drives."""
+    own = [
+        vars(each.counts[each.readings.sensors.index(name)])
+        for each in parts
+        if name in each.readings.sensors
+    ]
+    return SyncCounts(**{field: sum(each[field] for each in own) for field in own[0]})
