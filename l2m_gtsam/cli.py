@@ -13,6 +13,7 @@ import typer
 from l2m_gtsam.commands import exports
 from l2m_gtsam.commands.fleet import batch
 from l2m_gtsam.commands.report import report
+from l2m_gtsam.commands.slam import slam
 from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
 from l2m_gtsam.commands.validate import validate
@@ -34,6 +35,7 @@ app.command()(batch)
 exports.register(app)
 app.command()(report)
 app.command()(validate)
+app.command()(slam)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")

@@ -9,6 +9,7 @@ from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.graph.prior_options import PriorOptions
+from l2m_gtsam.graph.slam.options import SlamOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
@@ -83,6 +84,8 @@ class Config(Options):
     """`l2m calibrate`, and `l2m plan` before it."""
     plan: PlanOptions = PlanOptions()
     """`l2m plan`."""
+    slam: SlamOptions = SlamOptions()
+    """`l2m slam`."""
     qa: QaOptions = QaOptions()
     """Verdicts of `l2m report`."""
     fleet: FleetOptions = FleetOptions()

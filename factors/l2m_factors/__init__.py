@@ -1,9 +1,16 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
+from l2m_factors.carried import (
+    Calibrations,
+    CarriedReadings,
+    CarriedResiduals,
+    carried_residuals,
+)
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.field_map import FieldMap
-from l2m_factors.keys import D, M, P, Q, S, T
-from l2m_factors.motion import PoseMotion, moved
+from l2m_factors.keys import D, M, P, Q, S, T, X
+from l2m_factors.motion import PoseMotion, moved, skew
+from l2m_factors.pose import CarriedBatch, key_pose_factor
 from l2m_factors.priors import (
     distance_prior,
     distortion_prior,
@@ -22,6 +29,10 @@ from l2m_factors.shared_errors import (
 
 __all__ = [
     "BatchedReadings",
+    "Calibrations",
+    "CarriedBatch",
+    "CarriedReadings",
+    "CarriedResiduals",
     "D",
     "FieldMap",
     "M",
@@ -33,12 +44,15 @@ __all__ = [
     "S",
     "SharedError",
     "T",
+    "X",
     "assert_jacobians_match",
     "block_factor",
+    "carried_residuals",
     "distance_prior",
     "distortion_prior",
     "field_rate",
     "held_directions",
+    "key_pose_factor",
     "map_weights_prior",
     "moved",
     "pose_errors_prior",
@@ -46,5 +60,6 @@ __all__ = [
     "reading_residuals",
     "rotation_prior",
     "shared_error",
+    "skew",
     "uncertain_block_factor",
 ]

@@ -3,6 +3,11 @@
 import gtsam
 
 
+def X(key_pose: int) -> int:
+    """Return the key of this key pose, ``T_map_lidar``: Pose3, metres."""
+    return int(gtsam.symbol("X", key_pose))
+
+
 def T(sensor: int) -> int:
     """Return the key of ``t_lidar_mag`` of this sensor: Point3, metres, lidar frame."""
     return int(gtsam.symbol("T", sensor))

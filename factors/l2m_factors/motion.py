@@ -62,9 +62,14 @@ def moved(
 def rotation_matrices(vectors: FloatArray) -> FloatArray:
     """Return the rotations by rotation vectors in radians, shape (N, 3): Rodrigues' formula."""
     angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    K = np.zeros((len(vectors), 3, 3))
-    K[:, [2, 0, 1], [1, 2, 0]] = vectors
-    K -= K.transpose(0, 2, 1)
+    K = skew(vectors)
     # np.sinc(x) is sin(pi x) / (pi x), without a hole at zero.
     sine, half = np.sinc(angle / np.pi), np.sinc(angle / (2 * np.pi))
     return np.asarray(np.eye(3) + sine * K + 0.5 * half**2 * K @ K)
+
+
+def skew(vectors: FloatArray) -> FloatArray:
+    """Return the matrices ``[v]x``, shape (N, 3, 3)."""
+    K = np.zeros((len(vectors), 3, 3))
+    K[:, [2, 0, 1], [1, 2, 0]] = vectors
+    return np.asarray(K - K.transpose(0, 2, 1))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l2m_factors import skew
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.view import QueryableMap
@@ -132,13 +133,6 @@ def pose_features(
     """
     turn = skew(b_lidar) - slope @ skew(t)
     return np.asarray(np.concatenate([turn, slope], axis=2) @ pose_root)
-
-
-def skew(vectors: FloatArray) -> FloatArray:
-    """Return the matrices ``[v]x``, shape (N, 3, 3)."""
-    K = np.zeros((len(vectors), 3, 3))
-    K[:, [2, 0, 1], [1, 2, 0]] = vectors
-    return np.asarray(K - K.transpose(0, 2, 1))
 
 
 def pose_seconds(readings: Readings) -> FloatArray:

@@ -14,15 +14,6 @@ from l2m_gtsam.storage.known_sensors import read_known_sensors
 from tests.bags import Entry, ros, write
 from tests.end_to_end.conftest import Demo, complaint, complaint_here, l2m
 
-SMALL_HALL = """\
-floor_plan: {length: 11.0, width: 6.4, rack_rows: 1, rack_depth: 1.4, blocks: 1, cross_aisle: 3.4}
-suite: {lateral: [-0.3, 0.3], heights: [-0.5, 0.0]}
-array: {count: 2}
-mapping_sampling: {field_rate: 5.0}
-calibration_sampling: {field_rate: 4.0}
-calibration_route: {turns: 1}
-"""
-
 
 def test_help_loads_nothing_heavy() -> None:
     """It answers within half a second only as long as the mathematics stays unloaded."""
@@ -60,25 +51,21 @@ def test_demo_ends_with_truth_and_estimate(demo: Demo) -> None:
         assert picture.width > 1000
 
 
-def test_another_container_gives_the_same_calibration(tmp_path: Path, repository: Path) -> None:
+def test_another_container_gives_the_same_calibration(
+    demo: Demo, tmp_path: Path, repository: Path
+) -> None:
     """Simulated again with the same seed, as ROS1, with the example configuration: same bits."""
-    options, config = tmp_path / "hall.yaml", repository / "configs" / "warehouse.yaml"
-    options.write_text(SMALL_HALL, encoding="utf-8")
-    first, second = tmp_path / "mcap", tmp_path / "ros1"
-    for folder in (first, second):
-        l2m("simulate", "--options", options, "--out", folder, "--kind", folder.name)
-    wanted = ("--config", config, "--suite", first / "suite.yaml", "--out", tmp_path / "map.npz")
-    structure = ("--structure", first / "structure.ply")
-    l2m("map", "build", first / "mapping_mcap", *structure, *wanted)
-    wanted = ("--map", tmp_path / "map.npz", "--config", config)
-    for bag in (first / "calibration_mcap", second / "calibration_ros1.bag"):
-        assert l2m("calibrate", bag, *wanted, "--out", bag.parent / "r").out.count("solved") == 2
-    a = read_calibration(first / "r" / "calibration.yaml")
-    b = read_calibration(second / "r" / "calibration.yaml")
+    l2m("simulate", "--out", tmp_path, "--kind", "ros1")
+    config = repository / "configs" / "warehouse.yaml"
+    bag = tmp_path / "calibration_ros1.bag"
+    out = l2m("calibrate", bag, "--map", demo.map, "--config", config, "--out", tmp_path / "r").out
+    assert out.count("solved") == 12
+    a = read_calibration(demo.folder / "calibration.yaml")
+    b = read_calibration(tmp_path / "r" / "calibration.yaml")
     for x, y in zip(a.sensors, b.sensors, strict=True):
         np.testing.assert_array_equal(x.t_lidar_mag, y.t_lidar_mag)
         np.testing.assert_array_equal(x.covariance, y.covariance)
-    assert (first / "truth.yaml").read_text() == (second / "truth.yaml").read_text()
+    assert (tmp_path / "truth.yaml").read_text() == (demo.folder / "truth.yaml").read_text()
 
 
 def test_optitrack_configuration_on_real_bags(

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from l2m_factors import skew
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.innovation import KnownCalibration, told_by
-from l2m_gtsam.graph.pose_errors import pose_seconds, skew
+from l2m_gtsam.graph.pose_errors import pose_seconds
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.solve.alterations import against_calibration, changes_of
 from tests.calibrations import SIGMA

@@ -1,0 +1,36 @@
+"""``l2m slam``: where the vehicle was."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
+
+
+def slam(
+    bag: Annotated[
+        Path,
+        typer.Argument(metavar="BAG", help="Drive with odometry: ROS1 .bag, ROS2 folder, .mcap."),
+    ],
+    map_path: Annotated[Path, typer.Option("--map", help="Map file made by `l2m map build`.")],
+    calibration: Annotated[
+        Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
+    ],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the results.")],
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML configuration; see `slam` in it.")
+    ] = None,
+) -> None:
+    """Localise a drive in a magnetic map: odometry and magnetometers, from a known start."""
+    from l2m_gtsam.batch.slam import SlamInput, slam_bag
+    from l2m_gtsam.config import load_config
+    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table
+
+    with shown_progress() as progress:
+        result = slam_bag(SlamInput(bag, map_path, calibration), load_config(config), out, progress)
+    print_table(slam_table(result))
+    for line in drift_lines(result):
+        typer.echo(line)
+    warn(result.notes)
+    typer.echo(f"written: {out}")

@@ -1,0 +1,1 @@
+"""Poses as unknowns: localisation in a magnetic map."""

@@ -1,0 +1,196 @@
+"""Recording + map + calibration -> poses in the map. Pure: no files, no terminal."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import (
+    FloatArray,
+    Readings,
+    Recording,
+    RigidTransform,
+    SourceFile,
+    Trajectory,
+)
+from l2m_gtsam.errors import CalibrationError, SyncError
+from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose, carried
+from l2m_gtsam.graph.slam.localisation import Localised, localise_drive
+from l2m_gtsam.graph.slam.odometry import key_pose_rows, odometry_steps
+from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
+from l2m_gtsam.graph.slam.outcome import localisation_result
+from l2m_gtsam.graph.view import Compilable, QueryableMap
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.slam_results import LocalisationResult
+from l2m_gtsam.solve.noise import NOISE_RANGE
+from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Where map and calibration came from, for the record."""
+
+    map: SourceFile | None = None
+    calibration: SourceFile | None = None
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """A localisation with what it rests on.
+
+    Attributes
+    ----------
+    result
+        The poses, and what else is told.
+    solution
+        Of the graph.
+    """
+
+    result: LocalisationResult
+    solution: Localised
+
+
+def localise(
+    recording: Recording,
+    field_map: QueryableMap,
+    calibration: CalibrationResult,
+    options: SlamOptions,
+    progress: Progress,
+    sources: Sources | None = None,
+) -> Localisation:
+    """Find where a vehicle was in a magnetic map.
+
+    Parameters
+    ----------
+    recording
+        A drive; its poses are odometry, whose first is in the map unless the options give another.
+    field_map
+        The magnetic map.
+    calibration
+        Of the sensors.
+    options
+        Key poses, odometry, start, and what becomes of the calibration.
+    progress
+        Called with a stage and the fraction of it that is done.
+    sources
+        Of map and calibration.
+
+    Raises
+    ------
+    CalibrationError
+        No sensor of the recording is calibrated.
+    SyncError
+        Readings and poses do not overlap, or there are fewer than two poses.
+    """
+    odometry = recording.trajectory
+    if len(odometry) < 2:
+        raise SyncError(f"{recording.source.path}: odometry of one pose; two or more are needed")
+    calibrated, notes = usable_sensors(recording, calibration)
+    readings = drive_readings(recording, calibrated, options)
+    rows = key_pose_rows(odometry, options.key_poses)
+    drive = Drive(
+        stamp_ns=odometry.stamp_ns[rows],
+        steps=odometry_steps(odometry, rows, options.drift),
+        readings=carried(readings, odometry, rows, options.key_poses.readings),
+        start=start_pose(odometry, options.start),
+        sensors=known_sensors(calibrated),
+    )
+    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    solution = localise_drive(drive, solver_map, options, progress)
+    refined = options.calibration is CalibrationUse.REFINED
+    result = localisation_result(drive, solution, calibration if refined else None)
+    sources = sources or Sources()
+    result = replace(
+        result,
+        notes=(*notes, *result.notes),
+        bag=recording.source,
+        map=sources.map,
+        calibration_source=sources.calibration,
+    )
+    return Localisation(result, solution)
+
+
+def usable_sensors(
+    recording: Recording, calibration: CalibrationResult
+) -> tuple[tuple[SensorCalibration, ...], tuple[str, ...]]:
+    """Return the calibrated sensors of a recording, and a note on each of the others.
+
+    Raises
+    ------
+    CalibrationError
+        There is none.
+    """
+    entries = {each.sensor: each for each in calibration.sensors}
+    usable, notes = [], []
+    for series in recording.series:
+        entry = entries.get(series.sensor)
+        if entry is None:
+            notes.append(f"{series.sensor} is left out: it has no calibration")
+        elif not is_determined(entry):
+            notes.append(f"{series.sensor} is left out: its calibration is {entry.status.value}")
+        else:
+            usable.append(entry)
+    if not usable:
+        sensors = ", ".join(series.sensor for series in recording.series)
+        raise CalibrationError(
+            f"{recording.source.path}: none of its sensors ({sensors}) is calibrated; the "
+            f"calibration has {', '.join(entries) or 'no sensor'}"
+        )
+    return tuple(usable), tuple(notes)
+
+
+def is_determined(sensor: SensorCalibration) -> bool:
+    """Return whether all 15 parameters of a sensor are known, how well, and its noise."""
+    values = np.append(sensor.distortion.vector(), [*sensor.t_lidar_mag, sensor.noise])
+    return bool(np.isfinite(values).all() and np.isfinite(sensor.covariance).all())
+
+
+def known_sensors(calibrated: tuple[SensorCalibration, ...]) -> KnownSensors:
+    """Return calibrations as arrays."""
+    return KnownSensors(
+        names=tuple(each.sensor for each in calibrated),
+        t=np.stack([each.t_lidar_mag for each in calibrated]),
+        distortion=np.stack([each.distortion.vector() for each in calibrated]),
+        offset=clock_offsets(calibrated),
+        noise=np.maximum([each.noise for each in calibrated], NOISE_RANGE[0]),
+        covariance=np.stack([each.covariance for each in calibrated]),
+    )
+
+
+def clock_offsets(calibrated: tuple[SensorCalibration, ...]) -> FloatArray:
+    """Return the sensors' clock offsets in seconds, shape (S,)."""
+    offsets = [each.time_offset for each in calibrated]
+    return np.array([0.0 if each is None else each.seconds for each in offsets])
+
+
+def drive_readings(
+    recording: Recording, calibrated: tuple[SensorCalibration, ...], options: SlamOptions
+) -> Readings:
+    """Return the readings of calibrated sensors with poses of odometry.
+
+    All are kept, also where the vehicle comes again: what is thinned out of a calibration is what
+    closes a loop.
+    """
+    names, offset = [each.sensor for each in calibrated], clock_offsets(calibrated)
+    chosen = tuple(each for each in recording.series if each.sensor in names)
+    sync = SyncOptions(
+        max_pose_gap_s=options.max_pose_gap_s, thin_distance_m=0.0, thin_angle_deg=0.0
+    )
+    largest = float(np.abs(offset).max())
+    readings = synchronise(replace(recording, series=chosen), sync, largest).readings
+    alive = readings.select(~np.isin(readings.sensor, stuck_sensors(readings)))
+    if not len(alive):
+        raise SyncError(f"{recording.source.path}: every sensor is stuck on one value")
+    return with_offsets(alive, recording.trajectory, offset)
+
+
+def start_pose(odometry: Trajectory, options: StartPoseOptions) -> StartPose:
+    """Return where a drive begins in the map."""
+    R, p = odometry.R[0], odometry.p[0]
+    if options.position is not None:
+        p = np.array(options.position)
+    if options.quaternion_xyzw is not None:
+        R = Rotation.from_quat(options.quaternion_xyzw).as_matrix()
+    sigma = np.repeat([np.deg2rad(options.rotation_deg), options.position_m], 3)
+    return StartPose(RigidTransform(R, p), np.diag(sigma**2))

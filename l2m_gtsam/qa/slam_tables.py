@@ -1,0 +1,44 @@
+"""A localisation as tables in the terminal."""
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from l2m_gtsam.slam_results import LocalisationResult
+
+
+def slam_table(result: LocalisationResult) -> Table:
+    """Return one row per sensor: what its readings were worth."""
+    table = Table(title="Readings", title_justify="left")
+    table.add_column("sensor", no_wrap=True)
+    for heading in ("on key poses", "outside map", "rejected", "residual rms (uT)", "chi2 per dof"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for each in result.sensors:
+        table.add_row(
+            escape(each.sensor),
+            str(each.readings),
+            str(each.outside_map),
+            str(each.rejected),
+            f"{each.rms:.3g}",
+            f"{each.chi2_per_dof:.2f}",
+        )
+    return table
+
+
+def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
+    """Return how far odometry had drifted and how well poses are known, a line each."""
+    drift, covariance = result.drift, result.trajectory.covariance
+    drifted = (
+        f"{len(result.trajectory)} key poses over {drift.way_m:.1f} m; odometry ended "
+        f"{drift.end_m:.2f} m and {drift.end_deg:.1f} deg off ({drift.end_share:.1%} of the way), "
+        f"{drift.largest_m:.2f} m at most"
+    )
+    lines = [f"{result.status.value}: {result.message}", drifted]
+    if covariance is not None:
+        sigma = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
+        known = (
+            f"stated error of the positions: {1e3 * np.median(sigma):.0f} mm in the median, "
+            f"{1e3 * sigma.max():.0f} mm at most"
+        )
+        lines.append(known)
+    return tuple(lines)

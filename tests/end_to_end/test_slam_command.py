@@ -1,0 +1,101 @@
+"""`l2m slam` on a bag, and on what it cannot work with."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from evo.tools import file_interface
+
+from l2m_gtsam.data import Distortion
+from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
+from tests.calibrations import calibration, sensor
+from tests.end_to_end.conftest import complaint_here, l2m
+from tests.end_to_end.yard import NOISE, Yard, make_yard, route
+
+SIGMA = np.concatenate([np.full(3, 0.01), np.full(9, 0.01), np.full(3, 1.0)])
+
+
+@pytest.fixture(scope="module")
+def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
+    return make_yard(tmp_path_factory.mktemp("yard"))
+
+
+@pytest.fixture(scope="module")
+def field_map(yard: Yard) -> Path:
+    path = yard.west.parent / "map.npz"
+    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def known(yard: Yard) -> Path:
+    """The sensor of the yard, which sits at the lidar and is ideal."""
+    path = yard.west.parent / "known.yaml"
+    ideal = sensor(
+        "mag",
+        t_lidar_mag=np.zeros(3),
+        distortion=Distortion.identity(),
+        covariance=np.diag(SIGMA**2),
+        noise=NOISE,
+        time_offset=None,
+    )
+    write_calibration(path, calibration(ideal))
+    return path
+
+
+def configured(yard: Yard, folder: Path, **slam: object) -> Path:
+    """Write the configuration of the yard with options of `slam`."""
+    content = json.loads(yard.config.read_text())
+    content["slam"] = {"key_poses": {"distance_m": 0.5, "angle_deg": 30}, **slam}
+    path = folder / "slam.yaml"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    config = configured(yard, tmp_path, calibration="refined", start={"position_m": 0.02})
+    files = ("--map", field_map, "--calibration", known, "--config", config, "--out", out)
+    run = l2m("slam", yard.west, *files)
+    assert "localised: the map explains" in run.out
+    told = json.loads((out / "slam.json").read_text())
+    assert told["status"] == "localised"
+    trajectory = file_interface.read_tum_trajectory_file(str(out / "trajectory.tum"))
+    assert trajectory.num_poses == len(told["poses"])
+    np.testing.assert_allclose(
+        trajectory.positions_xyz, [pose["p"] for pose in told["poses"]], atol=1e-9
+    )
+    # The poses of this bag are true, but most of the yard has a uniform field, which says nothing
+    # of places: half of the 20 cm that odometry is allowed over this way.
+    way = route(-3, 0.5)
+    apart = np.linalg.norm(trajectory.positions_xyz[:, None] - way, axis=2).min(axis=1)
+    assert np.sqrt(np.mean(apart**2)) < 0.1
+    _, values = gtsam.readG2o(str(out / "graph.g2o"), True)
+    assert values.size() == trajectory.num_poses
+    refined = read_calibration(out / "calibration.yaml")["mag"]
+    assert np.all(refined.H_sigma < 1.0)
+
+
+def test_bad_input_is_one_line_and_writes_nothing(
+    yard: Yard, field_map: Path, known: Path, tmp_path: Path
+) -> None:
+    out, config = tmp_path / "out", configured(yard, tmp_path)
+
+    def told(calibration_file: Path, config_file: Path) -> str:
+        files = ("--map", field_map, "--calibration", calibration_file)
+        return complaint_here("slam", yard.west, *files, "--config", config_file, "--out", out)
+
+    assert "no such file" in told(tmp_path / "none.yaml", config)
+    stranger, entry = tmp_path / "stranger.yaml", read_calibration(known)
+    write_calibration(stranger, replace(entry, sensors=(replace(entry["mag"], sensor="other"),)))
+    assert "none of its sensors (mag) is calibrated; the calibration has other" in told(
+        stranger, config
+    )
+    far = configured(yard, tmp_path, start={"position": [40.0, 0.0, 0.4]})
+    assert "the drive is not in this map" in told(known, far)
+    wrong = configured(yard, tmp_path, calibration="guessed")
+    assert "slam.calibration" in told(known, wrong)
+    assert not out.exists()

@@ -1,0 +1,207 @@
+"""Readings on poses that are variables: derivatives on the manifold, batching, and agreement."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from l2m_factors import (
+    BatchedReadings,
+    Calibrations,
+    CarriedBatch,
+    CarriedReadings,
+    D,
+    M,
+    MagneticReadings,
+    PoseMotion,
+    S,
+    SharedError,
+    T,
+    X,
+    assert_jacobians_match,
+    key_pose_factor,
+)
+from l2m_gtsam.data import FloatArray
+from tests.factors.test_reading import CountingWorld, random_values
+from tests.worlds import dipole_world
+
+SENSORS = 2
+MODES = 4  # of a map's error
+
+
+def random_carried(seed: int, key_poses: int = 2, each: int = 4) -> CarriedReadings:
+    """Return readings within half a metre of their key poses, the sensors in turn."""
+    rng, n = np.random.default_rng(seed), key_poses * each
+    return CarriedReadings(
+        key_pose=np.repeat(np.arange(key_poses), each),
+        sensor=np.arange(n) % SENSORS,
+        R_key_lidar=Rotation.from_rotvec(rng.normal(0, 0.3, (n, 3))).as_matrix(),
+        p_key_lidar=rng.normal(0, 0.3, (n, 3)),
+        field=rng.normal(0, 30, (n, 3)),
+    )
+
+
+def on(readings: CarriedReadings, key_pose: int) -> CarriedReadings:
+    return readings[np.flatnonzero(readings.key_pose == key_pose)]
+
+
+def moving(readings: CarriedReadings, seed: int) -> CarriedReadings:
+    rng, n = np.random.default_rng(seed), len(readings)
+    twist = np.hstack([rng.uniform(-1, 1, (n, 3)), rng.uniform(-2, 2, (n, 3))])
+    return replace(readings, motion=PoseMotion(twist, rng.uniform(-0.02, 0.02, n)))
+
+
+def values_for(seed: int, key_poses: int = 2) -> gtsam.Values:
+    """Return random poses over the floor of the hall, calibrations and weights."""
+    values, rng = random_values(seed, SENSORS), np.random.default_rng(seed + 1)
+    for k in range(key_poses):
+        R = gtsam.Rot3(Rotation.random(rng=rng).as_matrix())
+        p = np.append(rng.uniform(-4, 4, 2), 0.8 + 0.1 * rng.normal())
+        values.insert(X(k), gtsam.Pose3(R, p))
+    values.insert(M(7), rng.normal(size=MODES))
+    return values
+
+
+def calibrations(values: gtsam.Values) -> Calibrations:
+    return Calibrations(
+        np.stack([values.atPoint3(T(i)) for i in range(SENSORS)]),
+        np.stack([values.atVector(D(i)) for i in range(SENSORS)]),
+        np.array([values.atDouble(S(i)) for i in range(SENSORS)]),
+    )
+
+
+def whitenings(seed: int, n: int) -> FloatArray:
+    return np.random.default_rng(seed).normal(size=(n, 3, 3)) + 3 * np.eye(3)
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 10_000))
+def test_jacobians_match_central_differences(seed: int) -> None:
+    """By pose, place, distortion, time offset and the map's error; 1e-6 of the largest entry."""
+    world, values, readings = dipole_world(seed), values_for(seed), random_carried(seed)
+    timed = moving(readings, seed)
+    features = np.random.default_rng(seed).normal(size=(4, 3, MODES))
+    shared = [SharedError(M(7), features)]
+    W = whitenings(seed, 4)
+    fixed = calibrations(values)
+    for batch, errors in (
+        (CarriedBatch(world, readings), []),
+        (CarriedBatch(world, timed), shared),
+        (CarriedBatch(world, timed, fixed), shared),
+        (CarriedBatch(world, readings, fixed), []),
+    ):
+        factor = key_pose_factor(batch, 1, W, errors)
+        # Steps of 2e-5 leave 1e-8 of third derivatives; rounding of 50 uT is smaller yet.
+        assert_jacobians_match(factor, values, rtol=1e-6, step=2e-5)
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=10)
+def test_at_given_poses_it_is_the_factor_of_known_poses(seed: int) -> None:
+    """Same residuals and derivatives as readings whose poses are constants: up to rounding."""
+    world, values, carried = dipole_world(seed), values_for(seed), random_carried(seed)
+    poses = [values.atPose3(X(int(k))) for k in carried.key_pose]
+    lidars = [
+        pose.compose(gtsam.Pose3(gtsam.Rot3(R), p))
+        for pose, R, p in zip(poses, carried.R_key_lidar, carried.p_key_lidar, strict=True)
+    ]
+    known = MagneticReadings(
+        carried.sensor,
+        np.stack([each.rotation().matrix() for each in lidars]),
+        np.stack([each.translation() for each in lidars]),
+        carried.field,
+    )
+    expected = BatchedReadings(world, known).residuals(values, 0)
+    found = CarriedBatch(world, carried).residuals(values, 0).reading
+    np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.de_dt, expected.de_dt, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.de_dD, expected.de_dD, rtol=0, atol=1e-9)
+
+
+def graph_of(batch: CarriedBatch) -> gtsam.NonlinearFactorGraph:
+    graph = gtsam.NonlinearFactorGraph()
+    for k in batch.key_poses:
+        W = np.broadcast_to(np.eye(3), (len(batch.rows_of(k)), 3, 3))
+        graph.add(key_pose_factor(batch, k, W))
+    return graph
+
+
+def test_one_map_query_when_all_poses_move() -> None:
+    counting, values = CountingWorld(dipole_world(2)), values_for(2, key_poses=5)
+    graph = graph_of(CarriedBatch(counting, random_carried(2, key_poses=5)))
+    graph.error(values)
+    graph.linearize(values)
+    assert counting.calls == 1
+    tangent = values.zeroVectors()
+    for k in range(5):
+        tangent.update(step_of(X(k)))
+    graph.linearize(values.retract(tangent))
+    assert counting.calls == 2
+
+
+def step_of(key: int) -> gtsam.VectorValues:
+    step = gtsam.VectorValues()
+    step.insert(key, np.full(6, 0.01))
+    return step
+
+
+def test_a_batch_for_each_key_pose_pays_for_what_moves() -> None:
+    """What iSAM2 needs: of five key poses one is asked again, and its batch alone."""
+    counting, values = CountingWorld(dipole_world(3)), values_for(3, key_poses=5)
+    readings = random_carried(3, key_poses=5)
+    alone = [CarriedBatch(counting, on(readings, k)) for k in range(5)]
+    factors = [graph_of(batch).at(0) for batch in alone]
+    for factor in factors:
+        factor.linearize(values)
+    assert counting.calls == 5
+    tangent = values.zeroVectors()
+    tangent.update(step_of(X(3)))
+    later = values.retract(tangent)
+    for factor in factors:
+        factor.linearize(later)
+    assert counting.calls == 6
+
+
+def test_batches_of_any_size_are_the_same_graph() -> None:
+    world, values = dipole_world(4), values_for(4, key_poses=3)
+    readings = random_carried(4, key_poses=3)
+    whole = graph_of(CarriedBatch(world, readings)).linearize(values).hessian()
+    parts = gtsam.NonlinearFactorGraph()
+    for k in range(3):
+        parts.push_back(graph_of(CarriedBatch(world, on(readings, k))))
+    other = parts.linearize(values).hessian()
+    for one, two in zip(whole, other, strict=True):
+        np.testing.assert_allclose(one, two, rtol=0, atol=1e-12 * np.abs(one).max())
+
+
+def test_a_factor_alone_needs_only_its_own_variables() -> None:
+    readings, everything = random_carried(5), values_for(5)
+    mine = on(readings, 1)
+    batch = CarriedBatch(dipole_world(5), readings)
+    values = gtsam.Values()
+    values.insert(X(1), everything.atPose3(X(1)))
+    for i in range(SENSORS):
+        values.insert(T(i), everything.atPoint3(T(i)))
+        values.insert(D(i), everything.atVector(D(i)))
+    W = whitenings(5, len(mine))
+    alone = key_pose_factor(CarriedBatch(dipole_world(5), mine), 1, W)
+    assert key_pose_factor(batch, 1, W).error(values) == pytest.approx(alone.error(everything))
+
+
+def test_a_reading_pulls_its_pose_back() -> None:
+    """Exact readings of two sensors on one pose, calibration known: the pose comes back."""
+    world, values = dipole_world(6), values_for(6, key_poses=1)
+    readings, fixed = random_carried(6, key_poses=1, each=12), calibrations(values)
+    at = CarriedBatch(world, readings, fixed).residuals(values, 0).reading.residual
+    exact = replace(readings, field=readings.field + at)
+    start = gtsam.Values()
+    off = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.05, 0.05, -0.04, 0.03]))
+    start.insert(X(0), values.atPose3(X(0)).compose(off))
+    graph = graph_of(CarriedBatch(world, exact, fixed))
+    found = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize().atPose3(X(0))
+    # The optimiser ends when its error falls by less than 1e-5 uT^2: some micrometres.
+    np.testing.assert_allclose(found.matrix(), values.atPose3(X(0)).matrix(), atol=1e-4)
