@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from l2m_gtsam.batch import fleet as batch_fleet
-from l2m_gtsam.batch.drives import calibrate_bag
 from l2m_gtsam.batch.fleet import fleet_tasks, run_fleet
 from l2m_gtsam.batch.fleet_drives import FleetOrder, fleet_drives
 from l2m_gtsam.batch.fleet_task import (
@@ -26,9 +25,7 @@ from l2m_gtsam.batch.fleet_task import (
     lost_drive,
     open_map,
 )
-from l2m_gtsam.batch.reports import report_folder
 from l2m_gtsam.cluster import ClusterOptions
-from l2m_gtsam.config import load_config
 from l2m_gtsam.fleet_results import DriveOutcome
 from l2m_gtsam.maps.field_map import FieldMap
 from tests.end_to_end.conftest import Finished, complaint_here, l2m
@@ -115,10 +112,8 @@ def test_the_page_links_to_reports_that_are_there(run: Run) -> None:
 
 
 def test_a_drive_has_what_calibrate_writes(run: Run, tmp_path: Path) -> None:
-    config = load_config(run.place.config)
     bag = run.bags / "truck_1" / "day_0.bag"
-    calibrate_bag(bag, run.place.map, config, tmp_path, lambda *_: None)
-    report_folder(tmp_path, None)
+    l2m("calibrate", bag, "--map", run.place.map, "--config", run.place.config, "--out", tmp_path)
     assert {each.name for each in tmp_path.iterdir()} == set(RESULTS)
     for name in RESULTS:
         assert (run.out / "truck_1/day_0" / name).read_bytes() == (tmp_path / name).read_bytes()

@@ -1,5 +1,6 @@
 """Whether parts of what was driven tell the same: halves of a drive, or several drives."""
 
+from math import isfinite
 from pathlib import Path
 
 from l2m_gtsam.metric_results import Halves, SensorMetrics
@@ -97,13 +98,17 @@ def _remedy(case: Case) -> str:
 
 
 def _not_looked_at(metrics: SensorMetrics) -> list[Reason]:
-    """Return which of several drives say nothing by themselves, and why."""
+    """Return which of several drives say nothing by themselves, and why.
+
+    That the last drive which does has nothing to be compared with follows from the others.
+    """
     drives = () if metrics.drives is None else metrics.drives.drives
+    told = [each for each in drives if any(map(isfinite, each.estimate))]
     return [
         Reason(
             Level.PASS,
             f"{Path(each.bag).name} is not compared with the other drives: {each.reason}.",
         )
         for each in drives
-        if each.reason
+        if each.reason and told != [each]
     ]
