@@ -29,7 +29,7 @@ def test_a_study_from_options_to_page_and_again(tmp_path: Path) -> None:
     assert "--seed 1`: 2 cells" in page
     assert (out / "basin.png").stat().st_size > 1000
     content = json.loads((out / "study.json").read_text())
-    assert content["summary"]["rows"][0]["one_key_medium"] == {"successes": 6, "trials": 6}
+    assert content["summary"]["rows"][0]["one_key"]["medium"] == {"successes": 6, "trials": 6}
     assert l2m(*command).out == second.out
 
 

@@ -41,7 +41,7 @@ HALL = ScenarioOptions(
     calibration_sampling=SamplingOptions(field_rate=3.0),
 )
 SITE = SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("harmonic")))
-TINY = BasinOptions(distortions=1, starts=3, lm_starts=2, rings=2, width=1.5, site=SITE)
+TINY = BasinOptions(distortions=1, starts=3, few_starts=2, rings=2, width=1.5, site=SITE)
 
 
 @lru_cache
@@ -50,7 +50,7 @@ def tiny_cells() -> tuple[Cell, ...]:
 
 
 def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
-    """A cell where one-key ends with these errors, is never sure, and LM never moves."""
+    """A cell where one-key ends with these errors, LM never moves, and published leaves the map."""
     count = len(errors)
     t_start = np.full((count, 3), 1.0)
     return Cell(
@@ -62,7 +62,8 @@ def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
         margin=np.full(count, np.inf),
         ambiguous=np.arange(count) == 0,
         t_one_key=np.array(errors)[:, None] * np.array([1.0, 0.0, 0.0]),
-        t_lm=t_start[: TINY.lm_starts],
+        t_published=np.full((min(count, TINY.few_starts), 3), np.nan),
+        t_lm=t_start[: TINY.few_starts],
     )
 
 
@@ -70,8 +71,8 @@ def test_one_key_finds_the_sensor_from_every_start() -> None:
     table = basin_table(TINY, tiny_cells())
     assert [(row.inner, row.outer) for row in table.rows] == [(0.0, 1.5), (1.5, 3.0)]
     for row in table.rows:
-        assert row.one_key_medium == Share(3, 3)
-        assert row.lm_medium.trials == 2
+        assert row.one_key.medium == Share(3, 3)
+        assert row.lm.medium.trials == 2
     assert table.all_medium == Share(1, 1)
 
 
@@ -111,8 +112,9 @@ def test_all_cells_of_a_distortion_share_its_sensor_and_no_two_their_starts() ->
 def test_the_table_counts_what_cells_hold() -> None:
     cells = [made_up(0, 0, [0.01, 0.03, np.nan]), made_up(1, 0, [0.06, 0.02])]
     (row,) = basin_table(TINY, cells).rows
-    assert (row.one_key_small, row.one_key_medium) == (Share(2, 5), Share(3, 5))
-    assert (row.lm_small, row.lm_medium) == (Share(0, 4), Share(0, 4))
+    assert (row.one_key.small, row.one_key.medium) == (Share(2, 5), Share(3, 5))
+    assert (row.lm.small, row.lm.medium) == (Share(0, 4), Share(0, 4))
+    assert row.published.medium == Share(0, 4)  # off the map: no result
     # Ambiguous are the first of both cells; of the others 3 cm and the missing one are wrong.
     assert (row.ambiguous, row.unwarned) == (2, 2)
 
@@ -132,7 +134,7 @@ def test_table_and_figure_say_how_many_starts_each_method_got() -> None:
     cells = [made_up(0, 0, [0.01, 0.01, 0.01]), made_up(1, 0, [0.01, 0.01])]
     table = basin_table(TINY, cells)
     line = basin_markdown(table).splitlines()[2].split(" | ")
-    assert (line[1], line[4]) == ("5", "4")
+    assert (line[1], line[6]) == ("5", "4")
     (axes,) = basin_figure(table).axes
     _, legend = axes.get_legend_handles_labels()
     assert "LM, within 2 cm (4 starts a ring)" in legend
@@ -162,7 +164,7 @@ def test_the_global_start_forgives_any_guess_within_three_metres(tmp_path: Path)
     table = run_study(BASIN, BasinOptions(), tmp_path, cluster, lambda *_: None, "").summary
     assert len(table.rows) == 12
     for row in table.rows:
-        assert row.one_key_small.trials == 2000
-        assert row.one_key_small.rate >= 0.995, str(row)
-        assert row.lm_small.trials == 400
-    assert table.rows[-1].lm_medium.rate < 0.5
+        assert row.one_key.small.trials == 2000
+        assert row.one_key.small.rate >= 0.995, str(row)
+        assert row.lm.small.trials == 400
+    assert table.rows[-1].lm.medium.rate < 0.5

@@ -2,9 +2,9 @@
 
 The protocol is the paper's (Success rate): random distortions, each with random starts; a
 calibration succeeds if the sensor's position ends within 2 cm (small) or 5 cm (medium) of the
-truth. Two methods get the same readings, map and starts. *One-key* looks for a start in a ball
-around the given one and solves from there: the given start is all that it is told. *LM* is
-Levenberg-Marquardt over t, C and H from the given start itself.
+truth. All methods get the same readings, map and starts. *One-key* looks for a start in a ball
+around the given one and solves from there: the given start is all that it is told. *Published* is
+the paper's algorithm, *LM* Levenberg-Marquardt over t, C and H, from the given start itself.
 
 The starts of one distortion share a drive, and the lattice on which one-key looks: what differs
 between them is which of its nodes lie in the ball. Starts whose balls hold the same best nodes
@@ -30,6 +30,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.results import FoundStart, Uncertainty
 from l2m_gtsam.studies.basin.levenberg_marquardt import levenberg_marquardt
 from l2m_gtsam.studies.json_array import JsonBools, JsonFloats
+from l2m_gtsam.studies.methods import published
 from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, random_drive
 
@@ -45,9 +46,9 @@ class BasinOptions(Options):
     """Sensors of random place and distortion, each on its own drive."""
     starts: int = Field(default=100, ge=1)
     """Of each sensor in each ring."""
-    lm_starts: int = Field(default=20, ge=1)
-    """The baseline runs from so many of them, the first: its rate needs fewer trials, and far out
-    it takes seconds per start."""
+    few_starts: int = Field(default=20, ge=1)
+    """The published method and LM run from so many of them, the first: their rates need fewer
+    trials, and far out they take seconds per start."""
     rings: int = Field(default=12, ge=1)
     """Rings of initial offsets, from the truth outwards."""
     width: float = Field(default=0.25, gt=0)
@@ -86,8 +87,9 @@ class Cell:
         Which calibrations one-key would call ambiguous, shape (N,).
     t_one_key
         Where one-key ended, NaN where it ended without a result, shape (N, 3).
-    t_lm
-        Where Levenberg-Marquardt ended from the first L of the starts, shape (L, 3).
+    t_published, t_lm
+        Where the published method and Levenberg-Marquardt ended from the first L of the starts,
+        NaN where off the map, shape (L, 3).
     """
 
     distortion: int
@@ -98,6 +100,7 @@ class Cell:
     margin: JsonFloats
     ambiguous: JsonBools
     t_one_key: JsonFloats
+    t_published: JsonFloats
     t_lm: JsonFloats
 
     def error(self, t: FloatArray) -> FloatArray:
@@ -113,6 +116,14 @@ class DistortionCells:
 
 
 @dataclass(frozen=True)
+class Rates:
+    """Calibrations of one method that ended within a small and within a medium error."""
+
+    small: Share
+    medium: Share
+
+
+@dataclass(frozen=True)
 class RingRow:
     """The counts of one ring over all distortions.
 
@@ -120,8 +131,8 @@ class RingRow:
     ----------
     inner, outer
         Initial offsets in metres.
-    one_key_small, one_key_medium, lm_small, lm_medium
-        Calibrations that ended within a small or medium error.
+    one_key, published, lm
+        How often each method succeeded.
     ambiguous
         Calibrations that one-key called ambiguous.
     unwarned
@@ -130,10 +141,9 @@ class RingRow:
 
     inner: float
     outer: float
-    one_key_small: Share
-    one_key_medium: Share
-    lm_small: Share
-    lm_medium: Share
+    one_key: Rates
+    published: Rates
+    lm: Rates
     ambiguous: int
     unwarned: int
 
@@ -189,6 +199,7 @@ def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCe
     cells = []
     for index, ring in enumerate(rings):
         rows = slice(index * options.starts, (index + 1) * options.starts)
+        few = t_start[rows][: options.few_starts]
         cell = Cell(
             distortion=distortion,
             ring=ring,
@@ -198,7 +209,8 @@ def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCe
             margin=found.margin[rows],
             ambiguous=found.ambiguous[rows],
             t_one_key=t_one_key[rows],
-            t_lm=plain_lm(site, drive, t_start[rows][: options.lm_starts], options),
+            t_published=as_published(site, drive, few),
+            t_lm=plain_lm(site, drive, few, options),
         )
         cells.append(cell)
     return DistortionCells(tuple(cells))
@@ -244,6 +256,12 @@ def one_key(
     return ends[which.ravel()]
 
 
+def as_published(site: Site, drive: SiteDrive, t_start: FloatArray) -> FloatArray:
+    """Return where the paper's algorithm ends from each start, NaN off the map, shape (N, 3)."""
+    ends = [published(drive.readings, site.field_map, t) for t in t_start]
+    return np.array([np.full(3, np.nan) if end is None else end.t[0] for end in ends])
+
+
 def plain_lm(
     site: Site, drive: SiteDrive, t_start: FloatArray, options: BasinOptions
 ) -> FloatArray:
@@ -274,18 +292,23 @@ def basin_table(options: BasinOptions, cells: Sequence[Cell]) -> BasinTable:
 def ring_row(options: BasinOptions, cells: Sequence[Cell]) -> RingRow:
     """Return the counts of the cells of one ring."""
     ours = np.concatenate([each.error(each.t_one_key) for each in cells])
+    theirs = np.concatenate([each.error(each.t_published) for each in cells])
     plain = np.concatenate([each.error(each.t_lm) for each in cells])
     ambiguous = np.concatenate([each.ambiguous for each in cells])
     return RingRow(
         inner=options.width * cells[0].ring,
         outer=options.width * (cells[0].ring + 1),
-        one_key_small=within(ours, options.small),
-        one_key_medium=within(ours, options.medium),
-        lm_small=within(plain, options.small),
-        lm_medium=within(plain, options.medium),
+        one_key=rates(options, ours),
+        published=rates(options, theirs),
+        lm=rates(options, plain),
         ambiguous=int(np.count_nonzero(ambiguous)),
         unwarned=int(np.count_nonzero(~ambiguous & ~(ours <= options.small))),
     )
+
+
+def rates(options: BasinOptions, errors: FloatArray) -> Rates:
+    """Return how often errors in metres, shape (N,), NaN for no result, are small and medium."""
+    return Rates(within(errors, options.small), within(errors, options.medium))
 
 
 def within(error: FloatArray, most: float) -> Share:

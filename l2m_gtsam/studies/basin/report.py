@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.studies.basin.cells import BasinOptions, BasinTable, RingRow
+from l2m_gtsam.studies.basin.cells import BasinOptions, BasinTable, Rates, RingRow
 from l2m_gtsam.studies.share import Share
 
-# Blue and vermilion differ for all kinds of colour vision.
-ONE_KEY, LM = {"color": "#0072b2"}, {"color": "#d55e00"}
+# Blue, green and vermilion differ for all kinds of colour vision.
+COLOURS = {"LM": "#d55e00", "published": "#009e73", "one-key": "#0072b2"}
 # Where both thresholds have one rate, the small mark stands in the large one.
 NEAR = {"fmt": "o-", "markersize": 3.5}
 WIDE = {"fmt": "s--", "markersize": 8, "markerfacecolor": "white"}
@@ -26,8 +26,9 @@ def basin_page(table: BasinTable) -> str:
         f"The paper's protocol: {options.distortions} random sensors, each on its own drive "
         f"through the simulated warehouse, {options.starts} random starts in each ring of "
         f"{options.width:g} m around the true place. *One-key* is told the start alone: it looks "
-        f"for the sensor within {options.search.search_radius:g} m of it. *LM* is "
-        "Levenberg-Marquardt over t, C and H from there."
+        f"for the sensor within {options.search.search_radius:g} m of it. "
+        "*Published* is the paper's algorithm 1 from there (weights as printed; its intercept and "
+        "its Jacobian mended), *LM* Levenberg-Marquardt over t, C and H."
     )
     picture = "![Success rates over the initial offset](basin.png)"
     return f"{intro}\n\n{picture}\n\n{basin_markdown(table)}"
@@ -36,12 +37,13 @@ def basin_page(table: BasinTable) -> str:
 def basin_markdown(table: BasinTable) -> str:
     """Return the table of a study with 95 % intervals, and under it what was counted."""
     small, medium = sizes(table.options)
+    each = f"within {small} | within {medium}"
     head = (
-        f"| initial offset (m) | starts | one-key within {small} | within {medium} | LM starts "
-        f"| LM within {small} | within {medium} | ambiguous | wrong, not ambiguous |"
+        f"| initial offset (m) | starts | one-key {each} | ambiguous | wrong, not ambiguous "
+        f"| starts | published {each} | LM {each} |"
     )
     rows = [table_line(row) for row in table.rows]
-    return "\n".join([head, "|---" * 9 + "|", *rows, "", sensors(table), "", note(table)])
+    return "\n".join([head, "|---" * 11 + "|", *rows, "", sensors(table), "", note(table)])
 
 
 def sensors(table: BasinTable) -> str:
@@ -63,8 +65,8 @@ def note(table: BasinTable) -> str:
     """Return what was counted."""
     small, _ = sizes(table.options)
     return (
-        f"Both methods calibrate from the same starts, LM from the first {table.options.lm_starts} "
-        "of each distortion and ring, with "
+        "All methods calibrate from the same starts, published and LM from the first "
+        f"{table.options.few_starts} of each distortion and ring, with "
         f"{table.options.site.scenario.noise.field:g} uT of noise. In brackets Wilson's 95 % "
         "intervals, those of starts as if they were independent. They are not: the starts of one "
         "distortion share a drive and the lattice of the search, and differ for one-key in which "
@@ -81,17 +83,22 @@ def sizes(options: BasinOptions) -> tuple[str, str]:
 
 def table_line(row: RingRow) -> str:
     """Return one ring as a line of Markdown."""
-    shares = (row.one_key_small, row.one_key_medium, row.lm_small, row.lm_medium)
     cells = [
         f"{row.inner:.2f}-{row.outer:.2f}",
-        f"{row.one_key_small.trials:,}",
-        *(said(share) for share in shares[:2]),
-        f"{row.lm_small.trials:,}",
-        *(said(share) for share in shares[2:]),
+        f"{row.one_key.small.trials:,}",
+        *both(row.one_key),
         str(row.ambiguous),
         str(row.unwarned),
+        f"{row.lm.small.trials:,}",
+        *both(row.published),
+        *both(row.lm),
     ]
     return f"| {' | '.join(cells)} |"
+
+
+def both(rates: Rates) -> tuple[str, str]:
+    """Return both rates of a method."""
+    return said(rates.small), said(rates.medium)
 
 
 def said(share: Share) -> str:
@@ -101,25 +108,30 @@ def said(share: Share) -> str:
 
 
 def basin_figure(table: BasinTable) -> Figure:
-    """Draw success rates against the initial offset: two methods, two thresholds."""
-    figure = Figure(figsize=(7, 4.2), layout="constrained", dpi=150)
+    """Draw success rates against the initial offset: three methods, two thresholds."""
+    figure = Figure(figsize=(7.5, 4.6), layout="constrained", dpi=150)
     axes = figure.add_subplot()
     small, medium = sizes(table.options)
+    offset = np.array([(row.inner + row.outer) / 2 for row in table.rows])
+    for place, (name, colour) in enumerate(COLOURS.items()):
+        at = offset + ASIDE * table.options.width * (1 - place)
+        found = [of_method(row, name) for row in table.rows]
+        wide, near = [each.medium for each in found], [each.small for each in found]
+        count = trials(near)
+        draw_rates(axes, at, wide, label=f"{name}, within {medium}", color=colour, **WIDE)
+        told = f"{name}, within {small} ({count} starts a ring)"
+        draw_rates(axes, at, near, label=told, color=colour, **NEAR)
     rows = table.rows
-    offset = np.array([(row.inner + row.outer) / 2 for row in rows])
-    left, right = offset - ASIDE * table.options.width, offset + ASIDE * table.options.width
-    for name, style, at, shares in (
-        (f"LM, within {medium}", LM | WIDE, right, [row.lm_medium for row in rows]),
-        (f"LM, within {small}", LM | NEAR, right, [row.lm_small for row in rows]),
-        (f"one-key, within {medium}", ONE_KEY | WIDE, left, [row.one_key_medium for row in rows]),
-        (f"one-key, within {small}", ONE_KEY | NEAR, left, [row.one_key_small for row in rows]),
-    ):
-        draw_rates(axes, at, shares, label=f"{name} ({trials(shares)} starts a ring)", **style)
     axes.set(xlabel="initial offset (m)", ylabel="success rate (%)", ylim=(-3, 103))
     axes.set_xlim(0, max(row.outer for row in rows))
     axes.grid(alpha=0.3)
     axes.legend(loc="lower left")
     return figure
+
+
+def of_method(row: RingRow, name: str) -> Rates:
+    """Return the rates of a method by the name it has on the page."""
+    return {"one-key": row.one_key, "published": row.published, "LM": row.lm}[name]
 
 
 def trials(shares: Sequence[Share]) -> str:
