@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests.browsing import find_tools
+
 # Machines are as fast as they are, and the first call of a compiled function compiles it.
 settings.register_profile("l2m", deadline=None)
 settings.load_profile("l2m")
@@ -29,3 +31,9 @@ def shared_data() -> Path:
             pytest.fail(reason)
         pytest.skip(reason)
     return path
+
+
+@pytest.fixture(scope="session")
+def browser() -> str:
+    """Path of a browser that can be told what to do."""
+    return find_tools()

@@ -1,8 +1,5 @@
 """The fleet's page in a real browser: seen, sorted by keyboard, and no name of a file runs."""
 
-import json
-import os
-import subprocess
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +11,17 @@ from l2m_gtsam.fleet_results import FleetRow
 from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.fleet.outliers import with_outliers
 from l2m_gtsam.qa.fleet.page import fleet_page
-from tests.browser.conftest import HERE, TIMEOUT_S, Looked, look
+from tests.browsing import (
+    Looked,
+    check_accessibility,
+    check_figures,
+    check_phone,
+    check_silence,
+    look,
+    told_by,
+)
 from tests.fleet_rows import row, sensor_row
 
-GRAVE = {"serious", "critical"}  # of axe-core
-SMALLEST_PX = 9.0  # text in figures; below it labels are not read on a phone
 MOST_BYTES = 700_000  # 192 rows: a fleet of 800 then stays below three megabytes
 VEHICLES, DRIVES, SENSORS = 4, 12, 4
 HOSTILE = (
@@ -73,45 +76,25 @@ def looked(browser: str, page: Path, tmp_path_factory: pytest.TempPathFactory) -
 
 @pytest.fixture(scope="module")
 def sorting(browser: str, page: Path) -> Sorted:
-    run = subprocess.run(
-        ["node", HERE / "sort.js", page, "bag", "x (mm)", "x (mm)", "verdict", "verdict"],  # noqa: S607
-        capture_output=True,
-        text=True,
-        env={**os.environ, "L2M_BROWSER": browser},
-        check=False,
-        timeout=TIMEOUT_S,
-    )
-    assert run.returncode == 0, run.stderr
-    told = json.loads(run.stdout)
+    columns = ("bag", "x (mm)", "x (mm)", "verdict", "verdict")
+    told = told_by("sort.js", browser, page, *columns)
     return Sorted(told["presses"], told["errors"])
 
 
 def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:
-    for each in looked.looks:
-        assert each["errors"] == []
-        assert each["requests"] == []
+    check_silence(looked)
 
 
 def test_every_trend_is_seen(looked: Looked) -> None:
-    for each in looked.looks:
-        assert len(each["figures"]) == VEHICLES * SENSORS
-        for figure in each["figures"]:
-            assert figure["alt"]
-            assert figure["visible"]
-            assert figure["inside"]
-            assert figure["drawn"] > 5
-            assert min(figure["width"], figure["height"]) > 100
+    check_figures(looked, VEHICLES * SENSORS)
 
 
 def test_it_fits_a_phone(looked: Looked) -> None:
-    for each in looked.looks:
-        assert not each["wider"]
-        assert each["smallest_text"] >= SMALLEST_PX
+    check_phone(looked)
 
 
 def test_accessibility_has_no_grave_fault(looked: Looked) -> None:
-    for each in looked.looks:
-        assert [fault for fault in each["accessibility"] if fault["impact"] in GRAVE] == []
+    check_accessibility(looked)
 
 
 def test_names_are_text(looked: Looked) -> None:

@@ -6,38 +6,25 @@ import numpy as np
 from PIL import Image
 
 from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
-from tests.browser.conftest import BAG, HOSTILE, Looked
+from tests.browser.conftest import BAG, HOSTILE
+from tests.browsing import Looked, check_accessibility, check_figures, check_phone, check_silence
 
-GRAVE = {"serious", "critical"}  # of axe-core
 FIGURES = 4 + 3 * 8  # of vehicle and map, and of each sensor
-SMALLEST_PX = 9.0  # text in figures; below it labels are not read on a phone
 # A figure that failed to draw is a blank card: of one that is drawn at least this share differs
 # from its background.
 INKED = 0.01
 
 
 def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:
-    assert len(looked.looks) == 4
-    for look in looked.looks:
-        assert look["errors"] == []
-        assert look["requests"] == []
+    check_silence(looked)
 
 
 def test_every_figure_is_seen(looked: Looked) -> None:
-    for look in looked.looks:
-        assert len(look["figures"]) == FIGURES
-        for figure in look["figures"]:
-            assert figure["alt"]
-            assert figure["visible"]
-            assert figure["inside"]
-            assert figure["drawn"] > 5
-            assert min(figure["width"], figure["height"]) > 100
+    check_figures(looked, FIGURES)
 
 
 def test_it_fits_a_phone(looked: Looked) -> None:
-    for look in looked.looks:
-        assert not look["wider"]
-        assert look["smallest_text"] >= SMALLEST_PX
+    check_phone(looked)
 
 
 def test_light_and_dark_differ(looked: Looked) -> None:
@@ -52,8 +39,7 @@ def test_light_and_dark_differ(looked: Looked) -> None:
 
 
 def test_accessibility_has_no_grave_fault(looked: Looked) -> None:
-    for look in looked.looks:
-        assert [each for each in look["accessibility"] if each["impact"] in GRAVE] == []
+    check_accessibility(looked)
 
 
 def test_it_is_used_by_keyboard(looked: Looked) -> None:

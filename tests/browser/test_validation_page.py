@@ -13,8 +13,15 @@ from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
 from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.validate import validate
 from l2m_gtsam.validation_results import NamedSource, Validation
-from tests.browser.conftest import BAG, HOSTILE, Looked, look
-from tests.browser.test_report_page import GRAVE, SMALLEST_PX
+from tests.browser.conftest import BAG, HOSTILE
+from tests.browsing import (
+    Looked,
+    check_accessibility,
+    check_figures,
+    check_phone,
+    check_silence,
+    look,
+)
 from tests.degenerate_drives import STRONG
 from tests.validation_drives import OPTIONS, calibrated, changed, other_drive
 
@@ -50,27 +57,16 @@ def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
 
 
 def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:
-    assert len(looked.looks) == 4
-    for each in looked.looks:
-        assert each["errors"] == []
-        assert each["requests"] == []
+    check_silence(looked)
 
 
 def test_every_figure_is_seen_on_a_desk_and_on_a_phone(looked: Looked) -> None:
-    for each in looked.looks:
-        assert len(each["figures"]) == FIGURES
-        for figure in each["figures"]:
-            assert figure["alt"]
-            assert figure["visible"]
-            assert figure["inside"]
-            assert figure["drawn"] > 5
-        assert not each["wider"]
-        assert each["smallest_text"] >= SMALLEST_PX
+    check_figures(looked, FIGURES)
+    check_phone(looked)
 
 
 def test_accessibility_has_no_grave_fault(looked: Looked) -> None:
-    for each in looked.looks:
-        assert [fault for fault in each["accessibility"] if fault["impact"] in GRAVE] == []
+    check_accessibility(looked)
     names = [stop["name"] for stop in looked.tabbed]
     assert names[0] == "Skip to the report"
     assert all(stop["outline"] != "none" for stop in looked.tabbed)
