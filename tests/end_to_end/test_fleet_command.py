@@ -150,7 +150,7 @@ def other_verdicts(run: Run) -> None:
 
 
 def other_ways_to_map_and_plan(run: Run) -> None:
-    rewrite(run.place.config, "mapping", {"compare": {"block_m": 0.7}})
+    rewrite(run.place.config, "mapping", {"compare": {"folds": 5}})
     rewrite(run.place.config, "plan", {"rate_hz": 5})
     rewrite(run.place.config, "slam", {})
 

