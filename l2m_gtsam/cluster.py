@@ -73,7 +73,8 @@ def computed(
     Raises
     ------
     ClusterError
-        Dask is not installed, the scheduler does not answer, or a task kills its workers.
+        Dask is not installed, the scheduler does not answer or has no workers, or a task kills
+        its workers.
     """
     if not keys:
         return
@@ -157,6 +158,7 @@ def _client(options: ClusterOptions) -> "Iterator[Client]":
         except (OSError, ValueError) as error:
             raise ClusterError(f"--scheduler {options.scheduler}: {error}") from error
         with client:
+            _await_worker(client, options.scheduler)
             yield client
         return
     # Each worker has a core to itself, and so one thread for everything.
@@ -173,3 +175,14 @@ def _client(options: ClusterOptions) -> "Iterator[Client]":
         Client(cluster) as client,
     ):
         yield client
+
+
+def _await_worker(client: "Client", scheduler: str) -> None:
+    """Wait for the first worker of a scheduler, which may be starting; not for ever."""
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError as error:
+        raise ClusterError(
+            f"--scheduler {scheduler}: has no workers; start some: dask worker {scheduler} "
+            "--nthreads 1"
+        ) from error

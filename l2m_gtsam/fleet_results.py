@@ -6,20 +6,41 @@ infinite. Rows of axes are in the order x, y, z.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
 
 from l2m_gtsam.metric_results import Record, Row
 
+VERDICTS = ("pass", "warn", "fail")
+"""On a sensor."""
 ERROR = "error"
-"""Verdict on a drive that was not calibrated, beside pass, warn and fail."""
+"""Verdict on a drive that was not calibrated, beside those."""
+DATE = "%Y-%m-%dT%H:%M:%SZ"
+"""ISO 8601 in UTC, as `strftime` has it."""
+
+Axes = Annotated[Row, Field(min_length=3, max_length=3)]
+Quaternion = Annotated[Row, Field(min_length=4, max_length=4)]
 
 
 @dataclass(frozen=True)
 class RowKey(Record):
-    """What the outcome of a drive depends on: SHA-256 of each; empty where it cannot be read."""
+    """What the outcome of a drive depends on.
+
+    Attributes
+    ----------
+    bag, map
+        SHA-256 of each; empty where it cannot be read.
+    config
+        SHA-256 of the parts of the configuration that a calibration and its verdict depend on.
+    program
+        Version of this program.
+    """
 
     bag: str
     map: str
     config: str
+    program: str
 
 
 @dataclass(frozen=True)
@@ -53,13 +74,13 @@ class SensorRow(Record):
     sensor: str
     verdict: str
     reason: str
-    t: Row
-    t_sigma: Row
-    quaternion_xyzw: Row
-    rotation_sigma: Row
-    scale: Row
-    H: Row
-    H_sigma: Row
+    t: Axes
+    t_sigma: Axes
+    quaternion_xyzw: Quaternion
+    rotation_sigma: Axes
+    scale: Axes
+    H: Axes
+    H_sigma: Axes
     hard_iron: float
     hard_iron_sigma: float
     residual_rms: float

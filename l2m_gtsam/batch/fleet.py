@@ -39,6 +39,7 @@ from l2m_gtsam.storage.fleet_table import write_csv, write_parquet
 from l2m_gtsam.storage.folder_names import printable
 from l2m_gtsam.storage.outcome_file import read_outcome
 
+COUNTS = {"bag", "calibration", "qa"}  # parts of a configuration that a drive's results depend on
 WORK = Work(map_of, open_map, calibrated_drive, lost_drive)
 
 
@@ -68,7 +69,7 @@ def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) ->
     """Calibrate all drives of a fleet that are not there yet; write page and tables of all.
 
     A drive that fails is a row with its reason. What is there from an earlier run is taken over
-    where bag, map and configuration are the same.
+    where bag, map, configuration (`config_digest`) and the program's version are the same.
 
     Parameters
     ----------
@@ -140,8 +141,11 @@ def _map_digest(path: Path) -> str:
 
 
 def config_digest(config: Config) -> str:
-    """Return the digest of what a calibration depends on: not of how the fleet is shown."""
-    content = json.dumps(config.model_dump(mode="json", exclude={"fleet"}), sort_keys=True)
+    """Return the digest of what a calibration and its verdict depend on.
+
+    Not of how maps are built, drives planned or localised, or the fleet shown.
+    """
+    content = json.dumps(config.model_dump(mode="json", include=COUNTS), sort_keys=True)
     return hashlib.sha256(content.encode()).hexdigest()
 
 

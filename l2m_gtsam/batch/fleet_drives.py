@@ -1,11 +1,13 @@
 """Which drives a fleet made: from a folder or a manifest."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from l2m_gtsam.errors import BagError, ConfigError
-from l2m_gtsam.storage.find_bags import FILES, find_bags, is_bag
+from l2m_gtsam.fleet_results import DATE
+from l2m_gtsam.storage.find_bags import FILES, find_bags, is_bag, is_folder
 from l2m_gtsam.storage.folder_names import folder_names
 from l2m_gtsam.storage.manifest import ManifestEntry, read_manifest
 
@@ -71,11 +73,11 @@ def fleet_drives(order: FleetOrder) -> tuple[FleetDrive, ...]:
     Raises
     ------
     BagError
-        There are none.
+        There are none, or a folder cannot be read.
     ConfigError
         The manifest is not one, a drive has no map, or is listed twice.
     """
-    if order.source.is_dir():
+    if is_folder(order.source):
         return _with_folders(_in_folder(order))
     if is_bag(order.source):
         raise BagError(
@@ -98,11 +100,17 @@ def _in_folder(order: FleetOrder) -> list[FleetDrive]:
             bag,
             order.map_path,
             order.config,
-            bag.resolve().parent.name or "vehicle",
+            _vehicle(bag),
             _seen_from(order.source, bag),
         )
         for bag in bags
     ]
+
+
+def _vehicle(bag: Path) -> str:
+    """Return the name of the folder that a bag lies in: of a link, not of what it points to."""
+    here = bag if bag.name not in ("", "..") else bag.resolve()
+    return here.parent.resolve().name or "vehicle"
 
 
 def _listed(order: FleetOrder, entry: ManifestEntry) -> FleetDrive:
@@ -112,7 +120,7 @@ def _listed(order: FleetOrder, entry: ManifestEntry) -> FleetDrive:
             f"{order.source}: {entry.bag.name} has no map; give it as `map`, or one for all with "
             "--map"
         )
-    date = "" if entry.date is None else entry.date.strftime("%Y-%m-%dT%H:%M:%SZ")
+    date = "" if entry.date is None else entry.date.strftime(DATE)
     folder = order.source.parent
     listed = "\0".join(
         _seen_from(folder, path) for path in (entry.bag, entry.map, entry.config) if path
@@ -127,13 +135,16 @@ def _seen_from(folder: Path, path: Path) -> str:
 
 def _with_folders(drives: Sequence[FleetDrive]) -> tuple[FleetDrive, ...]:
     """Return drives with a folder each."""
-    vehicles = list(dict.fromkeys(each.vehicle for each in drives))
+    vehicles: dict[str, list[FleetDrive]] = {}
+    for drive in drives:
+        vehicles.setdefault(drive.vehicle, []).append(drive)
     reserved = (PAGE_FILE, CSV_FILE, PARQUET_FILE)
+    folders = folder_names(list(vehicles), list(vehicles), reserved)
     placed: list[FleetDrive] = []
-    for vehicle, folder in zip(vehicles, folder_names(vehicles, vehicles, reserved), strict=True):
-        own = [each for each in drives if each.vehicle == vehicle]
+    for (vehicle, own), folder in zip(vehicles.items(), folders, strict=True):
         identities = [each.listed for each in own]
-        if twice := [each for each in own if identities.count(each.listed) > 1]:
+        times = Counter(identities)
+        if twice := [each for each in own if times[each.listed] > 1]:
             raise ConfigError(f"{twice[0].bag}: listed twice for vehicle {vehicle!r}; remove one")
         names = folder_names([each.name for each in own], identities)
         placed += [

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 
@@ -18,7 +19,7 @@ from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import L2MError, OutputError
-from l2m_gtsam.fleet_results import DriveOutcome, Made, RowKey
+from l2m_gtsam.fleet_results import DATE, DriveOutcome, Made, RowKey
 from l2m_gtsam.qa.fleet.rows import sensor_rows
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.folder_names import printable
@@ -42,7 +43,7 @@ class FleetTask:
     out
         Folder for its results.
     map_digest, config_digest
-        Of what it is calibrated with.
+        Of what it is calibrated with; see `RowKey`.
     """
 
     drive: FleetDrive
@@ -53,7 +54,7 @@ class FleetTask:
 
     def key(self, bag_digest: str) -> RowKey:
         """Return what the outcome depends on."""
-        return RowKey(bag_digest, self.map_digest, self.config_digest)
+        return RowKey(bag_digest, self.map_digest, self.config_digest, version("l2m-gtsam"))
 
 
 @dataclass(frozen=True)
@@ -81,13 +82,15 @@ def map_of(task: FleetTask) -> Path:
 
 
 def open_map(path: Path) -> FleetMap:
-    """Open a map, once for all drives on it."""
+    """Open a map, once for all drives on it; whatever happens is the reason of their rows."""
     try:
         saved = SavedMap.read(path)
         opened = OpenMap(saved.open(_quiet), source_file(path))
+        return FleetMap(opened, SavedMap(path, replace(saved.state, arrays={})))
     except L2MError as error:
         return FleetMap(None, None, str(error))
-    return FleetMap(opened, SavedMap(path, replace(saved.state, arrays={})))
+    except Exception as error:  # one map is not the end of drives on others
+        return FleetMap(None, None, _unexpected(path, error))
 
 
 def calibrated_drive(task: FleetTask, shared: FleetMap) -> DriveOutcome:
@@ -121,9 +124,7 @@ def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
         digest = _digest(task.drive.bag)
         return _failed(task, str(error), begun, digest)
     except Exception as error:  # one drive is not the end of all others
-        told = " ".join(str(error).split())[:300]
-        reason = f"{task.drive.bag}: unexpected {type(error).__name__}: {told}"
-        return _failed(task, f"{reason}; `l2m --debug calibrate` shows where", begun)
+        return _failed(task, _unexpected(task.drive.bag, error), begun)
 
 
 def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float) -> DriveOutcome:
@@ -148,6 +149,12 @@ def _failed(task: FleetTask, reason: str, begun: float, digest: str = "") -> Dri
     return DriveOutcome(key, "", 0.0, (), printable(reason), bool(digest), _made(begun))
 
 
+def _unexpected(path: Path, error: Exception) -> str:
+    """Return the reason of a row for what was caused by a file, and should not have happened."""
+    told = " ".join(str(error).split())[:300]
+    return f"{path}: unexpected {type(error).__name__}: {told}; `l2m --debug calibrate` shows where"
+
+
 def _clear(folder: Path) -> None:
     """Remove results of an earlier bag, map or configuration: they must not pass for new ones."""
     files = [folder / name for name in (OUTCOME_FILE, *RESULTS, PDF_FILE)]
@@ -170,7 +177,7 @@ def _digest(bag: Path) -> str:
 
 def _start(recording: Recording) -> str:
     seconds = int(recording.trajectory.stamp_ns[0]) // NANOSECONDS
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return datetime.fromtimestamp(seconds, UTC).strftime(DATE)
 
 
 def _duration(recording: Recording) -> float:
@@ -179,7 +186,7 @@ def _duration(recording: Recording) -> float:
 
 
 def _made(begun: float) -> Made:
-    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    now = datetime.now(UTC).strftime(DATE)
     return Made(now, round(perf_counter() - begun, 3))
 
 

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.fleet_results import FleetRow, SensorRow
+from l2m_gtsam.fleet_results import DATE, FleetRow, SensorRow
 from l2m_gtsam.metric_results import Row
 from l2m_gtsam.storage.atomic import atomic_path
 
@@ -121,4 +121,4 @@ def _readable(value: Any) -> Any:
 
 
 def _stamp(date: str) -> datetime | None:
-    return datetime.strptime(date, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if date else None
+    return datetime.strptime(date, DATE).replace(tzinfo=UTC) if date else None

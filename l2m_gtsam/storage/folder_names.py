@@ -16,8 +16,9 @@ def folder_names(
     """Return a folder's name for each of these names, no two alike on any file system.
 
     A name that is one already stays as it is. Any other, and all of those that are alike but for
-    upper and lower case, get a few digits of a digest, so that the name of one does not depend on
-    how many others there are or in which order they stand.
+    upper and lower case, get a few digits of a digest. So the name of one does not depend on the
+    order in which they stand, and on others only when they are like it: one that had no digits gets
+    them when another like it is added.
 
     Parameters
     ----------

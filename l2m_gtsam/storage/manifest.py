@@ -2,18 +2,49 @@
 
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic_core import PydanticCustomError
 
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.options import Options
 from l2m_gtsam.storage.yaml_file import read_yaml
 
 MOST = 100_000  # drives
+YEARS = (1970, 2200)  # of recordings: stamps begin with the first
+
+
+def _no_number(value: Any) -> Any:
+    """Refuse a number, which would be taken for seconds since 1970: mostly it is 20260502."""
+    try:
+        float(value)
+    except (TypeError, ValueError, OverflowError):
+        return value
+    raise PydanticCustomError(
+        "date",
+        "{value} is a number; write a date as 2026-05-02",
+        {"value": str(value).strip()[:40]},
+    )
 
 
 def _in_utc(date: datetime) -> datetime:
+    first, last = YEARS
+    # A year away from both, lest the zone leads out of what a datetime can hold.
+    if not first - 1 <= date.year <= last + 1 or not first <= _utc(date).year <= last:
+        told = {"year": date.year, "first": first, "last": last}
+        raise PydanticCustomError("date", "year {year}; accepted: {first} to {last}", told)
+    return _utc(date)
+
+
+def _utc(date: datetime) -> datetime:
     return date.replace(tzinfo=UTC) if date.tzinfo is None else date.astimezone(UTC)
 
 
@@ -30,7 +61,7 @@ class ManifestEntry(Options):
     """Map file, that of the command line if not given."""
     config: Path | None = None
     """YAML configuration, that of the command line if not given."""
-    date: Annotated[datetime, AfterValidator(_in_utc)] | None = None
+    date: Annotated[datetime, BeforeValidator(_no_number), AfterValidator(_in_utc)] | None = None
     """When the drive was, in UTC if it names no zone, instead of what the bag's stamps say."""
 
 

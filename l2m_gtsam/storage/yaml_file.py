@@ -35,6 +35,9 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
         raise error(msg) from reason
     try:
         return YAML(typ="safe", pure=True).load(text)
+    except OverflowError as reason:  # moved to UTC, year 1 or 9999 may be left
+        msg = f"{path}: has a date that no calendar holds; accepted: years 2 to 9998"
+        raise error(msg) from reason
     except (YAMLError, ValueError, RecursionError) as reason:
         line = getattr(getattr(reason, "problem_mark", None), "line", None)
         where = "" if line is None else f", line {line + 1}"

@@ -9,8 +9,9 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import NoReturn, cast
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
@@ -25,6 +26,7 @@ from l2m_gtsam.batch.fleet_task import (
     lost_drive,
     open_map,
 )
+from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.cluster import ClusterOptions
 from l2m_gtsam.fleet_results import DriveOutcome
 from l2m_gtsam.maps.field_map import FieldMap
@@ -143,6 +145,16 @@ def other_options(run: Run) -> None:
     rewrite(run.place.config, "calibration", {"solve": {"uncertainty": "independent"}})
 
 
+def other_verdicts(run: Run) -> None:
+    rewrite(run.place.config, "qa", {"halves": True})
+
+
+def other_ways_to_map_and_plan(run: Run) -> None:
+    rewrite(run.place.config, "mapping", {"compare": {"folds": 5}})
+    rewrite(run.place.config, "plan", {"rate_hz": 5})
+    rewrite(run.place.config, "slam", {})
+
+
 def other_outliers(run: Run) -> None:
     rewrite(run.place.config, "fleet", {"outlier": 9})
 
@@ -159,6 +171,20 @@ def lost_report(run: Run) -> None:
 
 def damaged_outcome(run: Run) -> None:
     (run.out / "truck_1/day_9" / OUTCOME_FILE).write_text("{")
+
+
+def edited_outcome(run: Run) -> None:
+    path = run.out / "truck_1/day_9" / OUTCOME_FILE
+    content = json.loads(path.read_text())
+    content["outcome"]["sensors"][0]["verdict"] = "splendid"
+    path.write_text(json.dumps(content))
+
+
+def outcome_of_another_version(run: Run) -> None:
+    path = run.out / "truck_1/day_9" / OUTCOME_FILE
+    content = json.loads(path.read_text())
+    content["outcome"]["key"]["program"] += ".post1"
+    path.write_text(json.dumps(content))
 
 
 def passing_failure(run: Run) -> None:
@@ -179,12 +205,16 @@ def new_bag(run: Run) -> None:
         (another_drive, {"truck_1/day_0.bag"}),
         (mended_bag, {"truck_2/day_1.bag"}),
         (other_outliers, set()),
+        (other_ways_to_map_and_plan, set()),
         (lost_report, {"truck_1/day_9.mcap"}),
         (damaged_outcome, {"truck_1/day_9.mcap"}),
+        (edited_outcome, {"truck_1/day_9.mcap"}),
+        (outcome_of_another_version, {"truck_1/day_9.mcap"}),
         (passing_failure, {"truck_1/day_9.mcap"}),
         (new_bag, {"truck_3/day_0.bag"}),
         (another_map, None),
         (other_options, None),
+        (other_verdicts, None),
     ],
 )
 def test_only_what_is_missing_or_changed_is_computed(
@@ -246,6 +276,22 @@ def test_what_nobody_expects_is_a_row_too(run: Run, tmp_path: Path) -> None:
     assert not calibrated_drive(blocked, shared).lasting
     bad_map = calibrated_drive(tasks[0], open_map(tmp_path / "absent.npz"))
     assert "absent.npz" in bad_map.error
+
+
+@pytest.mark.parametrize("error", [MemoryError("no room"), np.linalg.LinAlgError("Singular")])
+def test_a_map_that_cannot_be_opened_is_the_reason_of_its_drives(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    there = run.copied(tmp_path)
+
+    def fail(*_: object) -> NoReturn:
+        raise error
+
+    monkeypatch.setattr(SavedMap, "open", fail)
+    shared = open_map(there.place.map)
+    outcome = calibrated_drive(fleet_tasks(fleet_drives(there.order), there.out)[0], shared)
+    assert outcome.error.startswith(f"{there.place.map}: unexpected {type(error).__name__}: ")
+    assert not outcome.lasting
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import dask
-import distributed  # noqa: F401 - its configuration is loaded before a part of it is changed
+import distributed  # its configuration is loaded before a part of it is changed
 import pytest
 
+from l2m_gtsam import cluster
 from l2m_gtsam.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.errors import ClusterError
 
@@ -57,3 +58,16 @@ def test_a_killer_is_lost_and_nobody_else() -> None:
 def test_without_a_word_for_it_a_killer_ends_all() -> None:
     with pytest.raises(ClusterError, match=r"^3: every worker that began it died"):
         results([KILLER], None)
+
+
+def test_a_scheduler_without_workers_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_S", 2)
+    with distributed.LocalCluster(
+        n_workers=0, host=cluster.LOOPBACK, dashboard_address=f"{cluster.LOOPBACK}:0"
+    ) as empty:
+        options = ClusterOptions(scheduler=empty.scheduler_address)
+        with pytest.raises(ClusterError) as error:
+            list(computed(Work(place, prepare, task, lost), [1], options))
+    told = str(error.value)
+    assert told.startswith(f"--scheduler {empty.scheduler_address}: has no workers; start some: ")
+    assert "\n" not in told

@@ -1,14 +1,22 @@
 """Which drives a fleet made: folders, manifests, and names that mean harm."""
 
+import os
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from l2m_gtsam.batch.fleet_drives import FleetDrive, FleetOrder, fleet_drives
 from l2m_gtsam.errors import BagError, ConfigError
+from l2m_gtsam.fleet_results import DATE
 from l2m_gtsam.storage.folder_names import folder_names, printable
+from l2m_gtsam.storage.manifest import ManifestEntry
 
 HOSTILE = ("../../etc", "/root", "..", ".", "", "a/b", "con\n", "\\x", "-rf", "fleet.csv", "\udcff")
 NAMES = st.lists(st.text(max_size=80) | st.sampled_from(HOSTILE), max_size=12, unique=True)
@@ -91,6 +99,114 @@ def test_a_loop_of_links_ends(tmp_path: Path) -> None:
     assert len(listed(tmp_path)) == 1
 
 
+def test_the_vehicle_of_a_link_is_the_folder_that_the_link_lies_in(tmp_path: Path) -> None:
+    touch(tmp_path / "archive" / "2026" / "a.bag", tmp_path / "archive" / "b" / "metadata.yaml")
+    truck = tmp_path / "fleet" / "truck_1"
+    truck.mkdir(parents=True)
+    (truck / "a.bag").symlink_to(tmp_path / "archive" / "2026" / "a.bag")
+    (truck / "b").symlink_to(tmp_path / "archive" / "b")
+    assert [each.vehicle for each in listed(tmp_path / "fleet")] == ["truck_1", "truck_1"]
+
+
+def test_a_bag_that_is_the_folder_itself_has_its_parent_for_a_vehicle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touch(tmp_path / "truck_1" / "ros2" / "metadata.yaml")
+    monkeypatch.chdir(tmp_path / "truck_1" / "ros2")
+    assert [each.vehicle for each in listed(Path())] == ["truck_1"]
+
+
+def closed_to_os(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a folder be listed or looked into by nobody, as for a user without the right to.
+
+    Root may read everything, so file modes would say nothing there.
+    """
+    scandir, stat = os.scandir, os.stat
+
+    def refuse(path: Any, places: Sequence[Path]) -> None:
+        if folder in places:
+            raise PermissionError(13, "Permission denied", str(path))
+
+    def no_scandir(path: Any = ".") -> Any:
+        refuse(path, [Path(path)])
+        return scandir(path)
+
+    def no_stat(path: Any, **options: Any) -> Any:
+        if isinstance(path, (str, os.PathLike)):
+            refuse(path, list(Path(path).parents))
+        return stat(path, **options)
+
+    monkeypatch.setattr(os, "scandir", no_scandir)
+    monkeypatch.setattr(os, "stat", no_stat)
+
+
+def test_a_folder_that_cannot_be_read_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touch(tmp_path / "truck_1" / "a.bag", tmp_path / "truck_2" / "deep" / "b.bag")
+    closed = tmp_path / "truck_2"
+    closed_to_os(closed, monkeypatch)
+    with pytest.raises(BagError) as error:
+        listed(tmp_path)
+    assert str(error.value).startswith(f"{closed}: cannot be read: Permission denied; allow ")
+    with pytest.raises(BagError, match="cannot be read: Permission denied"):
+        listed(closed / "deep")
+    with pytest.raises(BagError, match="cannot be read: Permission denied"):
+        listed(tmp_path, closed / "fleet.yaml")
+
+
+def test_a_folder_that_cannot_be_listed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One may look for names in it, and not see which there are."""
+    touch(tmp_path / "truck_1" / "a.bag", tmp_path / "truck_2" / "b.bag")
+    stat = os.stat
+    closed_to_os(tmp_path / "truck_2", monkeypatch)
+    monkeypatch.setattr(os, "stat", stat)
+    with pytest.raises(BagError, match=r"truck_2: cannot be read: Permission denied; allow "):
+        listed(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+@pytest.mark.parametrize("mode", [0o000, 0o300, 0o400])
+def test_a_folder_that_is_closed_is_named(tmp_path: Path, mode: int) -> None:
+    touch(tmp_path / "truck_1" / "a.bag", tmp_path / "truck_2" / "deep" / "b.bag")
+    closed = tmp_path / "truck_2"
+    closed.chmod(mode)
+    try:
+        with pytest.raises(BagError, match=r"truck_2.*: cannot be read: Permission denied; allow "):
+            listed(tmp_path)
+    finally:
+        closed.chmod(0o700)
+
+
+def test_the_folder_for_results_may_be_anything(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touch(tmp_path / "truck_1" / "a.bag", tmp_path / "out" / "metadata.yaml")
+    closed_to_os(tmp_path / "out", monkeypatch)
+    assert [each.vehicle for each in listed(tmp_path)] == ["truck_1"]
+
+
+def test_folders_of_many_drives_are_found_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Thousands of vehicles, and one with thousands of drives."""
+    many = 10_000
+    entries = [
+        ManifestEntry(bag=tmp_path / f"{k}.bag", vehicle=vehicle)
+        for k in range(many)
+        for vehicle in (f"truck_{k}", "all")
+    ]
+    monkeypatch.setattr("l2m_gtsam.batch.fleet_drives.read_manifest", lambda _: entries)
+    begun = time.process_time()
+    found = listed(tmp_path, tmp_path / "fleet.yaml")
+    taken = time.process_time() - begun
+    assert len({each.folder for each in found}) == 2 * many
+    # half a second of a processor; looking through all drives for each vehicle takes 7
+    assert taken < 3
+
+
 def test_a_manifest(tmp_path: Path) -> None:
     manifest = tmp_path / "fleet.yaml"
     manifest.write_text(
@@ -107,6 +223,20 @@ def test_a_manifest(tmp_path: Path) -> None:
     assert [each.folder for each in (one, two, three)] == ["7/a", "van/b", "van/c"]
 
 
+@given(st.datetimes(timezones=st.none() | st.timezones()))
+def test_every_date_is_read_back_or_refused(date: datetime) -> None:
+    """What is read can be written as text of a table, and read from it."""
+    try:
+        entry = ManifestEntry(bag=Path("a.bag"), vehicle="v", date=date)
+    except ValidationError:
+        assume(1971 <= date.year <= 2199)
+        raise
+    assert entry.date is not None
+    again = datetime.strptime(entry.date.strftime(DATE), DATE).replace(tzinfo=UTC)
+    assert again == entry.date.replace(microsecond=0)
+    assert 1970 <= again.year <= 2200
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -117,6 +247,24 @@ def test_a_manifest(tmp_path: Path) -> None:
         ("- {bag: a.bag, vehicle: v}\n- {bag: a.bag, vehicel: v}", "drive 2: vehicle: Field"),
         ("- {bag: a.bag, vehicle: v, colour: red}", "drive 1: colour: unknown key; accepted here"),
         ("- {bag: a.bag, vehicle: v, date: soon}", "drive 1: date: Input should be a valid date"),
+        (
+            "- {bag: a.bag, vehicle: v, date: 20260502}",
+            "drive 1: date: 20260502 is a number; write",
+        ),
+        ("- {bag: a.bag, vehicle: v, date: '20260502'}", "date: 20260502 is a number; write a"),
+        ("- {bag: a.bag, vehicle: v, date: 2026.5}", "date: 2026.5 is a number; write a date as"),
+        ("- {bag: a.bag, vehicle: v, date: true}", "date: True is a number; write a date as"),
+        ("- {bag: a.bag, vehicle: v, date: 0024-01-01}", "date: year 24; accepted: 1970 to 2200"),
+        ("- {bag: a.bag, vehicle: v, date: 2201-01-01}", "date: year 2201; accepted: 1970 to"),
+        (
+            "- {bag: a.bag, vehicle: v, date: '0001-01-01T00:00:00+02:00'}",
+            "drive 1: date: year 1; accepted: 1970 to 2200",
+        ),
+        (
+            "- {bag: a.bag, vehicle: v, date: '9999-12-31T23:00:00-02:00'}",
+            "drive 1: date: year 9999; accepted: 1970 to 2200",
+        ),
+        ("- {bag: a.bag, vehicle: v, date: 0001-01-01T00:00:00+02:00}", "accepted: "),
         ("- {bag: a.bag, vehicle: v}\n" * 2, "a.bag: listed twice for vehicle 'v'"),
         ("- {bag: a.bag", "not valid YAML"),
         ("- a.bag", "drive 1: Input should be a valid dictionary"),

@@ -1,5 +1,6 @@
 """Outliers and trends of a fleet: what is marked, and what never is."""
 
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.fleet_results import FleetRow
+from l2m_gtsam.qa.fleet import outliers
 from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.fleet.outliers import expected_deviation, rotations_apart, with_outliers
 from l2m_gtsam.qa.fleet.trends import trends, weighted_mean
@@ -107,6 +109,49 @@ def test_rotations_are_told_from_the_middle_one(seed: int) -> None:
     for k in range(5):
         again = (back * Rotation.from_rotvec(told[k], degrees=True)).as_matrix()
         assert again == pytest.approx(Rotation.from_quat(q[k]).as_matrix(), abs=1e-9)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 40))
+def test_the_middle_rotation_beside_one_found_by_trying_all(seed: int, count: int) -> None:
+    R = Rotation.random(random_state=seed) * near(seed, count)
+    sums = [sum((one.inv() * other).magnitude() for other in R) for one in R]
+    told = rotations_apart(R.as_quat())
+    (middle,) = np.flatnonzero(np.linalg.norm(told, axis=1) < 1e-9)
+    # two that are equally near to all others, as with two rotations, may be taken for each other
+    assert sums[middle] == pytest.approx(min(sums), abs=1e-9)
+
+
+@given(st.integers(0, 1000))
+def test_the_middle_of_a_sample_is_nearly_that_of_all(seed: int) -> None:
+    """Forty of two hundred: both lie well inside the scatter of 2 degrees per axis."""
+    q = near(seed, 200).as_quat()
+    whole = rotations_apart(q)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outliers, "MOST", 40)
+        sampled = rotations_apart(q)
+        assert (sampled == rotations_apart(q)).all()
+    between = (
+        Rotation.from_rotvec(whole, degrees=True)
+        * Rotation.from_rotvec(sampled, degrees=True).inv()
+    )
+    apart = np.rad2deg(between.magnitude())
+    assert np.ptp(apart) < 1e-6  # one rotation, the same for all drives
+    assert apart[0] < 3
+
+
+def test_thousands_of_rotations_take_little_memory() -> None:
+    q = near(1, 20_000).as_quat()
+    tracemalloc.start()
+    rotations_apart(q)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6  # each with each would be 3 GB
+
+
+def near(seed: int, count: int) -> Rotation:
+    """Return rotations by some 2 degrees about each axis."""
+    apart = np.random.default_rng(seed).normal(0, 2, (count, 3))
+    return Rotation.from_rotvec(apart, degrees=True)
 
 
 @given(st.integers(4, 60), st.floats(1e-3, 1e3), st.integers(0, 1000))

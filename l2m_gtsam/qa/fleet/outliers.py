@@ -11,6 +11,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.fleet_results import FleetRow, Outlier, SensorRow
 from l2m_gtsam.qa.fleet.options import FleetOptions
 
+MOST = 500  # rotations that are compared each with each: 2 MB
 MEDIAN = np.pi / 2  # variance of a median beside that of a mean, of normal numbers
 
 
@@ -87,6 +88,8 @@ def parameters(sensors: Sequence[SensorRow], options: FleetOptions) -> list[Para
 def rotations_apart(quaternions: FloatArray) -> FloatArray:
     """Return how rotations differ from the one that is nearest to all others.
 
+    Of more than `MOST`, that one is sought among as many, evenly spread in their order.
+
     Parameters
     ----------
     quaternions
@@ -101,12 +104,18 @@ def rotations_apart(quaternions: FloatArray) -> FloatArray:
     apart = np.full((len(quaternions), 3), np.nan)
     if known.any():
         R = Rotation.from_quat(quaternions[known])
-        # Angles between all of them, from the cosines of half of each.
-        q = R.as_quat()
-        angles = 2 * np.arccos(np.clip(np.abs(q @ q.T), 0, 1))
-        middle = R[int(np.argmin(angles.sum(axis=1)))]
-        apart[known] = np.rad2deg((middle.inv() * R).as_rotvec())
+        apart[known] = np.rad2deg((_middle(R).inv() * R).as_rotvec())
     return apart
+
+
+def _middle(R: Rotation) -> Rotation:
+    """Return the one of N rotations that is nearest to all others, or to `MOST` of them."""
+    count = min(len(R), MOST)
+    among = R[np.arange(count) * len(R) // count]
+    # Angles between all of them, from the cosines of half of each.
+    q = among.as_quat()
+    angles = 2 * np.arccos(np.clip(np.abs(q @ q.T), 0, 1))
+    return among[int(np.argmin(angles.sum(axis=1)))]
 
 
 def _column(sensors: Sequence[SensorRow], name: str) -> FloatArray:
