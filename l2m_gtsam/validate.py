@@ -163,10 +163,12 @@ def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration
 def joint_covariance(sensor: SensorCalibration) -> FloatArray:
     """Return the covariance of (t, C row by row, H, time offset), shape (16, 16).
 
-    A time offset that is held is taken for known.
+    The variance of a time offset that was held, or that the file does not speak of, is infinite:
+    nothing is known of that clock.
     """
     joint = np.zeros((16, 16))
     joint[:15, :15] = sensor.covariance
+    joint[15, 15] = np.inf
     offset = sensor.time_offset
     if offset is not None and offset.estimated:
         joint[15, :15] = joint[:15, 15] = offset.cross_covariance
