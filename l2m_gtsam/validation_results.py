@@ -93,8 +93,9 @@ class Change(Record):
         Which.
     change, sigma
         Now less then, and its standard deviation: place along the lidar's axes in m; degrees by
-        which the sensor turned about its own axes, R_lidar_mag = R_lidar_mag_then exp(change); gains of its axes; angles by which those between
-        its axes x y, y z, z x fell short of 90 degrees, in degrees; H in uT; time offset in s.
+        which the sensor turned about its own axes, R_lidar_mag = R_lidar_mag_then exp(change);
+        gains of its axes; angles by which those between its axes x y, y z, z x fell short of 90
+        degrees, in degrees; H in uT; time offset in s.
     size
         Length of the vector; of gains and angles the largest change.
     chance
