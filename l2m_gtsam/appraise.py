@@ -63,7 +63,8 @@ def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
     """
     evidence, maps = _evidence(calibrated), _maps(calibrated)
     name = recording.source.sha256
-    return calibration_scene(calibrated.result, evidence, recording.trajectory, maps, name)
+    drives = [each.trajectory for each in recording.parts]
+    return calibration_scene(calibrated.result, evidence, drives, maps, name)
 
 
 def _evidence(calibrated: Calibrated) -> DriveEvidence:

@@ -129,6 +129,9 @@ def usable_sensors(
             notes.append(f"{series.sensor} is left out: it has no calibration")
         elif not is_determined(entry):
             notes.append(f"{series.sensor} is left out: its calibration is {entry.status.value}")
+        elif entry.moving:
+            numbers = ", ".join(each.name for each in entry.moving)
+            notes.append(f"{series.sensor} is left out: a part of its readings follows {numbers}")
         else:
             usable.append(entry)
     if not usable:

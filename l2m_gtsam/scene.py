@@ -31,7 +31,7 @@ class DriveView:
     Attributes
     ----------
     seconds
-        Since the first, shape (K,).
+        Since the first of all drives, pauses between drives left out, shape (K,).
     R, p
         Rotations (K, 3, 3), and positions (K, 3) in metres.
     """
@@ -69,9 +69,9 @@ class SensorView:
 
 @dataclass(frozen=True)
 class Scene:
-    """Map, drive and sensors; ``name`` says of what."""
+    """Map, drives and sensors; ``name`` says of what."""
 
     name: str
     map: MapView
-    drive: DriveView
+    drives: tuple[DriveView, ...]
     sensors: tuple[SensorView, ...]

@@ -18,7 +18,7 @@ class LocalisationStatus(StrEnum):
 
 @dataclass(frozen=True)
 class DriftFigures:
-    """How far odometry had drifted from the localised poses, both from the same start.
+    """How far odometry, from where the drive is said to begin, is from the localised poses.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class LocalisationResult:
     trajectory
         Key poses in the map, with the covariance of each.
     odometry
-        Where odometry alone would have them, from the same start.
+        Where odometry alone would have them, from where the drive is said to begin.
     drift
         The difference of both in figures.
     sensors

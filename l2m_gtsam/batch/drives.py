@@ -108,6 +108,8 @@ def calibrate_drive(
     drives = [each.trajectory for each in recording.parts]
     figure = calibration_figure(opened.field_map, drives, result, truth)
     ensure_folder(out)
+    if view is not None:
+        ensure_folder(view.parent)
     write_calibration(out / CALIBRATION_FILE, result)
     write_metrics(out / METRICS_FILE, metrics)
     save_figure(figure, out / OVERVIEW_FILE)

@@ -20,7 +20,7 @@ from l2m_gtsam.storage.tum import write_tum
 TRAJECTORY_FILE = "trajectory.tum"
 GRAPH_FILE = "graph.g2o"
 SLAM_FILE = "slam.json"
-REFINED_FILE = "calibration.yaml"
+REFINED_FILE = "refined.yaml"
 NOWHERE = (LocalisationStatus.OUTSIDE_MAP, LocalisationStatus.NOT_HERE)
 
 
@@ -65,9 +65,9 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     """
     files = [out / name for name in (TRAJECTORY_FILE, GRAPH_FILE, SLAM_FILE, REFINED_FILE)]
     check_outputs(*files)
+    saved, calibration = SavedMap.read(given.map), read_calibration(given.calibration)
     if (out / REFINED_FILE).exists() and given.calibration.samefile(out / REFINED_FILE):
         raise OutputError(f"{given.calibration}: is what is read; choose another --out")
-    saved, calibration = SavedMap.read(given.map), read_calibration(given.calibration)
     recording = read_drive(given.bag, config, progress)
     start = config.slam.start
     # A start that is given puts odometry of any frame into the map.
@@ -87,7 +87,11 @@ def _write(found: Localisation, config: Config, out: Path) -> None:
     write_tum(out / TRAJECTORY_FILE, result.trajectory)
     with atomic_path(out / GRAPH_FILE) as temporary:
         write_g2o(temporary, found.solution)
+    options = config.model_dump(mode="json", include={"bag", "slam"})
+    (out / REFINED_FILE).unlink(missing_ok=True)  # of an earlier run, which these files replace
     if result.calibration is not None:
-        refined = replace(result.calibration, bag=result.bag, map=result.map)
+        refined = replace(
+            result.calibration, bag=result.bag, bags=(), map=result.map, options=options
+        )
         write_calibration(out / REFINED_FILE, refined)
-    write_slam(out / SLAM_FILE, result, config.model_dump(mode="json", include={"bag", "slam"}))
+    write_slam(out / SLAM_FILE, result, options)

@@ -1,5 +1,7 @@
 """A calibration as it is seen in three dimensions: map, drive, sensors and what does not fit."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Trajectory
@@ -12,13 +14,14 @@ from l2m_gtsam.scene import DriveView, MapView, Scene, SensorView
 
 AROUND = 1.5  # metres of the map on each side of a drive
 LATTICE = 4000  # places of the map, about
-POSES, READINGS = 2000, 2000  # of the drive, and of each sensor, at most
+POSES, READINGS = 2000, 2000  # of all drives, and of each sensor, at most
+PAUSE_S = 1.0  # between two drives on the view's time line
 
 
 def calibration_scene(
     result: CalibrationResult,
     evidence: DriveEvidence,
-    trajectory: Trajectory,
+    drives: Sequence[Trajectory],
     maps: MapForms,
     name: str,
 ) -> Scene:
@@ -30,17 +33,17 @@ def calibration_scene(
         The calibration.
     evidence
         Its readings.
-    trajectory
-        Poses of the lidar in the map.
+    drives
+        Poses of the lidar in the map, drive by drive.
     maps
         The map.
     name
-        Of the drive.
+        Of the recording.
     """
     solved = [each for each in result.sensors if each.residuals is not None]
     sensors = tuple(_sensor(each, evidence, maps.along_drive) for each in solved)
     places = np.concatenate([each.place for each in sensors])
-    return Scene(name, map_view(maps.anywhere, places), _drive(trajectory), sensors)
+    return Scene(name, map_view(maps.anywhere, places), drive_views(drives), sensors)
 
 
 def map_view(field_map: Queryable, places: FloatArray) -> MapView:
@@ -55,10 +58,15 @@ def map_view(field_map: Queryable, places: FloatArray) -> MapView:
     return MapView(place[sample.inside], sample.field[sample.inside], cell)
 
 
-def _drive(trajectory: Trajectory) -> DriveView:
-    keep = evenly(len(trajectory), POSES)
-    seconds = 1e-9 * (trajectory.stamp_ns[keep] - trajectory.stamp_ns[0])
-    return DriveView(seconds, trajectory.R[keep], trajectory.p[keep])
+def drive_views(drives: Sequence[Trajectory]) -> tuple[DriveView, ...]:
+    """Return the drives one after another."""
+    views, start = [], 0.0
+    for trajectory in drives:
+        keep = evenly(len(trajectory), POSES // len(drives))
+        seconds = start + 1e-9 * (trajectory.stamp_ns[keep] - trajectory.stamp_ns[0])
+        views.append(DriveView(seconds, trajectory.R[keep], trajectory.p[keep]))
+        start = seconds[-1] + PAUSE_S
+    return tuple(views)
 
 
 def _sensor(sensor: SensorCalibration, drive: DriveEvidence, field_map: Queryable) -> SensorView:

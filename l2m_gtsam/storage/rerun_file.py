@@ -40,7 +40,7 @@ def write_scene(path: Path, scene: Scene) -> None:
     """Write a scene.
 
     Entities: ``map/strength`` (places coloured by |B|) and ``map/anomaly`` (field less its mean),
-    ``drive`` (the path), ``lidar`` (its pose over time) with each sensor and its 95 % ellipsoid
+    ``drive`` (the paths), ``lidar`` (its pose over time) with each sensor and its 95 % ellipsoid
     under it, and ``misfit`` and ``rejected`` (arrows of corrected reading less map, by sensor).
 
     Parameters
@@ -63,7 +63,7 @@ def write_scene(path: Path, scene: Scene) -> None:
             recording.save(temporary)
             recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
             _log_map(recording, scene.map)
-            _log_drive(recording, scene.drive)
+            _log_drives(recording, scene.drives)
             metres = arrow_scale(scene.sensors)
             for sensor in scene.sensors:
                 _log_sensor(recording, sensor, metres)
@@ -105,16 +105,18 @@ def _log_map(recording: "RecordingStream", view: MapView) -> None:
     recording.log("map/anomaly", arrows, static=True)
 
 
-def _log_drive(recording: "RecordingStream", view: DriveView) -> None:
+def _log_drives(recording: "RecordingStream", views: tuple[DriveView, ...]) -> None:
     import rerun as rr
 
-    line = rr.LineStrips3D([view.p], colors=PATH, radii=0.01)
-    recording.log("drive", line, static=True)
+    lines = rr.LineStrips3D([each.p for each in views], colors=PATH, radii=0.01)
+    recording.log("drive", lines, static=True)
     recording.log("lidar", rr.Points3D([[0.0, 0.0, 0.0]], colors=LIDAR, radii=0.05), static=True)
     poses = rr.Transform3D.columns(
-        translation=view.p, quaternion=Rotation.from_matrix(view.R).as_quat()
+        translation=np.concatenate([each.p for each in views]),
+        quaternion=np.concatenate([Rotation.from_matrix(each.R).as_quat() for each in views]),
     )
-    recording.send_columns("lidar", [rr.TimeColumn(TIMELINE, duration=view.seconds)], poses)
+    seconds = np.concatenate([each.seconds for each in views])
+    recording.send_columns("lidar", [rr.TimeColumn(TIMELINE, duration=seconds)], poses)
 
 
 def _log_sensor(recording: "RecordingStream", view: SensorView, metres: float) -> None:

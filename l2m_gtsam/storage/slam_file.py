@@ -18,7 +18,7 @@ LEGEND = {
     "poses": "T_map_lidar at key poses: stamp_ns, p in metres, quaternion_xyzw",
     "covariance": "of a right perturbation, T_true = T_map_lidar Exp(error): rotation (rad), then "
     "translation (m), along the axes of the lidar",
-    "drift": "odometry alone less the localised poses, both from the same start",
+    "drift": "odometry alone, from where the drive is said to begin, less the localised poses",
     "chi2_per_dof": "mean square of whitened residuals; 1 is consistent",
 }
 

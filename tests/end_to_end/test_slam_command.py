@@ -75,8 +75,16 @@ def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path
     assert np.sqrt(np.mean(apart**2)) < 0.1
     _, values = gtsam.readG2o(str(out / "graph.g2o"), True)
     assert values.size() == trajectory.num_poses
-    refined = read_calibration(out / "calibration.yaml")["mag"]
+    refined = read_calibration(out / "refined.yaml")["mag"]
     assert np.all(refined.H_sigma < 1.0)
+    # Named as what is written, a file that is missing is still one line.
+    assert "no such file" in complaint_here(
+        *("slam", yard.west, "--map", field_map, "--calibration", tmp_path / "none.yaml"),
+        *("--out", out),
+    )
+    fixed = configured(yard, tmp_path, calibration="fixed", start={"position_m": 0.02})
+    l2m("slam", yard.west, *files[:-4], "--config", fixed, "--out", out)
+    assert not (out / "refined.yaml").exists()
 
 
 def test_bad_input_is_one_line_and_writes_nothing(

@@ -13,6 +13,7 @@ from l2m_gtsam.appraise import scene_of
 from l2m_gtsam.calibrate import Calibrated, calibrated
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import OutputError
+from l2m_gtsam.qa.scene import drive_views
 from l2m_gtsam.scene import Scene
 from l2m_gtsam.storage import rerun_file
 from l2m_gtsam.storage.rerun_file import arrow_scale, ellipsoid, write_scene
@@ -69,12 +70,19 @@ def test_rerun_reads_back_what_was_written(scene: Scene, tmp_path: Path) -> None
     expected = arrow_scale(scene.sensors) * sensor.misfit[~sensor.rejected]
     np.testing.assert_allclose(arrows, expected, atol=1e-6)  # stored in single precision
     poses = column(path, "/lidar", "Transform3D:translation")
-    np.testing.assert_allclose(poses, scene.drive.p, atol=1e-5)
+    np.testing.assert_allclose(poses, scene.drives[0].p, atol=1e-5)
     turns = Rotation.from_quat(column(path, "/lidar", "Transform3D:quaternion"))
-    assert (turns.inv() * Rotation.from_matrix(scene.drive.R)).magnitude().max() < 1e-5
+    assert (turns.inv() * Rotation.from_matrix(scene.drives[0].R)).magnitude().max() < 1e-5
     at = column(path, f"/lidar/{sensor.sensor}", "Points3D:positions")
     np.testing.assert_allclose(at[0], sensor.t_lidar_mag, atol=1e-6)
     assert [each.name for each in tmp_path.iterdir()] == ["view.rrd"]
+
+
+def test_no_path_is_drawn_between_drives(drive: Drive) -> None:
+    one = drive.recording.trajectory
+    first, second = drive_views([one, one])
+    np.testing.assert_array_equal(first.p, second.p)
+    assert second.seconds[0] > first.seconds[-1]
 
 
 @given(st.integers(0, 10_000))

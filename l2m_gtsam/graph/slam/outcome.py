@@ -82,13 +82,17 @@ def refined(calibration: CalibrationResult, solution: Localised) -> CalibrationR
         _refined(entry, solution, names.index(entry.sensor)) if entry.sensor in names else entry
         for entry in calibration.sensors
     ]
-    return replace(calibration, sensors=tuple(sensors))
+    return replace(calibration, sensors=tuple(sensors), disagreements=())
 
 
 def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCalibration:
     sensors, covariance = solution.drive.sensors, solution.calibration_covariance[i]
     distortion = Distortion.from_vector(sensors.distortion[i])
     rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
+    clock = entry.time_offset
+    if clock is not None:
+        # It took no part: what it had in common with the estimate before says nothing now.
+        clock = replace(clock, cross_covariance=np.zeros(15))
     return replace(
         entry,
         message="refined with the poses of a drive",
@@ -97,6 +101,7 @@ def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCal
         R_lidar_mag=rotation.R_mag_lidar.T,
         covariance=covariance,
         rotation_covariance=rotation.covariance,
+        time_offset=clock,
     )
 
 
