@@ -128,6 +128,11 @@ class SourceFile:
     sha256: str
 
 
+def same_content(one: SourceFile | None, other: SourceFile | None) -> bool:
+    """Return whether both are there and have the same content, wherever they lie."""
+    return one is not None and other is not None and one.sha256 == other.sha256
+
+
 @dataclass(frozen=True)
 class Recording:
     """One drive, or several joined by ``joining.joined``.

@@ -92,9 +92,10 @@ class Change(Record):
     part
         Which.
     change, sigma
-        Now less then, and its standard deviation: place along the lidar's axes in m; rotation of
-        the sensor about its own axes in degrees; gains of its axes; angles by which those between
-        its axes x y, y z, z x fell short of 90 degrees, in degrees; H in uT; time offset in s.
+        Now less then, and its standard deviation: place along the lidar's axes in m; degrees by
+        which the sensor turned about its own axes, R_lidar_mag = R_lidar_mag_then exp(change);
+        gains of its axes; angles by which those between its axes x y, y z, z x fell short of 90
+        degrees, in degrees; H in uT; time offset in s.
     size
         Length of the vector; of gains and angles the largest change.
     chance
@@ -273,7 +274,7 @@ class CalibrationComparison(Record):
     assumption
         How errors of both are taken to go together, as a sentence.
     same_bag
-        Whether both come from one drive.
+        Whether a drive took part in both.
     """
 
     sensors: tuple[ComparedSensor, ...]

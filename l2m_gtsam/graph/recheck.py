@@ -110,8 +110,11 @@ def recheck(
             used = usable(drive, field_map, known, options)
         told = _about(drive, field_map, known, known, used, options)
         told = against_calibration(told, spread, basis)
-    open_ = int(np.sum(~np.isfinite(np.diag(covariance))))
-    freedom = 3 * int(used.sum()) - open_, _determined(told) - open_
+    # What is open takes a degree of freedom, unless readings do not depend on it, as on a clock
+    # where motion is not known. (All depend on C, where coordinates are not the parameters.)
+    matters = np.linalg.norm(told.root, axis=0) > 0
+    open_ = int(np.sum(~np.isfinite(np.diag(covariance)) & matters))
+    freedom = 3 * int(used.sum()) - open_, int(matters.sum()) - open_
     return Recheck(told, freedom, followed.parts, followed.change, followed.covariance, used)
 
 
@@ -158,11 +161,6 @@ def _followed(
 def _settled(step: FloatArray, covariance: FloatArray) -> bool:
     sigma = np.sqrt(np.diag(covariance))
     return bool((np.abs(step) <= SETTLED_SIGMAS * sigma).all())
-
-
-def _determined(told: Told) -> int:
-    """Return the number of coordinates that readings depend on."""
-    return int(np.linalg.norm(told.root, axis=0).astype(bool).sum())
 
 
 def _about(

@@ -119,9 +119,10 @@ def against_calibration(told: Told, covariance: FloatArray, basis: FloatArray) -
 def changes_of(C: FloatArray) -> FloatArray:
     """Return what a change of each part does to (t, C row by row, H, time offset), (16, 16).
 
-    Columns are those of ``COLUMNS``: metres; degrees of a rotation of the sensor about its axes;
-    relative gains; degrees by which the angles x y, y z, z x between axes become smaller;
-    microtesla; seconds.
+    Columns are those of ``COLUMNS``: metres; degrees by which the sensor turns about its own axes,
+    R_lidar_mag to R_lidar_mag exp(d), so that field vectors turn the other way in it and C becomes
+    exp(-d) C; relative gains; degrees by which the angles x y, y z, z x between axes become
+    smaller; microtesla; seconds.
     """
     basis = np.zeros((PARAMETERS, PARAMETERS))
     basis[:3, COLUMNS[Part.PLACE]] = np.eye(3)
@@ -130,8 +131,8 @@ def changes_of(C: FloatArray) -> FloatArray:
     degree = np.deg2rad(1.0)
     for k, (i, j) in enumerate(PAIRS):
         turn, skew, gain = np.zeros((3, 3, 3))
-        # a rotation about the axis that completes the pair
-        turn[j, i], turn[i, j] = degree, -degree
+        # about the axis that completes the pair: -[d]x, what a sensor that turns by d reads
+        turn[j, i], turn[i, j] = -degree, degree
         skew[i, j] = skew[j, i] = degree / 2
         gain[k, k] = 1.0
         axis = 3 - i - j

@@ -8,16 +8,25 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FieldSample, FloatArray, Recording, ScalarSeries, SourceFile
+from l2m_gtsam.calibrate import calibrate
+from l2m_gtsam.data import (
+    Distortion,
+    FieldSample,
+    FloatArray,
+    Recording,
+    ScalarSeries,
+    SourceFile,
+)
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.model_results import MovingField
+from l2m_gtsam.qa.fleet.outliers import rotations_apart
 from l2m_gtsam.qa.metrics.changes import compare_calibrations
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
 from l2m_gtsam.qa.validation.tables import validation_lines
-from l2m_gtsam.results import CalibrationResult, SensorStatus
+from l2m_gtsam.results import CalibrationResult, SensorStatus, TimeOffset
 from l2m_gtsam.storage.validation_file import read_validation, write_validation
-from l2m_gtsam.validate import validate
+from l2m_gtsam.validate import joint_covariance, validate
 from l2m_gtsam.validation_results import (
     DriveValidation,
     NamedSource,
@@ -28,7 +37,7 @@ from l2m_gtsam.validation_results import (
 from tests.calibrations import unsolved
 from tests.degenerate_drives import STRONG
 from tests.validation_drives import MAP, OPTIONS, calibrated, changed, loops, other_drive
-from tests.verdict_drives import NOISE, SENSORS
+from tests.verdict_drives import NOISE, NOMINAL, SENSORS, drive
 from tests.worlds import DipoleWorld, dipole_world
 
 QA = QaOptions()
@@ -131,14 +140,80 @@ def test_a_loose_sensor_has_moved_and_turned() -> None:
     assert level_of(judged(found), "mag_2") == "fail"
 
 
-def test_a_clock_that_is_late_is_named() -> None:
+def test_a_turn_has_the_sign_of_the_sensor_s() -> None:
+    """Axes of a sensor turned by 10 degrees about its z: so says the drive, a comparison, a fleet.
+
+    What a sensor reads is the field along its axes, the columns of R_lidar_mag.
+    """
+    R_lidar_mag = Rotation.from_euler("xyz", [20, -30, 75], degrees=True).as_matrix()
+    turned = R_lidar_mag @ Rotation.from_euler("z", 10, degrees=True).as_matrix()
+    before, after = (
+        replace(SENSORS[0], distortion=Distortion(axes.T, SENSORS[0].distortion.H))
+        for axes in (R_lidar_mag, turned)
+    )
+    options = OPTIONS.model_copy(update={"start": {"mag_0": NOMINAL["mag_0"]}})
+    old = calibrate(drive(sensors=(before,)).recording, STRONG, options)
+    recording = other_drive((after,))
+    (sensor,) = validate(recording, STRONG, old, options, 1e-3).sensors
+    first = sensor.changes[0]
+    assert first.part is Part.ROTATION
+    # to first order of a change: ten degrees are 10 sin(10 deg) / 10 deg; and five sigmas
+    np.testing.assert_allclose(first.change, [0, 0, 10], atol=0.06 + 5 * max(first.sigma))
+
+    new = calibrate(recording, STRONG, options)
+    (compared,) = compare_calibrations(new, old, 1e-3).sensors
+    (turn,) = [each for each in compared.changes if each.part is Part.ROTATION]
+    np.testing.assert_allclose(turn.change, [0, 0, 10], atol=5 * max(turn.sigma))
+    rotations = Rotation.from_matrix([each["mag_0"].R_lidar_mag for each in (old, new)])
+    then, now = rotations_apart(rotations.as_quat())
+    # changes are kept in six digits
+    np.testing.assert_allclose(now - then, turn.change, atol=1e-5)
+
+
+def late_drive() -> Recording:
+    """Return a drive on which the clock of one sensor is late by 40 ms."""
     recording = other_drive()
     late = replace(recording.series[0], stamp_ns=recording.series[0].stamp_ns - 40_000_000)
-    found = on_drive(replace(recording, series=(late, *recording.series[1:])))
+    return replace(recording, series=(late, *recording.series[1:]))
+
+
+def test_a_clock_that_is_late_is_named() -> None:
+    found = on_drive(late_drive())
     (change,) = found.sensors[0].changes
     assert change.part is Part.CLOCK
     assert change.change[0] == pytest.approx(0.04, abs=0.003)
     assert level_of(judged(found), "mag_0") == "warn"
+
+
+@pytest.mark.parametrize(
+    "offset", [None, TimeOffset(0.0, np.inf, np.zeros(15), "held at 0: nothing shows it")]
+)
+def test_a_clock_that_was_not_known_is_not_called_changed(offset: TimeOffset | None) -> None:
+    """Whatever it is now; and all other figures are true beside it."""
+    known = calibrated()
+    unknown = replace(known.sensors[0], time_offset=offset)
+    found = on_drive(late_drive(), replace(known, sensors=(unknown, *known.sensors[1:])))
+    sensor = found.sensors[0]
+    assert np.isinf(joint_covariance(unknown)[15, 15])
+    assert sensor.changes == ()
+    assert level_of(judged(found), "mag_0") == "pass"
+    assert sensor.parameters.freedom == 15
+    # five standard deviations of figures about a noise that was estimated: 0.07 and 5.5
+    assert sensor.nis.ratio == pytest.approx(1, abs=0.35)
+    assert sensor.parameters.value < 15 + 5 * 5.5
+
+
+def test_clocks_that_are_taken_for_one_take_no_degree_of_freedom() -> None:
+    """Where no motion is known, readings do not depend on a clock: fifteen parameters are left."""
+    known = calibrated()
+    held = TimeOffset(0.0, np.inf, np.zeros(15), "held at 0: nothing shows it")
+    sensors = tuple(replace(each, time_offset=held) for each in known.sensors)
+    solve = OPTIONS.solve.model_copy(update={"largest_offset_s": 0.0})
+    options = OPTIONS.model_copy(update={"solve": solve})
+    found = validate(other_drive(), STRONG, replace(known, sensors=sensors), options, 1e-3)
+    for each in found.sensors:
+        assert each.parameters.freedom == 15
+        assert each.nis.freedom == 3 * each.readings
 
 
 def test_a_map_of_elsewhere_is_told() -> None:

@@ -95,7 +95,8 @@ def test_coordinates_are_what_they_are_called(R: FloatArray, seed: int) -> None:
     # an arcsine near zero is exact to rounding of cosines
     np.testing.assert_allclose(skews_deg(C), amounts[6:9], atol=100 * tiny**2)
     U, _, Vt = np.linalg.svd(C @ R.T)
-    turn = Rotation.from_matrix(U @ Vt).as_rotvec(degrees=True)
+    R_mag_lidar = U @ Vt @ R
+    turn = Rotation.from_matrix(R @ R_mag_lidar.T).as_rotvec(degrees=True)  # R_lidar_mag's
     np.testing.assert_allclose(turn, amounts[:3], atol=100 * tiny**2)
 
 

@@ -10,12 +10,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, SourceFile
+from l2m_gtsam.qa.fleet.outliers import rotations_apart
 from l2m_gtsam.qa.metrics.changes import (
     compare_calibrations,
     compare_sensor,
+    rotation_difference,
     shape_derivatives,
 )
 from l2m_gtsam.qa.metrics.mounting import gains, skews_deg
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.validation.judge import judge_validation
 from l2m_gtsam.results import SensorCalibration, SensorStatus
 from l2m_gtsam.solve.rotation import polar_rotation
 from l2m_gtsam.validation_results import Part
@@ -102,11 +106,43 @@ def test_the_part_that_changed_is_named(part: Part, vector: FloatArray, size: fl
 
 @given(rotations(), st.floats(1.5, 40))
 def test_a_turn_is_found_about_the_axes_of_the_sensor(R: FloatArray, angle: float) -> None:
-    turn = Rotation.from_rotvec([0, 0, angle], degrees=True).as_matrix()
-    found = compare_sensor(sensor(R_mag_lidar=turn @ R), sensor(R_mag_lidar=R), CHANCE)
-    (change,) = [each for each in found.changes if each.part is Part.ROTATION]
+    """With its sign: from R_lidar_mag to R_lidar_mag Rz(angle), as of a fleet's drives."""
+    turned = R.T @ Rotation.from_euler("z", angle, degrees=True).as_matrix()
+    new, old = sensor(R_mag_lidar=turned.T), sensor(R_mag_lidar=R)
+    (change,) = [
+        each for each in compare_sensor(new, old, CHANCE).changes if each.part is Part.ROTATION
+    ]
     np.testing.assert_allclose(change.change, [0, 0, angle], atol=1e-5)
     assert change.size == pytest.approx(angle, rel=1e-5)
+    quaternions = Rotation.from_matrix([R.T, turned]).as_quat()
+    before, after = rotations_apart(quaternions)
+    np.testing.assert_allclose(after - before, change.change, atol=1e-5)
+
+
+@given(rotations(), SEEDS)
+def test_errors_of_a_rotation_are_along_the_axes_of_the_new_one(R: FloatArray, seed: int) -> None:
+    """Derivatives of the turn by both errors, differenced, about a sensor that turned little."""
+    rng = np.random.default_rng(seed)
+    turn = Rotation.from_rotvec(0.02 * rng.normal(size=3)).as_matrix()
+    roots = 1e-5 * rng.normal(size=(2, 3, 3))
+    spreads = [root @ root.T for root in roots]
+    old = sensor(R_mag_lidar=R, rotation_covariance=spreads[0])
+    new = sensor(R_mag_lidar=turn.T @ R, rotation_covariance=spreads[1])
+    expected = np.zeros((3, 3))
+    for k, spread in enumerate(spreads):
+        J = np.empty((3, 3))
+        for axis, error in enumerate(1e-6 * np.eye(3)):
+            R_old, R_new = R, new.R_lidar_mag.T
+            shift = Rotation.from_rotvec(error).as_matrix()
+            R_old, R_new = (shift @ R_old, R_new) if k == 0 else (R_old, shift @ R_new)
+            off = Rotation.from_matrix(turn.T @ R_old @ R_new.T).as_rotvec()
+            J[:, axis] = off / 1e-6
+        expected += J @ spread @ J.T
+    found = rotation_difference(new, old).covariance
+    # differences over 1e-6 of rotations that are rounded at 1e-16
+    np.testing.assert_allclose(
+        found, np.rad2deg(1.0) ** 2 * expected, atol=1e-5 * np.abs(found).max()
+    )
 
 
 @given(SEEDS)
@@ -169,3 +205,22 @@ def test_it_says_how_errors_go_together() -> None:
     apart = compare_calibrations(new, replace(new, bag=other, map=other), CHANCE)
     assert "independent" in apart.assumption
     assert "one map" not in apart.assumption
+
+
+def test_joint_calibrations_that_share_a_drive_say_so() -> None:
+    """One of several drives is enough, in either order; a joint calibration has no bag."""
+    monday, tuesday, friday = (SourceFile(f"{k}.bag", f"{k}" * 64) for k in range(3))
+    copied = replace(tuesday, path="elsewhere/1.bag")
+    alone = calibration(sensor(), bag=copied)
+    first = calibration(sensor(), bag=None, bags=(monday, tuesday))
+    second = calibration(sensor(), bag=None, bags=(copied, friday))
+    for new, old in ((first, second), (second, first), (first, alone), (alone, first)):
+        found = compare_calibrations(new, old, CHANCE)
+        assert found.same_bag
+        assert "A drive took part in both" in found.assumption
+        verdict = judge_validation(None, found, QaOptions())
+        assert verdict.level == "warn"
+    other = calibration(sensor(), bag=None, bags=(friday,))
+    assert not compare_calibrations(first, other, CHANCE).same_bag
+    unknown = calibration(sensor(), bag=None)
+    assert not compare_calibrations(unknown, unknown, CHANCE).same_bag

@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.data import BoolArray, FloatArray, same_content
 from l2m_gtsam.qa.metrics.mounting import PAIRS, gains, sensor_axes, skews_deg
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
@@ -31,7 +32,7 @@ SHARED_MAP = (
     "but a small change may be missed."
 )
 SHARED_BAG = (
-    " Both come from one drive: their errors are not independent, and no vehicle changes on it."
+    " A drive took part in both: their errors are not independent, and no vehicle changes on it."
 )
 
 
@@ -102,16 +103,11 @@ def compare_calibrations(
         for each in old.sensors
         if each.sensor not in names
     ]
-    same_bag = _same(new.bag, old.bag)
+    same_bag = any(same_content(one, other) for one, other in product(new.drives, old.drives))
     assumption = INDEPENDENT + (SHARED_BAG if same_bag else "")
-    if _same(new.map, old.map) and not same_bag:
+    if same_content(new.map, old.map) and not same_bag:
         assumption += SHARED_MAP
     return CalibrationComparison(tuple(sensors), tuple(missing), assumption, same_bag)
-
-
-def _same(one: object, other: object) -> bool:
-    digests = [getattr(each, "sha256", None) for each in (one, other)]
-    return digests[0] is not None and digests[0] == digests[1]
 
 
 def _why_not(new: SensorCalibration, old: SensorCalibration | None) -> str:
@@ -169,12 +165,16 @@ def differences(
 
 
 def rotation_difference(new: SensorCalibration, old: SensorCalibration) -> Difference:
-    """Return how a sensor has turned about its own axes, in degrees."""
-    turn = new.R_lidar_mag.T @ old.R_lidar_mag  # exp(d) with R_mag_lidar = exp(d) @ the old one
+    """Return the d by which a sensor has turned about its own axes, in degrees.
+
+    R_lidar_mag = R_lidar_mag_old exp(d). With true R_mag_lidar = exp(error) @ estimate, d is off by
+    exp(-d) error_old - error_new to first order, along the axes of the new one.
+    """
+    turn = old.R_lidar_mag.T @ new.R_lidar_mag
     if not np.isfinite(turn).all():
         return Difference(np.full(3, np.nan), np.diag(np.full(3, np.inf)))
     d = Rotation.from_matrix(turn).as_rotvec()
-    spread = new.rotation_covariance + through(turn, old.rotation_covariance)
+    spread = new.rotation_covariance + through(turn.T, old.rotation_covariance)
     degree = np.rad2deg(1.0)
     return Difference(degree * d, degree**2 * spread)
 

@@ -1,4 +1,4 @@
-"""The page of a validation: one file that needs nothing else, drawn from `validation.json`."""
+"""The page of a validation: one file that needs nothing else, drawn from what was found."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -50,7 +50,7 @@ def judge_validation(
     if comparison is not None:
         shared.append(Reason(Level.PASS, comparison.assumption))
         if comparison.same_bag:
-            shared.append(Reason(Level.WARN, "Both calibrations come from one drive."))
+            shared.append(Reason(Level.WARN, "One drive took part in both calibrations."))
         for each in comparison.sensors:
             found.setdefault(each.sensor, []).extend(_on_comparison(each, options))
         _add_missing(found, comparison.missing)
