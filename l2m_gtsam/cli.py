@@ -6,7 +6,7 @@ Heavy modules are imported inside the commands, so that ``--help`` answers at on
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,9 @@ from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
 from l2m_gtsam.commands.validate import validate
 from l2m_gtsam.errors import L2MError
+
+if TYPE_CHECKING:
+    from l2m_gtsam.results import CalibrationResult
 
 app = typer.Typer(
     name="l2m",
@@ -188,32 +191,14 @@ def calibrate(
     from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
     from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
     from l2m_gtsam.config import load_config, with_uncertainty
-    from l2m_gtsam.qa.model_table import model_note, model_tables
-    from l2m_gtsam.qa.tables import (
-        calibration_table,
-        disagreement_note,
-        held_clocks_note,
-        missing_note,
-    )
     from l2m_gtsam.qa.verdict_text import verdict_lines
-    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     chosen = with_uncertainty(load_config(config), uncertainty)
     with shown_progress() as progress:
         drives = [*(bags or ()), *(more or ())]
         result = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
         verdict = report_folder(out, config)
-    print_table(calibration_table(result))
-    typer.echo(UNCERTAINTY[result.uncertainty])
-    warn(result.doubts)
-    warn(missing_note(result))
-    warn([disagreement_note(each) for each in result.disagreements])
-    if held := held_clocks_note(result):
-        typer.echo(held)
-    for table in model_tables(result) if models else ():
-        print_table(table)
-    for note in filter(None, map(model_note, result.sensors)):
-        typer.echo(note)
+    _print_calibration(result, models)
     typer.echo("\n".join(verdict_lines(verdict)))
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
     typer.echo(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
@@ -375,3 +360,27 @@ def _place(text: str) -> tuple[float, float, float]:
             f"--at: {text!r} is not a place; accepted: three numbers, x,y,z in metres"
         )
     return x, y, z
+
+
+def _print_calibration(result: "CalibrationResult", models: bool) -> None:
+    """Print what came out, and what its reader should know."""
+    from l2m_gtsam.qa.model_table import model_note, model_tables
+    from l2m_gtsam.qa.tables import (
+        calibration_table,
+        disagreement_note,
+        held_clocks_note,
+        missing_note,
+    )
+    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
+
+    print_table(calibration_table(result))
+    typer.echo(UNCERTAINTY[result.uncertainty])
+    warn(result.doubts)
+    warn(missing_note(result))
+    warn([disagreement_note(each) for each in result.disagreements])
+    if held := held_clocks_note(result):
+        typer.echo(held)
+    for table in model_tables(result) if models else ():
+        print_table(table)
+    for note in filter(None, map(model_note, result.sensors)):
+        typer.echo(note)

@@ -157,7 +157,7 @@ def segments_of(samples: Samples, segments: int) -> IntArray:
     segment, first = np.empty(len(samples), dtype=np.int64), 0
     for rows in samples.drives:
         n = rows.stop - rows.start
-        own = max(round(segments * n / len(samples)), 1)
+        own = min(max(round(segments * n / len(samples)), 1), n)  # none is empty
         segment[rows] = first + np.arange(n) * own // n
         first = int(segment[rows.stop - 1]) + 1
     return segment

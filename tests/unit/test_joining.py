@@ -67,7 +67,7 @@ def test_a_single_drive_is_left_as_it_is() -> None:
 @settings(max_examples=30, deadline=None)
 def test_the_order_of_drives_does_not_matter(drives: list[Recording], random: object) -> None:
     mixed = list(drives)
-    random.shuffle(mixed)  # type: ignore[attr-defined]
+    random.shuffle(mixed)  # type: ignore[attr-defined]  # untyped
     one, other = joined(drives), joined(mixed)
     assert [each.source for each in one.drives] == [each.source for each in other.drives]
     assert one.source == other.source

@@ -154,7 +154,7 @@ def _link(row: FleetRow) -> str:
 def _own(name: str) -> Markup:
     """Return a file of ours as it is."""
     environment = _environment()
-    text, _, _ = environment.loader.get_source(environment, name)  # type: ignore[union-attr]
+    text, _, _ = environment.loader.get_source(environment, name)  # type: ignore[union-attr]  # it has one
     return Markup(text)  # noqa: S704 - our own file
 
 

@@ -77,6 +77,7 @@ def common(parts: Sequence[Part]) -> Common:
     covariance[np.ix_(found, found)] = by_y @ S @ by_y.T
     root = None
     if all(part.shared_root is not None for part in parts):
+        # all have one here, which the type does not know
         rows = [part.shared_root[at] for part, at in zip(parts, kept, strict=True)]  # type: ignore[index]
         root = np.zeros((15, rows[0].shape[1]))
         root[found] = by_y @ np.concatenate(rows)
