@@ -1,4 +1,4 @@
-"""Readings in a field whose weights are variables: derivatives, the anchor, agreement with a map."""
+"""Readings in a field whose weights are variables: derivatives, anchor, agreement with a map."""
 
 import gtsam
 import numpy as np
