@@ -7,6 +7,7 @@ from l2m_factors.carried import (
     carried_residuals,
 )
 from l2m_factors.check import assert_jacobians_match
+from l2m_factors.doubt import FieldDoubt, doubt_factor
 from l2m_factors.field_map import FieldMap
 from l2m_factors.keys import D, M, P, Q, S, T, X
 from l2m_factors.motion import PoseMotion, moved, skew
@@ -26,7 +27,7 @@ from l2m_factors.shared_errors import (
     shared_error,
     uncertain_block_factor,
 )
-from l2m_factors.tile import TileBatch, TileField, WeightedField, tile_factor
+from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor
 
 __all__ = [
     "BatchedReadings",
@@ -35,6 +36,7 @@ __all__ = [
     "CarriedReadings",
     "CarriedResiduals",
     "D",
+    "FieldDoubt",
     "FieldMap",
     "M",
     "MagneticReadings",
@@ -47,6 +49,7 @@ __all__ = [
     "T",
     "TileBatch",
     "TileField",
+    "TilePlaces",
     "WeightedField",
     "X",
     "assert_jacobians_match",
@@ -54,6 +57,7 @@ __all__ = [
     "carried_residuals",
     "distance_prior",
     "distortion_prior",
+    "doubt_factor",
     "field_rate",
     "held_directions",
     "key_pose_factor",

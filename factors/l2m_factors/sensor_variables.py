@@ -92,5 +92,24 @@ class SensorVariables:
             blocks += [np.where(own, part, 0.0) for part in parts]
         return blocks
 
+    def place_keys(self, sensors: list[int]) -> list[int]:
+        """Return the positions of these sensors, where they are variables."""
+        return [T(sensor) for sensor in sensors] if self._fixed is None else []
+
+    def place_jacobians(self, R: FloatArray, rows: npt.NDArray[np.int64]) -> list[FloatArray]:
+        """Return derivatives of places by ``place_keys`` of the sensors of n readings.
+
+        Parameters
+        ----------
+        R
+            Rotations from lidar to the frame of the places, shape (n, 3, 3).
+        rows
+            The readings.
+        """
+        if self._fixed is not None:
+            return []
+        own = [(self._sensor[rows] == sensor)[:, None, None] for sensor in self.on(rows)]
+        return [np.where(each, R, 0.0) for each in own]
+
     def _keys(self, sensor: int) -> list[int]:
         return [T(sensor), D(sensor), *([S(sensor)] if self._timed else [])]

@@ -15,6 +15,7 @@ where in the map it is: one that were fixed there would take a place with more s
 a lower one.
 """
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import gtsam
@@ -24,6 +25,7 @@ import numpy.typing as npt
 from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals, carried_residuals
 from l2m_factors.field_map import FloatArray
 from l2m_factors.keys import M, X
+from l2m_factors.motion import skew
 from l2m_factors.sensor_variables import SensorVariables
 from l2m_factors.shared_errors import whitened
 
@@ -51,6 +53,27 @@ class WeightedField:
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
         return self._tile.field_and_gradient(points, self._weights)
+
+
+@dataclass(frozen=True)
+class TilePlaces:
+    """Where n readings on a key pose are in the frame of a tile's anchor.
+
+    Attributes
+    ----------
+    T_anchor_key
+        Key pose.
+    R_key_lidar, t_key
+        The lidar's rotation at each reading, (n, 3, 3), and the sensor's place in metres, (n, 3),
+        both from the key pose.
+    x
+        Places in the anchor's frame in metres, shape (n, 3).
+    """
+
+    T_anchor_key: gtsam.Pose3
+    R_key_lidar: FloatArray
+    t_key: FloatArray
+    x: FloatArray
 
 
 class TileBatch:
@@ -123,23 +146,41 @@ class TileBatch:
         """Return derivatives by each of ``keys_of`` of n readings, each of shape (n, 3, .)."""
         rows, relative = self._rows[key_pose], self._relative(values, key_pose)
         by_sensors = self._variables.jacobians(residuals.reading, rows)
-        blocks = [self._by_weights(values, relative, rows), *by_sensors]
+        blocks = [self._by_weights(values, key_pose), *by_sensors]
         if key_pose == self._anchor:
             return blocks
         by_key = residuals.de_dX[rows]
         return [by_key, -by_key @ relative.inverse().AdjointMap(), *blocks]
 
-    def _by_weights(
-        self, values: gtsam.Values, relative: gtsam.Pose3, rows: npt.NDArray[np.int64]
-    ) -> FloatArray:
-        readings = self._readings[rows]
-        known = self._variables.calibrations(values, self._variables.on(rows))
+    def places(self, values: gtsam.Values, key_pose: int) -> TilePlaces:
+        """Return where the readings on a key pose are."""
+        rows = self._rows[key_pose]
+        readings, relative = self._readings[rows], self._relative(values, key_pose)
+        known = self._variables.calibrations(values, self._sensors[key_pose])
         R_key_lidar, p = readings.lidar_at(known.offset)
-        R = relative.rotation().matrix() @ R_key_lidar
         t_key = np.einsum("nij,nj->ni", R_key_lidar, known.t[readings.sensor]) + p
         x = t_key @ relative.rotation().matrix().T + relative.translation()
-        C = known.distortion[readings.sensor, :9].reshape(-1, 3, 3)
-        return np.asarray(C @ R.transpose(0, 2, 1) @ self._field.features(x))
+        return TilePlaces(relative, R_key_lidar, t_key, x)
+
+    def place_keys_of(self, key_pose: int) -> list[int]:
+        """Return the keys that ``places`` depend on, but for time offsets."""
+        poses = [] if key_pose == self._anchor else [X(key_pose), X(self._anchor)]
+        return [*poses, *self._variables.place_keys(self._sensors[key_pose])]
+
+    def place_jacobians(self, key_pose: int, where: TilePlaces) -> list[FloatArray]:
+        """Return derivatives of n places by each of ``place_keys_of``, each of shape (n, 3, .)."""
+        R, n = where.T_anchor_key.rotation().matrix(), len(where.x)
+        blocks = self._variables.place_jacobians(R @ where.R_key_lidar, self._rows[key_pose])
+        if key_pose == self._anchor:
+            return blocks
+        by_key = np.concatenate([-R @ skew(where.t_key), np.tile(R, (n, 1, 1))], axis=2)
+        return [by_key, -by_key @ where.T_anchor_key.inverse().AdjointMap(), *blocks]
+
+    def _by_weights(self, values: gtsam.Values, key_pose: int) -> FloatArray:
+        where = self.places(values, key_pose)
+        R = where.T_anchor_key.rotation().matrix() @ where.R_key_lidar
+        C = self._variables.C(values, self._rows[key_pose])
+        return np.asarray(C @ R.transpose(0, 2, 1) @ self._field.features(where.x))
 
     def _present(self, values: gtsam.Values) -> list[int]:
         return [k for k in self._rows if k == self._anchor or values.exists(X(k))]

@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 from l2m_factors import (
     CarriedBatch,
     CarriedReadings,
+    FieldDoubt,
     M,
     TileBatch,
     WeightedField,
     X,
     assert_jacobians_match,
+    doubt_factor,
     key_pose_factor,
     tile_factor,
 )
@@ -86,6 +88,23 @@ def test_moving_the_whole_way_changes_nothing() -> None:
         values.update(X(k), shift.compose(values.atPose3(X(k))))
     after = [factor.error(values) for factor in factors]
     np.testing.assert_allclose(after, before, rtol=1e-9)
+
+
+@given(seed=st.integers(0, 10_000), free=st.booleans())
+@settings(deadline=None, max_examples=10)
+def test_derivatives_of_doubt_are_those_of_finite_differences(seed: int, free: bool) -> None:
+    readings, values, rng = random_carried(seed), tile_values(seed), np.random.default_rng(seed)
+    batch = batch_of(readings, 0, None if free else values)
+    for k in batch.key_poses:
+        x = batch.places(values, k).x
+        doubt = FieldDoubt(x - 0.1, rng.uniform(size=len(x)), rng.normal(size=(len(x), 3)))
+        factor = doubt_factor(batch, k, doubt)
+        if factor is None:
+            assert (k, free) == (0, False)  # at the anchor nothing moves
+            continue
+        assert_jacobians_match(factor, values)
+        linear = doubt.value + 0.1 * doubt.slope.sum(axis=1)
+        np.testing.assert_allclose(factor.unwhitenedError(values), linear, atol=1e-12)
 
 
 def test_at_the_anchor_readings_say_nothing_of_the_pose() -> None:

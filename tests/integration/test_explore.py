@@ -92,7 +92,10 @@ def test_where_no_place_is_come_to_again_it_is_said() -> None:
 
 
 def test_a_calibration_is_refined_without_a_map() -> None:
-    """Positions known to 5 cm: they come nearer, within what is said of them."""
+    """Places on the vehicle known to 5 cm: those of sensors to each other come out; all is covered.
+
+    Where the whole array sits is told by turns alone, and hardly: the map shifts with it.
+    """
     sensors, drive = drive_in(3, laps(60))
     sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
     rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
@@ -104,9 +107,9 @@ def test_a_calibration_is_refined_without_a_map() -> None:
         refined = found.calibration[truth.sensor]
         ideal = np.concatenate([truth.t_lidar_mag, truth.distortion.vector()])
         error = np.concatenate([refined.t_lidar_mag, refined.distortion.vector()]) - ideal
-        before.append(np.linalg.norm(start.t_lidar_mag - truth.t_lidar_mag))
-        after.append(np.linalg.norm(error[:3]))
+        before.append(start.t_lidar_mag - truth.t_lidar_mag)
+        after.append(error[:3])
         nees.append(error @ np.linalg.solve(refined.covariance, error))
-    assert np.mean(after) < 0.7 * np.mean(before)
+    assert np.std(after, axis=0).mean() < 0.6 * np.std(before, axis=0).mean()
     # Chi squared of 15 degrees of freedom passes 37.7 once in 1,000.
     assert max(nees) < 37.7

@@ -132,7 +132,7 @@ class TiledProblem:
         weights = self._weights(tiled, sights, noise, mu)
         chosen = np.flatnonzero(weights > NOTHING)
         graph = tiled.graph(
-            self._drive, W * np.sqrt(weights)[:, None, None], chosen, free=self._free
+            self._drive, noise, W * np.sqrt(weights)[:, None, None], chosen, free=self._free
         )
         graph.push_back(self._odometry)
         if self._free:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import M, TileBatch, tile_factor
+from l2m_factors import FieldDoubt, M, TileBatch, doubt_factor, tile_factor
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
@@ -41,6 +41,13 @@ class LaidTile:
         variance = own + self.field.unresolved(self.place.x)
         b = self.place.field(sensors)
         return self.field.likely_weights(self.place.x, b, variance)
+
+    def doubt(self, rows: IntArray, noise: FloatArray) -> FieldDoubt:
+        """Return what these of the tile's readings, which teach it, count for; see there."""
+        own = np.searchsorted(self.rows, rows)
+        x = self.place.x[own]
+        variance = noise[self.place.readings.sensor[own], None] ** 2 + self.field.unresolved(x)
+        return self.field.doubt(x, variance)
 
     def sight(self, weights: FloatArray, sensors: KnownSensors) -> Sight:
         """Return what the tile says of its readings, in the anchor's frame."""
@@ -116,7 +123,13 @@ class TiledDrive:
         return [tile.sight(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
 
     def graph(
-        self, drive: Drive, whitening: FloatArray, chosen: IntArray, *, free: bool
+        self,
+        drive: Drive,
+        noise: FloatArray,
+        whitening: FloatArray,
+        chosen: IntArray,
+        *,
+        free: bool,
     ) -> gtsam.NonlinearFactorGraph:
         """Return the factors of readings, and the prior of the tiles' weights.
 
@@ -124,6 +137,8 @@ class TiledDrive:
         ----------
         drive
             That was laid out.
+        noise
+            Standard deviation of each sensor's noise in uT, shape (S,).
         whitening
             Of the residuals of all its N readings, 1/uT, shape (N, 3, 3).
         chosen
@@ -140,8 +155,13 @@ class TiledDrive:
             if len(rows):
                 readings = drive.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
+                doubt = tile.doubt(rows, noise)
                 for k in batch.key_poses:
-                    graph.add(tile_factor(batch, k, whitening[rows[batch.rows_of(k)]]))
+                    own = batch.rows_of(k)
+                    graph.add(tile_factor(batch, k, whitening[rows[own]]))
+                    factor = doubt_factor(batch, k, doubt[own])
+                    if factor is not None:
+                        graph.add(factor)
         return graph
 
 
