@@ -39,7 +39,7 @@ from l2m_gtsam.validation_results import ChiSquare, NamedSource
 
 SPANS = 60  # of a timeline, at most
 BAND = np.array([0.025, 0.975])
-SIGMA_DIGITS = 6
+DIGITS = 9
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def _odometry(drive: Drive, at: Trajectory) -> tuple[OdometryRecord, ...]:
     variance = np.diagonal(to_ros(odometry_covariance(drive), at.R), axis1=1, axis2=2)
     sigma = np.sqrt(variance) * np.repeat([1.0, np.rad2deg(1.0)], 3)
     return tuple(
-        OdometryRecord(row(p), row(q), row(each, SIGMA_DIGITS))
+        OdometryRecord(row(p), row(q), row(each))
         for p, q, each in zip(at.p, quaternions, sigma, strict=True)
     )
 
@@ -160,10 +160,10 @@ def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSenso
     low, high = chi2.ppf(BAND, len(PARAMETERS))
     return RefinedSensor(
         sensor=before.sensor,
-        before=row(old),
-        sigma_before=row(np.sqrt(np.diag(before.covariance))),
-        after=row(new),
-        sigma_after=row(np.sqrt(np.diag(after.covariance))),
+        before=row(old, DIGITS),
+        sigma_before=row(np.sqrt(np.diag(before.covariance)), DIGITS),
+        after=row(new, DIGITS),
+        sigma_after=row(np.sqrt(np.diag(after.covariance)), DIGITS),
         change=ChiSquare(float(whitened @ whitened), len(PARAMETERS), float(low), float(high)),
     )
 

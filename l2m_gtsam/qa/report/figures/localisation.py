@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.data import FloatArray
@@ -54,9 +55,8 @@ def way_figure(course: Course, picture: MapPicture, truth: Rows | None) -> Figur
     """Draw the localised way over the map beside odometry's, with ellipses of one sigma."""
     figure, axes = strength_background(picture)
     keep = evenly(len(course.p), DRAWN)
-    axes.plot(*course.odometry[keep, :2].T, color="black", linewidth=2.2)
-    axes.plot(*course.odometry[keep, :2].T, "--", color="#ffb000", linewidth=1.3, label="odometry")
-    _path(axes, course.p[keep], "localised")
+    _line(axes, course.odometry[keep], "--", color="#ffb000", label="odometry")
+    _line(axes, course.p[keep], "-", color="white", label="localised")
     if truth is not None:
         axes.plot(*np.array(truth)[keep, :2].T, ":", color="#ff4fd8", linewidth=1.6, label="truth")
     scale = ellipse_scale(course, picture)
@@ -179,9 +179,10 @@ def _bars(
     axes.fill_between(edges, *steps, step="post", linewidth=0, **style)
 
 
-def _path(axes: Axes, p: FloatArray, label: str) -> None:
-    axes.plot(*p[:, :2].T, color="black", linewidth=2.8)
-    axes.plot(*p[:, :2].T, color="white", linewidth=1.4, label=label)
+def _line(axes: Axes, p: FloatArray, dashes: str, **style: Any) -> None:
+    """Draw a way that is seen on any colour of the map, and beside it in the legend."""
+    edge = [Stroke(linewidth=2.8, foreground="black"), Normal()]
+    axes.plot(*p[:, :2].T, dashes, linewidth=1.4, path_effects=edge, **style)
 
 
 def _chosen(course: Course) -> FloatArray:
