@@ -130,7 +130,7 @@ def _odometry(drive: Drive, at: Trajectory) -> tuple[OdometryRecord, ...]:
     variance = np.diagonal(to_ros(odometry_covariance(drive), at.R), axis1=1, axis2=2)
     sigma = np.sqrt(variance) * np.repeat([1.0, np.rad2deg(1.0)], 3)
     return tuple(
-        OdometryRecord(row(p), row(q), row(each))
+        OdometryRecord(row(p, DIGITS), row(q, DIGITS), row(each, DIGITS))
         for p, q, each in zip(at.p, quaternions, sigma, strict=True)
     )
 

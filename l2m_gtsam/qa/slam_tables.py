@@ -53,10 +53,15 @@ def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:
     errors = (
         f"against the truth at {truth.poses} key poses: odometry {1e3 * before.rms_m:.0f} mm rms, "
         f"{1e3 * before.largest_m:.0f} mm at most; localised {1e3 * after.rms_m:.0f} mm rms, "
-        f"{1e3 * after.largest_m:.0f} mm at most ({truth.removed:.0%} of it removed)"
+        f"{1e3 * after.largest_m:.0f} mm at most ({_gone(truth)})"
     )
     nees = (
         f"rotations {before.rms_deg:.2f} deg rms before, {after.rms_deg:.2f} deg after; NEES of "
         f"the poses {truth.nees:.1f}, 6 is honest"
     )
     return (errors, nees)
+
+
+def _gone(truth: TruthRecord) -> str:
+    gone = truth.removed
+    return f"{gone:.0%} less" if gone >= 0 else f"{-gone:.0%} more"

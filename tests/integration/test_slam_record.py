@@ -36,9 +36,9 @@ def test_odometry_is_as_sure_as_its_graph() -> None:
         np.testing.assert_allclose(pose.rotation().matrix(), R[k], atol=1e-12)
     sigma = np.sqrt(np.diagonal(to_ros(found, R), axis1=1, axis2=2))
     told = course_of(record()).odometry_sigma
-    # Six digits are kept.
-    np.testing.assert_allclose(told[:, :3], sigma[:, :3], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(told[:, 3:], np.rad2deg(sigma[:, 3:]), rtol=0, atol=1e-6)
+    # Nine digits are kept.
+    np.testing.assert_allclose(told[:, :3], sigma[:, :3], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(told[:, 3:], np.rad2deg(sigma[:, 3:]), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("index", [0, 1])

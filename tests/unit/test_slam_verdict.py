@@ -9,7 +9,13 @@ from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.reasons.reason import Level
 from l2m_gtsam.qa.slam.judge import judge_localisation, slam_thresholds
-from l2m_gtsam.slam_records import LocalisationRecord, PoseErrors, PoseRecord, SensorRecord
+from l2m_gtsam.slam_records import (
+    LocalisationRecord,
+    PoseErrors,
+    PoseRecord,
+    SensorRecord,
+    Timeline,
+)
 from l2m_gtsam.slam_results import LocalisationStatus
 from l2m_gtsam.validation_results import ChiSquare
 from tests.localised import record
@@ -20,9 +26,15 @@ def judged(told: LocalisationRecord) -> Verdict:
 
 
 def used(sensor: SensorRecord, rejected: int = 0, chi2: float = 1.0) -> SensorRecord:
-    """Return a sensor of which so many of 100 readings are rejected."""
+    """Return a sensor of which so many of 100 readings are rejected, at no time most."""
     use = replace(sensor.use, readings=100, outside_map=0, rejected=rejected, chi2_per_dof=chi2)
-    return replace(sensor, use=use)
+    line = timed(sensor, [1] * len(sensor.timeline.used), [0] * len(sensor.timeline.used))
+    return replace(sensor, use=use, timeline=line)
+
+
+def timed(sensor: SensorRecord, used: list[int], rejected: list[int]) -> Timeline:
+    none = (0,) * len(used)
+    return Timeline(sensor.timeline.edges, tuple(used), tuple(rejected), none)
 
 
 def sure(pose: PoseRecord, position: float, rotation_deg: float) -> PoseRecord:
@@ -130,6 +142,33 @@ def test_a_bad_sensor_beside_a_good_one_is_a_warning_for_the_whole() -> None:
     assert text == "None of its 100 readings counts."
     noisy = judged(replace(good(), sensors=(first, used(second, chi2=2.25))))
     assert "1.5 times as large as noise and map" in texts(noisy, Level.WARN)[0]
+
+
+def test_a_place_that_changed_is_told_once_for_all_sensors() -> None:
+    start = good()
+    first, second = start.sensors
+    count = len(first.timeline.used)
+    wrong, none = [0, 0, 9, 9, 4, *[0] * (count - 5)], [0] * count
+    right = [9, 9, 1, 1, 5, *[9] * (count - 5)]
+    silent = [9, 9, 0, 0, 5, *[9] * (count - 5)]  # reads nothing where the other is wrong
+    seen = replace(first, timeline=timed(first, right, wrong))
+    both = replace(start, sensors=(seen, replace(second, timeline=timed(second, silent, none))))
+    (text,) = texts(judged(both), Level.WARN)
+    low, high = (first.timeline.edges[k] for k in (2, 4))
+    assert text.startswith(f"From {low:.0f} to {high:.0f} s, between (")
+    assert "the place has changed since it was mapped, or something passed by" in text
+    # The other sensor fits there, or there is no other: then it may be the sensor.
+    fits = replace(start, sensors=(seen, second))
+    assert judged(fits).level is judged(replace(start, sensors=(seen,))).level is Level.PASS
+
+
+def test_a_start_that_is_wrong_is_told() -> None:
+    start = good()
+    away = np.array([0.6, 0.0, 0.0])
+    poses = tuple(replace(each, p=tuple(np.add(each.p, away))) for each in start.poses)
+    (text,) = texts(judged(replace(start, poses=poses)), Level.WARN)
+    apart = np.linalg.norm(np.add(start.poses[0].p, away) - start.odometry[0].p)
+    assert f"The drive begins {apart:.2f} m and" in text
 
 
 def test_what_sigmas_leave_out_is_told() -> None:

@@ -51,6 +51,11 @@ class Course:
         """The largest along an axis of the map in metres, shape (K,)."""
         return np.asarray(self.sigma[:, :3].max(axis=1))
 
+    def place_at(self, second: float) -> tuple[float, float]:
+        """Return where the lidar was then, x and y in the map in metres."""
+        x, y = (float(np.interp(second, self.seconds, axis)) for axis in self.p[:, :2].T)
+        return x, y
+
 
 def course_of(record: LocalisationRecord) -> Course:
     """Return the course of a drive."""
