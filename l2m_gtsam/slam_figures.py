@@ -37,6 +37,7 @@ from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.validation_results import ChiSquare, NamedSource
 
+NO_TRUTH = "no key pose lies between two true ones that are near enough: nothing is compared"
 SPANS = 60  # of a timeline, at most
 BAND = np.array([0.025, 0.975])
 DIGITS = 9
@@ -86,7 +87,7 @@ def localisation_record(found: Localisation, told: Told) -> LocalisationRecord:
     return LocalisationRecord(
         status=result.status,
         message=result.message,
-        notes=result.notes,
+        notes=(*result.notes, *([] if told.truth is None or truth else [NO_TRUTH])),
         drift=result.drift,
         steps=solution.bent,
         map_errors_shared=isinstance(told.field_map, UncertainMap),
@@ -196,7 +197,7 @@ def sensor_evidence(solution: Localised, inside: IntArray) -> SensorEvidence:
     at, C = sight.place.readings, sight.place.C[inside]
     R, field, residual = at.R_map_lidar[inside], at.field[inside], sight.residual[inside]
     H = drive.sensors.distortion[at.sensor[inside], 9:]
-    b = np.linalg.solve(C, (residual + field - H)[:, :, None])[:, :, 0]
+    b = np.asarray(np.linalg.solve(C, (residual + field - H)[:, :, None])[:, :, 0], dtype=float)
     W = sight.whitening(drive.sensors.noise)[inside]
     readings = Readings(
         sensors=drive.sensors.names,
