@@ -15,7 +15,6 @@ from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.factors import root_information
 from l2m_gtsam.graph.slam.localisation import Localised
 from l2m_gtsam.graph.view import QueryableMap
-from l2m_gtsam.localise import Localisation
 from l2m_gtsam.pose_covariance import moved, to_ros
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
 from l2m_gtsam.qa.metrics.curves import curves, series
@@ -69,17 +68,20 @@ class Told:
     truth_source: SourceFile | None = None
 
 
-def localisation_record(found: Localisation, told: Told) -> LocalisationRecord:
+def localisation_record(
+    result: LocalisationResult, solution: Localised, told: Told
+) -> LocalisationRecord:
     """Return what is kept of a localisation.
 
     Parameters
     ----------
-    found
-        The localisation with what it rests on.
+    result
+        The localisation.
+    solution
+        Of its graph.
     told
         What it was made from.
     """
-    result, solution = found.result, found.solution
     truth = None
     if told.truth is not None:
         truth = truth_record(told.truth, result.trajectory, result.odometry, told.max_pose_gap_s)

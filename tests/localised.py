@@ -54,4 +54,5 @@ def record() -> LocalisationRecord:
     drive, known = driven()
     options = {"slam": OPTIONS.model_dump(mode="json")}
     truth = SourceFile("truth.tum", "01" * 32)
-    return localisation_record(localised(), Told(known, WORLD, options, 0.5, drive.truth, truth))
+    done, told = localised(), Told(known, WORLD, options, 0.5, drive.truth, truth)
+    return localisation_record(done.result, done.solution, told)

@@ -115,7 +115,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     options = config.model_dump(mode="json", include={"bag", "slam", "qa"})
     truth_source = None if given.truth is None else source_file(given.truth)
     told = Told(calibration, field_map, options, gap, truth, truth_source)
-    made = _Made(recording, found, localisation_record(found, told))
+    made = _Made(recording, found, localisation_record(found.result, found.solution, told))
     ensure_folder(out)
     _write(made, out)
     verdict = write_slam_report(out / REPORT_FILE, made.record, config.qa)

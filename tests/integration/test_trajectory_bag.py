@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -109,7 +110,7 @@ def test_twists_are_velocities_along_the_axes_of_the_lidar(
     write_trajectory_bag(path, motion)
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Ros2Reader(path) as reader:
-        messages = [
+        messages: list[Any] = [
             store.deserialize_cdr(data, connection.msgtype)
             for connection, _, data in reader.messages()
             if connection.topic == TOPIC
