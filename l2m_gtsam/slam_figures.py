@@ -38,6 +38,7 @@ from l2m_gtsam.validation_results import ChiSquare, NamedSource
 
 NO_TRUTH = "no key pose lies between two true ones that are near enough: nothing is compared"
 SPANS = 60  # of a timeline, at most
+POSES = 3  # key poses in a span, at least in the mean
 BAND = np.array([0.025, 0.975])
 DIGITS = 9
 
@@ -226,7 +227,7 @@ def _timeline(solution: Localised, own: IntArray) -> Timeline:
     """Return when readings of a sensor, by their rows, counted."""
     drive, sight = solution.drive, solution.sight
     at = 1e-9 * (drive.stamp_ns - drive.stamp_ns[0])
-    edges = np.linspace(0.0, at[-1], min(SPANS, len(drive)) + 1)
+    edges = np.linspace(0.0, at[-1], min(SPANS, max(len(drive) // POSES, 1)) + 1)
     seconds, inside, used = at[drive.readings.key_pose[own]], sight.inside[own], solution.used[own]
 
     def count(which: FloatArray) -> tuple[int, ...]:

@@ -148,13 +148,13 @@ def test_a_place_that_changed_is_told_once_for_all_sensors() -> None:
     start = good()
     first, second = start.sensors
     count = len(first.timeline.used)
-    wrong, none = [0, 0, 9, 9, 4, *[0] * (count - 5)], [0] * count
-    right = [9, 9, 1, 1, 5, *[9] * (count - 5)]
-    silent = [9, 9, 0, 0, 5, *[9] * (count - 5)]  # reads nothing where the other is wrong
+    wrong, none = [0, 9, 0, 9, 4, *[0] * (count - 5)], [0] * count
+    right = [9, 1, 0, 1, 5, *[9] * (count - 5)]  # and nothing is read between
+    silent = [9, 0, 0, 0, 5, *[9] * (count - 5)]  # reads nothing where the other is wrong
     seen = replace(first, timeline=timed(first, right, wrong))
     both = replace(start, sensors=(seen, replace(second, timeline=timed(second, silent, none))))
     (text,) = texts(judged(both), Level.WARN)
-    low, high = (first.timeline.edges[k] for k in (2, 4))
+    low, high = (first.timeline.edges[k] for k in (1, 4))
     assert text.startswith(f"From {low:.0f} to {high:.0f} s, between (")
     assert "the place has changed since it was mapped, or something passed by" in text
     # The other sensor fits there, or there is no other: then it may be the sensor.

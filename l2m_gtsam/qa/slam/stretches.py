@@ -20,8 +20,9 @@ def stretches(sensors: Sequence[SensorRecord]) -> list[tuple[float, float]]:
         return []
     wrong = np.array([each.timeline.rejected for each in told])
     inside = wrong + np.array([each.timeline.used for each in told])
+    read = np.flatnonzero(inside.sum(axis=0))  # spans between key poses hold nothing
     # A sensor without a reading there says nothing against it.
-    all_wrong = np.all(wrong >= MOST * inside, axis=0) & (wrong.sum(axis=0) > 0)
+    all_wrong = np.all(wrong[:, read] >= MOST * inside[:, read], axis=0)
     ends = np.flatnonzero(np.diff(np.concatenate([[False], all_wrong, [False]])))
     edges = told[0].timeline.edges
-    return [(edges[first], edges[last]) for first, last in ends.reshape(-1, 2).tolist()]
+    return [(edges[read[first]], edges[read[last - 1] + 1]) for first, last in ends.reshape(-1, 2)]

@@ -39,6 +39,7 @@ LARGEST = 0.05  # of the picture's longer side: half an axis of the largest elli
 SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 BAND_95 = 12.59  # chi-square of six
 ROW = 0.42  # inches of a sensor
+DECADE = 10.0
 SHORTEST = 1e-4  # m and degrees: less is nothing on an axis of decades
 
 
@@ -202,7 +203,14 @@ def _ellipse(course: Course, k: int, scale: int) -> Ellipse:
 
 
 def _decades(axes: Axes) -> None:
-    """Count upwards in decades, with plain numbers: mathematics is text in these figures."""
+    """Count upwards in decades, with plain numbers: mathematics is text in these figures.
+
+    Within less than one a plain axis is easier to read.
+    """
+    low, high = axes.dataLim.intervaly
+    if not low * DECADE < high:
+        axes.set_ylim(0, None)
+        return
     axes.set_yscale("log", nonpositive="clip")
     low, high = axes.get_ylim()
     axes.set_ylim(max(low, SHORTEST), high)
