@@ -158,7 +158,7 @@ def _counted(record: LocalisationRecord, course: Course) -> tuple[Picture, ...]:
             figures.counted_figure(record.sensors),
             "counted",
             f"Shares of readings that count over time, a row per sensor: {told}.",
-            f"{told}. A gap in all rows is a place that has changed or something that passed by; "
+            f"{told}. Red in all rows is a place that has changed or something that passed by; "
             "in one row it is that sensor.",
         ),
         picture(
