@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from l2m_gtsam.data import SourceFile, Trajectory
+from l2m_gtsam.metric_records import Record
 from l2m_gtsam.results import CalibrationResult
 
 
@@ -17,7 +18,7 @@ class LocalisationStatus(StrEnum):
 
 
 @dataclass(frozen=True)
-class DriftFigures:
+class DriftFigures(Record):
     """How far odometry, from where the drive is said to begin, is from the localised poses.
 
     Attributes
@@ -43,7 +44,7 @@ class DriftFigures:
 
 
 @dataclass(frozen=True)
-class SensorUse:
+class SensorUse(Record):
     """What a sensor's readings were worth.
 
     Attributes

@@ -181,6 +181,24 @@ def with_offsets(readings: Readings, trajectory: Trajectory, offset: FloatArray)
     return replace(readings, R_map_lidar=R, p_map_lidar=p, motion=motion)
 
 
+def has_pose(trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float) -> BoolArray:
+    """Return which times lie between two poses that are not further apart, shape (N,)."""
+    spanned = _spanned(trajectory.stamp_ns, stamp_ns, 0)
+    return spanned & (_longest_gap_ns(trajectory.stamp_ns, stamp_ns, 0) <= max_pose_gap_s * 1e9)
+
+
+def interpolated(trajectory: Trajectory, stamp_ns: IntArray) -> Trajectory:
+    """Return the poses at N times; beyond its ends the body stands still. No covariances."""
+    R, p = _poses_at(trajectory, 1e-9 * (stamp_ns - trajectory.stamp_ns[0]))
+    return replace(trajectory, stamp_ns=stamp_ns, R=R, p=p, covariance=None)
+
+
+def twists(trajectory: Trajectory, stamp_ns: IntArray) -> FloatArray:
+    """Return the body's velocity at N times: rad/s, then m/s, in its own frame, shape (N, 6)."""
+    at = 1e-9 * (stamp_ns - trajectory.stamp_ns[0])
+    return _twist_at(trajectory, at, _poses_at(trajectory, at)[0])
+
+
 def _poses_at(trajectory: Trajectory, at: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Interpolate on SE(3): rotations along the shortest arc, positions along the line.
 

@@ -1,4 +1,4 @@
-"""Reports: rendered from what a calibration left behind."""
+"""Reports: rendered from what a calibration or a localisation left behind."""
 
 from pathlib import Path
 
@@ -6,8 +6,9 @@ from pydantic import ValidationError
 
 from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE
 from l2m_gtsam.batch.outputs import check_outputs
+from l2m_gtsam.batch.slam_report import SLAM_FILE, report_localisation
 from l2m_gtsam.config import load_config
-from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.errors import ConfigError, OutputError
 from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.qa.judge import Verdict, judge
 from l2m_gtsam.qa.nominal import check_names
@@ -24,14 +25,15 @@ PDF_FILE = "report.pdf"
 
 
 def report_folder(folder: Path, config: Path | None, *, pdf: bool = False) -> Verdict:
-    """Write `report.html` from `calibration.yaml` and `metrics.json` in a folder.
+    """Write `report.html` from what is in a folder.
 
     Parameters
     ----------
     folder
-        Where a calibration was written to.
+        Where a calibration (`calibration.yaml` and `metrics.json`) or a localisation (`slam.json`)
+        was written to.
     config
-        Configuration with thresholds; those of the calibration if there is none.
+        Configuration with thresholds; those that it was computed with if there is none.
     pdf
         Whether `report.pdf` is written, too.
 
@@ -41,13 +43,38 @@ def report_folder(folder: Path, config: Path | None, *, pdf: bool = False) -> Ve
         A file is missing or damaged, or there is no browser to print with; one line.
     """
     check_outputs(folder / REPORT_FILE, folder / PDF_FILE)
-    result = read_calibration(folder / CALIBRATION_FILE)
-    metrics = read_metrics(folder / METRICS_FILE)
-    options = _saved(result) if config is None else load_config(config).qa
-    verdict = write_report(folder, result, metrics, options)
+    if holds_localisation(folder):
+        verdict = report_localisation(folder, config, folder / REPORT_FILE)
+    else:
+        verdict = _report_calibration(folder, config)
     if pdf:
         print_page(folder / REPORT_FILE, folder / PDF_FILE)
     return verdict
+
+
+def holds_localisation(folder: Path) -> bool:
+    """Return whether a report on a folder is one on a localisation.
+
+    Raises
+    ------
+    OutputError
+        It holds a calibration, too: there can be one report only.
+    """
+    if not (folder / SLAM_FILE).exists():
+        return False
+    if (folder / METRICS_FILE).exists():
+        raise OutputError(
+            f"{folder}: holds a calibration ({METRICS_FILE}) and a localisation ({SLAM_FILE}), "
+            "which have one report each; move one of them to a folder of its own"
+        )
+    return True
+
+
+def _report_calibration(folder: Path, config: Path | None) -> Verdict:
+    result = read_calibration(folder / CALIBRATION_FILE)
+    metrics = read_metrics(folder / METRICS_FILE)
+    options = _saved(result) if config is None else load_config(config).qa
+    return write_report(folder, result, metrics, options)
 
 
 def write_report(

@@ -8,7 +8,8 @@ import typer
 
 def report(
     folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Folder that `l2m calibrate` wrote to.")
+        Path,
+        typer.Argument(metavar="DIR", help="Folder that `l2m calibrate` or `l2m slam` wrote to."),
     ],
     config: Annotated[
         Path | None,
@@ -20,7 +21,7 @@ def report(
         bool, typer.Option("--pdf", help="Write report.pdf, too: needs Chromium, Chrome or Edge.")
     ] = False,
 ) -> None:
-    """Write report.html from a calibration: verdict, reasons, pictures; needs no bag and no map."""
+    """Write report.html: verdict, reasons, pictures; needs no bag and no map."""
     from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
     from l2m_gtsam.qa.verdict_text import verdict_lines
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
+from l2m_gtsam.commands.terminal import print_table, shown_progress
 
 
 def slam(
@@ -18,6 +18,10 @@ def slam(
         Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for the results.")],
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", help="True poses of the LiDAR in the map (TUM), to compare with."),
+    ] = None,
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML configuration; see `slam` in it.")
     ] = None,
@@ -25,12 +29,15 @@ def slam(
     """Localise a drive in a magnetic map: odometry and magnetometers, from a known start."""
     from l2m_gtsam.batch.slam import SlamInput, slam_bag
     from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table
+    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table, truth_lines
+    from l2m_gtsam.qa.verdict_text import verdict_lines
 
+    given = SlamInput(bag, map_path, calibration, truth)
     with shown_progress() as progress:
-        result = slam_bag(SlamInput(bag, map_path, calibration), load_config(config), out, progress)
-    print_table(slam_table(result))
-    for line in drift_lines(result):
+        done = slam_bag(given, load_config(config), out, progress)
+    print_table(slam_table(done.result))
+    for line in (*drift_lines(done.result), *truth_lines(done.record.truth)):
         typer.echo(line)
-    warn(result.notes)
+    for line in verdict_lines(done.verdict):
+        typer.echo(line)
     typer.echo(f"written: {out}")

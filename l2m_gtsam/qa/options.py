@@ -67,6 +67,27 @@ class ValidationOptions(Options):
     changed; 1 is consistent."""
 
 
+class SlamQaOptions(Options):
+    """Thresholds of the verdict of `l2m slam`.
+
+    It shares `qa.rejected`, `qa.outside_map` and `qa.chi_square` with the report on a calibration.
+    """
+
+    position_sigma_m: Limit = Limit(warn=0.1, fail=0.5)
+    """Largest standard deviation of the position of a key pose along an axis of the map, metres."""
+    heading_sigma_deg: Limit = Limit(warn=2.0, fail=10.0)
+    """Largest standard deviation of the heading of a key pose, degrees."""
+    steps: Limit = Limit(warn=2.0, fail=4.0)
+    """Mean square of what steps between localised poses differ by from odometry's, in units of its
+    covariance; 1 is consistent."""
+    nees: Limit = Limit(warn=3.0, fail=10.0)
+    """Normalised squared error of the poses against the truth, if one is given, per degree of
+    freedom; 1 is honest. Poses of a drive err together, so that a drive counts as one."""
+    chance: float = Field(default=1e-3, gt=0, lt=0.1)
+    """Share of true calibrations of which it may be said, by chance, that refining them changed
+    them by more than they allow."""
+
+
 class QaOptions(Options):
     """Thresholds of the verdict in a report."""
 
@@ -128,3 +149,5 @@ class QaOptions(Options):
     """Readings of each sensor that a half is calibrated on, spread evenly over it."""
     validation: ValidationOptions = ValidationOptions()
     """Thresholds of `l2m validate`."""
+    slam: SlamQaOptions = SlamQaOptions()
+    """Thresholds of `l2m slam`."""

@@ -4,6 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from l2m_gtsam.slam_records import TruthRecord
 from l2m_gtsam.slam_results import LocalisationResult
 
 
@@ -42,3 +43,25 @@ def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
         )
         lines.append(known)
     return tuple(lines)
+
+
+def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:
+    """Return errors against the truth before and after, a line each; none without a truth."""
+    if truth is None:
+        return ()
+    before, after = truth.odometry, truth.localised
+    errors = (
+        f"against the truth at {truth.poses} key poses: odometry {1e3 * before.rms_m:.0f} mm rms, "
+        f"{1e3 * before.largest_m:.0f} mm at most; localised {1e3 * after.rms_m:.0f} mm rms, "
+        f"{1e3 * after.largest_m:.0f} mm at most ({_gone(truth)})"
+    )
+    nees = (
+        f"rotations {before.rms_deg:.2f} deg rms before, {after.rms_deg:.2f} deg after; NEES of "
+        f"the poses {truth.nees:.1f}, 6 is honest"
+    )
+    return (errors, nees)
+
+
+def _gone(truth: TruthRecord) -> str:
+    gone = truth.removed
+    return f"{gone:.0%} less" if gone >= 0 else f"{-gone:.0%} more"

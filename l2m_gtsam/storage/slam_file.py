@@ -1,70 +1,68 @@
 """``slam.json``: how a localisation ended, in figures, and the covariance of every pose."""
 
-import json
-from dataclasses import asdict
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
-import numpy as np
-from scipy.spatial.transform import Rotation
+from pydantic import TypeAdapter
 
-from l2m_gtsam.slam_results import LocalisationResult, SensorUse
+from l2m_gtsam.metric_results import Record
+from l2m_gtsam.slam_records import LocalisationRecord
 from l2m_gtsam.storage.atomic import atomic_path
-from l2m_gtsam.storage.calibration_file import source_entry
+from l2m_gtsam.storage.record_file import read_record
 
-FORMAT = "l2m-slam"
-VERSION = 1
+FORMAT: Literal["l2m-slam"] = "l2m-slam"
+VERSION: Literal[2] = 2
 LEGEND = {
     "poses": "T_map_lidar at key poses: stamp_ns, p in metres, quaternion_xyzw",
     "covariance": "of a right perturbation, T_true = T_map_lidar Exp(error): rotation (rad), then "
     "translation (m), along the axes of the lidar",
-    "drift": "odometry alone, from where the drive is said to begin, less the localised poses",
+    "odometry": "alone, from where the drive is said to begin; sigma along x, y, z of the map (m), "
+    "and about them (deg)",
+    "drift": "odometry alone less the localised poses, in m and deg",
     "chi2_per_dof": "mean square of whitened residuals; 1 is consistent",
+    "steps": "the same of what steps between poses differ by from odometry's",
+    "truth": "errors against a trajectory that was given, nothing aligned; nees of 6 is honest",
 }
 
 
-def write_slam(path: Path, result: LocalisationResult, options: dict[str, Any]) -> None:
-    """Write a localisation with the options that made it.
+@dataclass(frozen=True)
+class _Head(Record):
+    format: Literal["l2m-slam"]
+    version: Literal[2]
+    legend: dict[str, str]
+
+
+@dataclass(frozen=True)
+class _SlamFile(LocalisationRecord, _Head):
+    """A head, and the record after it."""
+
+
+_ADAPTER = TypeAdapter(_SlamFile)
+
+
+def write_slam(path: Path, record: LocalisationRecord) -> None:
+    """Write a localisation; `read_slam` gives it back equal.
 
     Raises
     ------
     OutputError
         The file cannot be written.
     """
-    content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "legend": LEGEND,
-        "status": result.status.value,
-        "message": result.message,
-        "notes": list(result.notes),
-        "drift": {**asdict(result.drift), "end_share": result.drift.end_share},
-        "sensors": {each.sensor: _use_entry(each) for each in result.sensors},
-        "bag": source_entry(result.bag),
-        "map": source_entry(result.map),
-        "calibration": source_entry(result.calibration_source),
-        "poses": _pose_entries(result),
-        "options": options,
-    }
+    content = {each.name: getattr(record, each.name) for each in fields(LocalisationRecord)}
+    file = _SlamFile(format=FORMAT, version=VERSION, legend=LEGEND, **content)
     with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+        temporary.write_bytes(_ADAPTER.dump_json(file) + b"\n")
 
 
-def _use_entry(use: SensorUse) -> dict[str, Any]:
-    numbers = {**asdict(use), "used": use.used}
-    del numbers["sensor"]
-    return {name: value if np.isfinite(value) else None for name, value in numbers.items()}
+def read_slam(path: Path) -> LocalisationRecord:
+    """Return the localisation in a file.
 
-
-def _pose_entries(result: LocalisationResult) -> list[dict[str, Any]]:
-    at, covariance = result.trajectory, result.trajectory.covariance
-    quaternions = Rotation.from_matrix(at.R).as_quat()
-    return [
-        {
-            "stamp_ns": int(stamp),
-            "p": p.tolist(),
-            "quaternion_xyzw": q.tolist(),
-            "covariance": None if covariance is None else covariance[k].tolist(),
-        }
-        for k, (stamp, p, q) in enumerate(zip(at.stamp_ns, at.p, quaternions, strict=True))
-    ]
+    Raises
+    ------
+    CalibrationError
+        The file is missing, damaged or something else.
+    """
+    file = read_record(path, _ADAPTER, "localisation", "`l2m slam` writes it")
+    content = {each.name: getattr(file, each.name) for each in fields(LocalisationRecord)}
+    return LocalisationRecord(**content)

@@ -7,10 +7,16 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from evo.core import metrics, sync
 from evo.tools import file_interface
 
+from l2m_gtsam.batch.reports import report_folder
 from l2m_gtsam.data import Distortion
+from l2m_gtsam.qa.reasons.reason import Level
+from l2m_gtsam.storage.bag import read_trajectory
+from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
+from l2m_gtsam.storage.tum import write_tum
 from tests.calibrations import calibration, sensor
 from tests.end_to_end.conftest import complaint_here, l2m
 from tests.end_to_end.yard import NOISE, Yard, make_yard, route
@@ -59,8 +65,11 @@ def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path
     out = tmp_path / "out"
     config = configured(yard, tmp_path, calibration="refined", start={"position_m": 0.02})
     files = ("--map", field_map, "--calibration", known, "--config", config, "--out", out)
-    run = l2m("slam", yard.west, *files)
+    truth = tmp_path / "truth.tum"
+    write_tum(truth, read_trajectory(yard.west, BagOptions(poses="/pose")))
+    run = l2m("slam", yard.west, *files, "--truth", truth)
     assert "localised: the map explains" in run.out
+    assert "verdict: " in run.out
     told = json.loads((out / "slam.json").read_text())
     assert told["status"] == "localised"
     trajectory = file_interface.read_tum_trajectory_file(str(out / "trajectory.tum"))
@@ -73,6 +82,16 @@ def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path
     way = route(-3, 0.5)
     apart = np.linalg.norm(trajectory.positions_xyz[:, None] - way, axis=2).min(axis=1)
     assert np.sqrt(np.mean(apart**2)) < 0.1
+    # What is told of errors is what evo finds in the files.
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    reference = file_interface.read_tum_trajectory_file(str(truth))
+    ape.process_data(sync.associate_trajectories(reference, trajectory))
+    rms = ape.get_statistic(metrics.StatisticsType.rmse)
+    assert told["truth"]["localised"]["rms_m"] == pytest.approx(rms, rel=1e-6)
+    assert f"localised {1e3 * rms:.0f} mm rms" in run.out
+    moved = read_trajectory(out / "trajectory.mcap", BagOptions())
+    np.testing.assert_allclose(moved.p, trajectory.positions_xyz, rtol=0, atol=1e-9)
+    assert moved.covariance is not None
     _, values = gtsam.readG2o(str(out / "graph.g2o"), True)
     assert values.size() == trajectory.num_poses
     refined = read_calibration(out / "refined.yaml")["mag"]
@@ -85,6 +104,26 @@ def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path
     fixed = configured(yard, tmp_path, calibration="fixed", start={"position_m": 0.02})
     l2m("slam", yard.west, *files[:-4], "--config", fixed, "--out", out)
     assert not (out / "refined.yaml").exists()
+    check_report(out, tmp_path)
+
+
+def check_report(out: Path, folder: Path) -> None:
+    """A report is rendered from the record alone, and judged by other thresholds on request."""
+    page = out / "report.html"
+    text = page.read_text()
+    assert "counts as exact" in text
+    page.unlink()
+    assert "verdict: " in l2m("report", out).out
+    assert page.read_text() == text
+    strict = folder / "strict.yaml"
+    strict.write_text("qa: {slam: {position_sigma_m: {warn: 1.0e-6, fail: 2.0e-6}}}")
+    assert report_folder(out, strict).level is Level.FAIL
+    (out / "metrics.json").write_text("{}")
+    assert "holds a calibration (metrics.json) and a localisation" in complaint_here("report", out)
+    (out / "metrics.json").unlink()
+    record = out / "slam.json"
+    record.write_text(record.read_text()[:-100])
+    assert "slam.json: not a localisation file" in complaint_here("report", out)
 
 
 def test_bad_input_is_one_line_and_writes_nothing(
@@ -104,6 +143,20 @@ def test_bad_input_is_one_line_and_writes_nothing(
     )
     far = configured(yard, tmp_path, start={"position": [40.0, 0.0, 0.4]})
     assert "the drive is not in this map" in told(known, far)
+    late = tmp_path / "late.tum"
+    late.write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    files = ("--map", field_map, "--calibration", known, "--config", config, "--out", out)
+    for truth, line in (
+        (tmp_path / "none.tum", "none.tum: no such file"),
+        (known, "is no time in seconds"),
+        (late, "late.tum: runs from 1.000 to 2.000 s"),
+    ):
+        assert line in complaint_here("slam", yard.west, *files, "--truth", truth)
     wrong = configured(yard, tmp_path, calibration="guessed")
     assert "slam.calibration" in told(known, wrong)
     assert not out.exists()
+    out.mkdir()
+    (out / "metrics.json").write_text("{}")
+    right = configured(yard, tmp_path)
+    assert "holds a calibration, whose report would be lost" in told(known, right)
+    assert [each.name for each in out.iterdir()] == ["metrics.json"]

@@ -144,7 +144,7 @@ def _curves(anchor: str, name: str, found: SensorMetrics) -> Picture:
     before, after = found.curves.before**0.5, found.curves.after**0.5
     return picture(
         "Before, after, map",
-        course.curves_figure(found),
+        course.curves_figure(found.series),
         f"{anchor}-curves",
         f"Readings of {name} along the lidar's axes before and after the calibration beside the "
         f"map's: {before:.1f} and {after:.2f} µT rms away from it.",
@@ -158,7 +158,7 @@ def _residuals(anchor: str, name: str, found: SensorMetrics) -> Picture:
     wrong = sum(found.series.rejected)
     return picture(
         "Residuals over time",
-        course.residuals_figure(found),
+        course.residuals_figure(found.series),
         f"{anchor}-residuals",
         f"Residuals of {name} over time: rms {rms} µT along x, y, z; {wrong} drawn readings are "
         "rejected.",
@@ -170,7 +170,7 @@ def _residuals(anchor: str, name: str, found: SensorMetrics) -> Picture:
 def _over_the_map(anchor: str, name: str, found: SensorMetrics) -> Picture:
     return picture(
         "Residuals over the map",
-        place.residual_figure(found),
+        place.residual_figure(found.series),
         f"{anchor}-place",
         f"Length of the residuals of {name} where they were read.",
         "Bright spots that keep together are places where map and readings disagree.",
@@ -207,7 +207,7 @@ def _chi_square(anchor: str, name: str, found: SensorMetrics) -> Picture:
     std = ", ".join(f"{each:.2f}" for each in found.normalised.std)
     return picture(
         "Normalised residuals",
-        statistics.chi_square_figure(found),
+        statistics.chi_square_figure(found.normalised),
         f"{anchor}-chi2",
         f"Squared normalised residuals of {name} beside chi-square: standard deviations {std} "
         f"along x, y, z, {found.normalised.beyond_95:.1%} beyond the 95 % quantile.",

@@ -150,7 +150,7 @@ def _of_drive(anchor: str, sensor: ValidatedSensor) -> list[Picture]:
     return [
         picture(
             "Before, after, map",
-            course.curves_figure(sensor),
+            course.curves_figure(sensor.series),
             f"{anchor}-curves",
             f"Readings of {name} along the lidar's axes before and after the calibration beside "
             f"the map's: {before:.1f} and {after:.2f} µT rms away from it.",
@@ -159,7 +159,7 @@ def _of_drive(anchor: str, sensor: ValidatedSensor) -> list[Picture]:
         ),
         picture(
             "Residuals over time",
-            course.residuals_figure(sensor),
+            course.residuals_figure(sensor.series),
             f"{anchor}-residuals",
             f"Residuals of {name} over time; {wrong} drawn readings are rejected.",
             "Should look like noise around zero. A level that is off is a changed H; crosses do "
@@ -167,7 +167,7 @@ def _of_drive(anchor: str, sensor: ValidatedSensor) -> list[Picture]:
         ),
         picture(
             "Residuals over the map",
-            place.residual_figure(sensor),
+            place.residual_figure(sensor.series),
             f"{anchor}-place",
             f"Length of the residuals of {name} where they were read.",
             "Bright spots that keep together are places where map and readings disagree.",

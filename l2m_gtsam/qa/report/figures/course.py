@@ -1,7 +1,5 @@
 """What a sensor read along the drive."""
 
-from typing import Protocol
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -25,21 +23,12 @@ from l2m_gtsam.qa.report.svg import (
 BETWEEN = 0.04  # of all drives' time, between two drives in a figure
 
 
-class WithSeries(Protocol):
-    """Figures of a sensor with the course of its drive."""
-
-    @property
-    def series(self) -> Series:
-        """The course, thinned."""
-        ...
-
-
-def residuals_figure(sensor: WithSeries) -> Figure:
+def residuals_figure(series: Series) -> Figure:
     """Draw residuals over time, an axis each, with rejected readings marked."""
     figure = plain_figure(3.8)
     parts = figure.subplots(3, 1, sharex=True, sharey=True)
-    seconds, wrong = along(sensor.series), np.array(sensor.series.rejected)
-    residual = np.array(sensor.series.residual)
+    seconds, wrong = along(series), np.array(series.rejected)
+    residual = np.array(series.residual)
     limit = 1.3 * float(np.quantile(np.abs(residual[~wrong]), 0.995)) if (~wrong).any() else 1.0
     for k, axes in enumerate(parts):
         axes.axhline(0, color=MUTED, linewidth=0.7)
@@ -50,15 +39,15 @@ def residuals_figure(sensor: WithSeries) -> Figure:
         axes.set_ylabel(f"{'xyz'[k]} (µT)")
     parts[0].set_ylim(-1.05 * limit, 1.05 * limit)
     parts[-1].set_xlabel("time (s)")
-    show_drives(parts, sensor.series)
+    show_drives(parts, series)
     return figure
 
 
-def curves_figure(sensor: WithSeries) -> Figure:
+def curves_figure(course: Series) -> Figure:
     """Draw readings before and after the calibration beside those of the map, an axis each."""
     figure = plain_figure(4.6)
     parts = figure.subplots(3, 1, sharex=True)
-    course, ends = sensor.series, _ends(sensor.series)
+    ends = _ends(course)
     seconds = np.insert(along(course), ends, np.nan)
     for k, axes in enumerate(parts):
         before, after, there = (

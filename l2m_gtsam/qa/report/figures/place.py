@@ -8,8 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import Metrics, Rows
-from l2m_gtsam.qa.report.figures.course import WithSeries
+from l2m_gtsam.metric_results import MapPicture, Metrics, Rows, Series
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.results import Disagreement
 
@@ -19,7 +18,7 @@ BELOW: Any = {"location": "bottom", "shrink": 0.7, "aspect": 40, "pad": 0.02}
 
 def strength_figure(metrics: Metrics, stretches: Sequence[Disagreement]) -> Figure:
     """Draw the field of the map, the drive, and where the place has changed."""
-    figure, axes = _map(metrics, metrics.map.strength, "field strength (µT)", "viridis")
+    figure, axes = strength_background(metrics.map)
     _drive(axes, metrics)
     for stretch in stretches:
         axes.plot(
@@ -35,18 +34,19 @@ def strength_figure(metrics: Metrics, stretches: Sequence[Disagreement]) -> Figu
 
 def sigma_figure(metrics: Metrics) -> Figure:
     """Draw how well the map knows its field along the drive."""
-    figure, axes = _map(metrics, metrics.map.sigma, "standard deviation per axis (µT)", "cividis")
+    label = "standard deviation per axis (µT)"
+    figure, axes = _map(metrics.map, metrics.map.sigma, label, "cividis")
     _drive(axes, metrics)
     return figure
 
 
-def residual_figure(sensor: WithSeries) -> Figure:
+def residual_figure(series: Series) -> Figure:
     """Draw the length of a sensor's residuals where they were read."""
-    place, residual = np.array(sensor.series.place), np.array(sensor.series.residual)
-    wrong = np.array(sensor.series.rejected)
+    place, residual = np.array(series.place), np.array(series.residual)
+    wrong = np.array(series.rejected)
     size = np.linalg.norm(residual, axis=1)
     x, y = place[~wrong, :2].T
-    figure, axes = _wide(np.ptp(place[:, :2], axis=0))
+    figure, axes = wide(np.ptp(place[:, :2], axis=0))
     high = float(np.quantile(size[~wrong], 0.98)) if (~wrong).any() else 1.0
     drawn = axes.scatter(
         x, y, c=size[~wrong], cmap="viridis", vmin=0, vmax=high, s=10, linewidths=0, rasterized=True
@@ -59,16 +59,21 @@ def residual_figure(sensor: WithSeries) -> Figure:
     return figure
 
 
-def _wide(extent: FloatArray) -> tuple[Figure, Axes]:
+def wide(extent: FloatArray) -> tuple[Figure, Axes]:
     """Return a figure as high as a place of this extent, shape (2,), asks for."""
     height = 0.85 * WIDTH * float(extent[1]) / max(float(extent[0]), 0.1)
     figure = new_figure(float(np.clip(height + 1.3, 2.0, 4.8)))
     return figure, figure.add_subplot()
 
 
-def _map(metrics: Metrics, values: Rows, label: str, colours: str) -> tuple[Figure, Axes]:
-    left, right, bottom, top = metrics.map.extent
-    figure, axes = _wide(np.array([right - left, top - bottom]))
+def strength_background(picture: MapPicture) -> tuple[Figure, Axes]:
+    """Draw the field of a map, to draw on."""
+    return _map(picture, picture.strength, "field strength (µT)", "viridis")
+
+
+def _map(picture: MapPicture, values: Rows, label: str, colours: str) -> tuple[Figure, Axes]:
+    left, right, bottom, top = picture.extent
+    figure, axes = wide(np.array([right - left, top - bottom]))
     image = np.array(values)
     known = image[np.isfinite(image)]
     low, high = np.quantile(known, [0.01, 0.99]) if len(known) else (0.0, 1.0)
@@ -76,7 +81,7 @@ def _map(metrics: Metrics, values: Rows, label: str, colours: str) -> tuple[Figu
         image, origin="lower", extent=(left, right, bottom, top), cmap=colours, vmin=low, vmax=high
     )
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
-    axes.set_title(f"at z = {metrics.map.height:.2f} m; blank: no data")
+    axes.set_title(f"at z = {picture.height:.2f} m; blank: no data")
     axes.grid(visible=False)
     figure.colorbar(drawn, ax=axes, label=label, **BELOW)
     return figure, axes
@@ -89,10 +94,11 @@ def _drive(axes: Axes, metrics: Metrics) -> None:
     starts = [0, *(np.flatnonzero(np.isnan(path[0])) + 1)]
     for k, first in enumerate(starts):
         name = "start" if len(starts) == 1 else f"start {k + 1}"
-        _start(axes, path[:, first], name)
+        mark(axes, path[:, first], name)
 
 
-def _start(axes: Axes, place: FloatArray, name: str) -> None:
+def mark(axes: Axes, place: FloatArray, name: str) -> None:
+    """Mark and name a place, shape (2,), on a map."""
     axes.plot(*place, "o", color="white", markeredgecolor="black", markersize=6)
     axes.annotate(
         name,

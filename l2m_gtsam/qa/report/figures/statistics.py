@@ -4,18 +4,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from l2m_gtsam.metric_results import Row, SensorMetrics
+from l2m_gtsam.metric_results import Normalised, Row, SensorMetrics
 from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, SMALL, X, Y, plain_figure
 
 CUT = 7.81  # 95 % of chi-square of three
 ALIKE = 3.0  # sigmas: of fifteen parameters one is beyond in 4 % of all drives
 
 
-def chi_square_figure(sensor: SensorMetrics) -> Figure:
+def chi_square_figure(found: Normalised) -> Figure:
     """Draw squared normalised residuals beside the chi-square that they should have."""
     figure = plain_figure(2.9)
     axes = figure.add_subplot()
-    found = sensor.normalised
     edges, counts = np.array(found.edges), np.array(found.counts)
     density = counts / max(counts.sum(), 1) / np.diff(edges)
     axes.stairs(density, edges, fill=True, color=X, alpha=0.5, label="read")

@@ -1,0 +1,1 @@
+"""A localisation in figures and words."""
