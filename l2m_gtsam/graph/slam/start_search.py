@@ -1,0 +1,163 @@
+"""Where a drive begins, without a guess: its first metres are laid over the whole map.
+
+All places and headings of a lattice are screened; those that readings do not rule out are followed
+to their minima, and the likelihoods of the best of these are compared. As long as two of them, or
+none, explain the readings, more of the drive is looked at.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.graph.global_start import spread_out
+from l2m_gtsam.graph.slam.drive import Drive, StartPose
+from l2m_gtsam.graph.slam.field_lattice import FieldLattice, lattice_over
+from l2m_gtsam.graph.slam.options import SlamOptions, StartPoseOptions
+from l2m_gtsam.graph.slam.start_descent import descended
+from l2m_gtsam.graph.slam.start_fit import Beforehand, WindowFit
+from l2m_gtsam.graph.slam.start_options import StartSearchOptions
+from l2m_gtsam.graph.slam.start_screen import Places, about_z, screen
+from l2m_gtsam.graph.slam.start_verdict import judged
+from l2m_gtsam.graph.slam.start_window import Pattern, Window, window_of
+from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.maps.field_map import Surveyed
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.slam_results import StartCandidate, StartSearch, StartVerdict
+
+STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not followed
+SAME = 0.25  # steps: minima nearer than that are one
+GROWTH = 2.0  # of a window
+SIGMAS = 3.0  # of a start that was found: its readings are going to be used once more
+
+
+def find_start(
+    drive: Drive, field_map: QueryableMap, options: SlamOptions, progress: Progress
+) -> StartSearch:
+    """Look all over a map for where a drive begins.
+
+    Parameters
+    ----------
+    drive
+        The drive; of its start only what is up counts.
+    field_map
+        The map.
+    options
+        How to look.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    MapError
+        The map does not tell where it was surveyed, or is too large for the lattice.
+    """
+    if not isinstance(field_map, Surveyed):
+        raise MapError("the map does not tell where it has data: give the start of the drive")
+    search = options.start.search
+    progress("looking for the start", 0.0)
+    lattice = lattice_over(field_map, field_map.readings, search.step_m)
+    window_m = min(search.window_m, search.longest_m)
+    while True:
+        window = window_of(drive, window_m, search.readings)
+        found = search_window(window, lattice, field_map, options)
+        progress("looking for the start", min(window_m / search.longest_m, 1.0))
+        last = window_m >= search.longest_m or len(window.p) == len(drive)
+        if last or found.verdict is StartVerdict.UNIQUE:
+            return found
+        window_m = min(GROWTH * window_m, search.longest_m)
+
+
+def start_found(found: StartSearch, options: StartPoseOptions) -> StartPose:
+    """Return the start that a search found.
+
+    Raises
+    ------
+    MapError
+        It is not the only one, or there is none.
+    """
+    if found.verdict is not StartVerdict.UNIQUE:
+        raise MapError(found.message)
+    best = found.candidates[0]
+    sigma = np.repeat([np.deg2rad(options.rotation_deg), options.position_m], 3)
+    return StartPose(best.T_map_lidar, SIGMAS**2 * best.covariance + np.diag(sigma**2))
+
+
+def search_window(
+    window: Window, lattice: FieldLattice, field_map: QueryableMap, options: SlamOptions
+) -> StartSearch:
+    """Return where in a map a window of a drive fits."""
+    search, known = options.start.search, beforehand(window, lattice, options)
+    pattern = window.pattern(known.tilt)
+    rises = pattern.origin[2] - window.p_odom_lidar[2] + known.height
+    slack = SIGMAS * known.height_m
+    places = screen(pattern, lattice, lattice.between(rises - slack, rises + slack), search)
+    ends = followed(places, pattern, field_map, search)
+    fit = WindowFit(window, field_map, known)
+    fits = [fit.at(pose) for pose in poses_of(ends, pattern, window)]
+    return judged(distinct(fits, search), window, places.looked_at, search)
+
+
+def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> Beforehand:
+    """Return what is known of the start without readings."""
+    start, height = options.start, options.start.search.height_m
+    z = lattice.places(np.arange(len(lattice)))[:, 2]
+    anywhere = float(np.ptp(z)) + 2.0 * lattice.step
+    return Beforehand(
+        up=window.R_odom_lidar[2],
+        tilt=float(np.deg2rad(start.rotation_deg)),
+        height=float(z.mean()) if height is None else height,
+        height_m=anywhere if height is None else start.position_m,
+        spread=lattice.spread,
+        largest=options.robust.largest,
+    )
+
+
+def followed(
+    places: Places, pattern: Pattern, field_map: QueryableMap, options: StartSearchOptions
+) -> Places:
+    """Return the best minima that places lead to."""
+    if not len(places):
+        return places
+    apart = STRIDE * options.step_m
+    seeds = places[np.array(spread_out(drawn(places, pattern), apart, options.seeds))]
+    ends = descended(seeds, pattern, field_map, options.step_m)
+    ends = ends[np.argsort(ends.score, kind="stable")]
+    same = SAME * options.step_m
+    return ends[np.array(spread_out(drawn(ends, pattern), same, options.candidates))]
+
+
+def drawn(places: Places, pattern: Pattern) -> FloatArray:
+    """Return places as points in metres, shape (N, 5): headings lie on a circle of the pattern."""
+    radius = max(pattern.radius, 0.5)
+    circle = radius * np.column_stack([np.cos(places.yaw), np.sin(places.yaw)])
+    return np.hstack([places.p, circle])
+
+
+def poses_of(places: Places, pattern: Pattern, window: Window) -> list[RigidTransform]:
+    """Return where the first key pose is if the pattern lies at these places."""
+    lever, poses = window.p_odom_lidar - pattern.origin, []
+    for p, yaw in zip(places.p, places.yaw.tolist(), strict=True):
+        Rz = about_z(yaw)
+        poses.append(RigidTransform(Rz @ window.R_odom_lidar, Rz @ lever + p))
+    return poses
+
+
+def distinct(
+    fits: Sequence[StartCandidate], options: StartSearchOptions
+) -> tuple[StartCandidate, ...]:
+    """Return candidates that are apart, the likeliest first."""
+    kept: list[StartCandidate] = []
+    for fit in sorted(fits, key=lambda each: -each.log_likelihood):
+        if all(are_apart(fit, other, options) for other in kept):
+            kept.append(fit)
+    return tuple(kept)
+
+
+def are_apart(one: StartCandidate, other: StartCandidate, options: StartSearchOptions) -> bool:
+    """Return whether two candidates are two places."""
+    a, b = one.T_map_lidar, other.T_map_lidar
+    turn = np.rad2deg(Rotation.from_matrix(a.R.T @ b.R).magnitude())
+    return bool(np.linalg.norm(a.t - b.t) > options.apart_m or turn > options.apart_deg)
