@@ -64,10 +64,10 @@ class Beforehand:
 
         By a right perturbation, rotation before translation.
         """
-        leans = at.R.T[:, 2] - self.up
+        leans = at.R[2] - self.up
         rises = at.t[2] - self.height
         J = np.zeros((4, 6))
-        J[:3, :3], J[3, 3:] = skew(at.R.T[:, 2]) / self.tilt, at.R[2] / self.height_m
+        J[:3, :3], J[3, 3:] = skew(at.R[2:])[0] / self.tilt, at.R[2] / self.height_m
         e = np.append(leans / self.tilt, rises / self.height_m)
         return float(0.5 * e @ e), J.T @ e, J.T @ J + np.diag(UNKNOWN**-2)
 

@@ -1,18 +1,20 @@
 r"""Which places and headings of a lattice can be where a pattern of fields was read.
 
 Within half a step of the truth a reading's residual is that of the truth, e, and at most a
-tolerance more: slope times displacement, the field's horizontal part times half a heading, and what
-the tangent leaves. By Cauchy and Schwarz
+tolerance more: slope times displacement, what half a heading turns the field by, and what the
+tangent leaves. By Cauchy and Schwarz
 
 .. math::
     (|e| + \tau)^2 \le (\sigma^2 + \tau^2) \, (|e|^2 / \sigma^2 + 1)
 
 so that with the tolerance as a further variance the truth's node scores no more than the truth
-itself, and one for each reading. Nodes beyond what noise and outliers leave are given up as soon as
-a part of the readings says so: most of them after a few.
+itself, and one for each reading. The tilt of the pattern is common to all readings and solved for
+on the way, which only lowers a score. Nodes beyond what noise and outliers leave are given up as
+soon as a part of the readings says so: most of them after a few.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -28,6 +30,7 @@ COARSEST = np.deg2rad(10.0)  # between headings
 LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
 MEAN = 3.0  # of it, by noise
 SIGMAS = 4.0  # of their sum
+MOST_UNKNOWN = 0.5  # share of the readings where the map has no data
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
@@ -43,25 +46,82 @@ class Places:
         Heading of its x axis, rad, shape (N,).
     score
         The lower the better, shape (N,).
-    looked_at
-        How many were looked at.
     """
 
     p: FloatArray
     yaw: FloatArray
     score: FloatArray
-    looked_at: int
 
     def __len__(self) -> int:
         return len(self.yaw)
 
     def __getitem__(self, rows: IntArray) -> "Places":
-        return Places(self.p[rows], self.yaw[rows], self.score[rows], self.looked_at)
+        return Places(self.p[rows], self.yaw[rows], self.score[rows])
+
+
+@dataclass(frozen=True)
+class Screened:
+    """The places that readings do not rule out, the best first, and how many were looked at."""
+
+    places: Places
+    looked_at: int
+
+
+class Heading(NamedTuple):
+    """A pattern of N readings with a heading, in the map's axes.
+
+    Attributes
+    ----------
+    node
+        The node nearest to each reading, in steps from that of the origin, shape (N, 3).
+    rest
+        The way from there, metres, shape (N, 3).
+    field
+        What was read, uT, shape (N, 3).
+    variance
+        Of it without the map's, uT^2, shape (N,).
+    drift2
+        Of its place by odometry, m^2, shape (N,).
+    moved
+        The largest displacement within half a cell and half a heading, metres, shape (N,).
+    swung
+        What half a heading turns the field by, uT, shape (N,).
+    """
+
+    node: IntArray
+    rest: FloatArray
+    field: FloatArray
+    variance: FloatArray
+    drift2: FloatArray
+    moved: FloatArray
+    swung: FloatArray
+
+
+class Rules(NamedTuple):
+    """What rules a place out: its score, or how many readings are where the map has no data.
+
+    ``tilt2`` is the variance of the pattern's tilt about each axis, rad^2.
+    """
+
+    limit: float
+    most_unknown: int
+    tilt2: float
+
+
+class Nodes(NamedTuple):
+    """A lattice as the kernel takes it; see ``FieldLattice``."""
+
+    index: IntArray
+    field: FloatArray
+    gradient: FloatArray
+    slope: FloatArray
+    bend: FloatArray
+    variance: FloatArray
 
 
 def screen(
     pattern: Pattern, lattice: FieldLattice, nodes: IntArray, options: StartSearchOptions
-) -> Places:
+) -> Screened:
     """Return the places that readings do not rule out, at most ``MOST_KEPT``.
 
     Parameters
@@ -78,21 +138,15 @@ def screen(
     turn = heading_step(pattern.radius, lattice.step)
     headings = turn * np.arange(round(2 * np.pi / turn))
     pattern = in_turn(pattern)
-    limit, unknown = largest_score(len(pattern.x), options)
+    rules, told, at = rules_of(pattern, options), nodes_of(lattice), lattice.at[nodes]
 
     def look(yaw: float) -> Places:
         score = np.empty(len(nodes))
-        _scores(
-            *(lattice.index, lattice.at[nodes], lattice.field, lattice.gradient),
-            *(lattice.slope, lattice.bend, lattice.variance),
-            *turned(pattern, lattice.step, yaw, turn),
-            *(limit, unknown, score),
-        )
+        write_scores(at, told, heading(pattern, lattice.step, yaw, turn), rules, score)
         kept = np.flatnonzero(np.isfinite(score))
-        where = lattice.places(nodes[kept])
-        return Places(where, np.full(len(kept), yaw), score[kept], len(nodes))
+        return Places(lattice.places(nodes[kept]), np.full(len(kept), yaw), score[kept])
 
-    return best_of(in_threads(look, headings))
+    return Screened(best_of(in_threads(look, headings)), len(headings) * len(nodes))
 
 
 def heading_step(radius: float, step: float) -> float:
@@ -104,42 +158,37 @@ def heading_step(radius: float, step: float) -> float:
     return float(2 * np.pi / np.ceil(2 * np.pi / angle))
 
 
-def largest_score(readings: int, options: StartSearchOptions) -> tuple[float, int]:
-    """Return what noise and outliers leave at most, and how many may be where no map is."""
-    wrong = options.outliers * readings
-    noise = (readings - wrong) * (MEAN + 1) + SIGMAS * np.sqrt(2 * MEAN * readings)
-    return float(noise + wrong * (LARGEST + 1)), int(0.5 * readings)
+def rules_of(pattern: Pattern, options: StartSearchOptions) -> Rules:
+    """Return what noise and outliers leave at most."""
+    N = len(pattern.x)
+    wrong = options.outliers * N
+    noise = (N - wrong) * (MEAN + 1) + SIGMAS * np.sqrt(2 * MEAN * N) + LARGEST
+    return Rules(float(noise + wrong * (LARGEST + 1)), int(MOST_UNKNOWN * N), pattern.tilt**2)
 
 
 def in_turn(pattern: Pattern) -> Pattern:
     """Return the readings in an order in which neighbours come late: the first ones tell most."""
-    order = np.argsort(GOLDEN * np.arange(len(pattern.x)) % 1, kind="stable")
-    parts = (pattern.x, pattern.field, pattern.variance, pattern.drift_m)
-    return Pattern(*(part[order] for part in parts), pattern.origin)
+    return pattern[np.argsort(GOLDEN * np.arange(len(pattern.x)) % 1, kind="stable")]
 
 
-def turned(
-    pattern: Pattern, step: float, yaw: float, turn: float
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return what does not depend on the place: per reading of a pattern with this heading.
+def nodes_of(lattice: FieldLattice) -> Nodes:
+    """Return a lattice as the kernel takes it."""
+    return Nodes(*(getattr(lattice, name) for name in Nodes._fields))
 
-    The nearest node in steps from the pattern's (N, 3), the way from there in metres (N, 3), the
-    field (N, 3) and its variance (N,) in the map's axes, the position's variance by odometry (N,),
-    the largest displacement by half a cell and half a heading (N,), metres, and what half a
-    heading does to the field, uT, shape (N,).
-    """
+
+def heading(pattern: Pattern, step: float, yaw: float, turn: float) -> Heading:
+    """Return a pattern with a heading, among headings ``turn`` apart; both in rad."""
     Rz = about_z(yaw)
     x, field = pattern.x @ Rz.T, pattern.field @ Rz.T
     node = np.round(x / step)
-    moved = 0.5 * (np.sqrt(3) * step + turn * np.linalg.norm(x[:, :2], axis=1))
-    swung = 0.5 * turn * np.linalg.norm(field[:, :2], axis=1)
-    return (
-        node.astype(np.int64),
-        x - step * node,
-        field,
-        np.column_stack([pattern.variance, pattern.drift_m**2]),
-        moved,
-        swung,
+    return Heading(
+        node=node.astype(np.int64),
+        rest=x - step * node,
+        field=field,
+        variance=pattern.variance,
+        drift2=pattern.drift_m**2,
+        moved=0.5 * (np.sqrt(3) * step + turn * np.linalg.norm(x[:, :2], axis=1)),
+        swung=0.5 * turn * np.linalg.norm(field[:, :2], axis=1),
     )
 
 
@@ -151,55 +200,70 @@ def about_z(yaw: float) -> FloatArray:
 
 def best_of(parts: list[Places]) -> Places:
     """Return the places with the least scores, the best first."""
-    p, yaw, score = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("p", "yaw", "score")
-    )
-    best = np.argsort(score, kind="stable")[:MOST_KEPT]
-    return Places(p[best], yaw[best], score[best], sum(part.looked_at for part in parts))
+    p = np.concatenate([part.p for part in parts])
+    yaw = np.concatenate([part.yaw for part in parts])
+    score = np.concatenate([part.score for part in parts])
+    return Places(p, yaw, score)[np.argsort(score, kind="stable")[:MOST_KEPT]]
 
 
 @njit(cache=True, nogil=True)
-def _scores(
-    index,
-    at,
-    field,
-    gradient,
-    slope,
-    bend,
-    variance,
-    node,
-    rest,
-    read,
-    known,
-    moved,
-    swung,
-    limit,
-    most_unknown,
-    score,
-):  # type: ignore[no-untyped-def]  # numba compiles it for the arrays of `screen`
-    """Write the score of each node as the pattern's place; infinite beyond the limit."""
-    N = len(node)
+def write_scores(
+    at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules, score: FloatArray
+) -> None:
+    """Write the score of each node, shape (M, 3), as the pattern's place."""
     for m in range(len(at)):
-        total, unknown = 0.0, 0
-        for n in range(N):
-            i, j, k = at[m, 0] + node[n, 0], at[m, 1] + node[n, 1], at[m, 2] + node[n, 2]
-            row = -1
-            if 0 <= i < index.shape[0] and 0 <= j < index.shape[1] and 0 <= k < index.shape[2]:
-                row = index[i, j, k]
-            if row < 0:
-                unknown += 1
-                total += MEAN + 1
+        score[m] = score_at(at[m], nodes, pattern, rules)
+
+
+@njit(cache=True, nogil=True)
+def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> float:
+    """Return the score of a node, shape (3,), as the pattern's place; infinite beyond the limit.
+
+    It is the least over the tilt (u, v) about the x and y axes of the squared residuals in sigmas,
+    which turn by (v fz, -u fz, u fy - v fx), and the squared tilt in its own.
+    """
+    total, unknown, per_tilt2 = 0.0, 0, 1 / rules.tilt2
+    a, b, c, g, h = per_tilt2, 0.0, per_tilt2, 0.0, 0.0  # [[a, b], [b, c]] (u, v) = (g, h)
+    r = np.empty(3)
+    for n in range(len(pattern.node)):
+        row = row_of(nodes.index, at, pattern.node[n])
+        if row < 0:
+            unknown += 1
+            total += MEAN + 1
+        else:
+            r2 = 0.0
+            for axis in range(3):
+                r[axis] = pattern.field[n, axis] - nodes.field[row, axis]
+                for along in range(3):
+                    r[axis] -= nodes.gradient[row, axis, along] * pattern.rest[n, along]
+                r2 += r[axis] ** 2
+            slope = nodes.slope[row]
+            tolerance = slope * pattern.moved[n] + pattern.swung[n] + nodes.bend[row]
+            s2 = pattern.variance[n] + nodes.variance[row] + slope**2 * pattern.drift2[n]
+            s2 += tolerance**2
+            x, y, z = pattern.field[n, 0], pattern.field[n, 1], pattern.field[n, 2]
+            leaning = rules.tilt2 * (x * x + y * y + 2 * z * z)
+            if r2 > (LARGEST + 1) * (s2 + leaning):
+                total += LARGEST + 1
             else:
-                r2 = 0.0
-                for axis in range(3):
-                    b = field[row, axis]
-                    for along in range(3):
-                        b += gradient[row, axis, along] * rest[n, along]
-                    r2 += (read[n, axis] - b) ** 2
-                tolerance = slope[row] * moved[n] + swung[n] + bend[row]
-                s2 = known[n, 0] + variance[row] + slope[row] ** 2 * known[n, 1] + tolerance**2
-                total += min(r2 / s2, LARGEST + 1)
-            if total > limit or unknown > most_unknown:
-                total = np.inf
-                break
-        score[m] = total
+                total += r2 / s2
+                a += (z * z + y * y) / s2
+                b -= x * y / s2
+                c += (z * z + x * x) / s2
+                g += (y * r[2] - z * r[1]) / s2
+                h += (z * r[0] - x * r[2]) / s2
+        taken = (c * g * g - 2 * b * g * h + a * h * h) / (a * c - b * b)
+        if total - taken > rules.limit or unknown > rules.most_unknown:
+            return np.inf
+    return total - taken
+
+
+@njit(cache=True, nogil=True)
+def row_of(index: IntArray, at: IntArray, node: IntArray) -> int:
+    """Return which node of the lattice is so many steps from another, shapes (3,), or -1."""
+    i, j, k = at[0] + node[0], at[1] + node[1], at[2] + node[2]
+    if i < 0 or j < 0 or k < 0:
+        return -1
+    if i >= index.shape[0] or j >= index.shape[1] or k >= index.shape[2]:
+        return -1
+    return int(index[i, j, k])

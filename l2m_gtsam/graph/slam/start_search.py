@@ -16,10 +16,10 @@ from l2m_gtsam.graph.global_start import spread_out
 from l2m_gtsam.graph.slam.drive import Drive, StartPose
 from l2m_gtsam.graph.slam.field_lattice import FieldLattice, lattice_over
 from l2m_gtsam.graph.slam.options import SlamOptions, StartPoseOptions
-from l2m_gtsam.graph.slam.start_descent import descended
+from l2m_gtsam.graph.slam.start_descent import Laid, descended
 from l2m_gtsam.graph.slam.start_fit import Beforehand, WindowFit
 from l2m_gtsam.graph.slam.start_options import StartSearchOptions
-from l2m_gtsam.graph.slam.start_screen import Places, about_z, screen
+from l2m_gtsam.graph.slam.start_screen import Places, screen
 from l2m_gtsam.graph.slam.start_verdict import judged
 from l2m_gtsam.graph.slam.start_window import Pattern, Window, window_of
 from l2m_gtsam.graph.view import QueryableMap
@@ -28,6 +28,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam_results import StartCandidate, StartSearch, StartVerdict
 
 STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not followed
+SMALLEST = 0.5  # metres: of the circle of headings
 SAME = 0.25  # steps: minima nearer than that are one
 GROWTH = 2.0  # of a window
 SIGMAS = 3.0  # of a start that was found: its readings are going to be used once more
@@ -93,11 +94,12 @@ def search_window(
     pattern = window.pattern(known.tilt)
     rises = pattern.origin[2] - window.p_odom_lidar[2] + known.height
     slack = SIGMAS * known.height_m
-    places = screen(pattern, lattice, lattice.between(rises - slack, rises + slack), search)
-    ends = followed(places, pattern, field_map, search)
+    nodes = lattice.between(rises - slack, rises + slack)
+    screened = screen(pattern, lattice, nodes, search)
+    ends = followed(screened.places, pattern, field_map, search)
     fit = WindowFit(window, field_map, known)
     fits = [fit.at(pose) for pose in poses_of(ends, pattern, window)]
-    return judged(distinct(fits, search), window, places.looked_at, search)
+    return judged(distinct(fits, search), window, screened.looked_at, search)
 
 
 def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> Beforehand:
@@ -117,32 +119,28 @@ def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> B
 
 def followed(
     places: Places, pattern: Pattern, field_map: QueryableMap, options: StartSearchOptions
-) -> Places:
+) -> Laid:
     """Return the best minima that places lead to."""
     if not len(places):
-        return places
+        return Laid.upright(places)
     apart = STRIDE * options.step_m
-    seeds = places[np.array(spread_out(drawn(places, pattern), apart, options.seeds))]
+    seeds = places[np.array(spread_out(drawn(Laid.upright(places), pattern), apart, options.seeds))]
     ends = descended(seeds, pattern, field_map, options.step_m)
-    ends = ends[np.argsort(ends.score, kind="stable")]
+    ends = ends[np.argsort(ends.cost, kind="stable")]
     same = SAME * options.step_m
     return ends[np.array(spread_out(drawn(ends, pattern), same, options.candidates))]
 
 
-def drawn(places: Places, pattern: Pattern) -> FloatArray:
-    """Return places as points in metres, shape (N, 5): headings lie on a circle of the pattern."""
-    radius = max(pattern.radius, 0.5)
-    circle = radius * np.column_stack([np.cos(places.yaw), np.sin(places.yaw)])
-    return np.hstack([places.p, circle])
+def drawn(laid: Laid, pattern: Pattern) -> FloatArray:
+    """Return poses as points in metres, shape (S, 5): headings lie on a circle of the pattern."""
+    return np.hstack([laid.p, max(pattern.radius, SMALLEST) * laid.R[:, :2, 0]])
 
 
-def poses_of(places: Places, pattern: Pattern, window: Window) -> list[RigidTransform]:
-    """Return where the first key pose is if the pattern lies at these places."""
-    lever, poses = window.p_odom_lidar - pattern.origin, []
-    for p, yaw in zip(places.p, places.yaw.tolist(), strict=True):
-        Rz = about_z(yaw)
-        poses.append(RigidTransform(Rz @ window.R_odom_lidar, Rz @ lever + p))
-    return poses
+def poses_of(laid: Laid, pattern: Pattern, window: Window) -> list[RigidTransform]:
+    """Return where the first key pose is if the pattern lies at these poses."""
+    lever = window.p_odom_lidar - pattern.origin
+    R, p = laid.R @ window.R_odom_lidar, laid.R @ lever + laid.p
+    return [RigidTransform(*each) for each in zip(R, p, strict=True)]
 
 
 def distinct(

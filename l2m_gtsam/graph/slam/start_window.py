@@ -25,6 +25,8 @@ class Pattern:
         Of each axis of that without the map's share, uT^2, shape (N,).
     drift_m
         Standard deviation per axis of ``x`` by odometry's errors, metres, shape (N,).
+    tilt
+        Standard deviation of what is up, about each axis, rad.
     origin
         The frame's origin in the frame of odometry, metres, shape (3,).
     """
@@ -33,7 +35,12 @@ class Pattern:
     field: FloatArray
     variance: FloatArray
     drift_m: FloatArray
+    tilt: float
     origin: FloatArray
+
+    def __getitem__(self, rows: IntArray) -> "Pattern":
+        own = (each[rows] for each in (self.x, self.field, self.variance, self.drift_m))
+        return Pattern(*own, self.tilt, self.origin)
 
     @property
     def radius(self) -> float:
@@ -86,9 +93,9 @@ class Window:
         b = np.linalg.solve(C, (first.field - self.sensors.distortion[sensor, 9:])[..., None])
         middle = central(x)
         drift = self._drift(int(key[middle]))[key]
-        known = self._variance(C, b[..., 0], drift[:, 0] + tilt**2)
+        known = self._variance(C, b[..., 0], drift[:, 0])
         field = np.einsum("nij,njk->ni", R, b)
-        return Pattern(x - x[middle], field, known, np.sqrt(drift[:, 1]), x[middle])
+        return Pattern(x - x[middle], field, known, np.sqrt(drift[:, 1]), tilt, x[middle])
 
     def _variance(self, C: FloatArray, b: FloatArray, turn: FloatArray) -> FloatArray:
         """Return variances per axis from noise, calibration and rotation (rad^2), shape (N,)."""
