@@ -22,15 +22,15 @@ def slam(
         Path | None, typer.Option("--config", help="YAML configuration; see `slam` in it.")
     ] = None,
 ) -> None:
-    """Localise a drive in a magnetic map: odometry and magnetometers, from a known start."""
+    """Localise a drive in a magnetic map, from a start that is known or looked for."""
     from l2m_gtsam.batch.slam import SlamInput, slam_bag
     from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table
+    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table, start_lines
 
     with shown_progress() as progress:
         result = slam_bag(SlamInput(bag, map_path, calibration), load_config(config), out, progress)
     print_table(slam_table(result))
-    for line in drift_lines(result):
+    for line in (*start_lines(result.start), *drift_lines(result)):
         typer.echo(line)
     warn(result.notes)
     typer.echo(f"written: {out}")

@@ -4,7 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.slam_results import LocalisationResult
+from l2m_gtsam.slam_results import LocalisationResult, StartSearch
 
 
 def slam_table(result: LocalisationResult) -> Table:
@@ -23,6 +23,22 @@ def slam_table(result: LocalisationResult) -> Table:
             f"{each.chi2_per_dof:.2f}",
         )
     return table
+
+
+def start_lines(search: StartSearch | None) -> tuple[str, ...]:
+    """Return where the drive was found to begin, a line each; none where that was known."""
+    if search is None:
+        return ()
+    best = search.candidates[0]
+    sigma = np.sqrt(np.diag(best.covariance))
+    second = "no second place was found"
+    if np.isfinite(search.margin):
+        second = f"the second best place is less likely by exp({search.margin:.0f})"
+    return (
+        f"start: {search.message}",
+        f"  within {1e3 * sigma[3:].max():.0f} mm and {np.rad2deg(sigma[:3].max()):.1f} deg (one "
+        f"sigma); {second} of {search.looked_at} places and headings",
+    )
 
 
 def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
