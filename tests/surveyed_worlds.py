@@ -38,7 +38,7 @@ def surveyed(world: DipoleWorld, *rooms: float) -> SurveyedWorld:
     lines = np.arange(-ROOM, ROOM + 0.1, 0.3)
     x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
     one = np.column_stack([x, y, np.full(len(x), 0.5)])
-    points = np.concatenate([one + [room, 0.0, 0.0] for room in rooms or (0.0,)])
+    points = np.concatenate([one + np.array([room, 0.0, 0.0]) for room in rooms or (0.0,)])
     field, _ = world.field_and_gradient(points)
     return SurveyedWorld(world, TrainingSet(points, field, np.ones(len(points))))
 

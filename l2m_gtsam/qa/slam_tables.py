@@ -34,11 +34,9 @@ def start_lines(search: StartSearch | None) -> tuple[str, ...]:
     second = "no second place was found"
     if np.isfinite(search.margin):
         second = f"the second best place is less likely by exp({search.margin:.0f})"
-    return (
-        f"start: {search.message}",
-        f"  within {1e3 * sigma[3:].max():.0f} mm and {np.rad2deg(sigma[:3].max()):.1f} deg (one "
-        f"sigma); {second} of {search.looked_at} places and headings",
-    )
+    place = f"{1e3 * sigma[3:].max():.0f} mm and {np.rad2deg(sigma[:3].max()):.1f} deg (one sigma)"
+    searched = f"{second}; {search.looked_at} places and headings were looked at"
+    return f"start: {search.message}", f"start known within {place}; {searched}"
 
 
 def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
