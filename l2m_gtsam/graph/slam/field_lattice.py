@@ -26,7 +26,7 @@ class FieldLattice:
         Metres.
     lowest
         The first node of the box in steps, shape (3,).
-    index
+    rows
         Which node of the lattice each of the box is, -1 for none, shape (nx, ny, nz).
     at
         Where each node is in the box, shape (M, 3).
@@ -42,7 +42,7 @@ class FieldLattice:
 
     step: float
     lowest: IntArray
-    index: IntArray
+    rows: IntArray
     at: IntArray
     field: FloatArray
     gradient: FloatArray
@@ -53,9 +53,9 @@ class FieldLattice:
     def __len__(self) -> int:
         return len(self.at)
 
-    def places(self, rows: IntArray) -> FloatArray:
+    def places(self, nodes: IntArray) -> FloatArray:
         """Return where nodes are in the map, metres, shape (N, 3)."""
-        return np.asarray(self.step * (self.lowest + self.at[rows]))
+        return np.asarray(self.step * (self.lowest + self.at[nodes]))
 
     def between(self, low: float, high: float) -> IntArray:
         """Return the nodes at some heights in metres, and no further off than half a step."""
@@ -88,17 +88,17 @@ def lattice_over(field_map: QueryableMap, survey: TrainingSet, step: float) -> F
     """
     lowest, near = nodes_near(survey, step)
     asked = np.argwhere(near)
-    sample = field_map.query(step * (lowest + asked))
+    sample = field_map.query(np.asarray(step * (lowest + asked)))
     at = asked[sample.inside]
     if not len(at):
         raise MapError("the map has no data at any place of the lattice; choose a smaller step_m")
-    index = np.full(near.shape, -1, dtype=np.int32)
-    index[tuple(at.T)] = np.arange(len(at))
+    rows = np.full(near.shape, -1)
+    rows[tuple(at.T)] = np.arange(len(at))
     field, gradient = sample.field[sample.inside], sample.gradient[sample.inside]
     slope = np.linalg.svd(gradient, compute_uv=False)[:, 0]
-    bend = FURTHEST**2 * remainder(index, at, field, gradient, step)
+    bend = FURTHEST**2 * remainder(rows, at, field, gradient, step)
     variance = sample.variance[sample.inside].mean(axis=1)
-    return FieldLattice(step, lowest, index, at, field, gradient, slope, bend, variance)
+    return FieldLattice(step, lowest, rows, at, field, gradient, slope, np.asarray(bend), variance)
 
 
 def nodes_near(survey: TrainingSet, step: float) -> tuple[IntArray, BoolArray]:
@@ -119,10 +119,10 @@ def nodes_near(survey: TrainingSet, step: float) -> tuple[IntArray, BoolArray]:
 
 
 def remainder(
-    index: IntArray, at: IntArray, field: FloatArray, gradient: FloatArray, step: float
+    rows: IntArray, at: IntArray, field: FloatArray, gradient: FloatArray, step: float
 ) -> FloatArray:
     """Return how far the field of neighbours is from a node's tangent at most, uT, shape (M,)."""
-    padded = np.pad(index, 1, constant_values=-1)
+    padded = np.pad(rows, 1, constant_values=-1)
     most = np.zeros(len(at))
     for axis in range(AXES):
         for way in (-1, 1):

@@ -15,13 +15,21 @@ same readings.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import carried_residuals, skew
+from l2m_factors import carried_residuals
 from l2m_gtsam.data import BoolArray, FloatArray, RigidTransform
 from l2m_gtsam.graph.slam.shared import SharedMapErrors, errors_of
 from l2m_gtsam.graph.slam.sight import Place, Sight, look
+from l2m_gtsam.graph.slam.start_prior import Beforehand
+from l2m_gtsam.graph.slam.start_roots import (
+    block_diagonal,
+    diagonal_blocks,
+    inverse,
+    map_root,
+    root_of,
+    steps_root,
+)
 from l2m_gtsam.graph.slam.start_window import Window, carried_back
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.slam_results import StartCandidate
@@ -30,46 +38,6 @@ from l2m_gtsam.solve.noise import map_covariance, reading_covariance
 ROUNDS = 3  # with covariances of their own
 STEPS = 4  # in each
 LONGEST = np.repeat([0.2, 0.3], 3)  # of a step: rad and m
-UNKNOWN = np.repeat([10.0, 1e3], 3)  # rad and m: sigmas of what nothing is known of
-ROUNDING = 1e-12
-
-
-@dataclass(frozen=True)
-class Beforehand:
-    """What is known before readings are looked at.
-
-    Attributes
-    ----------
-    up
-        The map's z axis in the frame of the first key pose, shape (3,).
-    tilt
-        Its standard deviation about each axis, rad.
-    height, height_m
-        Of the first key pose in the map, and its standard deviation, metres.
-    spread
-        Standard deviation per axis of the map's field from place to place, uT.
-    largest
-        Largest squared length of a whitened residual that passes for noise.
-    """
-
-    up: FloatArray
-    tilt: float
-    height: float
-    height_m: float
-    spread: float
-    largest: float
-
-    def said(self, at: RigidTransform) -> tuple[float, FloatArray, FloatArray]:
-        """Return half the squared error in sigmas of a pose, with its derivatives (6,) and (6, 6).
-
-        By a right perturbation, rotation before translation.
-        """
-        leans = at.R[2] - self.up
-        rises = at.t[2] - self.height
-        J = np.zeros((4, 6))
-        J[:3, :3], J[3, 3:] = skew(at.R[2:])[0] / self.tilt, at.R[2] / self.height_m
-        e = np.append(leans / self.tilt, rises / self.height_m)
-        return float(0.5 * e @ e), J.T @ e, J.T @ J + np.diag(UNKNOWN**-2)
 
 
 @dataclass(frozen=True)
@@ -109,12 +77,13 @@ class WindowFit:
 
     def at(self, T_map_lidar: RigidTransform) -> StartCandidate:
         """Return the fit that a first key pose leads to."""
-        pose, trusted = T_map_lidar, None
+        pose = T_map_lidar
+        trusted = self._plausible(pose)
         for round_ in range(ROUNDS):
             seen, sight = self._linearised(pose), self._sight(pose)
             S = self._covariance(seen, sight, shared=round_ == ROUNDS - 1)
-            trusted = sight.inside & self._consistent(seen.e, S, trusted)
-            P = np.linalg.inv(self._doubted(S, trusted))
+            trusted = sight.inside & self._predicted(seen.e, S, trusted)
+            P = inverse(self._doubted(S, trusted))
             for _ in range(STEPS):
                 pose = self._stepped(pose, seen, P)
                 seen = self._linearised(pose)
@@ -130,7 +99,7 @@ class WindowFit:
         likelihood = 0.5 * (log_det - squared - len(seen.e) * np.log(2 * np.pi)) - prior
         return StartCandidate(
             T_map_lidar=pose,
-            covariance=np.linalg.inv(J.T @ P @ J + curvature),
+            covariance=inverse(J.T @ P @ J + curvature),
             log_likelihood=float(likelihood),
             explained=float(trusted.mean()),
             chi2_per_dof=squared / max(len(seen.e) - 6, 1),
@@ -196,20 +165,19 @@ class WindowFit:
         K = np.where(own, seen.by_calibration, 0.0)
         return np.asarray((K @ root_of(self._window.sensors.covariance[sensor])).reshape(-1, 15))
 
-    def _consistent(self, e: FloatArray, S: FloatArray, trusted: BoolArray | None) -> BoolArray:
-        """Return which readings are predicted by those that were trusted, shape (N,).
+    def _plausible(self, pose: RigidTransform) -> BoolArray:
+        """Return which readings are within their own covariances, shape (N,)."""
+        seen, sight = self._linearised(pose), self._sight(pose)
+        blocks = diagonal_blocks(self._covariance(seen, sight, shared=False))
+        return sight.inside & self._passes(seen.e.reshape(-1, 3), inverse(blocks))
 
-        At first by no other: by their own covariance.
-        """
-        N = len(e) // 3
-        if trusted is None:
-            blocks = np.linalg.inv(diagonal_blocks(S))
-            return self._passes(e.reshape(N, 3), blocks)
-        P = np.linalg.inv(self._doubted(S, trusted))
-        left_out = np.linalg.inv(diagonal_blocks(P))
-        e = np.einsum("nij,nj->ni", left_out, (P @ e).reshape(N, 3))
+    def _predicted(self, e: FloatArray, S: FloatArray, trusted: BoolArray) -> BoolArray:
+        """Return which readings those of the others that are trusted predict, shape (N,)."""
+        P = inverse(self._doubted(S, trusted))
+        left_out = inverse(diagonal_blocks(P))
+        missed = np.einsum("nij,nj->ni", left_out, (P @ e).reshape(-1, 3))
         own = left_out - self._doubt(trusted)[:, None, None] * np.eye(3)
-        return self._passes(e, np.linalg.inv(own))
+        return self._passes(missed, inverse(own))
 
     def _passes(self, e: FloatArray, information: FloatArray) -> BoolArray:
         return np.asarray(np.einsum("ni,nij,nj->n", e, information, e) <= self._known.largest)
@@ -220,47 +188,3 @@ class WindowFit:
     def _doubted(self, S: FloatArray, trusted: BoolArray) -> FloatArray:
         """Return S with the variance of readings that are not trusted."""
         return np.asarray(S + np.diag(np.repeat(self._doubt(trusted), 3)))
-
-
-def steps_root(window: Window) -> FloatArray:
-    """Return what a unit of each step's errors moves the first frame by, shape (K - 1, 6, 6).
-
-    As seen from what comes after the step.
-    """
-    back = carried_back(window.R[1:], window.p[1:])
-    return np.asarray(np.linalg.solve(back, np.linalg.cholesky(window.covariance)))
-
-
-def root_of(covariance: FloatArray) -> FloatArray:
-    """Return L with ``L L^T`` a covariance that may be singular."""
-    sigma = np.sqrt(np.maximum(np.diag(covariance), ROUNDING))
-    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    return np.asarray(sigma[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
-def map_root(errors: SharedMapErrors, C: FloatArray) -> FloatArray:
-    """Return a root of what the map's errors add to S, shape (3N, K)."""
-    columns = []
-    for tile, size in errors.sizes.items():
-        F = np.zeros((len(C), 3, size))
-        own = errors.owner == tile
-        F[own] = C[own] @ errors.features[tile]
-        columns.append(F.reshape(-1, size))
-    W = errors.root_information
-    return np.asarray(
-        solve_triangular(W, np.concatenate(columns, axis=1).T, lower=True, trans="T").T
-    )
-
-
-def block_diagonal(blocks: FloatArray) -> FloatArray:
-    """Return N blocks, shape (N, 3, 3), as one matrix, shape (3N, 3N)."""
-    N = len(blocks)
-    S = np.zeros((N, 3, N, 3))
-    S[np.arange(N), :, np.arange(N)] = blocks
-    return S.reshape(3 * N, 3 * N)
-
-
-def diagonal_blocks(S: FloatArray) -> FloatArray:
-    """Return the blocks of three rows on the diagonal, shape (N, 3, 3)."""
-    N = len(S) // 3
-    return np.asarray(S.reshape(N, 3, N, 3)[np.arange(N), :, np.arange(N)])

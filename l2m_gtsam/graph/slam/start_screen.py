@@ -111,7 +111,7 @@ class Rules(NamedTuple):
 class Nodes(NamedTuple):
     """A lattice as the kernel takes it; see ``FieldLattice``."""
 
-    index: IntArray
+    rows: IntArray
     field: FloatArray
     gradient: FloatArray
     slope: FloatArray
@@ -226,7 +226,7 @@ def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> floa
     a, b, c, g, h = per_tilt2, 0.0, per_tilt2, 0.0, 0.0  # [[a, b], [b, c]] (u, v) = (g, h)
     r = np.empty(3)
     for n in range(len(pattern.node)):
-        row = row_of(nodes.index, at, pattern.node[n])
+        row = row_of(nodes.rows, at, pattern.node[n])
         if row < 0:
             unknown += 1
             total += MEAN + 1
@@ -259,11 +259,11 @@ def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> floa
 
 
 @njit(cache=True, nogil=True)
-def row_of(index: IntArray, at: IntArray, node: IntArray) -> int:
+def row_of(rows: IntArray, at: IntArray, node: IntArray) -> int:
     """Return which node of the lattice is so many steps from another, shapes (3,), or -1."""
     i, j, k = at[0] + node[0], at[1] + node[1], at[2] + node[2]
     if i < 0 or j < 0 or k < 0:
         return -1
-    if i >= index.shape[0] or j >= index.shape[1] or k >= index.shape[2]:
+    if i >= rows.shape[0] or j >= rows.shape[1] or k >= rows.shape[2]:
         return -1
-    return int(index[i, j, k])
+    return int(rows[i, j, k])

@@ -17,8 +17,9 @@ from l2m_gtsam.graph.slam.drive import Drive, StartPose
 from l2m_gtsam.graph.slam.field_lattice import FieldLattice, lattice_over
 from l2m_gtsam.graph.slam.options import SlamOptions, StartPoseOptions
 from l2m_gtsam.graph.slam.start_descent import Laid, descended
-from l2m_gtsam.graph.slam.start_fit import Beforehand, WindowFit
+from l2m_gtsam.graph.slam.start_fit import WindowFit
 from l2m_gtsam.graph.slam.start_options import StartSearchOptions
+from l2m_gtsam.graph.slam.start_prior import Beforehand
 from l2m_gtsam.graph.slam.start_screen import Places, screen
 from l2m_gtsam.graph.slam.start_verdict import judged
 from l2m_gtsam.graph.slam.start_window import Pattern, Window, window_of

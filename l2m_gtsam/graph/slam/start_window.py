@@ -1,6 +1,6 @@
 """The first metres of a drive as one rigid pattern of fields, to be laid over a map."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,8 +39,13 @@ class Pattern:
     origin: FloatArray
 
     def __getitem__(self, rows: IntArray) -> "Pattern":
-        own = (each[rows] for each in (self.x, self.field, self.variance, self.drift_m))
-        return Pattern(*own, self.tilt, self.origin)
+        return replace(
+            self,
+            x=self.x[rows],
+            field=self.field[rows],
+            variance=self.variance[rows],
+            drift_m=self.drift_m[rows],
+        )
 
     @property
     def radius(self) -> float:
@@ -90,11 +95,13 @@ class Window:
         lever = np.einsum("nij,nj->ni", first.R_map_lidar, self.sensors.t[sensor])
         x = (lever + first.p_map_lidar) @ self.R_odom_lidar.T + self.p_odom_lidar
         C = self.sensors.distortion[sensor, :9].reshape(-1, 3, 3)
-        b = np.linalg.solve(C, (first.field - self.sensors.distortion[sensor, 9:])[..., None])
+        b = np.linalg.solve(C, (first.field - self.sensors.distortion[sensor, 9:])[..., None])[
+            ..., 0
+        ]
         middle = central(x)
         drift = self._drift(int(key[middle]))[key]
-        known = self._variance(C, b[..., 0], drift[:, 0])
-        field = np.einsum("nij,njk->ni", R, b)
+        known = self._variance(C, np.asarray(b), drift[:, 0])
+        field = np.einsum("nij,nj->ni", R, b)
         return Pattern(x - x[middle], field, known, np.sqrt(drift[:, 1]), tilt, x[middle])
 
     def _variance(self, C: FloatArray, b: FloatArray, turn: FloatArray) -> FloatArray:
