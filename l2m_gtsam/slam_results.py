@@ -95,8 +95,10 @@ class StartCandidate:
         Of a right perturbation of it, rotation (rad) before translation (m), shape (6, 6).
     log_likelihood
         Of the readings looked at.
+    inside
+        Share of them that the map has data for.
     explained
-        Share of them that fit.
+        Share of those that fit.
     chi2_per_dof
         Mean square of what they leave, in sigmas; 1 is consistent.
     """
@@ -104,6 +106,7 @@ class StartCandidate:
     T_map_lidar: RigidTransform
     covariance: FloatArray
     log_likelihood: float
+    inside: float
     explained: float
     chi2_per_dof: float
 

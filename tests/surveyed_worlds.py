@@ -13,7 +13,8 @@ from tests.worlds import DipoleWorld
 
 REACH = 0.4  # metres
 SIGMA = 0.05  # uT, what the map says of itself
-ROOM = 4.0  # metres to each side of its middle
+HEIGHTS = (0.1, 0.5, 0.9)  # metres
+ROOM = 4.5  # metres to each side of its middle
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,10 @@ class SurveyedWorld:
 
 
 def surveyed(world: DipoleWorld, *rooms: float) -> SurveyedWorld:
-    """Return the world as a map of rooms about these x (m), or about x = 0, at one height."""
+    """Return the world as a map of rooms about these x (m), or about x = 0, at three heights."""
     lines = np.arange(-ROOM, ROOM + 0.1, 0.3)
     x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
-    one = np.column_stack([x, y, np.full(len(x), 0.5)])
+    one = np.concatenate([np.column_stack([x, y, np.full(len(x), z)]) for z in HEIGHTS])
     points = np.concatenate([one + np.array([room, 0.0, 0.0]) for room in rooms or (0.0,)])
     field, _ = world.field_and_gradient(points)
     return SurveyedWorld(world, TrainingSet(points, field, np.ones(len(points))))

@@ -73,6 +73,7 @@ def _candidate_entry(candidate: StartCandidate) -> dict[str, Any]:
         "quaternion_xyzw": Rotation.from_matrix(pose.R).as_quat().tolist(),
         "covariance": candidate.covariance.tolist(),
         "log_likelihood": candidate.log_likelihood,
+        "inside": candidate.inside,
         "explained": candidate.explained,
         "chi2_per_dof": candidate.chi2_per_dof,
     }

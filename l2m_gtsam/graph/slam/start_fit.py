@@ -87,10 +87,15 @@ class WindowFit:
             for _ in range(STEPS):
                 pose = self._stepped(pose, seen, P)
                 seen = self._linearised(pose)
-        return self._told(pose, seen, P, trusted)
+        return self._told(pose, seen, P, trusted, sight.inside)
 
     def _told(
-        self, pose: RigidTransform, seen: Linearisation, P: FloatArray, trusted: BoolArray
+        self,
+        pose: RigidTransform,
+        seen: Linearisation,
+        P: FloatArray,
+        trusted: BoolArray,
+        inside: BoolArray,
     ) -> StartCandidate:
         prior, _, curvature = self._known.said(pose)
         squared = float(seen.e @ P @ seen.e)
@@ -101,7 +106,8 @@ class WindowFit:
             T_map_lidar=pose,
             covariance=inverse(J.T @ P @ J + curvature),
             log_likelihood=float(likelihood),
-            explained=float(trusted.mean()),
+            inside=float(inside.mean()),
+            explained=float(trusted.sum() / max(inside.sum(), 1)),
             chi2_per_dof=squared / max(len(seen.e) - 6, 1),
         )
 

@@ -34,7 +34,9 @@ class StartSearchOptions(Options):
     clear: float = Field(default=10.0, gt=0)
     """The start is unique if the second best place is less likely than the best by this factor's
     natural logarithm; 10 are odds of 22,000 to 1."""
+    least_inside: float = Field(default=0.4, gt=0, le=1)
+    """A place where the map has data for a smaller share of the readings does not count."""
     least_explained: float = Field(default=0.7, gt=0, le=1)
-    """A place that explains a smaller share of the readings is not where the drive was,"""
+    """One that explains a smaller share of these is not where the drive was,"""
     largest_chi2: float = Field(default=3.0, gt=1)
     """nor is one that leaves more than so many times the variance of what is known to be wrong."""

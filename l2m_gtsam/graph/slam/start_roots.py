@@ -1,4 +1,4 @@
-"""Roots of what several readings of a window have in common: each adds ``L L^T`` to a covariance."""
+"""Roots L of what readings of a window have in common: each adds ``L L^T`` to a covariance."""
 
 import numpy as np
 from scipy.linalg import solve_triangular

@@ -30,7 +30,6 @@ COARSEST = np.deg2rad(10.0)  # between headings
 LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
 MEAN = 3.0  # of it, by noise
 SIGMAS = 4.0  # of their sum
-MOST_UNKNOWN = 0.5  # share of the readings where the map has no data
 GOLDEN = (np.sqrt(5) - 1) / 2
 
 
@@ -163,7 +162,9 @@ def rules_of(pattern: Pattern, options: StartSearchOptions) -> Rules:
     N = len(pattern.x)
     wrong = options.outliers * N
     noise = (N - wrong) * (MEAN + 1) + SIGMAS * np.sqrt(2 * MEAN * N) + LARGEST
-    return Rules(float(noise + wrong * (LARGEST + 1)), int(MOST_UNKNOWN * N), pattern.tilt**2)
+    return Rules(
+        float(noise + wrong * (LARGEST + 1)), int((1 - options.least_inside) * N), pattern.tilt**2
+    )
 
 
 def in_turn(pattern: Pattern) -> Pattern:

@@ -46,9 +46,9 @@ def verdict_of(
     best = candidates[0]
     if not explains(best, options):
         message = (
-            f"no place of the map explains the readings: the best, {named(best)}, explains "
-            f"{best.explained:.0%} of them and leaves {best.chi2_per_dof:.1f} times the variance "
-            f"of what is known to be wrong: {elsewhere()}"
+            f"no place of the map explains the readings: at the best, {named(best)}, it has data "
+            f"for {best.inside:.0%} of them, explains {best.explained:.0%} of these and leaves "
+            f"{best.chi2_per_dof:.1f} times the variance of their errors: {elsewhere()}"
         )
         return StartVerdict.NOT_HERE, message
     if margin < options.clear:
@@ -76,7 +76,8 @@ def elsewhere() -> str:
 def explains(candidate: StartCandidate, options: StartSearchOptions) -> bool:
     """Return whether a candidate can be where the drive was."""
     fits = candidate.chi2_per_dof <= options.largest_chi2
-    return fits and candidate.explained >= options.least_explained
+    inside = candidate.inside >= options.least_inside
+    return fits and inside and candidate.explained >= options.least_explained
 
 
 def margin_of(candidates: tuple[StartCandidate, ...]) -> float:
