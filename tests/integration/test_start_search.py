@@ -24,8 +24,11 @@ from tests.surveyed_worlds import (
 from tests.worlds import DipoleWorld, dipole_world, random_sensors
 
 
+QUICK = {"readings": 40, "seeds": 60, "step_m": 0.25}  # small rooms, strong fields
+
+
 def searching(**search: object) -> SlamOptions:
-    return SlamOptions.model_validate({"start": {"anywhere": True, "search": search}})
+    return SlamOptions.model_validate({"start": {"anywhere": True, "search": QUICK | search}})
 
 
 def lost_drive(
@@ -78,7 +81,7 @@ def test_the_drive_is_followed_from_there() -> None:
 
 
 def test_a_uniform_field_tells_no_place() -> None:
-    nothing = DipoleWorld(np.array([22.0, 3.0, -38.0]), np.zeros((1, 3)), np.zeros((1, 3)))
+    nothing = DipoleWorld(np.array([22.0, 3.0, -38.0]), np.full((1, 3), -50.0), np.zeros((1, 3)))
     found = searched(lost_drive(nothing, 1, seconds=10), surveyed(nothing))
     assert found.verdict is StartVerdict.AMBIGUOUS
     assert len(found.candidates) > 2

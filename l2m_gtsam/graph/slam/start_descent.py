@@ -11,7 +11,6 @@ from l2m_gtsam.graph.slam.start_screen import Places, about_z
 from l2m_gtsam.graph.slam.start_window import Pattern
 from l2m_gtsam.graph.view import QueryableMap
 
-STEPS = 15
 SCALE2 = 9.0  # squared residual in sigmas from which on a reading pulls less (Cauchy)
 LEAST, MORE, LESS = 1e-6, 100.0, 0.1  # damping, of the curvature's trace, and its changes
 SETTLED = 0.005  # of the longest step
@@ -87,12 +86,14 @@ class Slopes:
         return np.asarray(longest * step / np.maximum(length, 1.0))
 
 
-def descended(places: Places, pattern: Pattern, field_map: QueryableMap, longest_m: float) -> Laid:
-    """Return where places lead to by damped Gauss-Newton steps, all of them abreast.
+def descended(
+    laid: Laid, pattern: Pattern, field_map: QueryableMap, longest_m: float, steps: int
+) -> Laid:
+    """Return where poses lead to by damped Gauss-Newton steps, all of them abreast, the best first.
 
     Parameters
     ----------
-    places
+    laid
         Where to begin.
     pattern
         What was read.
@@ -100,11 +101,13 @@ def descended(places: Places, pattern: Pattern, field_map: QueryableMap, longest
         The map.
     longest_m
         Of a step, at the origin and at the pattern's outermost reading.
+    steps
+        The most.
     """
     longest = np.repeat([longest_m / max(pattern.radius, longest_m), longest_m], 3)
-    laid, slopes = sloped(Laid.upright(places), pattern, field_map)
+    laid, slopes = sloped(laid, pattern, field_map)
     damping = np.full(len(laid), LEAST)
-    for _ in range(STEPS):
+    for _ in range(steps):
         step = slopes.step(damping, longest)
         tried, there = sloped(laid.moved(step), pattern, field_map)
         better = tried.cost < laid.cost
@@ -112,7 +115,7 @@ def descended(places: Places, pattern: Pattern, field_map: QueryableMap, longest
         damping = np.maximum(np.where(better, LESS, MORE) * damping, LEAST)
         if (np.abs(step) < SETTLED * longest).all():
             break
-    return laid
+    return laid[np.argsort(laid.cost, kind="stable")]
 
 
 def sloped(laid: Laid, pattern: Pattern, field_map: QueryableMap) -> tuple[Laid, Slopes]:

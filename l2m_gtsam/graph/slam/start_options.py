@@ -23,7 +23,7 @@ class StartSearchOptions(Options):
     all heights that the map has data for if not given."""
     outliers: float = Field(default=0.15, ge=0, lt=0.5)
     """Share of the readings that may be wrong without a place being ruled out."""
-    seeds: int = Field(default=200, ge=10, le=2000)
+    seeds: int = Field(default=150, ge=10, le=2000)
     """The most places of the lattice that are followed to their minima,"""
     candidates: int = Field(default=8, ge=2, le=50)
     """and the most minima whose likelihoods are compared."""

@@ -30,6 +30,8 @@ from l2m_gtsam.slam_results import StartCandidate, StartSearch, StartVerdict
 
 STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not followed
 SMALLEST = 0.5  # metres: of the circle of headings
+FIRST_STEPS, LAST_STEPS = 4, 12  # of all descents, and of those that go on
+GO_ON = 5  # of them for each candidate
 SAME = 0.25  # steps: minima nearer than that are one
 GROWTH = 2.0  # of a window
 SIGMAS = 3.0  # of a start that was found: its readings are going to be used once more
@@ -124,12 +126,12 @@ def followed(
     """Return the best minima that places lead to."""
     if not len(places):
         return Laid.upright(places)
-    apart = STRIDE * options.step_m
-    seeds = places[np.array(spread_out(drawn(Laid.upright(places), pattern), apart, options.seeds))]
-    ends = descended(seeds, pattern, field_map, options.step_m)
-    ends = ends[np.argsort(ends.cost, kind="stable")]
-    same = SAME * options.step_m
-    return ends[np.array(spread_out(drawn(ends, pattern), same, options.candidates))]
+    step, seeds = options.step_m, Laid.upright(places)
+    seeds = seeds[np.array(spread_out(drawn(seeds, pattern), STRIDE * step, options.seeds))]
+    some = descended(seeds, pattern, field_map, step, FIRST_STEPS)
+    some = some[np.arange(min(len(some), GO_ON * options.candidates))]
+    ends = descended(some, pattern, field_map, step, LAST_STEPS)
+    return ends[np.array(spread_out(drawn(ends, pattern), SAME * step, options.candidates))]
 
 
 def drawn(laid: Laid, pattern: Pattern) -> FloatArray:
