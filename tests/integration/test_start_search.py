@@ -23,7 +23,6 @@ from tests.surveyed_worlds import (
 )
 from tests.worlds import DipoleWorld, dipole_world, random_sensors
 
-
 QUICK = {"readings": 40, "seeds": 60, "step_m": 0.25}  # small rooms, strong fields
 
 
