@@ -11,17 +11,8 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.graph.slam.field_lattice import FieldLattice, lattice_over
 from l2m_gtsam.graph.slam.start_options import StartSearchOptions
-from l2m_gtsam.graph.slam.start_screen import (
-    LARGEST,
-    Rules,
-    about_z,
-    heading,
-    heading_step,
-    nodes_of,
-    row_of,
-    score_at,
-    screen,
-)
+from l2m_gtsam.graph.slam.start_scores import LARGEST, Rules, row_of, score_at
+from l2m_gtsam.graph.slam.start_screen import about_z, heading, heading_step, nodes_of, screen
 from l2m_gtsam.graph.slam.start_window import Pattern
 from l2m_gtsam.maps.training import TrainingSet
 from tests.surveyed_worlds import SurveyedWorld, strange_hall, surveyed
