@@ -15,6 +15,8 @@ class StartSearchOptions(Options):
     """
     readings: int = Field(default=80, ge=10, le=400)
     """The most readings of a window that take part, spread over its way."""
+    least_readings: int = Field(default=16, ge=6)
+    """Fewer readings tell no place: among thousands of places one explains them by chance."""
     step_m: float = Field(default=0.2, ge=0.05, le=1)
     """Of the lattice of places in the map; headings are as far apart as moves the outermost reading
     by a step. The field of a building varies over about three times that."""

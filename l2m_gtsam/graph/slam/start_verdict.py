@@ -33,6 +33,9 @@ def judged(
     """
     margin = margin_of(candidates)
     verdict, message = verdict_of(candidates, margin, options)
+    if verdict is StartVerdict.UNIQUE and len(window) < options.least_readings:
+        verdict = StartVerdict.AMBIGUOUS
+        message = f"{len(window)} readings tell no place, {options.least_readings} may: {REMEDY}"
     told = f"over the first {window.way_m:.1f} m of the drive {message}"
     return StartSearch(verdict, told, candidates, margin, window.way_m, len(window), looked_at)
 
