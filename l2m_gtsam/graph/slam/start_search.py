@@ -32,7 +32,6 @@ STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not foll
 SMALLEST = 0.5  # metres: of the circle of headings
 FIRST_STEPS, LAST_STEPS = 4, 12  # of all descents, and of those that go on
 GO_ON = 5  # of them for each candidate
-SAME = 0.25  # steps: minima nearer than that are one
 GROWTH = 2.0  # of a window
 SIGMAS = 3.0  # of a start that was found: its readings are going to be used once more
 
@@ -131,7 +130,8 @@ def followed(
     some = descended(seeds, pattern, field_map, step, FIRST_STEPS)
     some = some[np.arange(min(len(some), GO_ON * options.candidates))]
     ends = descended(some, pattern, field_map, step, LAST_STEPS)
-    return ends[np.array(spread_out(drawn(ends, pattern), SAME * step, options.candidates))]
+    # Some descents of one basin are not at its bottom yet: they must not crowd out rivals.
+    return ends[np.array(spread_out(drawn(ends, pattern), options.apart_m, options.candidates))]
 
 
 def drawn(laid: Laid, pattern: Pattern) -> FloatArray:
