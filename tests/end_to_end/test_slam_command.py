@@ -104,6 +104,9 @@ def test_bad_input_is_one_line_and_writes_nothing(
     )
     far = configured(yard, tmp_path, start={"position": [40.0, 0.0, 0.4]})
     assert "the drive is not in this map" in told(known, far)
+    # The first metres are through a field that is the same everywhere.
+    lost = configured(yard, tmp_path, start={"anywhere": True, "search": {"longest_m": 6.0}})
+    assert "places of the map or more explain the readings" in told(known, lost)
     wrong = configured(yard, tmp_path, calibration="guessed")
     assert "slam.calibration" in told(known, wrong)
     assert not out.exists()
