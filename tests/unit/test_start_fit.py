@@ -49,7 +49,7 @@ def test_a_fit_ends_within_its_sigmas(hall: SurveyedWorld, driven: tuple[SlamDri
     truth = truth_of(drive)
     begun = RigidTransform(
         truth.R @ Rotation.from_rotvec([0.02, -0.01, 0.06]).as_matrix(),
-        truth.t + [0.12, -0.1, 0.08],
+        truth.t + np.array([0.12, -0.1, 0.08]),
     )
     found = WindowFit(window, hall, known_of(window)).at(begun)
     error = off(truth, found.T_map_lidar)

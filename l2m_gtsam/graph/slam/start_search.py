@@ -123,15 +123,20 @@ def followed(
     places: Places, pattern: Pattern, field_map: QueryableMap, options: StartSearchOptions
 ) -> Laid:
     """Return the best minima that places lead to."""
-    if not len(places):
-        return Laid.upright(places)
-    step, seeds = options.step_m, Laid.upright(places)
-    seeds = seeds[np.array(spread_out(drawn(seeds, pattern), STRIDE * step, options.seeds))]
+    seeds, step = Laid.upright(places), options.step_m
+    if not len(seeds):
+        return seeds
+    seeds = apart(seeds, pattern, STRIDE * step, options.seeds)
     some = descended(seeds, pattern, field_map, step, FIRST_STEPS)
-    some = some[np.arange(min(len(some), GO_ON * options.candidates))]
+    # Descents into one basin, which come in dozens, must not crowd out its rivals.
+    some = apart(some, pattern, options.apart_m, GO_ON * options.candidates)
     ends = descended(some, pattern, field_map, step, LAST_STEPS)
-    # Some descents of one basin are not at its bottom yet: they must not crowd out rivals.
-    return ends[np.array(spread_out(drawn(ends, pattern), options.apart_m, options.candidates))]
+    return apart(ends, pattern, options.apart_m, options.candidates)
+
+
+def apart(laid: Laid, pattern: Pattern, metres: float, most: int) -> Laid:
+    """Return the first poses that keep a distance from those before."""
+    return laid[np.array(spread_out(drawn(laid, pattern), metres, most), dtype=np.int64)]
 
 
 def drawn(laid: Laid, pattern: Pattern) -> FloatArray:
