@@ -71,7 +71,7 @@ def wandering(rng: np.random.Generator, seconds: float, within: float = 3.2) -> 
         yaw += turn / RATE_HZ
         place = place + SPEED / RATE_HZ * np.array([np.cos(yaw), np.sin(yaw)])
     p[:, 2] = 0.5 + 0.03 * np.sin(1.3 * at)
-    v = np.gradient(p, at, axis=0)
+    v = np.asarray(np.gradient(p, at, axis=0))
     turns = [np.arctan2(v[:, 1], v[:, 0]), 0.02 * np.sin(0.9 * at), 0.02 * np.cos(1.1 * at)]
     R = Rotation.from_euler("ZYX", np.column_stack(turns)).as_matrix()
     stamps = (1e9 * at).astype(np.int64) + 1_700_000_000_000_000_000

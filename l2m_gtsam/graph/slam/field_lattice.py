@@ -95,7 +95,7 @@ def lattice_over(field_map: QueryableMap, survey: TrainingSet, step: float) -> F
     rows = np.full(near.shape, -1)
     rows[tuple(at.T)] = np.arange(len(at))
     field, gradient = sample.field[sample.inside], sample.gradient[sample.inside]
-    slope = np.linalg.svd(gradient, compute_uv=False)[:, 0]
+    slope = np.asarray(np.linalg.svd(gradient, compute_uv=False)[:, 0])
     bend = FURTHEST**2 * remainder(rows, at, field, gradient, step)
     variance = sample.variance[sample.inside].mean(axis=1)
     return FieldLattice(step, lowest, rows, at, field, gradient, slope, np.asarray(bend), variance)
