@@ -19,6 +19,7 @@ from l2m_gtsam.graph.slam.localisation import Localised, localise_drive
 from l2m_gtsam.graph.slam.odometry import key_pose_rows, odometry_steps
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
 from l2m_gtsam.graph.slam.outcome import localisation_result
+from l2m_gtsam.graph.slam.start_search import find_start, start_found
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
@@ -82,9 +83,15 @@ def localise(
         No sensor of the recording is calibrated.
     SyncError
         Readings and poses do not overlap, or there are fewer than two poses.
+    MapError
+        The start was looked for, and is not the only one that fits, or none does.
     """
     drive, notes = prepared(recording, calibration, options)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    search = None
+    if options.start.anywhere:
+        search = find_start(drive, solver_map, options, progress)
+        drive = replace(drive, start=start_found(search, options.start))
     solution = localise_drive(drive, solver_map, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
     result = localisation_result(drive, solution, calibration if refined else None)
@@ -95,6 +102,7 @@ def localise(
         bag=recording.source,
         map=sources.map,
         calibration_source=sources.calibration,
+        start=search,
     )
     return Localisation(result, solution)
 

@@ -29,9 +29,11 @@ from l2m_gtsam.slam_records import (
     PoseRecord,
     RefinedSensor,
     SensorRecord,
+    StartCandidateRecord,
+    StartRecord,
     Timeline,
 )
-from l2m_gtsam.slam_results import LocalisationResult, SensorUse
+from l2m_gtsam.slam_results import LocalisationResult, SensorUse, StartSearch
 from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.validation_results import ChiSquare, NamedSource
@@ -98,6 +100,7 @@ def localisation_record(
         refined=_refined(told.calibration, result),
         poses=_poses(result.trajectory),
         odometry=_odometry(solution.drive, result.odometry),
+        start=None if result.start is None else _start(result.start),
         truth=truth,
         picture=map_picture(told.field_map, result.trajectory.p),
         sources=_sources(result, told),
@@ -127,6 +130,29 @@ def _poses(at: Trajectory) -> tuple[PoseRecord, ...]:
         covariance = [tuple(map(tuple, each)) for each in at.covariance.tolist()]
     poses = zip(at.stamp_ns.tolist(), at.p.tolist(), quaternions, covariance, strict=True)
     return tuple(PoseRecord(stamp, tuple(p), tuple(q), each) for stamp, p, q, each in poses)
+
+
+def _start(search: StartSearch) -> StartRecord:
+    return StartRecord(
+        verdict=search.verdict,
+        message=search.message,
+        margin=search.margin if np.isfinite(search.margin) else float("nan"),
+        window_m=search.window_m,
+        readings=search.readings,
+        looked_at=search.looked_at,
+        candidates=tuple(
+            StartCandidateRecord(
+                p=row(each.T_map_lidar.t, DIGITS),
+                quaternion_xyzw=row(Rotation.from_matrix(each.T_map_lidar.R).as_quat(), DIGITS),
+                covariance=tuple(map(tuple, each.covariance.tolist())),
+                log_likelihood=each.log_likelihood,
+                inside=each.inside,
+                explained=each.explained,
+                chi2_per_dof=each.chi2_per_dof,
+            )
+            for each in search.candidates
+        ),
+    )
 
 
 def _odometry(drive: Drive, at: Trajectory) -> tuple[OdometryRecord, ...]:

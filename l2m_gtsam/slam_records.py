@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from l2m_gtsam.metric_results import Fit, MapPicture, Normalised, Record, Row, Rows, Series
-from l2m_gtsam.slam_results import DriftFigures, LocalisationStatus, SensorUse
+from l2m_gtsam.slam_results import DriftFigures, LocalisationStatus, SensorUse, StartVerdict
 from l2m_gtsam.validation_results import ChiSquare, NamedSource
 
 POSE_FREEDOM = 6
@@ -168,6 +168,54 @@ class TruthRecord(Record):
 
 
 @dataclass(frozen=True)
+class StartCandidateRecord(Record):
+    """A place where a drive may have begun; see ``StartCandidate``.
+
+    Attributes
+    ----------
+    p, quaternion_xyzw
+        Position and rotation of the first key pose.
+    covariance
+        Of a right perturbation of it, rotation (rad), then translation (m), (6, 6).
+    log_likelihood, inside, explained, chi2_per_dof
+        Of the readings looked at, and how they fit.
+    """
+
+    p: Row
+    quaternion_xyzw: Row
+    covariance: Rows
+    log_likelihood: float
+    inside: float
+    explained: float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True)
+class StartRecord(Record):
+    """A search for the start all over the map; see ``StartSearch``.
+
+    Attributes
+    ----------
+    verdict, message
+        What it came to.
+    margin
+        Natural logarithm of how much likelier the first place is than the second; NaN without one.
+    window_m, readings, looked_at
+        What it rests on.
+    candidates
+        The likeliest first.
+    """
+
+    verdict: StartVerdict
+    message: str
+    margin: float
+    window_m: float
+    readings: int
+    looked_at: int
+    candidates: tuple[StartCandidateRecord, ...]
+
+
+@dataclass(frozen=True)
 class LocalisationRecord(Record):
     """All that a report on a localisation is made from.
 
@@ -190,6 +238,8 @@ class LocalisationRecord(Record):
         Calibrations before and after; empty where they were fixed.
     poses, odometry
         At key poses.
+    start
+        Where it was looked for; absent where it was given.
     truth
         Absent where none was given.
     picture
@@ -212,6 +262,7 @@ class LocalisationRecord(Record):
     refined: tuple[RefinedSensor, ...]
     poses: tuple[PoseRecord, ...]
     odometry: tuple[OdometryRecord, ...]
+    start: StartRecord | None
     truth: TruthRecord | None
     picture: MapPicture
     sources: tuple[NamedSource, ...]

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from l2m_gtsam.data import SourceFile, Trajectory
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, RigidTransform, SourceFile, Trajectory
 from l2m_gtsam.metric_records import Record
 from l2m_gtsam.results import CalibrationResult
 
@@ -74,6 +76,76 @@ class SensorUse(Record):
         return self.readings - self.outside_map - self.rejected
 
 
+class StartVerdict(StrEnum):
+    """What a search for the start of a drive came to."""
+
+    UNIQUE = "unique"
+    AMBIGUOUS = "ambiguous"
+    NOT_HERE = "not_here"
+
+
+@dataclass(frozen=True)
+class StartCandidate:
+    """A place where a drive may have begun.
+
+    Attributes
+    ----------
+    T_map_lidar
+        First key pose.
+    covariance
+        Of a right perturbation of it, rotation (rad) before translation (m), shape (6, 6).
+    log_likelihood
+        Of the readings looked at.
+    inside
+        Share of them that the map has data for.
+    explained
+        Share of those that fit.
+    chi2_per_dof
+        Mean square of what they leave, in sigmas; 1 is consistent.
+    """
+
+    T_map_lidar: RigidTransform
+    covariance: FloatArray
+    log_likelihood: float
+    inside: float
+    explained: float
+    chi2_per_dof: float
+
+    @property
+    def yaw_deg(self) -> float:
+        """Heading of the lidar's x axis in the map in degrees."""
+        R = self.T_map_lidar.R
+        return float(np.rad2deg(np.arctan2(R[1, 0], R[0, 0])))
+
+
+@dataclass(frozen=True)
+class StartSearch:
+    """Where in a map a drive began, looked for all over it.
+
+    Attributes
+    ----------
+    verdict, message
+        What it came to, and a sentence about it.
+    candidates
+        Places that are apart, the likeliest first.
+    margin
+        By what natural logarithm the first is likelier than the second, tempered where the first
+        leaves more than noise; infinite without a second.
+    window_m, readings
+        The way that was looked at in the end, metres, and how many readings on it.
+    looked_at
+        Places and headings of the lattice.
+    """
+
+    verdict: StartVerdict
+    message: str
+    candidates: tuple[StartCandidate, ...]
+    margin: float
+    window_m: float
+    readings: int
+    looked_at: int
+
+
 @dataclass(frozen=True)
 class LocalisationResult:
     """A drive localised in a magnetic map.
@@ -96,6 +168,8 @@ class LocalisationResult:
         What is worth a warning, a sentence each.
     bag, map, calibration_source
         Sources with hashes; absent when the data did not come from files.
+    start
+        How the start was found; absent where it was known.
     """
 
     status: LocalisationStatus
@@ -109,3 +183,4 @@ class LocalisationResult:
     bag: SourceFile | None
     map: SourceFile | None
     calibration_source: SourceFile | None
+    start: StartSearch | None = None

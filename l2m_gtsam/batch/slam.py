@@ -93,7 +93,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     ------
     L2MError
         Whatever is wrong with the input, in one line; nothing is written then. A MapError if the
-        drive turns out not to be in this map.
+        drive turns out not to be in this map, or may have begun at several places of it.
     """
     _check_folder(out)
     saved, calibration = SavedMap.read(given.map), read_calibration(given.calibration)
@@ -105,8 +105,9 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     if truth is not None:
         check_truth(truth, recording.trajectory, gap, str(given.truth))
     start = config.slam.start
-    # A start that is given puts odometry of any frame into the map.
-    anywhere = start.position is not None and start.quaternion_xyzw is not None
+    # A start that is given, or found, puts odometry of any frame into the map.
+    is_given = start.position is not None and start.quaternion_xyzw is not None
+    anywhere = start.anywhere or is_given
     field_map = saved.open(progress, [] if anywhere else [recording])
     sources = Sources(source_file(given.map), source_file(given.calibration))
     found = localise(recording, field_map, calibration, config.slam, progress, sources)

@@ -26,17 +26,18 @@ def slam(
         Path | None, typer.Option("--config", help="YAML configuration; see `slam` in it.")
     ] = None,
 ) -> None:
-    """Localise a drive in a magnetic map: odometry and magnetometers, from a known start."""
+    """Localise a drive in a magnetic map, from a start that is known or looked for."""
     from l2m_gtsam.batch.slam import SlamInput, slam_bag
     from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table, truth_lines
+    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table, start_lines, truth_lines
     from l2m_gtsam.qa.verdict_text import verdict_lines
 
     given = SlamInput(bag, map_path, calibration, truth)
     with shown_progress() as progress:
         done = slam_bag(given, load_config(config), out, progress)
     print_table(slam_table(done.result))
-    for line in (*drift_lines(done.result), *truth_lines(done.record.truth)):
+    lines = (*start_lines(done.result.start), *drift_lines(done.result))
+    for line in (*lines, *truth_lines(done.record.truth)):
         typer.echo(line)
     for line in verdict_lines(done.verdict):
         typer.echo(line)

@@ -5,7 +5,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.slam_records import TruthRecord
-from l2m_gtsam.slam_results import LocalisationResult
+from l2m_gtsam.slam_results import LocalisationResult, StartSearch
 
 
 def slam_table(result: LocalisationResult) -> Table:
@@ -24,6 +24,20 @@ def slam_table(result: LocalisationResult) -> Table:
             f"{each.chi2_per_dof:.2f}",
         )
     return table
+
+
+def start_lines(search: StartSearch | None) -> tuple[str, ...]:
+    """Return where the drive was found to begin, a line each; none where that was known."""
+    if search is None:
+        return ()
+    best = search.candidates[0]
+    sigma = np.sqrt(np.diag(best.covariance))
+    second = "no second place was found"
+    if np.isfinite(search.margin):
+        second = f"the second best place is less likely by exp({search.margin:.0f})"
+    place = f"{1e3 * sigma[3:].max():.0f} mm and {np.rad2deg(sigma[:3].max()):.1f} deg (one sigma)"
+    searched = f"{second}; {search.looked_at} places and headings were looked at"
+    return f"start: {search.message}", f"start known within {place}; {searched}"
 
 
 def drift_lines(result: LocalisationResult) -> tuple[str, ...]:

@@ -23,6 +23,8 @@ LEGEND = {
     "chi2_per_dof": "mean square of whitened residuals; 1 is consistent",
     "steps": "the same of what steps between poses differ by from odometry's",
     "truth": "errors against a trajectory that was given, nothing aligned; nees of 6 is honest",
+    "start": "where the drive may have begun, looked for all over the map, the likeliest first; "
+    "margin: natural logarithm of how much likelier the first is than the second, null without one",
 }
 
 

@@ -152,6 +152,9 @@ def test_bad_input_is_one_line_and_writes_nothing(
         (late, "late.tum: runs from 1.000 to 2.000 s"),
     ):
         assert line in complaint_here("slam", yard.west, *files, "--truth", truth)
+    # The first metres are through a field that is the same everywhere.
+    lost = configured(yard, tmp_path, start={"anywhere": True, "search": {"longest_m": 6.0}})
+    assert "places of the map or more explain the readings" in told(known, lost)
     wrong = configured(yard, tmp_path, calibration="guessed")
     assert "slam.calibration" in told(known, wrong)
     assert not out.exists()

@@ -5,6 +5,7 @@ from enum import StrEnum
 from pydantic import Field, model_validator
 
 from l2m_gtsam.graph.slam.field_prior import TileOptions
+from l2m_gtsam.graph.slam.start_options import StartSearchOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.robust import RobustOptions
 
@@ -62,6 +63,18 @@ class StartPoseOptions(Options):
     """Standard deviation of the position per axis in metres."""
     rotation_deg: float = Field(default=2.0, gt=0, le=45)
     """Standard deviation of the rotation about each axis in degrees."""
+    anywhere: bool = False
+    """The drive begins anywhere in the map: position and heading are looked for, from readings and
+    odometry alone. What is assumed then: the z axis of odometry's frame is up within
+    `rotation_deg`."""
+    search: StartSearchOptions = StartSearchOptions()
+    """How, with `anywhere`."""
+
+    @model_validator(mode="after")
+    def _known_or_not(self) -> "StartPoseOptions":
+        if self.anywhere and (self.position is not None or self.quaternion_xyzw is not None):
+            raise ValueError("`anywhere` and a `position` or `quaternion_xyzw`: give one of them")
+        return self
 
     @model_validator(mode="after")
     def _a_rotation(self) -> "StartPoseOptions":
