@@ -19,6 +19,9 @@ from l2m_gtsam.data import FloatArray, RigidTransform
 
 # 1 is expected where nothing but noise speaks; the estimate of N itself is good to a factor.
 NOISE_TIMES = 3.0
+# Neighbours further apart are of different things: rings of a lidar far down a corridor make planes
+# across it, which move with the lidar and seem to hold it.
+WIDEST_M = 0.8
 # Of the largest information: what is smaller is rounding.
 ROUNDING = 1e-12
 
@@ -37,7 +40,8 @@ class Planes:
         Two errors of each normal, one standard deviation each, as vectors in the plane, shape
         (N, 2, 3).
     flatness
-        Thickness over width of the neighbourhood that each was fitted to, shape (N,).
+        Thickness over width of the neighbourhood that each was fitted to, shape (N,); infinite
+        where that is too wide for one plane.
     """
 
     point: FloatArray
@@ -69,6 +73,8 @@ def fitted_planes(point: FloatArray, neighbours: FloatArray) -> Planes:
     # A normal that is off by a right angle is not known at all.
     slope = np.minimum(sigma, 1.0)[:, :, None] * vectors[:, :, 1:].swapaxes(1, 2)
     flatness = np.sqrt(values[:, 0] / values[:, 2])
+    width = np.linalg.norm(neighbours - point[:, None], axis=2).max(axis=1)
+    flatness[width > WIDEST_M] = np.inf
     return Planes(point, vectors[:, :, 0], slope, flatness)
 
 
