@@ -1,4 +1,4 @@
-"""Scans of a lidar, and what registering them says of its poses: frozen records."""
+"""What a LiDAR saw in one turn, and what registering it says of poses: frozen records."""
 
 from dataclasses import dataclass
 
@@ -10,22 +10,22 @@ from l2m_gtsam.data import FloatArray, RigidTransform
 
 @dataclass(frozen=True)
 class Scan:
-    """What a lidar saw in one turn.
+    """The points of one turn of a LiDAR.
 
     Attributes
     ----------
     stamp_ns
-        Time of the scan in nanoseconds.
+        Time in nanoseconds.
     points
-        Finite points in the lidar frame in metres, shape (N, 3).
-    offset_s
-        When each point was measured, in seconds after the stamp, shape (N,); absent for a scan
-        that was taken at once, or whose motion the driver has undone.
+        In metres, shape (N, 3), finite. Without ``time_s`` all are in the lidar frame at the stamp;
+        with it, each is in the lidar frame at its own time.
+    time_s
+        When each point was measured in seconds after the stamp, shape (N,); None for a snapshot.
     """
 
     stamp_ns: int
     points: FloatArray
-    offset_s: FloatArray | None = None
+    time_s: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -82,7 +82,7 @@ def taken_at_once(scan: Scan, twist: FloatArray) -> FloatArray:
         Angular velocity in rad/s and velocity in m/s in the lidar frame, shape (6,), constant over
         the scan.
     """
-    if scan.offset_s is None or not np.any(twist):
+    if scan.time_s is None or not np.any(twist):
         return scan.points
-    turned = Rotation.from_rotvec(scan.offset_s[:, None] * twist[:3]).apply(scan.points)
-    return np.asarray(turned + scan.offset_s[:, None] * twist[3:])
+    turned = Rotation.from_rotvec(scan.time_s[:, None] * twist[:3]).apply(scan.points)
+    return np.asarray(turned + scan.time_s[:, None] * twist[3:])
