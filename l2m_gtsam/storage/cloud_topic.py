@@ -2,11 +2,10 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import BagError
@@ -14,14 +13,11 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import located
 from l2m_gtsam.storage.messages import header_ns
-from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
-from l2m_gtsam.storage.point_table import MAX_POINTS, stacked
-from l2m_gtsam.storage.selection import listed
+from l2m_gtsam.storage.open_bag import Message, Progress, open_bag
+from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of
+from l2m_gtsam.storage.point_table import MAX_POINTS
 from l2m_gtsam.storage.tf import Link
 from l2m_gtsam.storage.voxels import VoxelMeans
-
-CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
-FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32 and FLOAT64
 
 
 class CloudTopicOptions(Options):
@@ -102,7 +98,7 @@ def read_cloud_topic(
     """
     merged = _MergedScans(f"{path}: topic {topic}", trajectory, options)
     with open_bag(path) as bag:
-        for message in bag.messages(_connections(bag, topic), progress):
+        for message in bag.messages(cloud_connections(bag, topic), progress):
             is_record = stamps is Stamps.RECORD
             merged.add(message, message.record_ns if is_record else header_ns(message.content))
     return merged.cloud()
@@ -129,7 +125,7 @@ class _MergedScans:
             return
         self._placed += 1
         try:
-            points = _in_range(_points(scan), self._options)
+            points = _in_range(points_of(scan), self._options)
             self._cells.add(located(points @ pose.R.T + pose.t, self._where))
         except ValueError as error:
             raise BagError(f"{self._where}: {error}") from error
@@ -178,19 +174,6 @@ class _MergedScans:
         )
 
 
-def _connections(bag: Bag, topic: str) -> list[Connection]:
-    named = [c for c in bag.connections if c.topic.lstrip("/") == topic.lstrip("/")]
-    clouds = [c for c in bag.connections if c.msgtype == CLOUD_TYPE]
-    if not named:
-        raise BagError(f"{bag.path}: no topic {topic!r}; with clouds there are: {listed(clouds)}")
-    if wrong := [c for c in named if c.msgtype != CLOUD_TYPE]:
-        raise BagError(
-            f"{bag.path}: topic {topic} is of type {wrong[0].msgtype}, a cloud must be "
-            f"{CLOUD_TYPE}; of that type there are: {listed(clouds)}"
-        )
-    return named
-
-
 def _pose_at(trajectory: Trajectory, stamp_ns: int, max_gap_s: float) -> RigidTransform | None:
     """Return the pose at a time, or nothing where there is none on either side near enough."""
     known = trajectory.stamp_ns
@@ -216,40 +199,3 @@ def _in_range(points: FloatArray, options: CloudTopicOptions) -> FloatArray:
     points = points[np.all(np.abs(points) <= options.max_range, axis=1)]
     distance = np.linalg.norm(points, axis=1)
     return np.asarray(points[(distance >= options.min_range) & (distance <= options.max_range)])
-
-
-def _points(scan: Any) -> FloatArray:
-    """Return x, y and z of a PointCloud2 as they stand, shape (N, 3).
-
-    Raises
-    ------
-    ValueError
-        The scan declares what its data does not hold, or has no x, y and z.
-    """
-    height, width, step = int(scan.height), int(scan.width), int(scan.point_step)
-    if not height * width:
-        return np.zeros((0, 3))
-    row = int(scan.row_step) if height > 1 else width * step
-    if row < width * step or (height - 1) * row + width * step > len(scan.data):
-        raise ValueError(
-            f"a scan declares {height} x {width} points of {step} bytes in rows of {row} bytes, "
-            f"which its {len(scan.data)} bytes are not"
-        )
-    order = ">" if scan.is_bigendian else "<"
-    columns = []
-    for axis in "xyz":
-        offset, kind = _field(scan, axis)
-        columns.append(np.ndarray((height, width), order + kind, scan.data, offset, (row, step)))
-    return stacked([column.ravel() for column in columns])
-
-
-def _field(scan: Any, name: str) -> tuple[int, str]:
-    """Return where a coordinate begins in a point, in bytes, and its type."""
-    found = [each for each in scan.fields if each.name == name]
-    if not found or found[0].datatype not in FLOATS or found[0].count > 1:
-        names = ", ".join(each.name for each in scan.fields[:20]) or "(none)"
-        raise ValueError(f"a scan has no field {name!r} of one float; its fields are: {names}")
-    offset, kind = int(found[0].offset), FLOATS[found[0].datatype]
-    if offset + np.dtype(kind).itemsize > scan.point_step:
-        raise ValueError(f"a scan's field {name!r} reaches over the end of a point")
-    return offset, kind
