@@ -170,6 +170,18 @@ class SimulatedScans:
         return Scan(stamp, points, times)
 
 
+def scan_stamps(options: LidarOptions, duration: float, rng: np.random.Generator) -> IntArray:
+    """Return when scans begin that end within ``duration`` seconds, in nanoseconds, shape (N,).
+
+    The first one begins at a random share of the interval: sources are not synchronised.
+    """
+    first = rng.uniform() / options.rate
+    count = int(max(0.0, duration - options.sweep - first) * options.rate) + 1
+    seconds = first + np.arange(count) / options.rate
+    within = seconds + options.sweep <= duration
+    return np.round(seconds[within] * NANOSECONDS).astype(np.int64)
+
+
 def scans(
     solids: Solids, options: LidarOptions, poses_at: PosesAt, stamp_ns: IntArray, seed: int = 0
 ) -> SimulatedScans:

@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.simulate.world import SteelWorld
 
 # Corners are numbered by the bits of x, y and z, x first; every face is two triangles of them.
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
@@ -48,6 +49,11 @@ class Solids:
         """Return boxes along the map's axes from lowest to highest corners, shapes (N, 3)."""
         low, high = np.reshape(low, (-1, 3)), np.reshape(high, (-1, 3))
         return cls(high - low, (low + high) / 2, np.tile(np.eye(3), (len(low), 1, 1)))
+
+    @classmethod
+    def of(cls, world: SteelWorld) -> Self:
+        """Return the bodies of a world as light meets them."""
+        return cls(world.dimensions, world.centres, world.R_map_body)
 
     def joined(self, other: "Solids") -> "Solids":
         """Return these boxes and others."""
