@@ -6,15 +6,17 @@ from typing import Self
 
 import numpy as np
 from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.options import Options
+from l2m_gtsam.scans import Scan, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import located
 from l2m_gtsam.storage.messages import header_ns
 from l2m_gtsam.storage.open_bag import Message, Progress, open_bag
-from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of
+from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of, times_of
 from l2m_gtsam.storage.point_table import MAX_POINTS
 from l2m_gtsam.storage.tf import Link
 from l2m_gtsam.storage.voxels import VoxelMeans
@@ -70,9 +72,10 @@ def read_cloud_topic(
     """Return what all scans of a topic saw, in the map frame.
 
     Scans must be in the frame of the lidar, whose poses the trajectory holds; what their frame is
-    called does not matter, but it must be the same in all of them. A scan is taken as a snapshot
-    at its stamp: where the driver does not correct for motion within a scan, points are off by up
-    to speed times the duration of a scan. Poses are interpolated on SE(3) as in `sync`.
+    called does not matter, but it must be the same in all of them. Points with times of their own
+    are moved to where they were at the scan's stamp; a scan without is taken as a snapshot: where
+    its driver does not correct for motion, points are off by up to speed times the duration of a
+    scan. Poses are interpolated on SE(3) as in `sync`.
 
     Parameters
     ----------
@@ -120,12 +123,16 @@ class _MergedScans:
         scan = message.content
         self._check_frame(scan.header.frame_id)
         self._scans += 1
-        pose = _pose_at(self._trajectory, stamp_ns, self._options.max_pose_gap_s)
+        pose = self._pose_at(stamp_ns)
         if pose is None:
             return
-        self._placed += 1
         try:
-            points = _in_range(points_of(scan), self._options)
+            seen = Scan(stamp_ns, points_of(scan), times_of(scan, stamp_ns))
+            twist = self._twist(seen, pose)
+            if twist is None:
+                return
+            self._placed += 1
+            points = _in_range(taken_at_once(seen, twist), self._options)
             self._cells.add(located(points @ pose.R.T + pose.t, self._where))
         except ValueError as error:
             raise BagError(f"{self._where}: {error}") from error
@@ -149,6 +156,20 @@ class _MergedScans:
                 f"and {self._options.max_range:g} m from the lidar; are its points in metres?"
             )
         return TopicCloud(points, self._scans, self._scans - self._placed)
+
+    def _pose_at(self, stamp_ns: int) -> RigidTransform | None:
+        return _pose_at(self._trajectory, stamp_ns, self._options.max_pose_gap_s)
+
+    def _twist(self, scan: Scan, pose: RigidTransform) -> FloatArray | None:
+        """Return the lidar's mean twist over a scan; nothing where its end has no pose."""
+        if scan.time_s is None or not np.any(scan.time_s):
+            return np.zeros(6)
+        furthest = float(scan.time_s[np.nanargmax(np.abs(scan.time_s))])
+        end = self._pose_at(scan.stamp_ns + round(furthest * 1e9))
+        if end is None:
+            return None
+        turn = Rotation.from_matrix(pose.R.T @ end.R).as_rotvec()
+        return np.concatenate([turn, pose.R.T @ (end.t - pose.t)]) / furthest
 
     def _check_frame(self, frame: str) -> None:
         self._frame = frame if self._frame is None else self._frame
