@@ -112,5 +112,3 @@ def _closed(
         return refusal
     estimate = by_scan(found, guess, options)
     return Loop(earlier.stamp_ns, here.stamp_ns, estimate.T, estimate.covariance)
-
-

@@ -157,9 +157,7 @@ class _Follower:
         believed = placed is not None
         self._advance(_Placed(surface, estimate.T), believed)
         self._stamp_ns, self._twist = scan.stamp_ns, difference(IDENTITY, step) / seconds
-        return ScanStep(
-            scan.stamp_ns, estimate.T, step, estimate.covariance, surface, believed
-        )
+        return ScanStep(scan.stamp_ns, estimate.T, step, estimate.covariance, surface, believed)
 
     def _registered(self, surface: Surface, guess: RigidTransform) -> PoseEstimate | None:
         """Return the pose by the key scan or, where that is out of sight, by the scan before."""

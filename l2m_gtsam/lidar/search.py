@@ -85,7 +85,9 @@ def _candidates(mapped: LidarMap, options: SearchOptions) -> list[RigidTransform
     angles = 2 * np.pi * np.arange(options.headings) / options.headings
     turns = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
     return [
-        RigidTransform(turn @ R, p) for R, p in zip(mapped.R, mapped.p, strict=True) for turn in turns
+        RigidTransform(turn @ R, p)
+        for R, p in zip(mapped.R, mapped.p, strict=True)
+        for turn in turns
     ]
 
 

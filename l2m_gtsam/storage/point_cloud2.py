@@ -56,8 +56,9 @@ def chosen_cloud_topic(bag: Bag, topic: str | None) -> list[Connection]:
     clouds = [c for c in bag.connections if c.msgtype == CLOUD_TYPE]
     topics = sorted({c.topic for c in clouds})
     if not topics:
-        raise BagError(f"{bag.path}: no topic of type {CLOUD_TYPE}; there are: "
-            f"{listed(bag.connections)}")
+        raise BagError(
+            f"{bag.path}: no topic of type {CLOUD_TYPE}; there are: {listed(bag.connections)}"
+        )
     if len(topics) > 1:
         raise BagError(
             f"{bag.path}: several topics carry point clouds, choose one with `lidar.topic`: "

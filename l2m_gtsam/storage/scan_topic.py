@@ -93,6 +93,18 @@ def has_clouds(path: Path) -> bool:
         return any(connection.msgtype == CLOUD_TYPE for connection in bag.connections)
 
 
+def cloud_topic(path: Path, topic: str | None) -> str:
+    """Return the topic of a bag's clouds, the only one if none is named.
+
+    Raises
+    ------
+    BagError
+        There is no such topic, or there are several.
+    """
+    with open_bag(path) as bag:
+        return chosen_cloud_topic(bag, topic)[0].topic
+
+
 def _scan(content: Any, stamp_ns: int, options: ScanOptions, where: str) -> Scan:
     try:
         points, times = points_of(content), times_of(content, stamp_ns)
