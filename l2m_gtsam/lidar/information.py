@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.data import FloatArray, IntArray, RigidTransform
 
 # 1 is expected where nothing but noise speaks; the estimate of N itself is good to a factor.
 NOISE_TIMES = 3.0
@@ -49,7 +49,7 @@ class Planes:
     slope: FloatArray
     flatness: FloatArray
 
-    def __getitem__(self, rows: FloatArray) -> "Planes":
+    def __getitem__(self, rows: IntArray) -> "Planes":
         return Planes(self.point[rows], self.normal[rows], self.slope[rows], self.flatness[rows])
 
 
@@ -80,7 +80,8 @@ def fitted_planes(point: FloatArray, neighbours: FloatArray) -> Planes:
 
 def distances(points: FloatArray, T: RigidTransform, planes: Planes) -> FloatArray:
     """Return how far points of a scan, shape (N, 3), are above their planes, shape (N,)."""
-    return np.einsum("ni,ni->n", planes.normal, points @ T.R.T + T.t - planes.point)
+    off = points @ T.R.T + T.t - planes.point
+    return np.asarray(np.einsum("ni,ni->n", planes.normal, off))
 
 
 def plane_information(
@@ -100,8 +101,8 @@ def plane_information(
         Standard deviation of the distances in metres.
     """
     J = _jacobian(points, T, planes.normal)
-    by_noise = sum(_squared(_jacobian(points, T, planes.slope[:, k])) for k in (0, 1))
-    return _above_noise(_squared(J), by_noise) / sigma**2
+    noise = np.vstack([_jacobian(points, T, planes.slope[:, k]) for k in (0, 1)])
+    return _above_noise(_squared(J), _squared(noise)) / sigma**2
 
 
 def _jacobian(points: FloatArray, T: RigidTransform, vectors: FloatArray) -> FloatArray:

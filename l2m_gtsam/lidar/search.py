@@ -20,7 +20,7 @@ class SearchOptions(Options):
 
     headings: int = Field(default=12, ge=1, le=360)
     """Headings that are tried at each place, evenly around the vertical."""
-    tried: int = Field(default=12, ge=1)
+    tried: int = Field(default=30, ge=1)
     """How many of the candidates that fit best are registered."""
     lead: float = Field(default=0.05, ge=0, le=1)
     """The start is ambiguous if another place has a share of inliers less than this below that of
@@ -84,11 +84,8 @@ def _candidates(mapped: LidarMap, options: SearchOptions) -> list[RigidTransform
     """Return the mapped poses, each turned about the vertical."""
     angles = 2 * np.pi * np.arange(options.headings) / options.headings
     turns = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
-    return [
-        RigidTransform(turn @ R, p)
-        for R, p in zip(mapped.R, mapped.p, strict=True)
-        for turn in turns
-    ]
+    poses = zip(mapped.R, mapped.p, strict=True)
+    return [RigidTransform(turn @ R, p) for R, p in poses for turn in turns]
 
 
 def _best(
