@@ -18,6 +18,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.lidar.surface import smoothed
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
@@ -134,6 +135,7 @@ def scanned_place(
             f"the cloud has {len(points):,} points, a map takes {MAX_LIDAR_POINTS:,} at most; "
             "choose a larger `mapping.lidar.edge` or a smaller `mapping.lidar.max_range`"
         )
+    points = smoothed(points)
     R, p = _along([each.trajectory for each in recordings])
     provenance = {"topics": topics, "points": len(points), "edge": options.edge, **_counts(clouds)}
     return ScannedPlace(LidarMap(points, R, p), provenance)

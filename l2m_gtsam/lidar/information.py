@@ -15,10 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from l2m_gtsam.data import FloatArray, IntArray, RigidTransform
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform
 
 # 1 is expected where nothing but noise speaks; the estimate of N itself is good to a factor.
 NOISE_TIMES = 3.0
+# Neighbourhoods thicker than this share of their width are no planes: edges, bushes, people.
+FLAT = 0.35
 # Neighbours further apart are of different things: rings of a lidar far down a corridor make planes
 # across it, which move with the lidar and seem to hold it.
 WIDEST_M = 0.8
@@ -49,6 +51,11 @@ class Planes:
     slope: FloatArray
     flatness: FloatArray
 
+    @property
+    def flat(self) -> BoolArray:
+        """Which of them are planes, shape (N,)."""
+        return np.asarray(self.flatness < FLAT)
+
     def __getitem__(self, rows: IntArray) -> "Planes":
         return Planes(self.point[rows], self.normal[rows], self.slope[rows], self.flatness[rows])
 
@@ -75,7 +82,7 @@ def fitted_planes(point: FloatArray, neighbours: FloatArray) -> Planes:
     flatness = np.sqrt(values[:, 0] / values[:, 2])
     width = np.linalg.norm(neighbours - point[:, None], axis=2).max(axis=1)
     flatness[width > WIDEST_M] = np.inf
-    return Planes(point, vectors[:, :, 0], slope, flatness)
+    return Planes(neighbours.mean(axis=1), vectors[:, :, 0], slope, flatness)
 
 
 def distances(points: FloatArray, T: RigidTransform, planes: Planes) -> FloatArray:

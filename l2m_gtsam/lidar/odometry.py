@@ -6,7 +6,7 @@ on the last key scan, from where KISS-ICP has it; that gives the pose and its co
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -57,7 +57,8 @@ class ScanStep:
     step
         The lidar in its frame at the scan before; the identity for the first.
     covariance
-        Of a right perturbation of the step, rotation (rad) before translation (m), shape (6, 6).
+        Of a right perturbation of the step, rotation (rad) before translation (m), shape (6, 6):
+        both its ends are wrong.
     surface
         What the scan saw, in the lidar frame at its stamp, thinned.
     believed
@@ -101,8 +102,8 @@ def follow(scans: Iterable[Scan], options: OdometryOptions) -> Iterator[ScanStep
 def odometry(scans: Iterable[Scan], options: OdometryOptions) -> Trajectory:
     """Return the poses that ``follow`` gives, with covariances that accumulate.
 
-    The frame is that of the first scan. Errors of steps count as independent: those of scans on
-    one key scan largely undo each other, so that sigmas are rather too large.
+    The frame is that of the first scan. Errors of steps count as independent. Those of scans on one
+    key scan undo each other, so that sigmas of poses far apart are rather too large.
     """
     return accumulated(follow(scans, options))
 
@@ -127,10 +128,11 @@ def accumulated(steps: Iterable[ScanStep]) -> Trajectory:
 
 @dataclass(frozen=True)
 class _Placed:
-    """A scan that others are registered on."""
+    """A scan that others are registered on, and the covariance of its pose on the key scan."""
 
     surface: Surface
     T: RigidTransform
+    covariance: FloatArray
 
 
 class _Follower:
@@ -140,7 +142,7 @@ class _Follower:
         self._options = options
         self._kiss = KissFollower(options.voxel_m, options.map_range_m)
         self._kiss.follow(scan.points, IDENTITY)
-        self._key = self._last = _Placed(surface, IDENTITY)
+        self._key = self._last = _Placed(surface, IDENTITY, np.zeros((6, 6)))
         self._stamp_ns, self._twist = scan.stamp_ns, np.zeros(6)
 
     def add(self, scan: Scan) -> ScanStep | None:
@@ -154,10 +156,11 @@ class _Follower:
         placed = self._registered(surface, compose(self._last.T, predicted))
         estimate = self._unknown(predicted, seconds) if placed is None else placed
         step = between(self._last.T, estimate.T)
+        covariance = moved(self._last.covariance[None], step)[0] + estimate.covariance
         believed = placed is not None
-        self._advance(_Placed(surface, estimate.T), believed)
+        self._advance(_Placed(surface, estimate.T, estimate.covariance), believed)
         self._stamp_ns, self._twist = scan.stamp_ns, difference(IDENTITY, step) / seconds
-        return ScanStep(scan.stamp_ns, estimate.T, step, estimate.covariance, surface, believed)
+        return ScanStep(scan.stamp_ns, estimate.T, step, covariance, surface, believed)
 
     def _registered(self, surface: Surface, guess: RigidTransform) -> PoseEstimate | None:
         """Return the pose by the key scan or, where that is out of sight, by the scan before."""
@@ -181,4 +184,4 @@ class _Follower:
         turned = np.linalg.norm(error[:3]) >= np.deg2rad(self._options.key_angle_deg)
         self._last = placed
         if far or turned or not believed:
-            self._key = placed
+            self._key = self._last = replace(placed, covariance=np.zeros((6, 6)))

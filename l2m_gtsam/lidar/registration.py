@@ -16,8 +16,6 @@ from l2m_gtsam.options import Options
 # Steps smaller than this end a registration: far below any error of it.
 STEP_RAD, STEP_M = 1e-4, 1e-4
 MAX_ITERATIONS = 30
-# Neighbourhoods thicker than this share of their width are no planes: edges, bushes, people.
-FLAT = 0.35
 # Distances beyond so many standard deviations are of other things.
 GATE = 3.0
 LEAST_SIGMA_M = 1e-3
@@ -188,7 +186,7 @@ def _judged(
     off = np.abs(distances(scan.points[near], T, planes))
     inlier = off <= options.inlier_m
     share = float(np.sum(inlier)) / len(scan)
-    flat = inlier & (planes.flatness < FLAT)
+    flat = inlier & (planes.flat)
     if np.sum(flat) < 6:
         return Registration(T, np.zeros((6, 6)), share, np.inf, 0)
     spread = 1.4826 * float(np.median(off[flat]))

@@ -8,6 +8,8 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.lidar.extra import library
 from l2m_gtsam.lidar.information import Planes, fitted_planes
 
+# Points that are smoothed at once.
+PIECE_POINTS = 50_000
 # Neighbours that a plane or a covariance is fitted to.
 NEIGHBOURS = 15
 
@@ -49,3 +51,26 @@ class Surface:
         """Return the planes that fit the surface at some of its points."""
         found, _ = self.tree.batch_knn_search(self.points[rows], NEIGHBOURS)
         return fitted_planes(self.points[rows], self.points[np.array(found, dtype=np.int64)])
+
+
+def smoothed(points: FloatArray) -> FloatArray:
+    """Return points moved onto the planes that fit their neighbours, where these are flat.
+
+    A wall that many scans saw is as thick as their noise. Points of another scan match the near
+    side of it, so that they seem to fit better than they do, and hold their pose where it was.
+
+    Parameters
+    ----------
+    points
+        Of a cloud that was thinned, shape (N, 3), metres.
+    """
+    surface = Surface(points)
+    if not surface.usable:
+        return points
+    moved = points.copy()
+    for low in range(0, len(points), PIECE_POINTS):
+        rows = np.arange(low, min(low + PIECE_POINTS, len(points)))
+        planes = surface.planes(rows)
+        off = np.einsum("ni,ni->n", planes.normal, points[rows] - planes.point)
+        moved[rows] -= np.where(planes.flat, off, 0.0)[:, None] * planes.normal
+    return moved
