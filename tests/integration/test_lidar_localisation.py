@@ -106,7 +106,7 @@ def test_the_start_is_found_along_the_mapping_drive(cloud: Surface, steps: list[
     """The mapping drive passed 0.4 m beside, heading 150 degrees elsewhere."""
     turn = Rotation.from_euler("Z", 150, degrees=True).as_matrix()
     places = replace(rows(MAPPING, range(0, 17, 4)), R=turn @ MAPPING.R[:17:4])
-    beside = replace(places, p=places.p + [0.3, -0.3, 0.0])
+    beside = replace(places, p=places.p + np.array([0.3, -0.3, 0.0]))
     found = find_start(
         steps[12].surface, cloud, mapped(beside), SearchOptions(), OPTIONS.registration
     )
@@ -117,7 +117,7 @@ def test_an_ambiguous_start_is_refused() -> None:
     """An empty room looks the same turned by half a turn."""
     hall = Room(((-5.0, -3.0, 0.0), (5.0, 3.0, 3.0)))
     steps = list(follow(scans(hall, rows(DRIVE, [3]), np.random.default_rng(2)), OdometryOptions()))
-    with pytest.raises(LidarError, match="fits at several places, .* and .*; say with `lidar.st"):
+    with pytest.raises(LidarError, match=r"fits at several places, .* and .*; say with `lidar.st"):
         find_start(
             steps[0].surface, cloud_of(hall), mapped(MAPPING), SearchOptions(), OPTIONS.registration
         )

@@ -1,4 +1,4 @@
-"""Scans on clouds of rooms: poses to the millimetre, covariances that hold, wrong places refused."""
+"""Scans on clouds of rooms: poses to a millimetre, covariances that hold, refusals."""
 
 import sys
 
@@ -126,7 +126,7 @@ def test_smoothing_thins_walls_and_leaves_the_rest() -> None:
     rng = np.random.default_rng(0)
     sides = rng.uniform(0, 4, (4000, 2))
     wall = np.column_stack([sides, 0.02 * rng.standard_normal(4000)])
-    bush: FloatArray = rng.uniform(0, 1, (3000, 3)) + [10, 0, 0]
+    bush: FloatArray = rng.uniform(0, 1, (3000, 3)) + np.array([10, 0, 0])
     smooth = smoothed(np.concatenate([wall, bush]))
     # The mean of 15 neighbours has a quarter of the noise of one; less well at the rim.
     assert np.std(smooth[:4000, 2]) < 0.5 * 0.02
