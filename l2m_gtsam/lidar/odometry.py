@@ -40,7 +40,9 @@ class OdometryOptions(Options):
     """A scan becomes the key scan after so much way,"""
     key_angle_deg: float = Field(default=20.0, gt=0, le=180)
     """or so much turning."""
-    registration: RegistrationOptions = RegistrationOptions(unseen_m=1.0, unseen_deg=5.0)
+    registration: RegistrationOptions = RegistrationOptions(
+        least_share=0.6, unseen_m=1.0, unseen_deg=5.0
+    )
     """How scans are registered on key scans. `unseen_m` and `unseen_deg` are those of one step."""
 
 

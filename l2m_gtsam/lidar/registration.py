@@ -32,8 +32,9 @@ class RegistrationOptions(Options):
     """and over this distance in the end."""
     inlier_m: float = Field(default=0.1, gt=0)
     """A point lies on the surface if its plane is nearer than this, metres."""
-    least_share: float = Field(default=0.7, gt=0, le=1)
-    """A registration is refused if a smaller share of the scan's points lies on the surface,"""
+    least_share: float = Field(default=0.8, gt=0, le=1)
+    """A registration is refused if a smaller share of the scan's points lies on the surface: floor
+    and ceiling, and a wall or two, fit nearly everywhere;"""
     least_directions: int = Field(default=3, ge=1, le=6)
     """or if the scan determines fewer of the six directions of a pose."""
     unseen_m: float = Field(default=10.0, gt=0)
