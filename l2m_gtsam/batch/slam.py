@@ -3,8 +3,9 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from l2m_gtsam.batch.opening import SavedMap, read_drive
+from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.config import Config
 from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.graph.slam.g2o import write_g2o
@@ -68,7 +69,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     saved, calibration = SavedMap.read(given.map), read_calibration(given.calibration)
     if (out / REFINED_FILE).exists() and given.calibration.samefile(out / REFINED_FILE):
         raise OutputError(f"{given.calibration}: is what is read; choose another --out")
-    recording = read_drive(given.bag, config, progress)
+    recording = read_drive_or_follow(given.bag, config, progress)
     start = config.slam.start
     # A start that is given puts odometry of any frame into the map.
     anywhere = start.position is not None and start.quaternion_xyzw is not None

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.batch.opening import read_drive
+from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import (
     FloatArray,
@@ -85,7 +85,7 @@ def read_survey(
     options = config.mapping.structure
     is_file = structure is not None and _names_file(structure)
     cloud = _structure_file(Path(structure or ""), options) if is_file else None
-    recordings = [read_drive(bag, config, progress) for bag in bags]
+    recordings = [read_drive_or_follow(bag, config, progress) for bag in bags]
     if structure is not None and not is_file:
         cloud = _structure_topic(structure, bags, recordings, config, progress)
     return Survey(recordings, known, cloud)
@@ -137,7 +137,9 @@ def scanned_place(
         )
     points = smoothed(points)
     R, p = _along([each.trajectory for each in recordings])
+    notes = [each.note for each in recordings if each.note]
     provenance = {"topics": topics, "points": len(points), "edge": options.edge, **_counts(clouds)}
+    provenance |= {"notes": notes} if notes else {}
     return ScannedPlace(LidarMap(points, R, p), provenance)
 
 
