@@ -1,6 +1,8 @@
 """Drives whose poses come from their point clouds."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 from l2m_gtsam.batch.opening import (

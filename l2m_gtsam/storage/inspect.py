@@ -24,7 +24,6 @@ from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
 from l2m_gtsam.storage.units import MICROTESLA_PER, Strength, fault, is_turning, strength
 
-
 BY_CLOUDS = "a map made with `l2m map build --lidar` gives poses to its point clouds"
 
 
