@@ -83,19 +83,7 @@ def localise(
     SyncError
         Readings and poses do not overlap, or there are fewer than two poses.
     """
-    odometry = recording.trajectory
-    if len(odometry) < 2:
-        raise SyncError(f"{recording.source.path}: odometry of one pose; two or more are needed")
-    calibrated, notes = usable_sensors(recording, calibration)
-    readings = drive_readings(recording, calibrated, options)
-    rows = key_pose_rows(odometry, options.key_poses)
-    drive = Drive(
-        stamp_ns=odometry.stamp_ns[rows],
-        steps=odometry_steps(odometry, rows, options.drift),
-        readings=carried(readings, odometry, rows, options.key_poses.readings),
-        start=start_pose(odometry, options.start),
-        sensors=known_sensors(calibrated),
-    )
+    drive, notes = prepared(recording, calibration, options)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     solution = localise_drive(drive, solver_map, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
@@ -109,6 +97,34 @@ def localise(
         calibration_source=sources.calibration,
     )
     return Localisation(result, solution)
+
+
+def prepared(
+    recording: Recording, calibration: CalibrationResult, options: SlamOptions
+) -> tuple[Drive, tuple[str, ...]]:
+    """Return a recording as a drive of its calibrated sensors, and a note on each of the others.
+
+    Raises
+    ------
+    CalibrationError
+        No sensor of the recording is calibrated.
+    SyncError
+        Readings and poses do not overlap, or there are fewer than two poses.
+    """
+    odometry = recording.trajectory
+    if len(odometry) < 2:
+        raise SyncError(f"{recording.source.path}: odometry of one pose; two or more are needed")
+    calibrated, notes = usable_sensors(recording, calibration)
+    readings = drive_readings(recording, calibrated, options)
+    rows = key_pose_rows(odometry, options.key_poses)
+    drive = Drive(
+        stamp_ns=odometry.stamp_ns[rows],
+        steps=odometry_steps(odometry, rows, options.drift),
+        readings=carried(readings, odometry, rows, options.key_poses.readings),
+        start=start_pose(odometry, options.start),
+        sensors=known_sensors(calibrated),
+    )
+    return drive, notes
 
 
 def usable_sensors(

@@ -26,6 +26,7 @@ from l2m_factors.shared_errors import (
     shared_error,
     uncertain_block_factor,
 )
+from l2m_factors.tile import TileBatch, TileField, WeightedField, tile_factor
 
 __all__ = [
     "BatchedReadings",
@@ -44,6 +45,9 @@ __all__ = [
     "S",
     "SharedError",
     "T",
+    "TileBatch",
+    "TileField",
+    "WeightedField",
     "X",
     "assert_jacobians_match",
     "block_factor",
@@ -61,5 +65,6 @@ __all__ = [
     "rotation_prior",
     "shared_error",
     "skew",
+    "tile_factor",
     "uncertain_block_factor",
 ]

@@ -69,6 +69,18 @@ class CarriedReadings:
             motion,
         )
 
+    def lidar_at(self, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return where the lidar stood in the key pose's frame, (N, 3, 3) and (N, 3) in metres.
+
+        Parameters
+        ----------
+        offset
+            Time offset of each sensor in seconds, shape (S,); it counts for readings with motion.
+        """
+        if self.motion is None:
+            return self.R_key_lidar, self.p_key_lidar
+        return moved(self.R_key_lidar, self.p_key_lidar, self.motion, offset[self.sensor])
+
     def placed(self, R_map_key: FloatArray, p_map_key: FloatArray) -> MagneticReadings:
         """Return the readings with the lidar's poses in the map.
 
@@ -145,9 +157,7 @@ def carried_residuals(
     """
     placed = readings.placed(R_map_key, p_map_key)
     seen = reading_residuals(placed, field_map, sensors.t, sensors.distortion, sensors.offset)
-    R, p, t = readings.R_key_lidar, readings.p_key_lidar, sensors.t[readings.sensor]
-    if readings.motion is not None:
-        R, p = moved(R, p, readings.motion, sensors.offset[readings.sensor])
+    (R, p), t = readings.lidar_at(sensors.offset), sensors.t[readings.sensor]
     C = sensors.distortion[:, :9].reshape(-1, 3, 3)[readings.sensor]
     R_lidar_key = R.transpose(0, 2, 1)
     t_key_mag = np.einsum("nij,nj->ni", R, t) + p

@@ -1,6 +1,5 @@
 """Magnetic readings on an estimated ``Pose3``, ``X(k)``, as GTSAM factors: one per key pose."""
 
-import struct
 from collections.abc import Sequence
 
 import gtsam
@@ -9,7 +8,8 @@ import numpy.typing as npt
 
 from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals, carried_residuals
 from l2m_factors.field_map import FieldMap, FloatArray
-from l2m_factors.keys import D, S, T, X
+from l2m_factors.keys import X
+from l2m_factors.sensor_variables import SensorVariables
 from l2m_factors.shared_errors import SharedError, shared_error, whitened
 
 
@@ -36,11 +36,11 @@ class CarriedBatch:
     def __init__(
         self, field_map: FieldMap, readings: CarriedReadings, fixed: Calibrations | None = None
     ) -> None:
-        self._map, self._readings, self._fixed = field_map, readings, fixed
-        self._timed = fixed is None and readings.motion is not None
+        self._map, self._readings = field_map, readings
+        self._variables = SensorVariables(readings, fixed)
         numbers, self._slot = np.unique(readings.key_pose, return_inverse=True)
         self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
-        self._sensors = {k: self._sensors_on(rows) for k, rows in self._rows.items()}
+        self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
         self._seen: dict[int, bytes] = {}
         self._residuals: CarriedResiduals | None = None
 
@@ -58,8 +58,7 @@ class CarriedBatch:
 
     def keys_of(self, key_pose: int) -> list[int]:
         """Return the keys that the readings on a key pose depend on."""
-        of_sensors = [self._keys(sensor) for sensor in self._sensors[key_pose]]
-        return [X(key_pose), *(key for keys in of_sensors for key in keys)]
+        return [X(key_pose), *self._variables.keys(self._sensors[key_pose])]
 
     def residuals(self, values: gtsam.Values, key_pose: int) -> CarriedResiduals:
         """Return all residuals, evaluated anew if the variables of this key pose changed.
@@ -88,42 +87,16 @@ class CarriedBatch:
             What shared errors add to the field in the lidar frame in uT, shape (n, 3).
         """
         rows = self._rows[key_pose]
-        blocks = [residuals.de_dX[rows]]
-        if self._fixed is not None:
-            return blocks
-        by_D = residuals.reading.de_dD[rows]
-        for axis in range(3):
-            by_D[:, axis, 3 * axis : 3 * axis + 3] += more
-        parts = [residuals.reading.de_dt[rows], by_D]
-        if self._timed:
-            parts.append(residuals.reading.de_dS[rows])
-        for sensor in self._sensors[key_pose]:
-            own = (self._readings.sensor[rows] == sensor)[:, None, None]
-            blocks += [np.where(own, part, 0.0) for part in parts]
-        return blocks
+        by_sensors = self._variables.jacobians(residuals.reading, rows, more)
+        return [residuals.de_dX[rows], *by_sensors]
 
     def C(self, values: gtsam.Values, key_pose: int) -> FloatArray:
         """Return the distortion matrix of each reading on a key pose, shape (n, 3, 3)."""
-        sensors = self._calibrations(values, self._sensors[key_pose])
-        sensor = self._readings.sensor[self._rows[key_pose]]
-        return np.asarray(sensors.distortion[sensor, :9].reshape(-1, 3, 3))
-
-    def _sensors_on(self, rows: npt.NDArray[np.int64]) -> list[int]:
-        return [int(sensor) for sensor in np.unique(self._readings.sensor[rows])]
-
-    def _keys(self, sensor: int) -> list[int]:
-        if self._fixed is not None:
-            return []
-        return [T(sensor), D(sensor), *([S(sensor)] if self._timed else [])]
+        return self._variables.C(values, self._rows[key_pose])
 
     def _stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
-        """Return the values of a key pose as bytes, which compare faster than arrays."""
-        parts = [values.atPose3(X(key_pose)).matrix().tobytes()]
-        for sensor in self._sensors[key_pose] if self._fixed is None else []:
-            parts += [values.atPoint3(T(sensor)).tobytes(), values.atVector(D(sensor)).tobytes()]
-            if self._timed:
-                parts.append(struct.pack("d", values.atDouble(S(sensor))))
-        return b"".join(parts)
+        own = values.atPose3(X(key_pose)).matrix().tobytes()
+        return own + self._variables.stamp(values, self._sensors[key_pose])
 
     def _evaluated(self, values: gtsam.Values) -> CarriedResiduals:
         R, p = np.tile(np.eye(3), (len(self._rows), 1, 1)), np.zeros((len(self._rows), 3))
@@ -131,21 +104,8 @@ class CarriedBatch:
             if values.exists(X(k)):
                 pose = values.atPose3(X(k))
                 R[slot], p[slot] = pose.rotation().matrix(), pose.translation()
-        sensors = self._calibrations(values, self._sensors_on(np.arange(len(self))))
+        sensors = self._variables.calibrations(values, self._variables.on(np.arange(len(self))))
         return carried_residuals(self._readings, self._map, R[self._slot], p[self._slot], sensors)
-
-    def _calibrations(self, values: gtsam.Values, sensors: list[int]) -> Calibrations:
-        """Return the calibrations of these sensors; zeros for others, and where none is known."""
-        if self._fixed is not None:
-            return self._fixed
-        known = Calibrations.zeros(max(sensors) + 1)
-        for sensor in sensors:
-            if values.exists(T(sensor)):
-                known.t[sensor] = values.atPoint3(T(sensor))
-                known.distortion[sensor] = values.atVector(D(sensor))
-                if self._timed:
-                    known.offset[sensor] = values.atDouble(S(sensor))
-        return known
 
 
 def key_pose_factor(

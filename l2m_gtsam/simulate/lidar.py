@@ -160,7 +160,7 @@ class SimulatedScans:
         rays = options.directions()
         seconds = options.sweep * np.arange(options.columns) / options.columns
         poses = self.poses_at(stamp + np.round(seconds * NANOSECONDS).astype(np.int64))
-        directions = np.einsum("cij,cbj->cbi", poses.R, rays).reshape(-1, 3)
+        directions = (rays @ poses.R.swapaxes(1, 2)).reshape(-1, 3)
         exact = self.caster.ranges(np.repeat(poses.p, options.beams, axis=0), directions)
         noise = np.random.default_rng([self.seed, index]).normal(0.0, options.noise, len(exact))
         measured = exact + noise

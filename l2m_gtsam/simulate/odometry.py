@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.options import Options
-from l2m_gtsam.pose_covariance import moved
 from l2m_gtsam.simulate.sensors import NoiseOptions
 
 # An error of nothing cannot be told from one that is unknown: metres and radians.
@@ -131,11 +130,25 @@ def _step_covariances(
 
 
 def _accumulated(start: FloatArray, R: FloatArray, p: FloatArray, Q: FloatArray) -> FloatArray:
-    """Return the covariance of every pose, shape (N, 6, 6)."""
-    R_step = R[:-1].swapaxes(1, 2) @ R[1:]
-    p_step = np.einsum("nji,nj->ni", R[:-1], np.diff(p, axis=0))
-    found = [start]
-    for R_next, p_next, fresh in zip(R_step, p_step, Q, strict=True):
-        P = moved(found[-1][None], RigidTransform(R_next, p_next))[0] + fresh
-        found.append((P + P.T) / 2)
-    return np.stack(found)
+    """Return the covariance of every pose, shape (N, 6, 6).
+
+    All steps' errors are moved to the first pose, where they add up, and the sums to each pose.
+    """
+    there, back = _adjoints(R, p - p[0]), _adjoints(*_inverse(R, p - p[0]))
+    fresh = np.concatenate([start[None], Q])
+    summed = np.cumsum(there @ fresh @ there.swapaxes(1, 2), axis=0)
+    P = back @ summed @ back.swapaxes(1, 2)
+    return np.asarray((P + P.swapaxes(1, 2)) / 2)
+
+
+def _inverse(R: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    back = R.swapaxes(1, 2)
+    return back, -np.einsum("nij,nj->ni", back, p)
+
+
+def _adjoints(R: FloatArray, p: FloatArray) -> FloatArray:
+    """Return what takes small motions of a body to those of its frame, shape (N, 6, 6)."""
+    found = np.zeros((len(p), 6, 6))
+    found[:, :3, :3] = found[:, 3:, 3:] = R
+    found[:, 3:, :3] = np.cross(p[:, None], R.swapaxes(1, 2)).swapaxes(1, 2)
+    return found

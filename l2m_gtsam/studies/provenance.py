@@ -40,7 +40,7 @@ class Provenance:
 @lru_cache(maxsize=1)
 def code_version() -> str:
     """Return the version of this package, with the commit where it runs from a checkout."""
-    git, folder = which("git"), Path(__file__).parent
+    git, folder = which("git"), Path(__file__).parents[1]
     released = version("l2m-gtsam")
     if git is None:
         return released

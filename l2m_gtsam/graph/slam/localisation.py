@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import CarriedBatch, D, T, X, key_pose_factor
+from l2m_factors import CarriedBatch, key_pose_factor
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.optimise import Ending, Optimizer, optimise
+from l2m_gtsam.graph.slam.covariances import pose_covariances, sensor_covariances
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.factors import calibration_graph, odometry_graph
 from l2m_gtsam.graph.slam.following import Follower, follow
@@ -183,26 +184,19 @@ class Problem:
         optimised = optimise(graph, values, Optimizer.LM, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
         marginals = gtsam.Marginals(graph, values)
-        count = range(len(self._drive))
         sight = self.look(values)
         return Localised(
             drive=replace(self._drive, sensors=sensors),
-            poses=list(poses_in(values, len(count)).values()),
-            pose_covariance=np.stack([marginals.marginalCovariance(X(k)) for k in count]),
-            calibration_covariance=self._calibration_covariance(marginals),
+            poses=list(poses_in(values, len(self._drive)).values()),
+            pose_covariance=pose_covariances(marginals, len(self._drive)),
+            calibration_covariance=(
+                sensor_covariances(marginals, len(sensors.names))
+                if self.free
+                else sensors.covariance
+            ),
             sight=sight,
             squared=sight.squared(sight.whitening(sensors.noise)),
             weights=weights * sight.inside,
             bent=2 * self._odometry.error(values) / (6 * len(self._drive)),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
         )
-
-    def _calibration_covariance(self, marginals: gtsam.Marginals) -> FloatArray:
-        if not self.free:
-            return self._drive.sensors.covariance
-        blocks = []
-        for i in range(len(self._drive.sensors.names)):
-            keys = [T(i), D(i)]
-            joint = marginals.jointMarginalCovariance(keys)
-            blocks.append(np.block([[joint.at(a, b) for b in keys] for a in keys]))
-        return np.stack(blocks)

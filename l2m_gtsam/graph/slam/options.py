@@ -4,6 +4,7 @@ from enum import StrEnum
 
 from pydantic import Field, model_validator
 
+from l2m_gtsam.graph.slam.field_prior import TileOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.robust import RobustOptions
 
@@ -84,5 +85,7 @@ class SlamOptions(Options):
     """`fixed`, or `refined`: estimated with the poses, with its covariance as the prior."""
     robust: RobustOptions = RobustOptions()
     """How readings are treated that the map does not explain."""
+    tiles: TileOptions = TileOptions()
+    """How the field is described where there is no map."""
     max_iterations: int = Field(default=50, ge=1)
     """The most steps of the optimiser in each round."""

@@ -31,6 +31,13 @@ class Place:
     x: FloatArray
     C: FloatArray
 
+    def field(self, sensors: KnownSensors) -> FloatArray:
+        """Return the field that was measured there, in the map's frame in uT, shape (N, 3)."""
+        at = self.readings
+        H = sensors.distortion[at.sensor, 9:]
+        b_lidar = np.linalg.solve(self.C, (at.field - H)[:, :, None])
+        return np.asarray((at.R_map_lidar @ b_lidar)[:, :, 0])
+
 
 @dataclass(frozen=True)
 class Sight:

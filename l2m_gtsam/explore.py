@@ -1,0 +1,106 @@
+"""Recording + calibration -> poses and the field along them, without a map. Pure."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Recording, SourceFile
+from l2m_gtsam.graph.slam.drive import Drive
+from l2m_gtsam.graph.slam.field_prior import FieldPrior, TileOptions, field_prior
+from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.mapping import map_drive
+from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.graph.slam.outcome import localisation_result
+from l2m_gtsam.graph.slam.sight import place
+from l2m_gtsam.localise import prepared
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.slam_results import LocalisationResult
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """A drive through a place without a map.
+
+    Attributes
+    ----------
+    result
+        The poses, and what else is told.
+    solution
+        Of the graph.
+    points, field
+        Where readings that count were taken, in metres, and the field there in uT, in the map,
+        shapes (N, 3).
+    """
+
+    result: LocalisationResult
+    solution: Localised
+    points: FloatArray
+    field: FloatArray
+
+
+def explore(
+    recording: Recording,
+    calibration: CalibrationResult,
+    options: SlamOptions,
+    progress: Progress,
+    calibration_source: SourceFile | None = None,
+) -> Exploration:
+    """Find where a vehicle was and what the field is there, from where its odometry begins.
+
+    Parameters
+    ----------
+    recording
+        A drive; its poses are odometry.
+    calibration
+        Of the sensors.
+    options
+        Key poses, odometry, start, tiles, and what becomes of the calibration.
+    progress
+        Called with a stage and the fraction of it that is done.
+    calibration_source
+        For the record.
+
+    Raises
+    ------
+    CalibrationError
+        No sensor of the recording is calibrated.
+    SyncError
+        Readings and poses do not overlap, or there are fewer than two poses.
+    MapError
+        There are too few readings to learn a prior of the field from.
+    """
+    drive, notes = prepared(recording, calibration, options)
+    progress("learning the field's prior", 0.0)
+    mapped = map_drive(drive, drive_prior(drive, options.tiles), options, progress)
+    refined = options.calibration is CalibrationUse.REFINED
+    result = localisation_result(drive, mapped.solution, calibration if refined else None)
+    if not len(mapped.returns):
+        told = "no place was come to twice: readings of an unknown field take out little drift then"
+        notes = (*notes, told)
+    result = replace(
+        result,
+        notes=(*notes, *result.notes),
+        bag=recording.source,
+        calibration_source=calibration_source,
+    )
+    points, field = surveyed(mapped.solution.drive, mapped.solution)
+    return Exploration(result, mapped.solution, points, field)
+
+
+def drive_prior(drive: Drive, options: TileOptions) -> FieldPrior:
+    """Learn the prior of the field from the first part of a drive, by dead reckoning."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    early = np.flatnonzero(way[drive.readings.key_pose] <= options.learn_over_m)
+    readings, poses = drive.readings[early], drive.dead_reckoning()
+    where = place(
+        readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
+    )
+    return field_prior(where.x, where.field(drive.sensors), options)
+
+
+def surveyed(drive: Drive, solution: Localised) -> tuple[FloatArray, FloatArray]:
+    """Return places in metres and the field there in uT of the readings that count, (N, 3)."""
+    rows = np.flatnonzero(solution.used)
+    where = solution.sight.place
+    return where.x[rows], where.field(drive.sensors)[rows]

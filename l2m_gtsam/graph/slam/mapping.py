@@ -1,0 +1,194 @@
+"""A drive through a place whose field is not known: poses and field together, off line.
+
+The field is laid out on tiles that are fixed to key poses. All poses and the tiles' weights are
+solved together by Levenberg-Marquardt, in stages: at first readings count as if their noise were
+many times what it is, so that only the field's long waves speak, and a place that is come to again
+is recognised from as far off as odometry has drifted; then more finely. At each stage tiles are
+laid anew where the poses are by then, and readings that no tile explains lose their weight.
+"""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import X
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.graph.optimise import Ending, LinearSolver, Optimizer, optimise
+from l2m_gtsam.graph.slam.covariances import pose_covariances, sensor_covariances
+from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
+from l2m_gtsam.graph.slam.factors import calibration_graph, calibration_values, odometry_graph
+from l2m_gtsam.graph.slam.field_prior import FieldPrior
+from l2m_gtsam.graph.slam.localisation import NOTHING, Localised
+from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.graph.slam.sight import Sight, place, poses_in, sensors_in
+from l2m_gtsam.graph.slam.tiled import TiledDrive
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.solve.robust import WEIGHTS
+
+# How many times its noise a reading may be off, stage by stage, and how sharply good readings are
+# told from wrong ones (mu of ``solve.robust``).
+STAGES = ((16.0, 1.0), (4.0, 1.0), (1.0, 1.0), (1.0, np.inf), (1.0, np.inf))
+AWAY_M = 5.0  # of way after which a tile that is entered again closes a loop
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A drive and the field along it.
+
+    Attributes
+    ----------
+    solution
+        Poses, sensors, and what the tiles say of the readings.
+    tiles
+        That the drive was laid out on.
+    returns
+        Key poses in tiles that had been left before.
+    """
+
+    solution: Localised
+    tiles: int
+    returns: IntArray
+
+
+def map_drive(drive: Drive, prior: FieldPrior, options: SlamOptions, progress: Progress) -> Mapped:
+    """Find the poses of a drive and the field along it.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    prior
+        Of the field.
+    options
+        How to solve.
+    progress
+        Called with a stage and the fraction of it that is done.
+    """
+    problem = TiledProblem(drive, prior, options)
+    poses, sensors = drive.dead_reckoning(), drive.sensors
+    for stage, (scale, mu) in enumerate(STAGES[:-1]):
+        progress("solving poses and field", stage / len(STAGES))
+        solved = problem.solved(poses, sensors, scale, mu)
+        poses, sensors = solved.poses, solved.sensors
+    scale, mu = STAGES[-1]
+    found = problem.finished(problem.solved(poses, sensors, scale, mu))
+    progress("solving poses and field", 1.0)
+    return found
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A stage: tiles as they were laid, the graph and where it led."""
+
+    tiled: TiledDrive
+    graph: gtsam.NonlinearFactorGraph
+    weights: FloatArray
+    values: gtsam.Values
+    poses: list[gtsam.Pose3]
+    sensors: KnownSensors
+    ending: Ending
+
+
+class TiledProblem:
+    """The graph of a drive in an unknown field.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    prior
+        Of the field.
+    options
+        How to solve.
+    """
+
+    def __init__(self, drive: Drive, prior: FieldPrior, options: SlamOptions) -> None:
+        self._drive, self._prior, self._options = drive, prior, options
+        self._odometry = odometry_graph(drive)
+        self._free = options.calibration is CalibrationUse.REFINED
+
+    def solved(
+        self, poses: list[gtsam.Pose3], sensors: KnownSensors, scale: float, mu: float
+    ) -> Solved:
+        """Lay tiles at these poses and solve for poses and weights.
+
+        Parameters
+        ----------
+        poses, sensors
+            Where to start.
+        scale
+            How many times its noise a reading may be off.
+        mu
+            Stage of the graduation of the readings' weights.
+        """
+        tiled = TiledDrive.lay(self._drive, poses, sensors, self._prior)
+        noise = scale * sensors.noise
+        values = tiled.weights(sensors, noise)
+        for k, pose in enumerate(poses):
+            values.insert(X(k), pose)
+        sights = tiled.sights(values, sensors)
+        W = self._gathered(tiled, [sight.whitening(noise) for sight in sights])
+        weights = self._weights(tiled, sights, noise, mu)
+        chosen = np.flatnonzero(weights > NOTHING)
+        graph = tiled.graph(
+            self._drive, W * np.sqrt(weights)[:, None, None], chosen, free=self._free
+        )
+        graph.push_back(self._odometry)
+        if self._free:
+            graph.push_back(calibration_graph(self._drive.sensors))
+            values.insert(calibration_values(sensors))
+        end = optimise(
+            graph, values, Optimizer.LM, self._options.max_iterations, LinearSolver.CHOLESKY
+        )
+        found = list(poses_in(end.values, len(poses)).values())
+        after = sensors_in(end.values, sensors)
+        return Solved(tiled, graph, weights, end.values, found, after, end.ending)
+
+    def finished(self, solved: Solved) -> Mapped:
+        """Return a solved stage with its covariances and residuals."""
+        drive, sensors = self._drive, solved.sensors
+        marginals = gtsam.Marginals(solved.graph, solved.values)
+        tiled = solved.tiled.moved(drive, solved.poses, sensors)
+        sights = tiled.sights(solved.values, sensors)
+        squared = [sight.squared(sight.whitening(sensors.noise)) for sight in sights]
+        solution = Localised(
+            drive=replace(drive, sensors=sensors),
+            poses=solved.poses,
+            pose_covariance=pose_covariances(marginals, len(drive)),
+            calibration_covariance=(
+                sensor_covariances(marginals, len(sensors.names))
+                if self._free
+                else sensors.covariance
+            ),
+            sight=self._sight(solved, sights),
+            squared=self._gathered(tiled, squared),
+            weights=solved.weights,
+            bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
+            ending=solved.ending,
+        )
+        way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+        returns = tiled.anchoring.returns(way, AWAY_M)
+        return Mapped(solution, len(tiled.tiles), returns)
+
+    def _weights(
+        self, tiled: TiledDrive, sights: list[Sight], noise: FloatArray, mu: float
+    ) -> FloatArray:
+        robust = self._options.robust
+        r2 = self._gathered(tiled, [sight.squared(sight.whitening(noise)) for sight in sights])
+        return np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
+
+    def _gathered(self, tiled: TiledDrive, parts: list[FloatArray]) -> FloatArray:
+        """Return what tiles say of their readings in the order of the drive's."""
+        whole = np.zeros((len(self._drive.readings), *parts[0].shape[1:]))
+        for tile, part in zip(tiled.tiles, parts, strict=True):
+            whole[tile.rows] = part
+        return whole
+
+    def _sight(self, solved: Solved, sights: list[Sight]) -> Sight:
+        """Return what the tiles say, with places in the map."""
+        drive, tiled = self._drive, solved.tiled
+        where = place(drive.readings, dict(enumerate(solved.poses)), solved.sensors)
+        variance = self._gathered(tiled, [sight.map_variance for sight in sights])
+        residual = self._gathered(tiled, [sight.residual for sight in sights])
+        return Sight(where, np.ones(len(residual), bool), variance, residual)

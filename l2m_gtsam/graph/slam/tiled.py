@@ -1,0 +1,158 @@
+"""A drive whose readings are laid out on tiles of an unknown field, at an estimate of its poses."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import M, TileBatch, tile_factor
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
+from l2m_gtsam.graph.slam.field_prior import FieldPrior
+from l2m_gtsam.graph.slam.sight import Place, Sight, look, place
+from l2m_gtsam.graph.slam.tiles import Anchoring, WaveTile, anchored
+
+
+@dataclass(frozen=True)
+class LaidTile:
+    """A tile and the readings in it.
+
+    Attributes
+    ----------
+    number, anchor
+        Its own, and of the key pose that it is fixed to.
+    rows
+        Readings of the drive that lie in it, shape (n,).
+    field
+        What its weights mean.
+    place
+        Where the readings are in the anchor's frame.
+    """
+
+    number: int
+    anchor: int
+    rows: IntArray
+    field: WaveTile
+    place: Place
+
+    def likely_weights(self, sensors: KnownSensors, noise: FloatArray) -> FloatArray:
+        """Return the weights that the readings make most likely where they are taken to be."""
+        own = noise[self.place.readings.sensor, None] ** 2
+        variance = own + self.field.unresolved(self.place.x)
+        b = self.place.field(sensors)
+        return self.field.likely_weights(self.place.x, b, variance)
+
+    def sight(self, weights: FloatArray, sensors: KnownSensors) -> Sight:
+        """Return what the tile says of its readings, in the anchor's frame."""
+        return look(_TileMap(self.field, weights), self.place, sensors)
+
+
+class _TileMap:
+    """A tile with weights that are given, as a map in the anchor's frame."""
+
+    def __init__(self, tile: WaveTile, weights: FloatArray) -> None:
+        self._tile, self._weights = tile, weights
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        return self._tile.field_and_gradient(points, self._weights)
+
+    def query(self, points: FloatArray) -> FieldSample:
+        field, gradient = self.field_and_gradient(points)
+        inside = np.ones(len(points), bool)
+        return FieldSample(field, gradient, self._tile.unresolved(points), inside)
+
+
+@dataclass(frozen=True)
+class TiledDrive:
+    """All tiles of a drive.
+
+    Attributes
+    ----------
+    anchoring
+        Which key pose lies in which.
+    tiles
+        Those with readings.
+    """
+
+    anchoring: Anchoring
+    tiles: tuple[LaidTile, ...]
+
+    @classmethod
+    def lay(
+        cls, drive: Drive, poses: list[gtsam.Pose3], sensors: KnownSensors, prior: FieldPrior
+    ) -> "TiledDrive":
+        """Lay a drive out on tiles, with its key poses and sensors taken for these."""
+        R = np.stack([pose.rotation().matrix() for pose in poses])
+        p = np.stack([pose.translation() for pose in poses])
+        anchoring = anchored(R, p, prior.options.core)
+        owner = anchoring.tile[drive.readings.key_pose]
+        tiles = []
+        for number, anchor in enumerate(anchoring.anchor.tolist()):
+            rows = np.flatnonzero(owner == number)
+            if len(rows):
+                where = _relative_place(drive, rows, poses, anchor, sensors)
+                z = where.x[:, 2]
+                field = WaveTile.about(prior, float(z.min()), float(z.max()))
+                tiles.append(LaidTile(number, anchor, rows, field, where))
+        return cls(anchoring, tuple(tiles))
+
+    def moved(self, drive: Drive, poses: list[gtsam.Pose3], sensors: KnownSensors) -> "TiledDrive":
+        """Return the same tiles with their readings where these poses and sensors put them."""
+        tiles = (
+            replace(tile, place=_relative_place(drive, tile.rows, poses, tile.anchor, sensors))
+            for tile in self.tiles
+        )
+        return TiledDrive(self.anchoring, tuple(tiles))
+
+    def weights(self, sensors: KnownSensors, noise: FloatArray) -> gtsam.Values:
+        """Return the most likely weights of all tiles."""
+        values = gtsam.Values()
+        for tile in self.tiles:
+            values.insert(M(tile.number), tile.likely_weights(sensors, noise))
+        return values
+
+    def sights(self, values: gtsam.Values, sensors: KnownSensors) -> list[Sight]:
+        """Return what each tile says of its readings."""
+        return [tile.sight(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
+
+    def graph(
+        self, drive: Drive, whitening: FloatArray, chosen: IntArray, *, free: bool
+    ) -> gtsam.NonlinearFactorGraph:
+        """Return the factors of readings, and the prior of the tiles' weights.
+
+        Parameters
+        ----------
+        drive
+            That was laid out.
+        whitening
+            Of the residuals of all its N readings, 1/uT, shape (N, 3, 3).
+        chosen
+            Readings that count.
+        free
+            Whether calibrations are variables.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        fixed = None if free else drive.sensors.fixed()
+        for tile in self.tiles:
+            rows = np.intersect1d(tile.rows, chosen)
+            unit = gtsam.noiseModel.Unit.Create(len(tile.field))
+            graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
+            if len(rows):
+                readings = drive.readings[rows]
+                batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
+                for k in batch.key_poses:
+                    graph.add(tile_factor(batch, k, whitening[rows[batch.rows_of(k)]]))
+        return graph
+
+
+def _relative_place(
+    drive: Drive,
+    rows: IntArray,
+    poses: list[gtsam.Pose3],
+    anchor: int,
+    sensors: KnownSensors,
+) -> Place:
+    readings = drive.readings[rows]
+    origin = poses[anchor]
+    own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
+    return place(readings, own, sensors)

@@ -1,0 +1,153 @@
+"""Tiles of an unknown field, each fixed to a key pose of the drive."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.graph.slam.field_prior import FieldPrior
+from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.frame import TileFrame
+from l2m_gtsam.maps.harmonic.furnish import UNIFORM_SIGMA
+from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
+from l2m_gtsam.maps.harmonic.uniform import UniformField
+
+# Widening of the waves' prior. Poses and weights are estimated together, and the mode of both at
+# once, unlike the poses' own distribution, is drawn to where features are large and weights small:
+# with the prior as learnt a vehicle seemed to sink by 0.1-0.2 m, with sigmas of 0.04 m. The pull
+# falls with the square of this; what is lost is small, for readings are dense along the way.
+WIDER = 10.0
+
+
+@dataclass(frozen=True)
+class WaveTile:
+    """Uniform field, floor and ceiling waves of a box about an anchor, in the anchor's frame.
+
+    Attributes
+    ----------
+    basis
+        Waves.
+    scale
+        Prior standard deviation of each one's weight, shape (m,).
+    prior
+        They follow from.
+    """
+
+    basis: Basis
+    scale: FloatArray
+    prior: FieldPrior
+
+    @classmethod
+    def about(cls, prior: FieldPrior, low: float, high: float) -> "WaveTile":
+        """Return the tile whose lowest and highest readings are there, metres from the anchor."""
+        edge = prior.options.edge
+        size, corner = np.array([edge, edge]), np.array([-edge / 2, -edge / 2, low])
+        frame = TileFrame(np.eye(3), corner, size, high - low)
+        floor = modes_up_to(FLOOR, size, 0.0, prior.resolution.floor)
+        ceiling = modes_up_to(CEILING, size, frame.height, prior.resolution.ceiling)
+        basis = Basis(frame, (UniformField(UNIFORM_SIGMA), floor, ceiling))
+        learnt = np.exp(0.5 * basis.prior(prior.hyperparameters).log_variance)
+        wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
+        return cls(basis, wider * learnt, prior)
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    def features(self, points: FloatArray, /) -> FloatArray:
+        """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
+        return self.basis.features(points) * self.scale
+
+    def field_and_gradient(
+        self, points: FloatArray, weights: FloatArray, /
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
+        return self.basis.field_and_gradient(points, self.scale * weights)
+
+    def unresolved(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis that waves left out hold, uT^2, shape (N, 3)."""
+        h, kept = self.prior.hyperparameters, self.prior.resolution
+        z = self.basis.frame.localise(points)[:, 2]
+        over = self.basis.frame.height - z
+        # Nearer to the sources than half their depth the tile says nothing any more.
+        z, over = np.maximum(z, -0.5 * h.floor_depth), np.maximum(over, -0.5 * h.ceiling_depth)
+        vertical = left_out(h.floor_scale, h.floor_depth, kept.floor, z)
+        vertical = vertical + left_out(h.ceiling_scale, h.ceiling_depth, kept.ceiling, over)
+        return np.asarray(vertical[:, None] * np.array([0.5, 0.5, 1.0]))
+
+    def likely_weights(
+        self, points: FloatArray, field: FloatArray, variance: FloatArray
+    ) -> FloatArray:
+        """Return the most likely weights, shape (m,).
+
+        Parameters
+        ----------
+        points, field
+            Readings in the anchor's frame, metres and uT, shapes (N, 3).
+        variance
+            Of each one's noise per axis in uT^2, shape (N, 3).
+        """
+        root = 1 / np.sqrt(variance)
+        F = (self.features(points) * root[:, :, None]).reshape(-1, len(self))
+        y = (field * root).ravel()
+        return np.asarray(np.linalg.solve(F.T @ F + np.eye(len(self)), F.T @ y))
+
+
+@dataclass(frozen=True)
+class Anchoring:
+    """Which tile each key pose lies in.
+
+    Attributes
+    ----------
+    anchor
+        The key pose that each of B tiles is fixed to, shape (B,).
+    tile
+        Of each of K key poses, shape (K,).
+    """
+
+    anchor: IntArray
+    tile: IntArray
+
+    def __len__(self) -> int:
+        return len(self.anchor)
+
+    def returns(self, way: FloatArray, least_m: float) -> IntArray:
+        """Return the key poses in tiles that were left at least so far ago on the way.
+
+        Parameters
+        ----------
+        way
+            From the start to each key pose in metres, shape (K,).
+        least_m
+            What counts as having been away.
+        """
+        last = np.full(len(self), -np.inf)
+        returned, found = np.zeros(len(self), bool), []
+        for k, tile in enumerate(self.tile.tolist()):
+            returned[tile] |= np.isfinite(last[tile]) and way[k] - last[tile] >= least_m
+            if returned[tile]:
+                found.append(k)
+            last[tile] = way[k]
+        return np.array(found, dtype=np.int64)
+
+
+def anchored(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
+    """Lay tiles where the vehicle goes: a new one wherever it is in the core of none.
+
+    Parameters
+    ----------
+    R, p
+        Key poses in the map, shapes (K, 3, 3) and (K, 3), metres.
+    core
+        Of a tile in metres.
+    """
+    anchors, tile = [0], np.zeros(len(p), dtype=np.int64)
+    for k in range(1, len(p)):
+        at = np.array(anchors)
+        away = np.einsum("bji,bj->bi", R[at], p[k] - p[at])[:, :2]
+        distance = np.abs(away).max(axis=1)
+        nearest = int(distance.argmin())
+        if distance[nearest] > core / 2:
+            nearest = len(anchors)
+            anchors.append(k)
+        tile[k] = nearest
+    return Anchoring(np.array(anchors), tile)

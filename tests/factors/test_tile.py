@@ -1,0 +1,104 @@
+"""Readings in a field whose weights are variables: derivatives, anchor, agreement with a map."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from l2m_factors import (
+    CarriedBatch,
+    CarriedReadings,
+    M,
+    TileBatch,
+    WeightedField,
+    X,
+    assert_jacobians_match,
+    key_pose_factor,
+    tile_factor,
+)
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.frame import TileFrame
+from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
+from tests.factors.test_pose import (
+    calibrations,
+    moving,
+    on,
+    random_carried,
+    values_for,
+    whitenings,
+)
+
+TILE = 3
+EDGE = np.array([4.0, 4.0])
+FRAME = TileFrame(np.eye(3), np.array([-2.0, -2.0, -0.5]), EDGE, 1.0)
+BASIS = Basis(FRAME, (modes_up_to(FLOOR, EDGE, 0.0, 2.0), modes_up_to(CEILING, EDGE, 1.0, 1.5)))
+
+
+def tile_values(seed: int, key_poses: int = 2) -> gtsam.Values:
+    """Return poses near each other, calibrations, and weights of the tile."""
+    values, rng = values_for(seed, key_poses), np.random.default_rng(seed + 2)
+    first = values.atPose3(X(0))
+    for k in range(1, key_poses):
+        step = np.concatenate([rng.normal(0, 0.3, 3), rng.uniform(-0.5, 0.5, 3)])
+        values.update(X(k), first.compose(gtsam.Pose3.Expmap(step)))
+    values.insert(M(TILE), rng.normal(size=len(BASIS)))
+    return values
+
+
+def batch_of(readings: CarriedReadings, anchor: int, values: gtsam.Values | None) -> TileBatch:
+    fixed = None if values is None else calibrations(values)
+    return TileBatch(TILE, anchor, BASIS, readings, fixed)
+
+
+@given(seed=st.integers(0, 10_000), free=st.booleans(), timed=st.booleans())
+@settings(deadline=None, max_examples=20)
+def test_derivatives_are_those_of_finite_differences(seed: int, free: bool, timed: bool) -> None:
+    readings, values = random_carried(seed), tile_values(seed)
+    readings = moving(readings, seed) if timed else readings
+    batch = batch_of(readings, 0, None if free else values)
+    for k in batch.key_poses:
+        factor = tile_factor(batch, k, whitenings(seed, len(batch.rows_of(k))))
+        assert_jacobians_match(factor, values)
+
+
+def test_a_tile_whose_weights_are_known_is_a_map_in_the_frame_of_its_anchor() -> None:
+    readings, values = random_carried(1), tile_values(1)
+    W: FloatArray = whitenings(1, 4)
+    unknown = tile_factor(batch_of(readings, 0, values), 1, W)
+    relative = gtsam.Values()
+    relative.insert(X(1), values.atPose3(X(0)).between(values.atPose3(X(1))))
+    field = WeightedField(BASIS, values.atVector(M(TILE)))
+    known = key_pose_factor(CarriedBatch(field, on(readings, 1), calibrations(values)), 1, W)
+    ours, theirs = unknown.unwhitenedError(values), known.unwhitenedError(relative)
+    np.testing.assert_allclose(ours, theirs, atol=1e-9)
+
+
+def test_moving_the_whole_way_changes_nothing() -> None:
+    """A loop that closes moves tiles with their anchors: what was seen there stays explained."""
+    readings, values = random_carried(2), tile_values(2)
+    batch = batch_of(readings, 0, values)
+    factors = [tile_factor(batch, k, whitenings(2, 4)) for k in batch.key_poses]
+    before = [factor.error(values) for factor in factors]
+    shift = gtsam.Pose3.Expmap(np.array([0.3, -0.2, 1.0, 4.0, -7.0, 2.0]))
+    for k in range(2):
+        values.update(X(k), shift.compose(values.atPose3(X(k))))
+    after = [factor.error(values) for factor in factors]
+    np.testing.assert_allclose(after, before, rtol=1e-9)
+
+
+def test_at_the_anchor_readings_say_nothing_of_the_pose() -> None:
+    batch = batch_of(random_carried(3), 1, tile_values(3))
+    assert batch.keys_of(1) == [M(TILE)]
+    assert batch.keys_of(0) == [X(0), X(1), M(TILE)]
+
+
+def test_a_batch_is_evaluated_again_only_when_its_variables_change() -> None:
+    readings, values = random_carried(4), tile_values(4)
+    batch = batch_of(readings, 0, values)
+    seen = batch.residuals(values, 1)
+    assert batch.residuals(values, 0) is seen
+    values.update(M(TILE), values.atVector(M(TILE)) + 0.1)
+    assert batch.residuals(values, 1) is not seen
+    assert batch.residuals(values, 1).reading.residual != pytest.approx(seen.reading.residual)
