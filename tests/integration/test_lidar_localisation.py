@@ -64,7 +64,7 @@ def test_a_drive_on_a_cloud(cloud: Surface, steps: list[ScanStep]) -> None:
         for which, (error, covariance) in enumerate(
             [(by_scan, fix.covariance), (together, found.trajectory.covariance[k])]
         ):
-            nees[which].append(error @ np.linalg.solve(covariance - of_cloud, error))
+            nees[which].append(float(error @ np.linalg.solve(covariance - of_cloud, error)))
     # Without the share of the cloud; the floor of a millimetre is larger than the errors.
     assert np.mean(nees[0]) < 6.0
     assert np.mean(nees[1]) < 6.0

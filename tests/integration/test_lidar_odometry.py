@@ -102,7 +102,8 @@ def test_a_swept_scan_is_brought_to_its_stamp() -> None:
     low, high = np.array(ROOM.walls)
 
     def off(points: FloatArray) -> FloatArray:
-        return np.abs(np.stack([points - low, points - high])).min(axis=(0, 2))
+        away = np.abs(np.stack([points - low, points - high]))
+        return np.asarray(away.min(axis=(0, 2)))
 
     assert np.max(off(raw)) > 0.05
     assert np.max(off(still)) < 1e-9

@@ -21,7 +21,7 @@ from tests.integration.test_cloud_topic import SECOND, START, TYPE, entries, fie
 
 NEAR = ScanOptions(min_range=0.0, max_range=50.0)
 POINTS: FloatArray = np.random.default_rng(0).uniform(-5, 5, (40, 3))
-TENTH = np.linspace(0.0, 0.1, 40)
+TENTH: FloatArray = np.linspace(0.0, 0.1, 40)
 
 
 def read(path: Path, options: ScanOptions = NEAR, topic: str | None = None) -> list[Scan]:
@@ -82,6 +82,7 @@ def test_times_of_points_as_drivers_write_them(tmp_path: Path, driver: str) -> N
     clock = CLOCKS[driver]
     path = write(tmp_path, "mcap", entries([timed(clock, POINTS, TENTH)]))
     (found,) = read(path)
+    assert found.time_s is not None
     expected = -TENTH if driver == "signed" else TENTH
     # Seconds since 1970 as float64 have steps of 0.24 us.
     np.testing.assert_allclose(found.time_s, expected, atol=3e-7)
@@ -96,7 +97,7 @@ def test_times_that_are_not_of_the_scan_are_left_alone(tmp_path: Path) -> None:
 
 def test_points_out_of_range_go_with_their_times(tmp_path: Path) -> None:
     points = np.array([[1.0, 0, 0], [0.1, 0, 0], [np.nan, 0, 0], [0, 40, 0], [0, 0, 3]])
-    seconds = np.arange(5) * 0.01
+    seconds: FloatArray = 0.01 * np.arange(5.0)
     path = write(tmp_path, "mcap", entries([timed(CLOCKS["velodyne"], points, seconds)]))
     (found,) = read(path, ScanOptions(min_range=0.5, max_range=30.0))
     np.testing.assert_allclose(found.points, [[1, 0, 0], [0, 0, 3]])
