@@ -21,7 +21,7 @@ class Room:
     boxes: tuple[Box, ...] = ()
 
     def distances(self, origin: FloatArray, rays: FloatArray) -> FloatArray:
-        """Return how far rays, shape (N, 3), of unit length, go from a place inside, shape (N,)."""
+        """Return how far unit rays, shape (N, 3), go from one place inside or N, shape (N,)."""
         _, far = _slabs(self.walls, origin, rays)
         for box in self.boxes:
             enter, leave = _slabs(box, origin, rays)
@@ -74,6 +74,21 @@ def scans(
     for k, stamp in enumerate(trajectory.stamp_ns):
         pose = RigidTransform(trajectory.R[k], trajectory.p[k])
         yield Scan(int(stamp), seen(room, pose, rng, noise_m))
+
+
+def swept(
+    room: Room, trajectory: Trajectory, twist: FloatArray, seconds: float, columns: int = 180
+) -> Iterator[Scan]:
+    """Yield exact scans whose columns a lidar of constant twist measures one after the other."""
+    rays = directions(columns=columns)
+    turn = np.tile(np.arange(columns) / columns * seconds, len(rays) // columns)
+    for k, stamp in enumerate(trajectory.stamp_ns):
+        R, p = trajectory.R[k], trajectory.p[k]
+        R_ray = R @ Rotation.from_rotvec(turn[:, None] * twist[:3]).as_matrix()
+        far = room.distances(
+            p + turn[:, None] * (R @ twist[3:]), np.einsum("nij,nj->ni", R_ray, rays)
+        )
+        yield Scan(int(stamp), rays * far[:, None], turn)
 
 
 def round_trip(count: int = 60, rate_hz: float = 10.0, speed: float = 0.8) -> Trajectory:

@@ -7,6 +7,7 @@ on the last key scan, from where KISS-ICP has it; that gives the pose and its co
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from pydantic import Field
@@ -27,6 +28,8 @@ from l2m_gtsam.pose_covariance import moved
 from l2m_gtsam.scans import Scan, taken_at_once
 
 FRAME, CHILD_FRAME = "odom", "lidar"
+# A scan of fewer is of nothing, or broken.
+LEAST_POINTS = 100
 
 
 class OdometryOptions(Options):
@@ -90,15 +93,14 @@ def follow(scans: Iterable[Scan], options: OdometryOptions) -> Iterator[ScanStep
     LidarError
         The extra `lidar` is not installed.
     """
-    follower: _Follower | None = None
-    for scan in scans:
-        if follower is None:
-            first = Surface(scan.points, options.registration.edge)
-            if first.usable:
-                follower = _Follower(scan, first, options)
-                yield ScanStep(scan.stamp_ns, IDENTITY, IDENTITY, np.zeros((6, 6)), first, True)
-        elif (step := follower.add(scan)) is not None:
-            yield step
+    waiting = (scan for scan in scans if len(scan) >= LEAST_POINTS)
+    first, second = next(waiting, None), next(waiting, None)
+    if first is None:
+        return
+    follower = _Follower(first, _first_twist(first, second, options), options)
+    yield follower.first
+    for scan in waiting if second is None else chain([second], waiting):
+        yield follower.add(scan)
 
 
 def odometry(scans: Iterable[Scan], options: OdometryOptions) -> Trajectory:
@@ -140,28 +142,30 @@ class _Placed:
 class _Follower:
     """The state between two scans."""
 
-    def __init__(self, scan: Scan, surface: Surface, options: OdometryOptions) -> None:
+    def __init__(self, scan: Scan, twist: FloatArray, options: OdometryOptions) -> None:
+        points = taken_at_once(scan, twist)
+        surface, exact = Surface(points, options.registration.edge), np.zeros((6, 6))
+        self.first = ScanStep(scan.stamp_ns, IDENTITY, IDENTITY, exact, surface, True)
+        self.twist = twist
         self._options = options
         self._kiss = KissFollower(options.voxel_m, options.map_range_m)
-        self._kiss.follow(scan.points, IDENTITY)
-        self._key = self._last = _Placed(surface, IDENTITY, np.zeros((6, 6)))
-        self._stamp_ns, self._twist = scan.stamp_ns, np.zeros(6)
+        self._kiss.follow(points, IDENTITY)
+        self._key = self._last = _Placed(surface, IDENTITY, exact)
+        self._stamp_ns = scan.stamp_ns
 
-    def add(self, scan: Scan) -> ScanStep | None:
-        """Return where a scan is, or nothing if it has too few points."""
+    def add(self, scan: Scan) -> ScanStep:
+        """Return where a scan is that has points enough."""
         seconds = 1e-9 * (scan.stamp_ns - self._stamp_ns)
-        points = taken_at_once(scan, self._twist)
+        points = taken_at_once(scan, self.twist)
         surface = Surface(points, self._options.registration.edge)
-        if not surface.usable:
-            return None
-        predicted = self._kiss.follow(points, perturbed(IDENTITY, seconds * self._twist))
+        predicted = self._kiss.follow(points, perturbed(IDENTITY, seconds * self.twist))
         placed = self._registered(surface, compose(self._last.T, predicted))
         estimate = self._unknown(predicted, seconds) if placed is None else placed
         step = between(self._last.T, estimate.T)
         covariance = moved(self._last.covariance[None], step)[0] + estimate.covariance
         believed = placed is not None
         self._advance(_Placed(surface, estimate.T, estimate.covariance), believed)
-        self._stamp_ns, self._twist = scan.stamp_ns, difference(IDENTITY, step) / seconds
+        self._stamp_ns, self.twist = scan.stamp_ns, difference(IDENTITY, step) / seconds
         return ScanStep(scan.stamp_ns, estimate.T, step, covariance, surface, believed)
 
     def _registered(self, surface: Surface, guess: RigidTransform) -> PoseEstimate | None:
@@ -187,3 +191,12 @@ class _Follower:
         self._last = placed
         if far or turned or not believed:
             self._key = self._last = replace(placed, covariance=np.zeros((6, 6)))
+
+
+def _first_twist(first: Scan, second: Scan | None, options: OdometryOptions) -> FloatArray:
+    """Return how the lidar moves at first, shape (6,): motion distorts both scans alike."""
+    if second is None or first.time_s is None:
+        return np.zeros(6)
+    trial = _Follower(first, np.zeros(6), options)
+    trial.add(second)
+    return trial.twist

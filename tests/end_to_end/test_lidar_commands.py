@@ -112,14 +112,11 @@ def test_poses_of_a_drive_come_from_its_clouds(hall: Scanned) -> None:
     saved, config = SavedMap.read(hall.map), load_config(hall.config)
     found = read_drive_on(saved, hall.drive, config, lambda stage, share: None)
     assert "poses are those of its point clouds" in found.note
-    trajectory, true = found.trajectory, hall.scenario.calibration.truth()
+    trajectory = found.trajectory
     assert trajectory.frame == "map"
-    seconds = (trajectory.stamp_ns - true.stamp_ns[0]) * 1e-9
-    known = (true.stamp_ns - true.stamp_ns[0]) * 1e-9
-    p = np.column_stack([np.interp(seconds, known, axis) for axis in true.p.T])
-    error = np.einsum("nji,nj->ni", trajectory.R, p - trajectory.p)
-    # Range noise of 10 mm over 1,500 points; 3 mm noise of the mapping poses, smoothed; a third of
-    # a millimetre of bends between true poses.
+    true = hall.scenario.calibration.motion.at(trajectory.stamp_ns)
+    error = np.einsum("nji,nj->ni", trajectory.R, true.p - trajectory.p)
+    # Range noise of 10 mm over 1,500 points; 3 mm noise of the mapping poses, smoothed.
     assert np.sqrt(np.mean(error**2)) < 0.003
     assert trajectory.covariance is not None
     variance = np.diagonal(trajectory.covariance, axis1=1, axis2=2)[:, 3:]

@@ -17,7 +17,7 @@ from l2m_gtsam.lidar.rigid import between, difference, perturbed
 from l2m_gtsam.lidar.search import SearchOptions, find_start
 from l2m_gtsam.lidar.surface import Surface, smoothed
 from l2m_gtsam.storage.cloud import thinned_cloud
-from tests.lidar_rooms import ROOM, Room, round_trip, rows, scans
+from tests.lidar_rooms import ROOM, Room, round_trip, rows, scans, straight, swept
 
 MAPPING = rows(round_trip(130), range(0, 130, 8))
 DRIVE = rows(round_trip(150), range(1, 150, 4))  # once around the circle of 9.4 m and on
@@ -92,6 +92,16 @@ def test_scans_of_another_room_are_counted_and_left_out(
     kept = [k for k in range(len(DRIVE)) if not 5 <= k < 8]
     np.testing.assert_array_equal(found.trajectory.stamp_ns, DRIVE.stamp_ns[kept])
     np.testing.assert_allclose(found.trajectory.p, DRIVE.p[kept], rtol=0, atol=2e-3)
+
+
+def test_swept_scans_are_where_they_were_at_their_stamps(cloud: Surface) -> None:
+    """At 1 m/s a turn of 0.1 s would move them by 5 cm."""
+    true, twist = straight(6, speed=1.0), np.array([0, 0, 0, 1.0, 0, 0])
+    steps = follow(swept(ROOM, true, twist, 0.1), OdometryOptions())
+    found = localise_scans(steps, cloud, pose(true, 0), OPTIONS)
+    error = np.linalg.norm(found.trajectory.p - true.p, axis=1)
+    # The speed is that of the step before, wrong by centimetres per second.
+    assert np.all(error < 0.006)
 
 
 def test_no_scans() -> None:

@@ -1,17 +1,15 @@
 """Odometry from scans: a drive around a room, a corridor, swept and missing scans."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, accumulated, follow, odometry
 from l2m_gtsam.lidar.rigid import between, difference
 from l2m_gtsam.scans import Scan, taken_at_once
-from tests.lidar_rooms import CORRIDOR, ROOM, Room, directions, round_trip, rows, scans, straight
+from tests.lidar_rooms import CORRIDOR, ROOM, Room, round_trip, rows, scans, straight, swept
 
 OPTIONS = OdometryOptions()
 EMPTY = Room(ROOM.walls)
@@ -79,24 +77,11 @@ def test_in_a_corridor_the_covariance_opens_along_it() -> None:
     assert abs(last[2]) < np.deg2rad(0.1)
 
 
-def swept(trajectory: Trajectory, twist: FloatArray, seconds: float) -> Iterable[Scan]:
-    """Scans whose columns are measured one after the other, from a lidar of constant twist."""
-    rays = directions(columns=180)
-    turn = np.tile(np.arange(180) / 180 * seconds, 32)
-    for k, stamp in enumerate(trajectory.stamp_ns):
-        R, p = trajectory.R[k], trajectory.p[k]
-        R_ray = R @ Rotation.from_rotvec(turn[:, None] * twist[:3]).as_matrix()
-        p_ray = p + turn[:, None] * (R @ twist[3:])
-        world = np.einsum("nij,nj->ni", R_ray, rays)
-        far = np.array([EMPTY.distances(o, w[None])[0] for o, w in zip(p_ray, world, strict=True)])
-        yield Scan(int(stamp), rays * far[:, None], turn)
-
-
 def test_a_swept_scan_is_brought_to_its_stamp() -> None:
     """Against a snapshot: every point lies on a wall of the room again."""
     twist = np.array([0.0, 0.0, 0.8, 1.5, 0.0, 0.0])
     one = rows(round_trip(2), [0])
-    (scan,) = swept(one, twist, 0.1)
+    (scan,) = swept(EMPTY, one, twist, 0.1)
     still = taken_at_once(scan, twist) @ one.R[0].T + one.p[0]
     raw = scan.points @ one.R[0].T + one.p[0]
     low, high = np.array(ROOM.walls)
