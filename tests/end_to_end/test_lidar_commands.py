@@ -1,7 +1,7 @@
 """A mapping bag with point clouds, and a drive that has no poses but those of its clouds."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +9,13 @@ import pytest
 from rosbags.rosbag1 import Reader, Writer
 
 from l2m_gtsam.batch.opening import SavedMap
-from l2m_gtsam.batch.scan_poses import read_drive_on
+from l2m_gtsam.batch.scan_poses import read_drive_on, read_drive_or_follow
 from l2m_gtsam.batch.simulation import simulate_bags
-from l2m_gtsam.config import load_config
+from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
 from l2m_gtsam.storage.calibration_file import read_calibration
-from l2m_gtsam.storage.map_file import load_map
+from l2m_gtsam.storage.map_file import load_map, save_map
 from tests.end_to_end.conftest import complaint, l2m
 from tests.quick_maps import QUICK_HARMONIC
 
@@ -34,7 +34,7 @@ HALL = {
     "mapping_sampling": {"field_rate": 5.0},
     "calibration_sampling": {"field_rate": 4.0},
     "calibration_route": {"turns": 1},
-    "lidar": {"rate": 4.0, "columns": 120},
+    "lidar": {"rate": 2.5, "columns": 120},
 }
 PRIOR = {"floor_scale": 4.0, "floor_depth": 0.6, "noise": 0.1}
 
@@ -63,8 +63,8 @@ class Scanned:
     scenario: Scenario
 
 
-def without(topic: str, bag: Path, out: Path) -> Path:
-    """Copy a ROS1 bag without one of its topics."""
+def without(topic: str, bag: Path, out: Path, seconds: float = np.inf) -> Path:
+    """Copy a ROS1 bag, or the begin of it, without one of its topics."""
     with Reader(bag) as reader, Writer(out) as writer:
         kept = [c for c in reader.connections if c.topic != topic]
         assert len(kept) < len(reader.connections)
@@ -73,6 +73,8 @@ def without(topic: str, bag: Path, out: Path) -> Path:
             for c in kept
         }
         for connection, stamp, raw in reader.messages(kept):
+            if stamp - reader.start_time > 1e9 * seconds:
+                break
             writer.write(new[connection.id], stamp, raw)
     return out
 
@@ -89,7 +91,7 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
     common = {"mapping": mapping, "calibration": {"solve": solve}}
     config, nowhere = folder / "config.yaml", folder / "nowhere.yaml"
     config.write_text(json.dumps(common | {"lidar": {"start": {"position": begin.tolist()}}}))
-    nowhere.write_text(json.dumps(common))
+    nowhere.write_text(json.dumps(common | {"lidar": {"search": {"tried": 8}}}))
     path, bag = folder / "map.npz", folder / "mapping_ros1.bag"
     suite = ("--suite", folder / "suite.yaml")
     l2m("map", "build", bag, *suite, "--lidar", "--config", config, "--out", path)
@@ -121,6 +123,23 @@ def test_poses_of_a_drive_come_from_its_clouds(hall: Scanned) -> None:
     assert trajectory.covariance is not None
     variance = np.diagonal(trajectory.covariance, axis1=1, axis2=2)[:, 3:]
     assert np.mean(error**2 / variance) < 1.5
+
+
+def test_where_there_is_no_map_clouds_give_odometry(hall: Scanned, tmp_path: Path) -> None:
+    begin = without(
+        "/odometry", hall.drive.parent / "calibration_ros1.bag", tmp_path / "b.bag", 6.0
+    )
+    found = read_drive_or_follow(begin, Config(), lambda stage, share: None)
+    assert "odometry by its point clouds" in found.note
+    assert (found.trajectory.frame, len(found.series)) == ("odom", 1)
+    true = hall.scenario.calibration.motion.at(found.trajectory.stamp_ns)
+    way = np.einsum("ji,nj->ni", true.R[0], true.p - true.p[0])
+    assert np.linalg.norm(way[-1]) > 1.0
+    # Scans of 1,500 points, some of them 1 m from their key scan: a centimetre.
+    assert np.linalg.norm(found.trajectory.p - way, axis=1).max() < 0.015
+    told = l2m("inspect", begin).out
+    assert "poses where there are no others" in told
+    assert "gives poses to its point clouds" in told
 
 
 def test_a_bag_without_odometry_is_calibrated(hall: Scanned, tmp_path: Path) -> None:
@@ -157,8 +176,7 @@ def test_a_hall_that_looks_the_same_from_both_ends(hall: Scanned, tmp_path: Path
 
 def test_a_map_without_a_cloud_is_told(hall: Scanned, tmp_path: Path) -> None:
     plain = tmp_path / "plain.npz"
-    suite = ("--suite", hall.mapping.parent / "suite.yaml")
-    l2m("map", "build", hall.mapping, *suite, "--config", hall.config, "--out", plain)
+    save_map(plain, replace(load_map(hall.map), lidar=None))
     told = complaint(
         "calibrate", hall.drive, "--map", plain, "--config", hall.config, "--out", tmp_path / "x"
     )
