@@ -16,7 +16,7 @@ from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.map_file import load_map, save_map
-from tests.end_to_end.conftest import complaint, l2m
+from tests.end_to_end.conftest import complaint_here, l2m
 from tests.quick_maps import QUICK_HARMONIC
 
 # The tutorial's hall with a lidar of few columns, which a driver has freed of motion.
@@ -159,7 +159,7 @@ def test_a_bag_without_odometry_is_calibrated(hall: Scanned, tmp_path: Path) -> 
 
 def test_a_hall_that_looks_the_same_from_both_ends(hall: Scanned, tmp_path: Path) -> None:
     """Without a start it is looked for, and found twice."""
-    told = complaint(
+    told = complaint_here(
         "calibrate",
         hall.drive,
         "--map",
@@ -177,7 +177,7 @@ def test_a_hall_that_looks_the_same_from_both_ends(hall: Scanned, tmp_path: Path
 def test_a_map_without_a_cloud_is_told(hall: Scanned, tmp_path: Path) -> None:
     plain = tmp_path / "plain.npz"
     save_map(plain, replace(load_map(hall.map), lidar=None))
-    told = complaint(
+    told = complaint_here(
         "calibrate", hall.drive, "--map", plain, "--config", hall.config, "--out", tmp_path / "x"
     )
     assert "`l2m map build --lidar`" in told
@@ -185,6 +185,6 @@ def test_a_map_without_a_cloud_is_told(hall: Scanned, tmp_path: Path) -> None:
 
 def test_a_mapping_bag_without_clouds_is_told(hall: Scanned, tmp_path: Path) -> None:
     bare = without("/points", hall.mapping, tmp_path / "bare.bag")
-    told = complaint("map", "build", bare, "--lidar", "--out", tmp_path / "map.npz")
+    told = complaint_here("map", "build", bare, "--lidar", "--out", tmp_path / "map.npz")
     assert "no topic of type sensor_msgs/msg/PointCloud2" in told
     assert not (tmp_path / "map.npz").exists()
