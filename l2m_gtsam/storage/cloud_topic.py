@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -127,12 +127,10 @@ class _MergedScans:
         if pose is None:
             return
         try:
-            seen = Scan(stamp_ns, points_of(scan), times_of(scan, stamp_ns))
-            twist = self._twist(seen, pose)
-            if twist is None:
+            points = self._points(scan, stamp_ns, pose)
+            if points is None:
                 return
             self._placed += 1
-            points = _in_range(taken_at_once(seen, twist), self._options)
             self._cells.add(located(points @ pose.R.T + pose.t, self._where))
         except ValueError as error:
             raise BagError(f"{self._where}: {error}") from error
@@ -156,6 +154,12 @@ class _MergedScans:
                 f"and {self._options.max_range:g} m from the lidar; are its points in metres?"
             )
         return TopicCloud(points, self._scans, self._scans - self._placed)
+
+    def _points(self, message: Any, stamp_ns: int, pose: RigidTransform) -> FloatArray | None:
+        """Return a scan's points as they were at its stamp; nothing where its end has no pose."""
+        scan = Scan(stamp_ns, points_of(message), times_of(message, stamp_ns))
+        twist = self._twist(scan, pose)
+        return None if twist is None else _in_range(taken_at_once(scan, twist), self._options)
 
     def _pose_at(self, stamp_ns: int) -> RigidTransform | None:
         return _pose_at(self._trajectory, stamp_ns, self._options.max_pose_gap_s)
