@@ -264,6 +264,14 @@ def map_build(
     config: ConfigOption = None,
     suite: SuiteOption = None,
     structure: StructureOption = None,
+    lidar: Annotated[
+        bool,
+        typer.Option(
+            "--lidar",
+            help="Save the cloud of the bags' scans with the map, to localise drives on that have "
+            "point clouds and no poses.",
+        ),
+    ] = False,
 ) -> None:
     """Build a map from one or several bags of a calibrated mapping suite."""
     from l2m_gtsam.batch.maps import build_map_file
@@ -271,7 +279,7 @@ def map_build(
     from l2m_gtsam.qa.tables import map_table
 
     with shown_progress() as progress:
-        built = build_map_file(bags, out, load_config(config), suite, progress, structure)
+        built = build_map_file(bags, out, load_config(config), suite, progress, structure, lidar)
     print_table(map_table(built.description))
     warn(built.description.summary.doubts)
     typer.echo(f"written: {out}")
@@ -374,6 +382,8 @@ def _print_calibration(result: "CalibrationResult", models: bool) -> None:
     from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
     print_table(calibration_table(result))
+    for note in result.notes:
+        typer.echo(note)
     typer.echo(UNCERTAINTY[result.uncertainty])
     warn(result.doubts)
     warn(missing_note(result))

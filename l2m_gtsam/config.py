@@ -1,5 +1,6 @@
 """One configuration composed of the options beside each algorithm, read from YAML."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
@@ -10,6 +11,10 @@ from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.graph.prior_options import PriorOptions
 from l2m_gtsam.graph.slam.options import SlamOptions
+from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, ScanStartOptions
+from l2m_gtsam.lidar.loops import LoopOptions
+from l2m_gtsam.lidar.odometry import OdometryOptions
+from l2m_gtsam.lidar.search import SearchOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
 from l2m_gtsam.motion import MotionOptions
@@ -21,6 +26,7 @@ from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.model_comparison import ModelOptions
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
+from l2m_gtsam.storage.scan_topic import ScanOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
 from l2m_gtsam.sync import SyncOptions
 
@@ -36,6 +42,8 @@ class MappingOptions(Options):
     """The kind of map and its options."""
     structure: CloudTopicOptions = CloudTopicOptions(edge=0.05)
     """How a structure cloud is read: from a file, which is in the map frame, only `edge` counts."""
+    lidar: CloudTopicOptions = CloudTopicOptions(edge=0.1, max_range=30.0)
+    """How scans become the cloud that is saved with the map; their topic is `lidar.topic`."""
     compare: CompareOptions = CompareOptions()
     """How `l2m map compare` holds readings out."""
 
@@ -58,6 +66,36 @@ class CalibrationOptions(Options):
     """How models of each sensor are compared after the solve."""
     regressors: ResampleOptions = ResampleOptions()
     """How the numbers of `bag.regressors` get to the times of the readings."""
+
+
+class PoseSource(StrEnum):
+    """Where the poses of a drive in a map come from."""
+
+    AUTO = "auto"
+    CLOUDS = "clouds"
+
+
+class LidarOptions(Options):
+    """How poses come from point clouds."""
+
+    poses: PoseSource = PoseSource.AUTO
+    """`auto`: from the clouds where a bag has no poses of its own, and the map has a cloud; or
+    `clouds`: from the clouds, whatever else there is."""
+    topic: str | None = None
+    """Topic of type sensor_msgs/PointCloud2; if not given, the only one of the bag. Scans are in
+    the frame of the lidar."""
+    scan: ScanOptions = ScanOptions()
+    """What is taken of each scan."""
+    odometry: OdometryOptions = OdometryOptions()
+    """How the lidar is followed from scan to scan."""
+    start: ScanStartOptions | None = None
+    """Where the drive begins in the map; looked for along the mapping drives if it is not given."""
+    search: SearchOptions = SearchOptions()
+    """How it is looked for."""
+    localisation: ScanLocalisationOptions = ScanLocalisationOptions()
+    """How scans are localised on the map's cloud."""
+    loops: LoopOptions = LoopOptions()
+    """How places are recognised that a drive returns to."""
 
 
 class PlanOptions(Options):
@@ -84,6 +122,8 @@ class Config(Options):
     """`l2m calibrate`, and `l2m plan` before it."""
     plan: PlanOptions = PlanOptions()
     """`l2m plan`."""
+    lidar: LidarOptions = LidarOptions()
+    """Poses from point clouds."""
     slam: SlamOptions = SlamOptions()
     """`l2m slam`."""
     qa: QaOptions = QaOptions()

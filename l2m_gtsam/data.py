@@ -151,6 +151,8 @@ class Recording:
         What it was joined from, each in its own time, in order of time; empty for one drive.
     moved_ns
         What was added to the stamps of each drive so that none overlaps another, nanoseconds.
+    note
+        Where its poses come from, if the bag has none: a sentence.
     """
 
     trajectory: Trajectory
@@ -159,6 +161,7 @@ class Recording:
     scalars: tuple[ScalarSeries, ...] = ()
     drives: tuple["Recording", ...] = ()
     moved_ns: tuple[int, ...] = ()
+    note: str = ""
 
     @property
     def parts(self) -> tuple["Recording", ...]:
@@ -304,6 +307,24 @@ class FieldSample:
 
 
 @dataclass(frozen=True)
+class LidarMap:
+    """What a lidar saw of a mapped place, and where it was then.
+
+    Attributes
+    ----------
+    points
+        In the map frame in metres, shape (N, 3).
+    R, p
+        Rotations (K, 3, 3) and positions (K, 3) in metres of the lidar in the map, along the
+        mapping drives, the first of them first.
+    """
+
+    points: FloatArray
+    R: FloatArray
+    p: FloatArray
+
+
+@dataclass(frozen=True)
 class MapState:
     """A map as plain arrays and facts: what a map file holds.
 
@@ -317,12 +338,15 @@ class MapState:
         Effective options, plain values.
     provenance
         Sources, dates, versions: plain values.
+    lidar
+        What a lidar saw of the place, if that was saved with it.
     """
 
     kind: str
     arrays: dict[str, npt.NDArray[Any]]
     options: dict[str, Any]
     provenance: dict[str, Any]
+    lidar: LidarMap | None = None
 
 
 @dataclass(frozen=True)

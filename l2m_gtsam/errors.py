@@ -43,3 +43,7 @@ class ClusterError(L2MError):
 
 class PeerError(L2MError):
     """A peer of a study that is not installed, or that cannot be run on what it is given."""
+
+
+class LidarError(L2MError):
+    """Poses that cannot be had from point clouds."""

@@ -274,6 +274,8 @@ class CalibrationResult:
         Versions of the packages that computed it.
     bags
         The drives that were calibrated together, in order of time; empty for a single one.
+    notes
+        What is worth knowing of the drives, a sentence each.
     """
 
     sensors: tuple[SensorCalibration, ...]
@@ -286,6 +288,7 @@ class CalibrationResult:
     options: dict[str, Any]
     versions: dict[str, str]
     bags: tuple[SourceFile, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

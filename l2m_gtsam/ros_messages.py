@@ -28,7 +28,7 @@ class Dialect:
     store: Typestore
     serialize: Callable[[object, str], bytes | memoryview]
 
-    def make(self, name: str, **fields: Any) -> Any:
+    def make(self, name: str, /, **fields: Any) -> Any:
         """Return a message of this type."""
         return self.store.types[name](**fields)
 
@@ -43,6 +43,14 @@ class Dialect:
     def vector(self, values: FloatArray) -> Any:
         """Return a vector of three values."""
         return self.make("geometry_msgs/msg/Vector3", **named("xyz", values))
+
+    def pose(self, p: FloatArray, quaternion: FloatArray) -> Any:
+        """Return a pose; the quaternion is x, y, z, w."""
+        return self.make(
+            "geometry_msgs/msg/Pose",
+            position=self.make("geometry_msgs/msg/Point", **named("xyz", p)),
+            orientation=self.quaternion(quaternion),
+        )
 
     def quaternion(self, values: FloatArray) -> Any:
         """Return a rotation from x, y, z, w."""
@@ -93,11 +101,7 @@ def odometry_channel(
     velocity = np.zeros((len(trajectory), 6)) if twist is None else twist
 
     def message(k: int) -> Any:
-        pose = dialect.make(
-            "geometry_msgs/msg/Pose",
-            position=dialect.make("geometry_msgs/msg/Point", **named("xyz", trajectory.p[k])),
-            orientation=dialect.quaternion(quaternions[k]),
-        )
+        pose = dialect.pose(trajectory.p[k], quaternions[k])
         return dialect.make(
             ODOMETRY,
             header=dialect.header(k, stamps[k], trajectory.frame),

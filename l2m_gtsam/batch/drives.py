@@ -5,8 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from l2m_gtsam.appraise import appraise, scene_of
-from l2m_gtsam.batch.opening import OpenMap, SavedMap, check_bags, read_drive, read_drives
+from l2m_gtsam.batch.opening import OpenMap, SavedMap, check_bags, read_drive
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.batch.scan_poses import read_drives_on
 from l2m_gtsam.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording
@@ -85,7 +86,7 @@ def calibrate_bags(
         require_rerun(view)
         check_outputs(view)
     saved = SavedMap.read(map_path)
-    recording = read_drives(bags, config, progress)
+    recording = read_drives_on(saved, bags, config, progress)
     field_map, source = saved.open(progress, recording.parts), source_file(map_path)
     opened = OpenMap(field_map, source)
     return calibrate_drive(recording, opened, config, out, progress, truth, view)

@@ -13,9 +13,10 @@ from l2m_gtsam.batch.drives import (
     calibrate_drive,
 )
 from l2m_gtsam.batch.fleet_drives import FleetDrive
-from l2m_gtsam.batch.opening import OpenMap, SavedMap, read_drive_and_numbers
+from l2m_gtsam.batch.opening import OpenMap, SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
+from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import L2MError, OutputError
@@ -128,7 +129,7 @@ def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
 
 
 def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float) -> DriveOutcome:
-    recording = read_drive_and_numbers(task.drive.bag, task.config, _quiet)
+    recording = read_drive_on(saved, task.drive.bag, task.config, _quiet)
     saved.check_frame(recording)
     result = calibrate_drive(recording, opened, task.config, task.out, _quiet)
     verdict = report_folder(task.out, None)

@@ -8,9 +8,9 @@ from typing import Any
 
 from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
-from l2m_gtsam.batch.survey import read_survey
+from l2m_gtsam.batch.survey import read_survey, scanned_place
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import Recording
+from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping import compare_recordings, map_recordings, update_map
 from l2m_gtsam.maps.build import refuse_structure
@@ -38,6 +38,7 @@ def build_map_file(
     suite: Path | None,
     progress: Progress,
     structure: str | None = None,
+    lidar: bool = False,
 ) -> BuiltMap:
     """Build a map from mapping bags and write it.
 
@@ -56,6 +57,8 @@ def build_map_file(
     structure
         What a LiDAR saw: a `.pcd`, `.ply` or `.npz` file in the map frame, else the name of a
         PointCloud2 topic of the bags.
+    lidar
+        Whether the cloud of the bags' scans is saved with it.
 
     Raises
     ------
@@ -66,6 +69,7 @@ def build_map_file(
     if structure is not None:
         refuse_structure(config.mapping.model.kind)
     survey = read_survey(bags, config, suite, structure, progress)
+    scanned = scanned_place(bags, survey.recordings, config, progress) if lidar else None
     progress("building the map", 0.0)
     field_map = map_recordings(survey.recordings, survey.suite, config.mapping, survey.cloud)
     progress("building the map", 1.0)
@@ -73,11 +77,12 @@ def build_map_file(
         "bags": [vars(recording.source) for recording in survey.recordings],
         "suite": None if suite is None else vars(source_file(suite)),
         "structure": None if survey.structure is None else survey.structure.provenance,
+        "lidar": None if scanned is None else scanned.provenance,
         "frame": survey.recordings[0].trajectory.frame,
         "config": config.model_dump(mode="json", include={"bag", "mapping"}),
         "version": version("l2m-gtsam"),
     }
-    return _save_map(out, field_map, provenance)
+    return _save_map(out, field_map, provenance, None if scanned is None else scanned.lidar)
 
 
 def update_map_file(
@@ -133,7 +138,7 @@ def update_map_file(
         "updates": [*saved.updates, update],
         "frame": survey.recordings[0].trajectory.frame,
     }
-    return _save_map(out, updated, provenance)
+    return _save_map(out, updated, provenance, saved.state.lidar)
 
 
 def compare_map_kinds(
@@ -177,10 +182,12 @@ def plot_map_file(path: Path, out: Path, height: float | None, progress: Progres
     save_figure(map_figure(field_map, height), out)
 
 
-def _save_map(out: Path, field_map: FieldMap, provenance: dict[str, Any]) -> BuiltMap:
+def _save_map(
+    out: Path, field_map: FieldMap, provenance: dict[str, Any], lidar: LidarMap | None
+) -> BuiltMap:
     """Write a map with where it came from, besides what it says of itself."""
     state = field_map.to_state()
-    state = replace(state, provenance={**state.provenance, **provenance})
+    state = replace(state, provenance={**state.provenance, **provenance}, lidar=lidar)
     ensure_folder(out.parent)
     save_map(out, state)
     return BuiltMap(field_map, MapDescription(field_map.summary, state.provenance))

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import MapState, Recording, SourceFile
+from l2m_gtsam.data import MapState, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import BagError, MapError
-from l2m_gtsam.joining import joined
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, counter
@@ -24,20 +23,14 @@ def read_drive(bag: Path, config: Config, progress: Progress) -> Recording:
 
 def read_drive_and_numbers(bag: Path, config: Config, progress: Progress) -> Recording:
     """Return what a bag recorded with the numbers that the configuration names."""
-    told = counter(f"reading numbers of {bag.name}", progress)
-    scalars = read_scalars(bag, config.bag.regressors, config.bag.stamps, told)
+    scalars = read_numbers(bag, config, progress)
     return replace(read_drive(bag, config, progress), scalars=scalars)
 
 
-def read_drives(bags: Sequence[Path], config: Config, progress: Progress) -> Recording:
-    """Return what one bag or several recorded, with numbers, as one recording.
-
-    Raises
-    ------
-    CalibrationError
-        Bags do not go together.
-    """
-    return joined([read_drive_and_numbers(bag, config, progress) for bag in bags])
+def read_numbers(bag: Path, config: Config, progress: Progress) -> tuple[ScalarSeries, ...]:
+    """Return the numbers of a bag that the configuration names."""
+    told = counter(f"reading numbers of {bag.name}", progress)
+    return read_scalars(bag, config.bag.regressors, config.bag.stamps, told)
 
 
 def check_bags(bags: Sequence[Path]) -> None:

@@ -5,12 +5,14 @@ from pathlib import Path
 
 from l2m_gtsam.batch.outputs import ensure_folder
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, write_bag
+from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, Beside, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.cloud import write_cloud
 from l2m_gtsam.storage.known_sensors import write_known_sensors
+from l2m_gtsam.storage.tum import write_tum
 
 SUITE_FILE, TRUTH_FILE, STRUCTURE_FILE = "suite.yaml", "truth.yaml", "structure.ply"
+GROUND_TRUTH_FILE = "ground_truth.tum"
 
 
 def simulate_bags(
@@ -22,7 +24,8 @@ def simulate_bags(
     ----------
     out
         Folder for `mapping_*` and `calibration_*` bags, `suite.yaml`, `truth.yaml` and
-        `structure.ply`, what a LiDAR sees of the steel.
+        `structure.ply`, what a LiDAR sees of the steel; where odometry drifts, `ground_truth.tum`
+        of the calibration drive, too.
     options
         The world and the drives.
     kinds
@@ -32,12 +35,10 @@ def simulate_bags(
     """
     scenario = simulate(options, progress)
     ensure_folder(out)
-    for index, kind in enumerate(kinds):
-        progress("writing bags", index / len(kinds))
-        for name, drive in (("mapping", scenario.mapping), ("calibration", scenario.calibration)):
-            path = out / bag_name(name, kind)
-            write_bag(path, kind, drive.recording, BagOptions(noise=options.noise))
-    progress("writing bags", 1.0)
+    _write_bags(out, scenario, kinds, progress)
+    (out / GROUND_TRUTH_FILE).unlink(missing_ok=True)  # of an earlier run with drift
+    if options.odometry is not None:
+        write_tum(out / GROUND_TRUTH_FILE, scenario.calibration.truth())
     write_cloud(out / STRUCTURE_FILE, scenario.cloud)
     facts = {"simulation": options.model_dump(mode="json")}
     write_known_sensors(
@@ -53,6 +54,26 @@ def simulate_bags(
         "The true positions and distortions of the sensors in the calibration drive.",
     )
     return scenario
+
+
+def _write_bags(
+    out: Path, scenario: Scenario, kinds: Sequence[BagKind], progress: Progress
+) -> None:
+    """Write both drives as bags of every kind."""
+    options = BagOptions(noise=scenario.options.noise)
+    mapping, calibration = scenario.mapping, scenario.calibration
+    truth = None if scenario.options.odometry is None else calibration.truth()
+    drives = {
+        "mapping": (mapping.recording, Beside(mapping.scans)),
+        "calibration": (calibration.recording, Beside(calibration.scans, truth)),
+    }
+    written = 0
+    for kind in kinds:
+        for name, (recording, beside) in drives.items():
+            progress("writing bags", written / (len(kinds) * len(drives)))
+            write_bag(out / bag_name(name, kind), kind, recording, options, beside)
+            written += 1
+    progress("writing bags", 1.0)
 
 
 def bag_name(drive: str, kind: BagKind) -> str:

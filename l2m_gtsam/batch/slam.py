@@ -4,9 +4,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from l2m_gtsam.batch.drives import METRICS_FILE
-from l2m_gtsam.batch.opening import SavedMap, read_drive
+from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.reports import REPORT_FILE
+from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.batch.slam_report import SLAM_FILE, write_slam_report
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
@@ -100,7 +101,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     if (out / REFINED_FILE).exists() and given.calibration.samefile(out / REFINED_FILE):
         raise OutputError(f"{given.calibration}: is what is read; choose another --out")
     truth = None if given.truth is None else read_tum(given.truth)
-    recording = read_drive(given.bag, config, progress)
+    recording = read_drive_or_follow(given.bag, config, progress)
     gap = config.slam.max_pose_gap_s
     if truth is not None:
         check_truth(truth, recording.trajectory, gap, str(given.truth))

@@ -7,14 +7,30 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.batch.opening import read_drive
+from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import FloatArray, KnownSensor, Recording
+from l2m_gtsam.data import (
+    FloatArray,
+    IntArray,
+    KnownSensor,
+    LidarMap,
+    Recording,
+    Trajectory,
+)
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.lidar.surface import smoothed
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.storage.cloud import read_cloud
-from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
+from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
+from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.known_sensors import read_known_sensors
+from l2m_gtsam.storage.scan_topic import cloud_topic
+
+# What a map file takes: 120 MB.
+MAX_LIDAR_POINTS = 5_000_000
+# Poses of the mapping drives that are kept: where the start of another drive is looked for.
+PLACES_M = 2.0
+MAX_PLACES = 1000
 
 
 @dataclass(frozen=True)
@@ -22,6 +38,14 @@ class Structure:
     """A structure cloud in the map frame in metres, shape (M, 3), and where it came from."""
 
     points: FloatArray
+    provenance: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ScannedPlace:
+    """What scans are localised on, and where it came from."""
+
+    lidar: LidarMap
     provenance: dict[str, Any]
 
 
@@ -61,7 +85,7 @@ def read_survey(
     options = config.mapping.structure
     is_file = structure is not None and _names_file(structure)
     cloud = _structure_file(Path(structure or ""), options) if is_file else None
-    recordings = [read_drive(bag, config, progress) for bag in bags]
+    recordings = [read_drive_or_follow(bag, config, progress) for bag in bags]
     if structure is not None and not is_file:
         cloud = _structure_topic(structure, bags, recordings, config, progress)
     return Survey(recordings, known, cloud)
@@ -84,20 +108,81 @@ def _structure_topic(
     progress: Progress,
 ) -> Structure:
     """Return what the scans of all bags saw, placed by their poses."""
-    clouds = [
+    topics = [topic] * len(bags)
+    clouds = _clouds(topics, bags, recordings, config.mapping.structure, config, progress)
+    points = np.concatenate([cloud.points for cloud in clouds])
+    return Structure(points, {"topic": topic, **_counts(clouds)})
+
+
+def scanned_place(
+    bags: Sequence[Path], recordings: Sequence[Recording], config: Config, progress: Progress
+) -> ScannedPlace:
+    """Return what the scans of mapping bags saw, to localise other scans on.
+
+    Raises
+    ------
+    BagError
+        A bag has no usable clouds.
+    MapError
+        The cloud would be too large.
+    """
+    options = config.mapping.lidar
+    topics = [cloud_topic(bag, config.lidar.topic) for bag in bags]
+    clouds = _clouds(topics, bags, recordings, options, config, progress)
+    points = thinned_cloud(np.concatenate([cloud.points for cloud in clouds]), options.edge)
+    if len(points) > MAX_LIDAR_POINTS:
+        raise MapError(
+            f"the cloud has {len(points):,} points, a map takes {MAX_LIDAR_POINTS:,} at most; "
+            "choose a larger `mapping.lidar.edge` or a smaller `mapping.lidar.max_range`"
+        )
+    points = smoothed(points)
+    R, p = _along([each.trajectory for each in recordings])
+    notes = [each.note for each in recordings if each.note]
+    provenance = {"topics": topics, "points": len(points), "edge": options.edge, **_counts(clouds)}
+    provenance |= {"notes": notes} if notes else {}
+    return ScannedPlace(LidarMap(points, R, p), provenance)
+
+
+def _clouds(
+    topics: Sequence[str],
+    bags: Sequence[Path],
+    recordings: Sequence[Recording],
+    options: CloudTopicOptions,
+    config: Config,
+    progress: Progress,
+) -> list[TopicCloud]:
+    """Return what the scans of each bag saw, placed by its poses."""
+    return [
         read_cloud_topic(
             bag,
             topic,
             recording.trajectory,
-            config.mapping.structure,
+            options,
             config.bag.stamps,
             counter(f"reading {topic} of {bag.name}", progress),
         )
-        for bag, recording in zip(bags, recordings, strict=True)
+        for topic, bag, recording in zip(topics, bags, recordings, strict=True)
     ]
-    provenance = {
-        "topic": topic,
+
+
+def _counts(clouds: Sequence[TopicCloud]) -> dict[str, int]:
+    return {
         "scans": sum(cloud.scans for cloud in clouds),
         "scans_without_pose": sum(cloud.without_pose for cloud in clouds),
     }
-    return Structure(np.concatenate([cloud.points for cloud in clouds]), provenance)
+
+
+def _along(trajectories: Sequence[Trajectory]) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (K, 3, 3) and positions (K, 3) of drives, some way apart."""
+    rows = [_spaced(each.p) for each in trajectories]
+    R = np.concatenate([each.R[row] for each, row in zip(trajectories, rows, strict=True)])
+    p = np.concatenate([each.p[row] for each, row in zip(trajectories, rows, strict=True)])
+    step = -(-len(p) // MAX_PLACES)
+    return R[::step], p[::step]
+
+
+def _spaced(p: FloatArray) -> IntArray:
+    """Return the rows of positions, shape (N, 3), after each `PLACES_M` of way."""
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    _, rows = np.unique(np.floor(way / PLACES_M), return_index=True)
+    return np.asarray(rows)

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from l2m_gtsam.batch.corrections import saved_options
-from l2m_gtsam.batch.opening import SavedMap, read_drive_and_numbers
+from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.calibrate import VERSIONED
 from l2m_gtsam.config import CalibrationOptions, Config, load_config
 from l2m_gtsam.data import SourceFile
@@ -186,7 +187,7 @@ def _tested(
     bag: Path, map_path: Path, new: CalibrationResult, config: Config, progress: Progress
 ) -> DriveValidation:
     saved = SavedMap.read(map_path)
-    recording = read_drive_and_numbers(bag, config, progress)
+    recording = read_drive_on(saved, bag, config, progress)
     field_map = saved.open(progress, [recording])
     source, chance = source_file(map_path), config.qa.validation.chance
     return validate(recording, field_map, new, config.calibration, chance, source, progress)

@@ -154,9 +154,10 @@ def map_table(description: MapDescription) -> Table:
         table.add_row(name, escape(str(description.provenance.get(name, "unknown"))))
     for source in _bags(description.provenance):
         table.add_row("made from", escape(", ".join(str(value) for value in source.values())))
-    if isinstance(structure := description.provenance.get("structure"), dict):
-        facts = (f"{name.replace('_', ' ')} {value}" for name, value in structure.items())
-        table.add_row("structure", escape(", ".join(facts)))
+    for name, shown in (("structure", "structure"), ("lidar", "cloud of scans")):
+        if isinstance(parts := description.provenance.get(name), dict):
+            facts = (f"{part.replace('_', ' ')} {value}" for part, value in parts.items())
+            table.add_row(shown, escape(", ".join(facts)))
     return table
 
 

@@ -1,9 +1,10 @@
 """Simulated recordings as real bags."""
 
 import tempfile
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -11,22 +12,19 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 
-from l2m_gtsam.data import FieldSeries, IntArray, Recording
+from l2m_gtsam.data import IntArray, Recording, Trajectory
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.options import Options
 from l2m_gtsam.ros_messages import (
     NANOSECONDS,
     Channel,
-    Dialect,
     odometry_channel,
     ros1,
     ros2,
     write_channels,
 )
+from l2m_gtsam.simulate.messages import Scans, magnetic_field, point_clouds, poses
 from l2m_gtsam.simulate.sensors import NoiseOptions
-
-TESLA_PER_MICROTESLA = 1e-6
-MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
 
 
 class BagKind(StrEnum):
@@ -42,6 +40,10 @@ class BagOptions(Options):
 
     odometry_topic: str = "/odometry"
     """Topic of the poses."""
+    points_topic: str = "/points"
+    """Topic of the scans, if there are any."""
+    truth_topic: str = "/ground_truth"
+    """Topic of the true poses, if they are written."""
     latency: Annotated[float, Field(ge=0)] = 0.003
     """Least time from measurement to record in seconds."""
     latency_spread: Annotated[float, Field(ge=0)] = 0.001
@@ -53,8 +55,28 @@ class BagOptions(Options):
     """Seed of the latencies."""
 
 
+@dataclass(frozen=True)
+class Beside:
+    """What a bag may hold beside poses and readings.
+
+    Attributes
+    ----------
+    scans
+        Point clouds in the lidar frame, made one by one as they are written.
+    truth
+        True poses.
+    """
+
+    scans: Scans | None = None
+    truth: Trajectory | None = None
+
+
 def write_bag(
-    path: Path, kind: BagKind, recording: Recording, options: BagOptions | None = None
+    path: Path,
+    kind: BagKind,
+    recording: Recording,
+    options: BagOptions | None = None,
+    beside: Beside | None = None,
 ) -> None:
     """Write a recording as a bag: odometry, and one topic of readings in tesla per sensor.
 
@@ -72,6 +94,9 @@ def write_bag(
         Poses and readings.
     options
         What the bag says beside these.
+    beside
+        Scans and true poses. These are no odometry but ``PoseStamped``, so that a reader that looks
+        for poses by type takes those of the recording.
 
     Raises
     ------
@@ -88,7 +113,7 @@ def write_bag(
         # rosbag2 repeats the folder's name inside, so the name is right and its parent temporary.
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as parent:
             unfinished = Path(parent) / path.name
-            _write(unfinished, kind, recording, options or BagOptions())
+            _write(unfinished, kind, recording, options or BagOptions(), beside or Beside())
             if path.is_dir():  # a folder that is not empty cannot be renamed over
                 path.rename(Path(parent) / "replaced")
             unfinished.rename(path)
@@ -105,13 +130,22 @@ def _is_replaceable(path: Path, kind: BagKind) -> bool:
     return path.is_dir() and {entry.name for entry in path.iterdir()} == ours
 
 
-def _write(path: Path, kind: BagKind, recording: Recording, options: BagOptions) -> None:
+def _write(
+    path: Path, kind: BagKind, recording: Recording, options: BagOptions, beside: Beside
+) -> None:
     """Write all messages to a bag at this path."""
     dialect = ros1() if kind is BagKind.ROS1 else ros2()
+    noise = options.noise.field
     channels = [
         odometry_channel(dialect, options.odometry_topic, recording.trajectory),
-        *(_magnetic_field(dialect, series, options.noise) for series in recording.series),
+        *(magnetic_field(dialect, series, noise) for series in recording.series),
     ]
+    # Last, so that the latencies of the others do not depend on them.
+    if beside.scans is not None:
+        frame = recording.trajectory.child_frame
+        channels.append(point_clouds(dialect, beside.scans, frame, options.points_topic))
+    if beside.truth is not None:
+        channels.append(poses(dialect, beside.truth, options.truth_topic))
     with _writer(path, kind) as writer:
         write_channels(writer, dialect, channels, _record_ns(channels, options))
 
@@ -130,20 +164,3 @@ def _record_ns(channels: list[Channel], options: BagOptions) -> IntArray:
     stamps = np.concatenate([channel.stamp_ns for channel in channels])
     delay = options.latency + rng.exponential(options.latency_spread, len(stamps))
     return np.asarray(stamps + np.round(delay * NANOSECONDS).astype(np.int64))
-
-
-def _magnetic_field(dialect: Dialect, series: FieldSeries, noise: NoiseOptions) -> Channel:
-    """Return the readings of one sensor in tesla."""
-    field = series.field * TESLA_PER_MICROTESLA
-    stamps = series.stamp_ns.tolist()
-    covariance = np.eye(3).ravel() * (noise.field * TESLA_PER_MICROTESLA) ** 2
-
-    def message(index: int) -> Any:
-        return dialect.make(
-            MAGNETIC_FIELD,
-            header=dialect.header(index, stamps[index], series.frame),
-            magnetic_field=dialect.vector(field[index]),
-            magnetic_field_covariance=covariance,
-        )
-
-    return Channel(series.topic, MAGNETIC_FIELD, series.stamp_ns, message)

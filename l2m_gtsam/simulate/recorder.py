@@ -1,14 +1,15 @@
 """What a vehicle's sensors record while it drives."""
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.simulate.drive import Motion
+from l2m_gtsam.simulate.lidar import SimulatedScans
 from l2m_gtsam.simulate.sensors import (
     NANOSECONDS,
     NoiseOptions,
@@ -49,10 +50,21 @@ class Vehicle:
 
 @dataclass(frozen=True)
 class SimulatedDrive:
-    """One drive: what was recorded, and the true motion behind it."""
+    """One drive: what was recorded, the true motion behind it, and the scans if there are any."""
 
     recording: Recording
     motion: Motion
+    scans: SimulatedScans | None = None
+
+    def truth(self) -> Trajectory:
+        """Return the true poses of the lidar at the times of those that were recorded."""
+        return self.motion.at(self.recording.trajectory.stamp_ns)
+
+    def with_poses(self, trajectory: Trajectory) -> "SimulatedDrive":
+        """Return the drive with other poses recorded."""
+        recording = self.recording
+        source = replace(recording.source, sha256=_digest(trajectory, recording.series))
+        return replace(self, recording=replace(recording, trajectory=trajectory, source=source))
 
 
 def record(
@@ -108,7 +120,7 @@ def _record_sensor(
     return FieldSeries(sensor.sensor, f"/{sensor.sensor}", sensor.sensor, stamp_ns, field)
 
 
-def _digest(trajectory: Trajectory, series: list[FieldSeries]) -> str:
+def _digest(trajectory: Trajectory, series: Sequence[FieldSeries]) -> str:
     """Return the SHA-256 of all arrays of a recording."""
     digest = hashlib.sha256()
     for array in (trajectory.stamp_ns, trajectory.R, trajectory.p):

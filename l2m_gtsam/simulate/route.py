@@ -33,6 +33,7 @@ class RouteShape(StrEnum):
     SERPENTINE = "serpentine"
     SLALOM = "slalom"
     WANDER = "wander"
+    LOOP = "loop"
 
 
 class CalibrationRouteOptions(Options):
@@ -41,7 +42,8 @@ class CalibrationRouteOptions(Options):
     shape: RouteShape = RouteShape.CIRCLES
     """`circles` (round a block of racks, with circles in both cross aisles), `eight` (round two
     blocks, one way and then the other), `serpentine` (to and fro through neighbouring aisles),
-    `slalom` (round a block, weaving), or `wander` (from crossing to crossing at random)."""
+    `slalom` (round a block, weaving), `wander` (from crossing to crossing at random), or `loop`
+    (round all racks, along the outermost aisles)."""
     length: Annotated[float, Field(gt=0)] = 100.0
     """Of `wander`, in metres."""
     seed: Annotated[int, Field(ge=0)] = 1
@@ -52,7 +54,7 @@ class CalibrationRouteOptions(Options):
     turn_radius: Annotated[float, Field(gt=0)] = 0.8
     """Radius of the circles in metres."""
     laps: Annotated[int, Field(ge=1)] = 1
-    """How often the loop round a block of racks is driven."""
+    """How often the route is driven."""
 
 
 def mapping_route(options: MappingRouteOptions, plan: FloorPlan) -> FloatArray:
@@ -69,13 +71,13 @@ def mapping_route(options: MappingRouteOptions, plan: FloorPlan) -> FloatArray:
     -------
     Corner points in the map in metres, shape (M, 2).
     """
-    y = _lanes(options, plan.aisle_y, plan.aisle_width)
-    x = _lanes(options, plan.cross_x, plan.cross_width)
-    along = _serpentine(y, x[0], x[-1])
+    y = lanes_of(options, plan.aisle_y, plan.aisle_width)
+    x = lanes_of(options, plan.cross_x, plan.cross_width)
+    along = to_and_fro(y, x[0], x[-1])
     # The sweep along x ends on the outermost cross lane of one side: go on from there.
     if along[-1, 0] == x[-1]:
         x = x[::-1]
-    across = _serpentine(x, y[-1], y[0])[:, ::-1]
+    across = to_and_fro(x, y[-1], y[0])[:, ::-1]
     return np.concatenate([along, across])
 
 
@@ -132,7 +134,7 @@ def serpentine(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
     x_low, x_high = plan.cross_x[block : block + 2]
     first = max(0, min(row, len(plan.aisle_y) - SERPENTINE_AISLES))
     lanes = plan.aisle_y[first : first + SERPENTINE_AISLES]
-    return _serpentine(lanes, x_low, x_high)
+    return to_and_fro(lanes, x_low, x_high)
 
 
 def slalom(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
@@ -161,12 +163,19 @@ def wander(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
     return np.asarray(corners + rng.uniform(-ASIDE, ASIDE, corners.shape))
 
 
+def loop(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
+    """Return a route round all racks, along the outermost aisles."""
+    (x_low, x_high), (y_low, y_high) = plan.cross_x[[0, -1]], plan.aisle_y[[0, -1]]
+    return np.array([[x_low, y_low], [x_high, y_low], [x_high, y_high], [x_low, y_high]])
+
+
 SHAPES = {
     RouteShape.CIRCLES: circles,
     RouteShape.EIGHT: eight,
     RouteShape.SERPENTINE: serpentine,
     RouteShape.SLALOM: slalom,
     RouteShape.WANDER: wander,
+    RouteShape.LOOP: loop,
 }
 
 
@@ -192,14 +201,14 @@ def _woven(start: FloatArray, end: FloatArray) -> FloatArray:
     return start + share[:, None] * way + ASIDE * np.sin(2 * np.pi * waves * share)[:, None] * left
 
 
-def _lanes(options: MappingRouteOptions, centres: FloatArray, width: float) -> FloatArray:
+def lanes_of(options: MappingRouteOptions, centres: FloatArray, width: float) -> FloatArray:
     """Return the lanes, ascending, of aisles with these centre lines and this width."""
     gaps = max(0, int((width - 2 * options.clearance) / options.lane_pitch))
     offsets = (np.arange(gaps + 1) - gaps / 2) * options.lane_pitch
     return np.asarray((centres[:, None] + offsets).ravel())
 
 
-def _serpentine(lanes: FloatArray, start: float, end: float) -> FloatArray:
+def to_and_fro(lanes: FloatArray, start: float, end: float) -> FloatArray:
     """Return (along, lane) of a path that runs each lane, to and fro, shape (2 L, 2)."""
     along = np.tile([start, end, end, start], (len(lanes) + 1) // 2)[: 2 * len(lanes)]
     return np.column_stack([along, np.repeat(lanes, 2)])

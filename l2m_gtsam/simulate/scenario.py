@@ -1,24 +1,23 @@
 """A whole scenario: a world, a mapping drive and a calibration drive in it."""
 
 import datetime as dt
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.options import Options
+from l2m_gtsam.simulate.corridor import CorridorOptions
 from l2m_gtsam.simulate.drive import DriveOptions, drive
 from l2m_gtsam.simulate.earth import EarthOptions, earth_field
-from l2m_gtsam.simulate.floor_plan import FloorPlan, FloorPlanOptions, plan_floor
+from l2m_gtsam.simulate.floor_plan import FloorPlan, FloorPlanOptions
+from l2m_gtsam.simulate.lidar import LidarOptions, RayCaster, SimulatedScans, scan_stamps
+from l2m_gtsam.simulate.odometry import OdometryOptions, drifting
+from l2m_gtsam.simulate.place import Place, RouteOptions, corridor, hall
 from l2m_gtsam.simulate.recorder import Progress, SimulatedDrive, Vehicle, record
-from l2m_gtsam.simulate.route import (
-    CalibrationRouteOptions,
-    MappingRouteOptions,
-    calibration_route,
-    mapping_route,
-)
+from l2m_gtsam.simulate.route import CalibrationRouteOptions, MappingRouteOptions
 from l2m_gtsam.simulate.sensors import (
     ArrayOptions,
     NoiseOptions,
@@ -28,12 +27,13 @@ from l2m_gtsam.simulate.sensors import (
     random_array,
 )
 from l2m_gtsam.simulate.structure import StructureOptions, structure_cloud
-from l2m_gtsam.simulate.warehouse import WarehouseOptions, build_warehouse
+from l2m_gtsam.simulate.warehouse import WarehouseOptions
 from l2m_gtsam.simulate.world import SteelWorld
 
 NANOSECONDS = 1_000_000_000
 MAPPING_TIME = dt.time(8)
 CALIBRATION_TIME = dt.time(10)
+ON_REQUEST = ("corridor", "lidar", "odometry")
 
 
 class ScenarioOptions(Options):
@@ -70,6 +70,20 @@ class ScenarioOptions(Options):
     """How the vehicle with the array drives."""
     calibration_sampling: SamplingOptions = SamplingOptions()
     """When the vehicle with the array measures."""
+    corridor: CorridorOptions | None = None
+    """A corridor without a feature in place of the hall, if it is given (`{}` for its defaults);
+    it is driven from end to end and back, `calibration_route.laps` times."""
+    lidar: LidarOptions | None = None
+    """Point clouds of both drives, if it is given (`{}` for its defaults)."""
+    odometry: OdometryOptions | None = None
+    """Drift of the poses of the vehicle with the array, if it is given (`{}` for its defaults);
+    the true poses stand beside them then."""
+
+    @model_serializer(mode="wrap")
+    def _as_asked(self, content: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what is only there when it is asked for."""
+        entries: dict[str, Any] = content(self)
+        return {k: v for k, v in entries.items() if v is not None or k not in ON_REQUEST}
 
 
 @dataclass(frozen=True)
@@ -119,54 +133,89 @@ def simulate(options: ScenarioOptions, progress: Progress | None = None) -> Scen
     Raises
     ------
     ConfigError
-        A drive would take a sensor through steel.
+        A drive would take a sensor through steel, or point clouds are asked for and the libraries
+        that cast rays are not installed.
     """
     # One stream per part: another array leaves the world and the mapping drive as they are.
-    steel, array, mapping, calibration, lidar = (
-        np.random.default_rng(seed) for seed in np.random.SeedSequence(options.seed).spawn(5)
+    steel, array, mapping, calibration, cloud, mapping_scans, scans, slips = (
+        np.random.default_rng(seed) for seed in np.random.SeedSequence(options.seed).spawn(8)
     )
     if options.survey_seed is not None:
         mapping = np.random.default_rng([options.seed, options.survey_seed])
-    plan = plan_floor(options.floor_plan)
-    world = build_warehouse(options.warehouse, plan, earth_field(options.earth), steel)
+        mapping_scans = np.random.default_rng([options.seed, options.survey_seed, 1])
+    place = _place(options, steel)
     suite, truth = mapping_suite(options.suite), random_array(options.array, array)
     report = progress or _ignore
+    eye = None if options.lidar is None else RayCaster(place.solids)
+    mapped = record(_mapper(options, place, suite, mapping), place.world, mapping, report)
+    driven = record(_rover(options, place, truth, calibration), place.world, calibration, report)
     return Scenario(
         options=options,
-        plan=plan,
-        world=world,
-        cloud=structure_cloud(world, options.structure, lidar),
-        mapping=record(_mapper(options, plan, suite, mapping), world, mapping, report),
-        calibration=record(_rover(options, plan, truth, calibration), world, calibration, report),
+        plan=place.plan,
+        world=place.world,
+        cloud=structure_cloud(place.structure, options.structure, cloud),
+        mapping=_scanned(mapped, options.lidar, eye, mapping_scans),
+        calibration=_scanned(_slipped(driven, options, slips), options.lidar, eye, scans),
         suite=suite,
         truth=truth,
     )
 
 
+def _place(options: ScenarioOptions, rng: np.random.Generator) -> Place:
+    """Return where both vehicles drive."""
+    routes = RouteOptions(options.mapping_route, options.calibration_route)
+    earth = earth_field(options.earth)
+    if options.corridor is None:
+        return hall(options.floor_plan, options.warehouse, routes, earth, rng)
+    return corridor(options.corridor, options.warehouse, routes, earth, rng)
+
+
 def _mapper(
     options: ScenarioOptions,
-    plan: FloorPlan,
+    place: Place,
     sensors: tuple[KnownSensor, ...],
     rng: np.random.Generator,
 ) -> Vehicle:
     """Return the mapping vehicle on its drive over the whole floor."""
-    route = mapping_route(options.mapping_route, plan)
     start_ns = _stamp(options.earth.date, MAPPING_TIME)
-    motion = drive(options.mapping_drive, route, start_ns, rng)
+    motion = drive(options.mapping_drive, place.mapping_route, start_ns, rng)
     return Vehicle("mapping", sensors, motion, options.mapping_sampling, options.noise)
 
 
 def _rover(
     options: ScenarioOptions,
-    plan: FloorPlan,
+    place: Place,
     sensors: tuple[KnownSensor, ...],
     rng: np.random.Generator,
 ) -> Vehicle:
     """Return the vehicle with the array on its calibration drive."""
-    route = calibration_route(options.calibration_route, plan)
     start_ns = _stamp(options.earth.date, CALIBRATION_TIME)
-    motion = drive(options.calibration_drive, route, start_ns, rng)
+    motion = drive(options.calibration_drive, place.calibration_route, start_ns, rng)
     return Vehicle("calibration", sensors, motion, options.calibration_sampling, options.noise)
+
+
+def _slipped(
+    driven: SimulatedDrive, options: ScenarioOptions, rng: np.random.Generator
+) -> SimulatedDrive:
+    """Return a drive with odometry that drifts, if that is asked for."""
+    if options.odometry is None:
+        return driven
+    return driven.with_poses(drifting(driven.truth(), options.odometry, options.noise, rng))
+
+
+def _scanned(
+    driven: SimulatedDrive,
+    options: LidarOptions | None,
+    eye: RayCaster | None,
+    rng: np.random.Generator,
+) -> SimulatedDrive:
+    """Return a drive with the scans of a LiDAR, if there is one."""
+    if options is None or eye is None:
+        return driven
+    motion = driven.motion
+    stamp_ns = motion.start_ns + scan_stamps(options, motion.duration, rng)
+    seed = int(rng.integers(1 << 32))
+    return replace(driven, scans=SimulatedScans(eye, options, motion.at, stamp_ns, seed))
 
 
 def _stamp(day: dt.date, time: dt.time) -> int:

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.options import Options
+from l2m_gtsam.simulate.solids import Solids
 from l2m_gtsam.simulate.world import SteelWorld
 
 
@@ -23,7 +24,7 @@ class StructureOptions(Options):
 
 
 def structure_cloud(
-    world: SteelWorld, options: StructureOptions, rng: np.random.Generator
+    world: SteelWorld | Solids, options: StructureOptions, rng: np.random.Generator
 ) -> FloatArray:
     """Return points on the surfaces of all bodies, as far as these stand above the floor.
 
@@ -33,7 +34,7 @@ def structure_cloud(
     Parameters
     ----------
     world
-        Steel over the floor, z = 0.
+        Bodies over the floor, z = 0.
     options
         Which points are seen, and how well.
     rng

@@ -1,6 +1,5 @@
 """The steel of a warehouse: what stands where, and how it is magnetised."""
 
-from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -10,21 +9,11 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.floor_plan import FloorPlan
+from l2m_gtsam.simulate.steel_parts import Parts, SectionOptions, alike, cells, grid, spread
 from l2m_gtsam.simulate.world import SteelWorld
 
 TESLA_PER_MICROTESLA = 1e-6
 TESLA_PER_MILLITESLA = 1e-3
-
-
-class SectionOptions(Options):
-    """The cross section of one kind of steel part, as a homogeneous box."""
-
-    breadth: Annotated[float, Field(gt=0)]
-    """Outer side of the section in metres."""
-    height: Annotated[float, Field(gt=0)]
-    """The other outer side in metres."""
-    fill: Annotated[float, Field(gt=0, le=1)]
-    """Share of the outer section that is steel: rolled and folded sections are mostly air."""
 
 
 class WarehouseOptions(Options):
@@ -68,21 +57,10 @@ class WarehouseOptions(Options):
     """Remanence across a part's length, relative to that along it."""
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """Parts of one kind: boxes along x, y, z, turned about z by ``yaw`` radians, shape (N,)."""
-
-    kind: str
-    fill: float
-    dimensions: FloatArray
-    centres: FloatArray
-    yaw: FloatArray
-
-
 def build_warehouse(
     options: WarehouseOptions, plan: FloorPlan, earth: FloatArray, rng: np.random.Generator
 ) -> SteelWorld:
-    """Return the steel of a hall in the Earth's field.
+    """Return the steel of a hall in the Earth's field, with racks or without.
 
     Each part is magnetised by the Earth's field, weakened by the part's own shape, and carries
     a random remanence, mostly along its length: the history of rolling, welding and lifting
@@ -99,10 +77,10 @@ def build_warehouse(
     rng
         Source of randomness.
     """
+    racks = (_uprights(options, plan), _rack_beams(options, plan)) if len(plan.block_x) else ()
     families = (
         _posts(options, plan),
-        _uprights(options, plan),
-        _rack_beams(options, plan),
+        *racks,
         _hall_beams(options, plan),
         _rebar(options, plan, rng),
     )
@@ -148,35 +126,35 @@ def _remanent(
     return drawn * spread * options.remanence * TESLA_PER_MILLITESLA
 
 
-def _posts(options: WarehouseOptions, plan: FloorPlan) -> _Parts:
+def _posts(options: WarehouseOptions, plan: FloorPlan) -> Parts:
     """Return posts behind the long walls and along the middle of every other row of racks."""
     section = options.post
-    wall_x = _spread(0.0, plan.length, options.post_pitch)
-    row_x = np.array([_spread(low, high, options.post_pitch)[1:-1] for low, high in plan.block_x])
+    wall_x = spread(0.0, plan.length, options.post_pitch)
+    row_x = np.array([spread(low, high, options.post_pitch)[1:-1] for low, high in plan.block_x])
     rows = plan.rack_y[::2].mean(axis=1)
     outside = options.wall + section.height / 2
     walls = np.array([-outside, plan.width + outside])
-    places = np.concatenate([_grid(wall_x, walls), _grid(row_x.ravel(), rows)])
+    places = np.concatenate([grid(wall_x, walls), grid(row_x.ravel(), rows)])
     centres = np.column_stack([places, np.full(len(places), options.hall_height / 2)])
     size = (section.breadth, section.height, options.hall_height)
-    return _alike("post", section, size, centres)
+    return alike("post", section, size, centres)
 
 
-def _uprights(options: WarehouseOptions, plan: FloorPlan) -> _Parts:
+def _uprights(options: WarehouseOptions, plan: FloorPlan) -> Parts:
     """Return uprights on both faces of every row of racks, just within the rack's outline."""
     section = options.upright
     inset = np.array([section.breadth / 2, -section.breadth / 2])
-    x = np.concatenate([_spread(low, high, options.bay) for low, high in plan.block_x + inset])
-    places = _grid(x, (plan.rack_y + inset).ravel())
+    x = np.concatenate([spread(low, high, options.bay) for low, high in plan.block_x + inset])
+    places = grid(x, (plan.rack_y + inset).ravel())
     centres = np.column_stack([places, np.full(len(places), options.rack_height / 2)])
     size = (section.breadth, section.height, options.rack_height)
-    return _alike("upright", section, size, centres)
+    return alike("upright", section, size, centres)
 
 
-def _rack_beams(options: WarehouseOptions, plan: FloorPlan) -> _Parts:
+def _rack_beams(options: WarehouseOptions, plan: FloorPlan) -> Parts:
     """Return one beam per bay, on both faces of the racks in turn."""
     section = options.rack_beam
-    edges = np.array([_spread(low, high, options.bay) for low, high in plan.block_x])
+    edges = np.array([spread(low, high, options.bay) for low, high in plan.block_x])
     middles = ((edges[:, 1:] + edges[:, :-1]) / 2).ravel()
     faces = plan.rack_y + np.array([section.breadth / 2, -section.breadth / 2])
     x, row = np.meshgrid(middles, np.arange(len(faces)))
@@ -184,25 +162,25 @@ def _rack_beams(options: WarehouseOptions, plan: FloorPlan) -> _Parts:
     level = np.full(x.size, options.rack_beam_level)
     centres = np.column_stack([x.ravel(), faces[row, face].ravel(), level])
     size = (float(edges[0, 1] - edges[0, 0]), section.breadth, section.height)
-    return _alike("rack beam", section, size, centres)
+    return alike("rack beam", section, size, centres)
 
 
-def _hall_beams(options: WarehouseOptions, plan: FloorPlan) -> _Parts:
+def _hall_beams(options: WarehouseOptions, plan: FloorPlan) -> Parts:
     """Return the beams across the hall, in two halves each, under the roof and the floor."""
     section = options.hall_beam
-    x = _spread(0.0, plan.length, options.post_pitch)
+    x = spread(0.0, plan.length, options.post_pitch)
     levels = np.array([options.hall_height + section.height / 2, -options.floor_beam_depth])
-    places = _grid(x, np.array([0.25, 0.75]) * plan.width)
+    places = grid(x, np.array([0.25, 0.75]) * plan.width)
     centres = np.column_stack(
         [np.tile(places, (len(levels), 1)), np.repeat(levels, len(places))],
     )
-    return _alike("hall beam", section, (section.breadth, plan.width / 2, section.height), centres)
+    return alike("hall beam", section, (section.breadth, plan.width / 2, section.height), centres)
 
 
-def _rebar(options: WarehouseOptions, plan: FloorPlan, rng: np.random.Generator) -> _Parts:
+def _rebar(options: WarehouseOptions, plan: FloorPlan, rng: np.random.Generator) -> Parts:
     """Return one bundle of bars per square of the floor, at a random place and angle."""
-    x, y = (_cells(extent, options.rebar_pitch) for extent in (plan.length, plan.width))
-    places = _grid(x, y)
+    x, y = (cells(extent, options.rebar_pitch) for extent in (plan.length, plan.width))
+    places = grid(x, y)
     places = places + rng.uniform(-0.5, 0.5, places.shape) * options.rebar_pitch
     centres = np.column_stack([places, np.full(len(places), -options.rebar_depth)])
     section = options.rebar
@@ -210,29 +188,4 @@ def _rebar(options: WarehouseOptions, plan: FloorPlan, rng: np.random.Generator)
     # Bars are laid along or across the hall, a few degrees askew.
     quarter_turns = rng.integers(0, 2, len(places)) * np.pi / 2
     yaw = quarter_turns + rng.normal(0.0, np.deg2rad(3.0), len(places))
-    return _Parts("rebar", section.fill, np.tile(size, (len(places), 1)), centres, yaw)
-
-
-def _alike(
-    kind: str, section: SectionOptions, size: tuple[float, float, float], centres: FloatArray
-) -> _Parts:
-    """Return parts of one size that stand along the hall's axes."""
-    count = len(centres)
-    return _Parts(kind, section.fill, np.tile(size, (count, 1)), centres, np.zeros(count))
-
-
-def _spread(low: float, high: float, pitch: float) -> FloatArray:
-    """Return evenly spaced places from ``low`` to ``high``, at most ``pitch`` apart."""
-    # Rounding of the edges must not add a part where the pitch divides the length.
-    return np.linspace(low, high, int(np.ceil((high - low) / pitch - 1e-9)) + 1)
-
-
-def _cells(extent: float, pitch: float) -> FloatArray:
-    """Return the centres of equal cells of about ``pitch`` that fill ``extent``."""
-    count = max(1, round(extent / pitch))
-    return (np.arange(count) + 0.5) * extent / count
-
-
-def _grid(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return all pairs of x and y, shape (len(x) * len(y), 2)."""
-    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return Parts("rebar", section.fill, np.tile(size, (len(places), 1)), centres, yaw)

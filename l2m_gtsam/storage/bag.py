@@ -72,7 +72,7 @@ def read_recording(path: Path, options: BagOptions, progress: Progress | None = 
         buffers = _read(bag, [*fields, *poses], options, progress)
     series = _all_series(path, buffers, fields, options)
     trajectory = _trajectory(path, buffers, options)
-    _check_clocks(path, trajectory, series)
+    check_clocks(path, trajectory, series)
     return Recording(trajectory, series, source_file(path))
 
 
@@ -102,6 +102,20 @@ def has_fields(path: Path) -> bool:
     """
     with open_bag(path) as bag:
         return any(connection.msgtype == FIELD_TYPE for connection in bag.connections)
+
+
+def has_poses(path: Path, options: BagOptions) -> bool:
+    """Return whether a bag has poses, or the options say where they are.
+
+    Raises
+    ------
+    BagError
+        The bag cannot be opened.
+    """
+    if options.poses is not None or options.tf is not None:
+        return True
+    with open_bag(path) as bag:
+        return any(connection.msgtype in POSE_TYPES for connection in bag.connections)
 
 
 def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
@@ -259,7 +273,8 @@ def _check_stamps(path: Path, what: str, stamps: IntArray) -> None:
         )
 
 
-def _check_clocks(path: Path, poses: Trajectory, series: tuple[FieldSeries, ...]) -> None:
+def check_clocks(path: Path, poses: Trajectory, series: tuple[FieldSeries, ...]) -> None:
+    """Raise a BagError if poses and readings have different clocks."""
     for each in series:
         if not len(each) or not len(poses):
             continue

@@ -123,6 +123,7 @@ class _CalibrationFile(Lenient):
     # Files of the first version do not say; their sigmas are of this kind.
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
     doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     disagreements: tuple[_Disagreement, ...] = ()
     bag: _Source | None
     # Of several drives together; files of one do not have it.
@@ -141,6 +142,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
         "uncertainty": str(result.uncertainty),
         "doubts": list(result.doubts),
+        **({"notes": list(result.notes)} if result.notes else {}),
         "disagreements": [_disagreement_entry(each) for each in result.disagreements],
         **bag_entries(result),
         "map": source_entry(result.map),
@@ -172,6 +174,7 @@ def read_calibration(path: Path) -> CalibrationResult:
         options=parsed.options,
         versions=parsed.versions,
         bags=tuple(SourceFile(each.path, each.sha256) for each in parsed.bags),
+        notes=parsed.notes,
     )
 
 

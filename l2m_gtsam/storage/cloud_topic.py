@@ -6,22 +6,20 @@ from typing import Any, Self
 
 import numpy as np
 from pydantic import Field, model_validator
-from rosbags.interfaces import Connection
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.options import Options
+from l2m_gtsam.scans import Scan, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import located
 from l2m_gtsam.storage.messages import header_ns
-from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
-from l2m_gtsam.storage.point_table import MAX_POINTS, stacked
-from l2m_gtsam.storage.selection import listed
+from l2m_gtsam.storage.open_bag import Message, Progress, open_bag
+from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of, times_of
+from l2m_gtsam.storage.point_table import MAX_POINTS
 from l2m_gtsam.storage.tf import Link
 from l2m_gtsam.storage.voxels import VoxelMeans
-
-CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
-FLOATS = {7: "f4", 8: "f8"}  # PointField.FLOAT32 and FLOAT64
 
 
 class CloudTopicOptions(Options):
@@ -74,9 +72,10 @@ def read_cloud_topic(
     """Return what all scans of a topic saw, in the map frame.
 
     Scans must be in the frame of the lidar, whose poses the trajectory holds; what their frame is
-    called does not matter, but it must be the same in all of them. A scan is taken as a snapshot
-    at its stamp: where the driver does not correct for motion within a scan, points are off by up
-    to speed times the duration of a scan. Poses are interpolated on SE(3) as in `sync`.
+    called does not matter, but it must be the same in all of them. Points with times of their own
+    are moved to where they were at the scan's stamp; a scan without is taken as a snapshot: where
+    its driver does not correct for motion, points are off by up to speed times the duration of a
+    scan. Poses are interpolated on SE(3) as in `sync`.
 
     Parameters
     ----------
@@ -102,7 +101,7 @@ def read_cloud_topic(
     """
     merged = _MergedScans(f"{path}: topic {topic}", trajectory, options)
     with open_bag(path) as bag:
-        for message in bag.messages(_connections(bag, topic), progress):
+        for message in bag.messages(cloud_connections(bag, topic), progress):
             is_record = stamps is Stamps.RECORD
             merged.add(message, message.record_ns if is_record else header_ns(message.content))
     return merged.cloud()
@@ -124,12 +123,14 @@ class _MergedScans:
         scan = message.content
         self._check_frame(scan.header.frame_id)
         self._scans += 1
-        pose = _pose_at(self._trajectory, stamp_ns, self._options.max_pose_gap_s)
+        pose = self._pose_at(stamp_ns)
         if pose is None:
             return
-        self._placed += 1
         try:
-            points = _in_range(_points(scan), self._options)
+            points = self._points(scan, stamp_ns, pose)
+            if points is None:
+                return
+            self._placed += 1
             self._cells.add(located(points @ pose.R.T + pose.t, self._where))
         except ValueError as error:
             raise BagError(f"{self._where}: {error}") from error
@@ -154,6 +155,26 @@ class _MergedScans:
             )
         return TopicCloud(points, self._scans, self._scans - self._placed)
 
+    def _points(self, message: Any, stamp_ns: int, pose: RigidTransform) -> FloatArray | None:
+        """Return a scan's points as they were at its stamp; nothing where its end has no pose."""
+        scan = Scan(stamp_ns, points_of(message), times_of(message, stamp_ns))
+        twist = self._twist(scan, pose)
+        return None if twist is None else _in_range(taken_at_once(scan, twist), self._options)
+
+    def _pose_at(self, stamp_ns: int) -> RigidTransform | None:
+        return _pose_at(self._trajectory, stamp_ns, self._options.max_pose_gap_s)
+
+    def _twist(self, scan: Scan, pose: RigidTransform) -> FloatArray | None:
+        """Return the lidar's mean twist over a scan; nothing where its end has no pose."""
+        if scan.time_s is None or not np.any(scan.time_s):
+            return np.zeros(6)
+        furthest = float(scan.time_s[np.nanargmax(np.abs(scan.time_s))])
+        end = self._pose_at(scan.stamp_ns + round(furthest * 1e9))
+        if end is None:
+            return None
+        turn = Rotation.from_matrix(pose.R.T @ end.R).as_rotvec()
+        return np.concatenate([turn, pose.R.T @ (end.t - pose.t)]) / furthest
+
     def _check_frame(self, frame: str) -> None:
         self._frame = frame if self._frame is None else self._frame
         if frame != self._frame:
@@ -176,19 +197,6 @@ class _MergedScans:
             f"{first:.3f} to {last:.3f} s and may be {self._options.max_pose_gap_s:g} s apart at "
             "most; if the clocks differ, try `bag.stamps: record`"
         )
-
-
-def _connections(bag: Bag, topic: str) -> list[Connection]:
-    named = [c for c in bag.connections if c.topic.lstrip("/") == topic.lstrip("/")]
-    clouds = [c for c in bag.connections if c.msgtype == CLOUD_TYPE]
-    if not named:
-        raise BagError(f"{bag.path}: no topic {topic!r}; with clouds there are: {listed(clouds)}")
-    if wrong := [c for c in named if c.msgtype != CLOUD_TYPE]:
-        raise BagError(
-            f"{bag.path}: topic {topic} is of type {wrong[0].msgtype}, a cloud must be "
-            f"{CLOUD_TYPE}; of that type there are: {listed(clouds)}"
-        )
-    return named
 
 
 def _pose_at(trajectory: Trajectory, stamp_ns: int, max_gap_s: float) -> RigidTransform | None:
@@ -216,40 +224,3 @@ def _in_range(points: FloatArray, options: CloudTopicOptions) -> FloatArray:
     points = points[np.all(np.abs(points) <= options.max_range, axis=1)]
     distance = np.linalg.norm(points, axis=1)
     return np.asarray(points[(distance >= options.min_range) & (distance <= options.max_range)])
-
-
-def _points(scan: Any) -> FloatArray:
-    """Return x, y and z of a PointCloud2 as they stand, shape (N, 3).
-
-    Raises
-    ------
-    ValueError
-        The scan declares what its data does not hold, or has no x, y and z.
-    """
-    height, width, step = int(scan.height), int(scan.width), int(scan.point_step)
-    if not height * width:
-        return np.zeros((0, 3))
-    row = int(scan.row_step) if height > 1 else width * step
-    if row < width * step or (height - 1) * row + width * step > len(scan.data):
-        raise ValueError(
-            f"a scan declares {height} x {width} points of {step} bytes in rows of {row} bytes, "
-            f"which its {len(scan.data)} bytes are not"
-        )
-    order = ">" if scan.is_bigendian else "<"
-    columns = []
-    for axis in "xyz":
-        offset, kind = _field(scan, axis)
-        columns.append(np.ndarray((height, width), order + kind, scan.data, offset, (row, step)))
-    return stacked([column.ravel() for column in columns])
-
-
-def _field(scan: Any, name: str) -> tuple[int, str]:
-    """Return where a coordinate begins in a point, in bytes, and its type."""
-    found = [each for each in scan.fields if each.name == name]
-    if not found or found[0].datatype not in FLOATS or found[0].count > 1:
-        names = ", ".join(each.name for each in scan.fields[:20]) or "(none)"
-        raise ValueError(f"a scan has no field {name!r} of one float; its fields are: {names}")
-    offset, kind = int(found[0].offset), FLOATS[found[0].datatype]
-    if offset + np.dtype(kind).itemsize > scan.point_step:
-        raise ValueError(f"a scan's field {name!r} reaches over the end of a point")
-    return offset, kind

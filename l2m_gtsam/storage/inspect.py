@@ -20,8 +20,11 @@ from l2m_gtsam.storage.messages import (
     header_ns,
 )
 from l2m_gtsam.storage.open_bag import Bag, Progress, open_bag
+from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
 from l2m_gtsam.storage.units import MICROTESLA_PER, Strength, fault, is_turning, strength
+
+BY_CLOUDS = "a map made with `l2m map build --lidar` gives poses to its point clouds"
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,8 @@ def inspect_bag(path: Path, options: BagOptions, progress: Progress | None = Non
             _report(topic, connections, collected.get(topic), uses.get(topic), duration, options)
             for topic, connections in topics.items()
         ]
+    if no_poses and any(report.msgtype == CLOUD_TYPE for report in reports):
+        no_poses = f"{no_poses}; {BY_CLOUDS}"
     obstacles = [reason for reason in (no_fields, no_poses) if reason]
     obstacles += [
         f"{r.topic}: {r.use}" for r in reports if r.use.startswith("refused") and r.topic in uses
@@ -245,4 +250,6 @@ def _use(
         return "poses, not used: another topic is preferred or must be chosen with bag.poses"
     if msgtype in TF_TYPES:
         return "transforms, used when bag.tf names a chain"
+    if msgtype == CLOUD_TYPE:
+        return "point clouds: a map's with --lidar, poses where there are no others"
     return "not needed"

@@ -1,8 +1,9 @@
 """Maps as ``.npz`` files: plain arrays, a version, a checksum, no pickle.
 
 The file is a zip archive of ``.npy`` members: ``header`` (JSON as bytes: format, version, kind,
-options, provenance), ``checksum`` (SHA-256) and one ``arrays/<name>`` per array. Members are
-stored uncompressed with a fixed date, so that the same map gives the same bytes.
+options, provenance), ``checksum`` (SHA-256) and one ``arrays/<name>`` per array, those of a lidar
+under ``arrays/lidar/``. Members are stored uncompressed with a fixed date, so that the same map
+gives the same bytes.
 """
 
 import hashlib
@@ -18,13 +19,15 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from l2m_gtsam.data import MapState
+from l2m_gtsam.data import LidarMap, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.storage.atomic import atomic_path
 
 FORMAT = "l2m-map"
 VERSION = 2
 HEADER, CHECKSUM, ARRAYS = "header.npy", "checksum.npy", "arrays/"
+LIDAR = "lidar/"
+LIDAR_SHAPES = {"points": (3,), "R": (3, 3), "p": (3,)}
 # Booleans, integers, unsigned, floating and complex numbers; anything else could hide objects.
 NUMERIC = "biufc"
 MAX_BYTES = 2 << 30
@@ -50,7 +53,8 @@ def save_map(path: Path, state: MapState) -> None:
         The file cannot be written.
     """
     header = _encode_header(path, state)
-    arrays = {name: np.asarray(array, order="C") for name, array in state.arrays.items()}
+    everything = {**state.arrays, **_lidar_arrays(state.lidar)}
+    arrays = {name: np.asarray(array, order="C") for name, array in everything.items()}
     if unfit := [name for name, array in arrays.items() if array.dtype.kind not in NUMERIC]:
         msg = f"{path}: array {unfit[0]!r} is not numeric and cannot be part of a map file"
         raise MapError(msg)
@@ -94,7 +98,27 @@ def load_map(path: Path) -> MapState:
     if checksum.tobytes() != _checksum(header, arrays).tobytes():
         msg = f"{path}: the checksum does not match, the file is damaged; build the map again"
         raise MapError(msg)
-    return MapState(content["kind"], arrays, content["options"], content["provenance"])
+    own = {name: array for name, array in arrays.items() if not name.startswith(LIDAR)}
+    lidar = _lidar(path, arrays) if len(own) < len(arrays) else None
+    return MapState(content["kind"], own, content["options"], content["provenance"], lidar)
+
+
+def _lidar_arrays(lidar: LidarMap | None) -> dict[str, npt.NDArray[Any]]:
+    return {} if lidar is None else {f"{LIDAR}{name}": array for name, array in vars(lidar).items()}
+
+
+def _lidar(path: Path, arrays: Arrays) -> LidarMap:
+    """Return what a lidar saw; a MapError if it is not what it should be."""
+    found = {name: arrays.get(f"{LIDAR}{name}", np.zeros(0)) for name in LIDAR_SHAPES}
+    sound = all(
+        found[name].dtype == np.float64
+        and found[name].shape[1:] == shape
+        and np.isfinite(found[name]).all()
+        for name, shape in LIDAR_SHAPES.items()
+    )
+    if not sound or not len(found["points"]) or len(found["R"]) != len(found["p"]):
+        raise MapError(f"{path}: its cloud is damaged; build the map again")
+    return LidarMap(**found)
 
 
 def _encode_header(path: Path, state: MapState) -> npt.NDArray[np.uint8]:

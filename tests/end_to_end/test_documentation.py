@@ -23,6 +23,7 @@ NOT_RUN = {
     "docs/tutorial.md": 1,
     "docs/basin.md": 1,
     "docs/fleet.md": 1,
+    "docs/lidar.md": 2,
     "docs/report.md": 1,
     "docs/studies/README.md": 2,
 }

@@ -39,7 +39,10 @@ def test_the_effective_configuration_reads_back() -> None:
             "calibration: {solve: {optimiser: gn}}",
             r"unknown key 'calibration.solve.optimiser'; accepted here: .*optimizer",
         ),
-        ("colour: red", r"unknown key 'colour'; accepted here: bag, calibration, fleet, mapping"),
+        (
+            "colour: red",
+            r"unknown key 'colour'; accepted here: bag, calibration, fleet, lidar, mapping",
+        ),
         ("calibration: {solve: {optimizer: newton}}", r"calibration.solve.optimizer: .*'lm' or"),
         ("calibration: {sync: {max_pose_gap_s: soon}}", r"max_pose_gap_s: .*number.*'soon'"),
         ("[1, 2]", r"the file: "),

@@ -1,6 +1,7 @@
 """Map files: round trip, determinism, and everything that may be wrong with them."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from l2m_gtsam.data import FloatArray, MapState
+from l2m_gtsam.data import FloatArray, LidarMap, MapState
 from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.storage import map_file
 from l2m_gtsam.storage.atomic import atomic_path
@@ -133,3 +134,45 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="cannot be written"), atomic_path(tmp_path / "no" / "a"):
         pass
+
+
+def with_cloud(**changes: FloatArray) -> MapState:
+    """A map that three scans saw, and two places of the mapping drive."""
+    parts: dict[str, FloatArray] = {
+        "points": np.arange(9.0).reshape(3, 3),
+        "R": np.stack([np.eye(3), np.eye(3)]),
+        "p": np.arange(6.0).reshape(2, 3),
+    }
+    return replace(state(), lidar=LidarMap(**(parts | changes)))
+
+
+def test_the_cloud_of_a_lidar_comes_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    save_map(path, with_cloud())
+    back = load_map(path)
+    assert back.lidar is not None
+    assert set(back.arrays) == set(state().arrays)  # a kind of map never sees it
+    for name, array in vars(with_cloud().lidar).items():
+        np.testing.assert_array_equal(getattr(back.lidar, name), array)
+    save_map(path, state())
+    assert load_map(path).lidar is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"points": np.zeros((0, 3))},
+        {"points": np.zeros((3, 2))},
+        {"points": np.full((3, 3), np.nan)},
+        {"points": np.zeros((3, 3), dtype=np.float32)},
+        {"p": np.zeros((5, 3))},
+        {"R": np.zeros((2, 3))},
+    ],
+    ids=["empty", "flat", "nan", "float32", "places", "rotations"],
+)
+def test_a_cloud_that_is_none_is_refused(tmp_path: Path, changes: dict[str, FloatArray]) -> None:
+    """A file may be written by anybody, checksum and all."""
+    path = tmp_path / "a.npz"
+    save_map(path, with_cloud(**changes))
+    with pytest.raises(MapError, match="its cloud is damaged; build the map again"):
+        load_map(path)

@@ -48,6 +48,17 @@ def test_a_route_is_closed_and_clear_of_racks_and_walls(
     assert clearance(plan, densified(corners)) > CLEAR
 
 
+@pytest.mark.parametrize("hall", HALLS, ids=["large", "small", "wide"])
+def test_a_loop_goes_round_all_racks(hall: FloorPlanOptions) -> None:
+    plan = plan_floor(hall)
+    x, y = calibration_route(CalibrationRouteOptions(shape=RouteShape.LOOP, laps=3), plan).T
+    assert x.min() < plan.block_x.min()
+    assert x.max() > plan.block_x.max()
+    assert y.min() < plan.rack_y.min()
+    assert y.max() > plan.rack_y.max()
+    assert len(x) == 3 * 4 + 1
+
+
 def test_routes_of_all_shapes_differ_and_repeat() -> None:
     plan = plan_floor(HALLS[0])
     routes = [calibration_route(CalibrationRouteOptions(shape=each), plan) for each in RouteShape]

@@ -24,7 +24,8 @@ from l2m_gtsam.simulate.sensors import (
     random_array,
     sample_stamps,
 )
-from l2m_gtsam.simulate.warehouse import SectionOptions, WarehouseOptions
+from l2m_gtsam.simulate.steel_parts import SectionOptions
+from l2m_gtsam.simulate.warehouse import WarehouseOptions
 
 SMALL: dict[str, Any] = {
     "floor_plan": FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),

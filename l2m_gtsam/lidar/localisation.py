@@ -1,0 +1,180 @@
+"""Scans localised on a cloud of the surroundings that was saved with a map."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.errors import LidarError
+from l2m_gtsam.lidar.odometry import CHILD_FRAME, ScanStep
+from l2m_gtsam.lidar.registration import (
+    PoseEstimate,
+    Refusal,
+    Registration,
+    RegistrationOptions,
+    by_scan,
+    combined,
+    register,
+)
+from l2m_gtsam.lidar.rigid import compose
+from l2m_gtsam.lidar.surface import Surface
+from l2m_gtsam.options import Options
+from l2m_gtsam.pose_covariance import moved
+from l2m_gtsam.scans import PoseFix
+
+
+class ScanStartOptions(Options):
+    """Where the lidar is at the first scan."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """In the map in metres; within `localisation.registration.reach_m` of the truth."""
+    quaternion_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """Rotation from lidar to map, of any length but zero; within about 15 degrees."""
+
+    @model_validator(mode="after")
+    def _a_rotation(self) -> "ScanStartOptions":
+        if not any(self.quaternion_xyzw):
+            raise ValueError("`quaternion_xyzw` is all zero, it must be a rotation")
+        return self
+
+    def rigid(self) -> RigidTransform:
+        """Return the pose."""
+        R = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
+        return RigidTransform(R, np.array(self.position))
+
+
+class ScanLocalisationOptions(Options):
+    """How scans are localised on a cloud."""
+
+    registration: RegistrationOptions = RegistrationOptions()
+    """How each is registered, and when it is refused."""
+    cloud_m: float = Field(default=0.005, ge=0)
+    """How wrong the cloud itself is, as a standard deviation of the position in metres that
+    neighbouring poses share: it bends with the errors of the mapping drive's poses,"""
+    cloud_deg: float = Field(default=0.05, ge=0)
+    """and of the rotation in degrees."""
+
+    def of_cloud(self) -> FloatArray:
+        """Return the covariance that the cloud's errors add to a pose, shape (6, 6)."""
+        return np.diag(np.repeat([np.deg2rad(self.cloud_deg), self.cloud_m], 3) ** 2)
+
+
+@dataclass(frozen=True)
+class ScanLocalisation:
+    """Where scans were taken.
+
+    Attributes
+    ----------
+    fixes
+        What each believed scan alone says.
+    trajectory
+        Their poses by scans and odometry together; scans that were refused have none.
+    refused
+        How many scans were refused, by reason.
+    """
+
+    fixes: tuple[PoseFix, ...]
+    trajectory: Trajectory
+    refused: dict[Refusal, int]
+
+    @property
+    def scans(self) -> int:
+        """How many scans there were."""
+        return len(self.fixes) + sum(self.refused.values())
+
+
+def localise_scans(
+    steps: Iterable[ScanStep],
+    cloud: Surface,
+    start: RigidTransform,
+    options: ScanLocalisationOptions,
+    frame: str = "map",
+) -> ScanLocalisation:
+    """Register scan after scan on a cloud, each from where odometry expects it.
+
+    Along what a scan shows, its pose is that of the registration; along the rest, that of odometry
+    from the scan before, and the covariance grows until something is seen again.
+
+    Parameters
+    ----------
+    steps
+        Scans with odometry, in order of time.
+    cloud
+        In the map frame.
+    start
+        The lidar in the map at the first scan.
+    options
+        How, and when a scan is refused.
+    frame
+        Name of the map frame.
+
+    Raises
+    ------
+    LidarError
+        There are no scans, or the first does not fit the cloud at the start.
+    """
+    found = _Localiser(cloud, options)
+    for step in steps:
+        found.add(step, start)
+    if not found.fixes:
+        raise LidarError("no scan has points enough to be localised")
+    return ScanLocalisation(tuple(found.fixes), found.trajectory(frame), dict(found.refused))
+
+
+class _Localiser:
+    """The poses so far."""
+
+    def __init__(self, cloud: Surface, options: ScanLocalisationOptions) -> None:
+        self._cloud, self._options = cloud, options
+        self._last: PoseEstimate | None = None
+        self.fixes: list[PoseFix] = []
+        self.poses: list[PoseEstimate] = []
+        self.refused: Counter[Refusal] = Counter()
+
+    def add(self, step: ScanStep, start: RigidTransform) -> None:
+        options = self._options.registration
+        expected = None if self._last is None else self._expected(self._last, step)
+        guess = start if expected is None else expected.T
+        found = register(step.surface, self._cloud, guess, options)
+        refusal = found.refusal(options)
+        if refusal is not None and expected is None:
+            raise LidarError(_not_at_start(start, found, refusal, options))
+        if refusal is not None:
+            self.refused[refusal] += 1
+            self._last = expected
+            return
+        fix = by_scan(found, guess, options)
+        self._last = fix if expected is None else combined(found, expected, options)
+        covariance = fix.covariance + self._options.of_cloud()
+        self.fixes.append(PoseFix(step.stamp_ns, fix.T, covariance))
+        self.poses.append(self._last)
+
+    def trajectory(self, frame: str) -> Trajectory:
+        return Trajectory(
+            np.array([each.stamp_ns for each in self.fixes], dtype=np.int64),
+            np.array([each.T.R for each in self.poses]),
+            np.array([each.T.t for each in self.poses]),
+            frame,
+            CHILD_FRAME,
+            np.array([each.covariance for each in self.poses]) + self._options.of_cloud(),
+        )
+
+    def _expected(self, last: PoseEstimate, step: ScanStep) -> PoseEstimate:
+        covariance = moved(last.covariance[None], step.step)[0] + step.covariance
+        return PoseEstimate(compose(last.T, step.step), covariance)
+
+
+def _not_at_start(
+    start: RigidTransform, found: Registration, refusal: Refusal, options: RegistrationOptions
+) -> str:
+    x, y, z = start.t
+    return (
+        f"the first scan does not fit the map's cloud at ({x:g}, {y:g}, {z:g}) m: {refusal} "
+        f"({found.share:.0%}, at least {options.least_share:.0%} is asked for, determining "
+        f"{found.directions} of 6 directions); say with `lidar.start` where the drive begins, or "
+        "is it another place?"
+    )

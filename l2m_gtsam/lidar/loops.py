@@ -1,0 +1,114 @@
+"""Loops: scans of places that odometry returns to, registered on those of the first visit."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from l2m_gtsam.data import RigidTransform
+from l2m_gtsam.lidar.odometry import ScanStep
+from l2m_gtsam.lidar.registration import Refusal, RegistrationOptions, by_scan, register
+from l2m_gtsam.lidar.rigid import between
+from l2m_gtsam.lidar.surface import Surface
+from l2m_gtsam.options import Options
+from l2m_gtsam.scans import Loop
+
+
+class LoopOptions(Options):
+    """Where loops are looked for, and which are believed."""
+
+    key_distance_m: float = Field(default=1.0, gt=0)
+    """A scan is kept after so much way; loops are between scans that were kept."""
+    search_m: float = Field(default=3.0, gt=0)
+    """Places are compared that odometry has nearer than this, metres,"""
+    least_way_m: float = Field(default=10.0, gt=0)
+    """and between which so much way lies."""
+    most: int = Field(default=2, ge=1)
+    """The most earlier places that a scan is compared with, the nearest first."""
+    registration: RegistrationOptions = RegistrationOptions(reach_m=2.0, least_directions=6)
+    """How scans are registered. A loop has to be believed both ways, and to determine all six
+    directions: one part of a corridor looks like another."""
+
+
+@dataclass(frozen=True)
+class LoopSearch:
+    """Loops of a drive.
+
+    Attributes
+    ----------
+    loops
+        Those that are believed, in order of time.
+    refused
+        How many others were compared, by reason.
+    """
+
+    loops: tuple[Loop, ...]
+    refused: dict[Refusal, int]
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A scan as it is kept: its thinned points, in half the memory, and where odometry has it."""
+
+    stamp_ns: int
+    points: "np.ndarray[tuple[int, ...], np.dtype[np.float32]]"
+    T: RigidTransform
+    way_m: float
+
+    def surface(self) -> Surface:
+        return Surface(self.points.astype(np.float64))
+
+
+def find_loops(steps: Iterable[ScanStep], options: LoopOptions) -> LoopSearch:
+    """Look for loops in a drive.
+
+    Memory grows with the way, by about 0.1 MB for each scan that is kept.
+
+    Parameters
+    ----------
+    steps
+        Scans with odometry, in order of time.
+    options
+        Where to look, and what to believe.
+    """
+    kept, loops, refused = list[_Kept](), list[Loop](), Counter[Refusal]()
+    way, last = 0.0, None
+    for step in steps:
+        way += float(np.linalg.norm(step.step.t))
+        if last is not None and way - last < options.key_distance_m:
+            continue
+        last = way
+        points = step.surface.points.astype(np.float32)
+        here = _Kept(step.stamp_ns, points, step.T_odom_lidar, way)
+        for earlier in _candidates(kept, here, options):
+            closed = _closed(earlier, here, step.surface, options.registration)
+            if isinstance(closed, Loop):
+                loops.append(closed)
+            else:
+                refused[closed] += 1
+        kept.append(here)
+    return LoopSearch(tuple(loops), dict(refused))
+
+
+def _candidates(kept: list[_Kept], here: _Kept, options: LoopOptions) -> list[_Kept]:
+    """Return the earlier scans that may be of the same place, the nearest first."""
+    old = [each for each in kept if here.way_m - each.way_m >= options.least_way_m]
+    away = [float(np.linalg.norm(each.T.t - here.T.t)) for each in old]
+    near = [k for k in np.argsort(away)[: options.most] if away[k] <= options.search_m]
+    return [old[k] for k in near]
+
+
+def _closed(
+    earlier: _Kept, here: _Kept, scan: Surface, options: RegistrationOptions
+) -> Loop | Refusal:
+    """Return the loop between two scans, or why there is none."""
+    first, guess = earlier.surface(), between(earlier.T, here.T)
+    found = register(scan, first, guess, options)
+    back = register(first, scan, found.T.inverse(), options)
+    refusal = found.refusal(options) or back.refusal(options)
+    if refusal is not None:
+        return refusal
+    estimate = by_scan(found, guess, options)
+    return Loop(earlier.stamp_ns, here.stamp_ns, estimate.T, estimate.covariance)

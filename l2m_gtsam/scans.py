@@ -1,0 +1,88 @@
+"""What a LiDAR saw in one turn, and what registering it says of poses: frozen records."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, RigidTransform
+
+
+@dataclass(frozen=True)
+class Scan:
+    """The points of one turn of a LiDAR.
+
+    Attributes
+    ----------
+    stamp_ns
+        Time in nanoseconds.
+    points
+        In metres, shape (N, 3), finite. Without ``time_s`` all are in the lidar frame at the stamp;
+        with it, each is in the lidar frame at its own time.
+    time_s
+        When each point was measured in seconds after the stamp, shape (N,); None for a snapshot.
+    """
+
+    stamp_ns: int
+    points: FloatArray
+    time_s: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class PoseFix:
+    """Where a lidar was in a map, by one scan alone.
+
+    Attributes
+    ----------
+    stamp_ns
+        Time of the scan in nanoseconds.
+    T_map_lidar
+        Pose.
+    covariance
+        Of its error, a right perturbation as in ``Trajectory``: rotation (rad) before translation
+        (m) in the axes of the lidar, shape (6, 6). Large along what the scan does not show.
+    """
+
+    stamp_ns: int
+    T_map_lidar: RigidTransform
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Where a lidar was, seen from where it had been before.
+
+    Attributes
+    ----------
+    from_ns, to_ns
+        Times of both scans in nanoseconds, the earlier one first.
+    T_from_to
+        The later pose in the frame of the earlier.
+    covariance
+        Of its error, a right perturbation as in ``PoseFix``, shape (6, 6).
+    """
+
+    from_ns: int
+    to_ns: int
+    T_from_to: RigidTransform
+    covariance: FloatArray
+
+
+def taken_at_once(scan: Scan, twist: FloatArray) -> FloatArray:
+    """Return the points of a scan as they were at its stamp, shape (N, 3), metres.
+
+    Parameters
+    ----------
+    scan
+        Measured while the lidar moved, if its points have times.
+    twist
+        Angular velocity in rad/s and velocity in m/s in the lidar frame, shape (6,), constant over
+        the scan.
+    """
+    if scan.time_s is None or not np.any(twist):
+        return scan.points
+    turned = Rotation.from_rotvec(scan.time_s[:, None] * twist[:3]).apply(scan.points)
+    return np.asarray(turned + scan.time_s[:, None] * twist[3:])

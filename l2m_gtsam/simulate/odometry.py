@@ -1,0 +1,154 @@
+"""Odometry that drifts as a vehicle drives, and says how far it may have."""
+
+from enum import StrEnum
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.options import Options
+from l2m_gtsam.simulate.sensors import NoiseOptions
+
+# An error of nothing cannot be told from one that is unknown: metres and radians.
+LEAST_ERROR = 1e-6
+
+
+class OdometryOrigin(StrEnum):
+    """Where odometry says that a drive begins."""
+
+    MAP = "map"
+    START = "start"
+
+
+class OdometryOptions(Options):
+    """How odometry drifts along a drive."""
+
+    scale: Annotated[float, Field(ge=0, lt=1)] = 0.01
+    """Every way is measured too long or too short by this share of it."""
+    scale_length: Annotated[float, Field(gt=0)] = 100.0
+    """After this way in metres it is drawn anew which of both."""
+    yaw_walk: Annotated[float, Field(ge=0)] = 0.05
+    """Random walk of the heading, degrees after a metre; it grows with the root of the way."""
+    position_walk: Annotated[float, Field(ge=0)] = 0.01
+    """Random walk of the position along each axis, metres after a metre."""
+    origin: OdometryOrigin = OdometryOrigin.MAP
+    """`map`: the first pose is the true one up to the noise of poses. `start`: it is the origin,
+    so that odometry does not know where in the map it is."""
+    frame: Annotated[str, Field(min_length=1)] = "odom"
+    """Name of the frame of the poses."""
+
+
+def drifting(
+    poses: Trajectory, options: OdometryOptions, noise: NoiseOptions, rng: np.random.Generator
+) -> Trajectory:
+    """Return what odometry makes of a drive, with the covariance of every pose.
+
+    Roll and pitch do not drift: gravity holds them. Covariances accumulate from step to step,
+    ``P' = Ad P Ad^T + Q``, with independent steps: those of a scale are exact for straight ways of
+    ``scale_length`` and its multiples, and larger than the error elsewhere.
+
+    Parameters
+    ----------
+    poses
+        True poses of the lidar in the map.
+    options
+        How far it drifts.
+    noise
+        Of poses: the error of the first one.
+    rng
+        Source of randomness.
+    """
+    steps = np.diff(poses.p, axis=0)
+    way = np.linalg.norm(steps, axis=1)
+    yaw, shift, scale = _errors(options, way, rng)
+    start, covariance = _start(noise, rng)
+    # An error of the start turns and shifts everything, one of the heading all that follows.
+    turn = poses.R[0] @ start.R @ poses.R[0].T @ _about_vertical(yaw)
+    measured = np.einsum("nij,nj->ni", turn[:-1], (1 + scale[:, None]) * steps + shift)
+    p = np.cumsum(np.vstack([poses.p[0] + poses.R[0] @ start.t, measured]), axis=0)
+    R = turn @ poses.R
+    if options.origin is OdometryOrigin.START:
+        R, p = R[0].T @ R, (p - p[0]) @ R[0]
+    stated = _accumulated(covariance, R, p, _step_covariances(options, poses.R[1:], R[1:], p))
+    return Trajectory(poses.stamp_ns, R, p, options.frame, poses.child_frame, stated)
+
+
+def _errors(
+    options: OdometryOptions, way: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return heading error of N poses (rad), shifts (m) and scale errors of N - 1 steps."""
+    root = np.sqrt(way)
+    yaw = np.cumsum(np.deg2rad(options.yaw_walk) * root * rng.standard_normal(len(way)))
+    shift = options.position_walk * root[:, None] * rng.standard_normal((len(way), 3))
+    travelled = np.cumsum(way) - way
+    piece = (travelled / options.scale_length).astype(np.int64)
+    sign = rng.choice([-1.0, 1.0], piece.max(initial=0) + 1)
+    return np.append(0.0, yaw), shift, options.scale * sign[piece]
+
+
+def _start(noise: NoiseOptions, rng: np.random.Generator) -> tuple[RigidTransform, FloatArray]:
+    """Return the error of the first pose and its covariance, shape (6, 6)."""
+    sigma = np.repeat([np.deg2rad(noise.rotation), noise.position], 3)
+    sigma = np.maximum(sigma, LEAST_ERROR)
+    drawn = sigma * rng.standard_normal(6)
+    return RigidTransform(Rotation.from_rotvec(drawn[:3]).as_matrix(), drawn[3:]), np.diag(sigma**2)
+
+
+def _about_vertical(angle: FloatArray) -> FloatArray:
+    """Return rotations about the map's vertical, shape (N, 3, 3)."""
+    return Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0])).as_matrix()
+
+
+def _step_covariances(
+    options: OdometryOptions, R_map_lidar: FloatArray, R: FloatArray, p: FloatArray
+) -> FloatArray:
+    """Return the covariance of each step's error, a right perturbation, shape (N - 1, 6, 6).
+
+    Parameters
+    ----------
+    options
+        How far odometry drifts.
+    R_map_lidar
+        True rotations at the ends of the steps, which tell where the vertical is.
+    R
+        Rotations of odometry there.
+    p
+        Positions of odometry, one more.
+    """
+    steps = np.einsum("nji,nj->ni", R, np.diff(p, axis=0))
+    way = np.linalg.norm(steps, axis=1)[:, None, None]
+    ahead = steps / np.maximum(way[:, 0], np.finfo(float).tiny)
+    up = R_map_lidar[:, 2]
+    Q = np.zeros((len(way), 6, 6))
+    Q[:, :3, :3] = way * np.deg2rad(options.yaw_walk) ** 2 * up[:, :, None] * up[:, None]
+    Q[:, 3:, 3:] = way * options.position_walk**2 * np.eye(3)
+    along = options.scale**2 * options.scale_length * ahead[:, :, None] * ahead[:, None]
+    Q[:, 3:, 3:] += way * along
+    return Q
+
+
+def _accumulated(start: FloatArray, R: FloatArray, p: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return the covariance of every pose, shape (N, 6, 6).
+
+    All steps' errors are moved to the first pose, where they add up, and the sums to each pose.
+    """
+    there, back = _adjoints(R, p - p[0]), _adjoints(*_inverse(R, p - p[0]))
+    fresh = np.concatenate([start[None], Q])
+    summed = np.cumsum(there @ fresh @ there.swapaxes(1, 2), axis=0)
+    P = back @ summed @ back.swapaxes(1, 2)
+    return np.asarray((P + P.swapaxes(1, 2)) / 2)
+
+
+def _inverse(R: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+    back = R.swapaxes(1, 2)
+    return back, -np.einsum("nij,nj->ni", back, p)
+
+
+def _adjoints(R: FloatArray, p: FloatArray) -> FloatArray:
+    """Return what takes small motions of a body to those of its frame, shape (N, 6, 6)."""
+    found = np.zeros((len(p), 6, 6))
+    found[:, :3, :3] = found[:, 3:, 3:] = R
+    found[:, 3:, :3] = np.cross(p[:, None], R.swapaxes(1, 2)).swapaxes(1, 2)
+    return found

@@ -1,0 +1,190 @@
+"""A mapping bag with point clouds, and a drive that has no poses but those of its clouds."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Reader, Writer
+
+from l2m_gtsam.batch.opening import SavedMap
+from l2m_gtsam.batch.scan_poses import read_drive_on, read_drive_or_follow
+from l2m_gtsam.batch.simulation import simulate_bags
+from l2m_gtsam.config import Config, load_config
+from l2m_gtsam.simulate.bag_writer import BagKind
+from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
+from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.map_file import load_map, save_map
+from tests.end_to_end.conftest import complaint_here, l2m
+from tests.quick_maps import QUICK_HARMONIC
+
+# The tutorial's hall with a lidar of few columns, which a driver has freed of motion.
+HALL = {
+    "floor_plan": {
+        "length": 11.0,
+        "width": 6.4,
+        "rack_rows": 1,
+        "rack_depth": 1.4,
+        "blocks": 1,
+        "cross_aisle": 3.4,
+    },
+    "suite": {"lateral": [-0.3, 0.3], "heights": [-0.5, 0.0]},
+    "array": {"count": 1},
+    "mapping_sampling": {"field_rate": 5.0},
+    "calibration_sampling": {"field_rate": 4.0},
+    "calibration_route": {"turns": 1},
+    "lidar": {"rate": 2.5, "columns": 120},
+}
+PRIOR = {"floor_scale": 4.0, "floor_depth": 0.6, "noise": 0.1}
+
+
+@dataclass(frozen=True)
+class Scanned:
+    """What lies on disk, and the truth.
+
+    Attributes
+    ----------
+    mapping, drive
+        Bags with point clouds; that of the drive has no poses.
+    map
+        A map with the cloud of the mapping bag.
+    config, nowhere
+        Configurations, with and without the start of the drive.
+    scenario
+        The truth.
+    """
+
+    mapping: Path
+    drive: Path
+    map: Path
+    config: Path
+    nowhere: Path
+    scenario: Scenario
+
+
+def without(topic: str, bag: Path, out: Path, seconds: float = np.inf) -> Path:
+    """Copy a ROS1 bag, or the begin of it, without one of its topics."""
+    with Reader(bag) as reader, Writer(out) as writer:
+        kept = [c for c in reader.connections if c.topic != topic]
+        assert len(kept) < len(reader.connections)
+        new = {
+            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
+            for c in kept
+        }
+        for connection, stamp, raw in reader.messages(kept):
+            if stamp - reader.start_time > 1e9 * seconds:
+                break
+            writer.write(new[connection.id], stamp, raw)
+    return out
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Scanned:
+    folder = tmp_path_factory.mktemp("scanned")
+    options = ScenarioOptions.model_validate(HALL)
+    scenario = simulate_bags(folder, options, [BagKind.ROS1], lambda stage, share: None)
+    harmonic = QUICK_HARMONIC | {"hyperparameters": PRIOR}
+    begin = scenario.calibration.recording.trajectory.p[0] + [0.3, -0.2, 0.1]
+    mapping = {"model": {"harmonic": harmonic}}
+    solve = {"uncertainty": "independent"}
+    common = {"mapping": mapping, "calibration": {"solve": solve}}
+    config, nowhere = folder / "config.yaml", folder / "nowhere.yaml"
+    config.write_text(json.dumps(common | {"lidar": {"start": {"position": begin.tolist()}}}))
+    nowhere.write_text(json.dumps(common | {"lidar": {"search": {"tried": 8}}}))
+    path, bag = folder / "map.npz", folder / "mapping_ros1.bag"
+    suite = ("--suite", folder / "suite.yaml")
+    l2m("map", "build", bag, *suite, "--lidar", "--config", config, "--out", path)
+    drive = without("/odometry", folder / "calibration_ros1.bag", folder / "drive.bag")
+    return Scanned(bag, drive, path, config, nowhere, scenario)
+
+
+def test_the_cloud_is_saved_with_the_map(hall: Scanned) -> None:
+    lidar = load_map(hall.map).lidar
+    assert lidar is not None
+    assert 5_000 < len(lidar.points) < 200_000
+    # Walls are where they are built, as far as 3 mm noise of the mapping poses goes.
+    outer = np.array([lidar.points.min(axis=0), lidar.points.max(axis=0)])
+    assert np.all(np.ptp(outer, axis=0)[:2] < [11.5, 6.9])
+    assert "cloud of scans" in l2m("map", "info", hall.map).out
+
+
+def test_poses_of_a_drive_come_from_its_clouds(hall: Scanned) -> None:
+    """Errors of millimetres, no larger than their sigmas say."""
+    saved, config = SavedMap.read(hall.map), load_config(hall.config)
+    found = read_drive_on(saved, hall.drive, config, lambda stage, share: None)
+    assert "poses are those of its point clouds" in found.note
+    trajectory = found.trajectory
+    assert trajectory.frame == "map"
+    true = hall.scenario.calibration.motion.at(trajectory.stamp_ns)
+    error = np.einsum("nji,nj->ni", trajectory.R, true.p - trajectory.p)
+    # Range noise of 10 mm over 1,500 points; 3 mm noise of the mapping poses, smoothed.
+    assert np.sqrt(np.mean(error**2)) < 0.003
+    assert trajectory.covariance is not None
+    variance = np.diagonal(trajectory.covariance, axis1=1, axis2=2)[:, 3:]
+    assert np.mean(error**2 / variance) < 1.5
+
+
+def test_where_there_is_no_map_clouds_give_odometry(hall: Scanned, tmp_path: Path) -> None:
+    begin = without(
+        "/odometry", hall.drive.parent / "calibration_ros1.bag", tmp_path / "b.bag", 6.0
+    )
+    found = read_drive_or_follow(begin, Config(), lambda stage, share: None)
+    assert "odometry by its point clouds" in found.note
+    assert (found.trajectory.frame, len(found.series)) == ("odom", 1)
+    true = hall.scenario.calibration.motion.at(found.trajectory.stamp_ns)
+    way = np.einsum("ji,nj->ni", true.R[0], true.p - true.p[0])
+    assert np.linalg.norm(way[-1]) > 1.0
+    # Scans of 1,500 points, some of them 1 m from their key scan: a centimetre.
+    assert np.linalg.norm(found.trajectory.p - way, axis=1).max() < 0.015
+    told = l2m("inspect", begin).out
+    assert "poses where there are no others" in told
+    assert "gives poses to its point clouds" in told
+
+
+def test_a_bag_without_odometry_is_calibrated(hall: Scanned, tmp_path: Path) -> None:
+    run = l2m(
+        "calibrate", hall.drive, "--map", hall.map, "--config", hall.config, "--out", tmp_path
+    )
+    assert "poses are those of its point clouds" in run.out
+    result = read_calibration(tmp_path / "calibration.yaml")
+    assert "poses are those of its point clouds" in result.notes[0]
+    truth = {each.sensor: each for each in hall.scenario.truth}
+    for sensor in result.sensors:
+        true = truth[sensor.sensor]
+        # A coarse map of a small hall, 200 readings: centimetres, as with odometry.
+        assert np.linalg.norm(sensor.t_lidar_mag - true.t_lidar_mag) < 0.04
+        assert np.abs(sensor.distortion.H - true.distortion.H).max() < 1.0
+
+
+def test_a_hall_that_looks_the_same_from_both_ends(hall: Scanned, tmp_path: Path) -> None:
+    """Without a start it is looked for, and found twice."""
+    told = complaint_here(
+        "calibrate",
+        hall.drive,
+        "--map",
+        hall.map,
+        "--config",
+        hall.nowhere,
+        "--out",
+        tmp_path / "x",
+    )
+    assert "fits at several places" in told
+    assert "lidar.start" in told
+    assert not (tmp_path / "x").exists()
+
+
+def test_a_map_without_a_cloud_is_told(hall: Scanned, tmp_path: Path) -> None:
+    plain = tmp_path / "plain.npz"
+    save_map(plain, replace(load_map(hall.map), lidar=None))
+    told = complaint_here(
+        "calibrate", hall.drive, "--map", plain, "--config", hall.config, "--out", tmp_path / "x"
+    )
+    assert "`l2m map build --lidar`" in told
+
+
+def test_a_mapping_bag_without_clouds_is_told(hall: Scanned, tmp_path: Path) -> None:
+    bare = without("/points", hall.mapping, tmp_path / "bare.bag")
+    told = complaint_here("map", "build", bare, "--lidar", "--out", tmp_path / "map.npz")
+    assert "no topic of type sensor_msgs/msg/PointCloud2" in told
+    assert not (tmp_path / "map.npz").exists()
