@@ -17,6 +17,9 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.slam_results import LocalisationResult
 
+# Of the first pose, rad^2 and m^2, where nothing is said of it: it is what poses are told from.
+HERE = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
+
 
 @dataclass(frozen=True)
 class Exploration:
@@ -55,7 +58,8 @@ def explore(
     calibration
         Of the sensors.
     options
-        Key poses, odometry, start, tiles, and what becomes of the calibration.
+        Key poses, odometry, start, tiles, and what becomes of the calibration. Where no start is
+        given, poses and their sigmas are those from the first pose on.
     progress
         Called with a stage and the fraction of it that is done.
     calibration_source
@@ -71,6 +75,8 @@ def explore(
         There are too few readings to learn a prior of the field from.
     """
     drive, notes = prepared(recording, calibration, options)
+    if options.start.position is None and options.start.quaternion_xyzw is None:
+        drive = replace(drive, start=replace(drive.start, covariance=HERE))
     progress("learning the field's prior", 0.0)
     mapped = map_drive(drive, drive_prior(drive, options.tiles), options, progress)
     refined = options.calibration is CalibrationUse.REFINED

@@ -53,6 +53,21 @@ def rounds(seconds: float, radius: float = 2.5) -> Trajectory:
     return Trajectory(stamps, R, p, "map", "lidar")
 
 
+def laps(seconds: float, radii: tuple[float, float] = (4.0, 2.5)) -> Trajectory:
+    """Return laps of an ellipse, never quite the same, with a little roll, pitch and heave."""
+    at = np.arange(0, seconds, 1 / RATE_HZ)
+    angle = SPEED * at / np.sqrt(np.mean(np.square(radii)))
+    wide = radii[0] + 0.15 * np.sin(1.37 * angle + 0.3)
+    deep = radii[1] + 0.15 * np.sin(1.71 * angle + 1.0)
+    height = 0.5 + 0.03 * np.sin(1.3 * at)
+    p = np.column_stack([wide * np.cos(angle), deep * np.sin(angle), height])
+    v = np.gradient(p, at, axis=0)
+    turns = [np.arctan2(v[:, 1], v[:, 0]), 0.02 * np.sin(0.9 * at), 0.02 * np.cos(1.1 * at)]
+    R = Rotation.from_euler("ZYX", np.column_stack(turns)).as_matrix()
+    stamps = (1e9 * at).astype(np.int64) + 1_700_000_000_000_000_000
+    return Trajectory(stamps, R, p, "map", "lidar")
+
+
 def drifted(truth: Trajectory, rng: np.random.Generator, share: float = 0.01) -> Trajectory:
     """Return what odometry makes of a drive: it slips one way, and the heading wanders a little.
 

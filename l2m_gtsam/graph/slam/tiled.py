@@ -10,7 +10,7 @@ from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
 from l2m_gtsam.graph.slam.sight import Place, Sight, look, place
-from l2m_gtsam.graph.slam.tiles import Anchoring, WaveTile, anchored
+from l2m_gtsam.graph.slam.tiles import Anchoring, WaveTile, anchored, level_axes
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ class TiledDrive:
         R = np.stack([pose.rotation().matrix() for pose in poses])
         p = np.stack([pose.translation() for pose in poses])
         anchoring = anchored(R, p, prior.options.core)
+        axes = level_axes(R)
         owner = anchoring.tile[drive.readings.key_pose]
         tiles = []
         for number, anchor in enumerate(anchoring.anchor.tolist()):
             rows = np.flatnonzero(owner == number)
             if len(rows):
                 where = _relative_place(drive, rows, poses, anchor, sensors)
-                z = where.x[:, 2]
-                field = WaveTile.about(prior, float(z.min()), float(z.max()))
+                field = WaveTile.about(prior, R[anchor].T @ axes[anchor], where.x)
                 tiles.append(LaidTile(number, anchor, rows, field, where))
         return cls(anchoring, tuple(tiles))
 

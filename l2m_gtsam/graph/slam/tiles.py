@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
@@ -17,11 +18,14 @@ from l2m_gtsam.maps.harmonic.uniform import UniformField
 # with the prior as learnt a vehicle seemed to sink by 0.1-0.2 m, with sigmas of 0.04 m. The pull
 # falls with the square of this; what is lost is small, for readings are dense along the way.
 WIDER = 10.0
+REWEIGHTINGS = 15
+AXES = 3
+LARGE = 2.0  # length of a whitened residual beyond which a reading counts for less
 
 
 @dataclass(frozen=True)
 class WaveTile:
-    """Uniform field, floor and ceiling waves of a box about an anchor, in the anchor's frame.
+    """Uniform field, floor and ceiling waves of a level box about an anchor, in its frame.
 
     Attributes
     ----------
@@ -38,11 +42,22 @@ class WaveTile:
     prior: FieldPrior
 
     @classmethod
-    def about(cls, prior: FieldPrior, low: float, high: float) -> "WaveTile":
-        """Return the tile whose lowest and highest readings are there, metres from the anchor."""
-        edge = prior.options.edge
+    def about(cls, prior: FieldPrior, R_anchor_level: FloatArray, points: FloatArray) -> "WaveTile":
+        """Return the tile of some readings.
+
+        Parameters
+        ----------
+        prior
+            Of the field.
+        R_anchor_level
+            Axes of the box in the anchor's frame, shape (3, 3); the last points up.
+        points
+            Where the readings are in the anchor's frame in metres, shape (N, 3).
+        """
+        edge, z = prior.options.edge, points @ R_anchor_level[:, 2]
+        low, high = float(z.min()), float(z.max())
         size, corner = np.array([edge, edge]), np.array([-edge / 2, -edge / 2, low])
-        frame = TileFrame(np.eye(3), corner, size, high - low)
+        frame = TileFrame(R_anchor_level, R_anchor_level @ corner, size, high - low)
         floor = modes_up_to(FLOOR, size, 0.0, prior.resolution.floor)
         ceiling = modes_up_to(CEILING, size, frame.height, prior.resolution.ceiling)
         basis = Basis(frame, (UniformField(UNIFORM_SIGMA), floor, ceiling))
@@ -77,7 +92,9 @@ class WaveTile:
     def likely_weights(
         self, points: FloatArray, field: FloatArray, variance: FloatArray
     ) -> FloatArray:
-        """Return the most likely weights, shape (m,).
+        """Return weights that readings make likely, wrong ones among them, shape (m,).
+
+        By reweighted least squares, each reading as in least absolute deviations beyond its noise.
 
         Parameters
         ----------
@@ -88,8 +105,15 @@ class WaveTile:
         """
         root = 1 / np.sqrt(variance)
         F = (self.features(points) * root[:, :, None]).reshape(-1, len(self))
-        y = (field * root).ravel()
-        return np.asarray(np.linalg.solve(F.T @ F + np.eye(len(self)), F.T @ y))
+        y, trust = (field * root).ravel(), np.ones(len(points))
+        weights: FloatArray = np.zeros(len(self))
+        for _ in range(REWEIGHTINGS):
+            by = np.repeat(trust, AXES)
+            information = F.T @ (F * by[:, None]) + np.eye(len(self))
+            weights = np.asarray(np.linalg.solve(information, F.T @ (by * y)))
+            off = np.linalg.norm((F @ weights - y).reshape(-1, AXES), axis=1)
+            trust = 1 / np.maximum(off / LARGE, 1.0)
+        return weights
 
 
 @dataclass(frozen=True)
@@ -111,22 +135,23 @@ class Anchoring:
         return len(self.anchor)
 
     def returns(self, way: FloatArray, least_m: float) -> IntArray:
-        """Return the key poses in tiles that were left at least so far ago on the way.
+        """Return the key poses of visits to tiles that were left at least so far ago on the way.
 
         Parameters
         ----------
         way
             From the start to each key pose in metres, shape (K,).
         least_m
-            What counts as having been away.
+                What counts as having been away.
         """
-        last = np.full(len(self), -np.inf)
-        returned, found = np.zeros(len(self), bool), []
-        for k, tile in enumerate(self.tile.tolist()):
-            returned[tile] |= np.isfinite(last[tile]) and way[k] - last[tile] >= least_m
-            if returned[tile]:
+        left_at = np.full(len(self), np.nan)
+        found, returned = [], False
+        for k, (before, tile) in enumerate(zip([-1, *self.tile[:-1]], self.tile, strict=True)):
+            if tile != before:
+                left_at[before] = way[k - 1]
+                returned = bool(way[k] - left_at[tile] >= least_m)
+            if returned:
                 found.append(k)
-            last[tile] = way[k]
         return np.array(found, dtype=np.int64)
 
 
@@ -140,10 +165,10 @@ def anchored(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
     core
         Of a tile in metres.
     """
-    anchors, tile = [0], np.zeros(len(p), dtype=np.int64)
+    anchors, tile, axes = [0], np.zeros(len(p), dtype=np.int64), level_axes(R)
     for k in range(1, len(p)):
         at = np.array(anchors)
-        away = np.einsum("bji,bj->bi", R[at], p[k] - p[at])[:, :2]
+        away = np.einsum("bji,bj->bi", axes[at], p[k] - p[at])[:, :2]
         distance = np.abs(away).max(axis=1)
         nearest = int(distance.argmin())
         if distance[nearest] > core / 2:
@@ -151,3 +176,9 @@ def anchored(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
             anchors.append(k)
         tile[k] = nearest
     return Anchoring(np.array(anchors), tile)
+
+
+def level_axes(R: FloatArray) -> FloatArray:
+    """Return axes in the map that turn about its vertical with the vehicle, (K, 3, 3)."""
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    return np.asarray(Rotation.from_euler("z", yaw[:, None]).as_matrix())
