@@ -12,9 +12,13 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 from scipy.spatial.transform import Rotation
 
+from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.simulate.bag_writer import BagKind
+from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.yaml_file import read_yaml
 from tests.end_to_end.conftest import complaint_here, l2m
 
@@ -66,10 +70,11 @@ def test_another_run_without_drift_leaves_no_truth_of_the_one_before(tmp_path: P
     out = tmp_path / "sim"
     out.mkdir()
     (out / "ground_truth.tum").write_text("of the run before")
-    plain = options(tmp_path, odometry=None, lidar=None)
-    l2m("simulate", "--options", plain, "--kind", "mcap", "--out", out)
+    plain = ScenarioOptions.model_validate({**CORRIDOR, "odometry": None, "lidar": None})
+    simulate_bags(out, plain, [BagKind.MCAP], lambda stage, share: None)
     assert not (out / "ground_truth.tum").exists()
-    assert "/points" not in l2m("inspect", out / "mapping_mcap").out
+    topics = {each.topic for each in inspect_bag(out / "calibration_mcap", BagOptions()).topics}
+    assert topics == {"/odometry", "/mag_00"}
 
 
 @pytest.mark.parametrize(
