@@ -1,10 +1,12 @@
 """Recording + calibration -> poses and the field along them, without a map. Pure."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Recording, SourceFile
+from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.field_prior import FieldPrior, TileOptions, field_prior
 from l2m_gtsam.graph.slam.localisation import Localised
@@ -15,8 +17,15 @@ from l2m_gtsam.graph.slam.sight import place
 from l2m_gtsam.localise import prepared
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult
-from l2m_gtsam.slam_results import LocalisationResult
+from l2m_gtsam.slam_results import Explored, LocalisationResult, LocalisationStatus
 
+NOWHERE_TWICE = (
+    "no place was come to twice: readings of an unknown field take out little drift then"
+)
+NO_FIELD = (
+    "no field explains the readings at poses that odometry allows: is the calibration that of "
+    "these sensors, and does the odometry jump?"
+)
 # Of the first pose, rad^2 and m^2, where nothing is said of it: it is what poses are told from.
 HERE = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
 
@@ -73,7 +82,11 @@ def explore(
         Readings and poses do not overlap, or there are fewer than two poses.
     MapError
         There are too few readings to learn a prior of the field from.
+    ConfigError
+        The start is to be looked for, in no map.
     """
+    if options.start.anywhere:
+        raise ConfigError("`slam.start.anywhere` looks for the start in a map: give one with --map")
     drive, notes = prepared(recording, calibration, options)
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=HERE))
@@ -81,17 +94,30 @@ def explore(
     mapped = map_drive(drive, drive_prior(drive, options.tiles), options, progress)
     refined = options.calibration is CalibrationUse.REFINED
     result = localisation_result(drive, mapped.solution, calibration if refined else None)
-    if not len(mapped.returns):
-        told = "no place was come to twice: readings of an unknown field take out little drift then"
-        notes = (*notes, told)
+    explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
     result = replace(
         result,
-        notes=(*notes, *result.notes),
+        **_ending(result, explored),
+        notes=(*notes, *([] if explored.returned else [NOWHERE_TWICE])),
         bag=recording.source,
         calibration_source=calibration_source,
+        explored=explored,
     )
     points, field = surveyed(mapped.solution.drive, mapped.solution)
     return Exploration(result, mapped.solution, points, field)
+
+
+def _ending(result: LocalisationResult, explored: Explored) -> dict[str, Any]:
+    """Return status and message: what is said of a map holds for the field that was met."""
+    if result.status is LocalisationStatus.LOCALISED:
+        told = (
+            f"{explored.tiles} tiles of field; {explored.returned:.0%} of the key poses lie where "
+            "the vehicle had been before"
+        )
+        return {"status": result.status, "message": told}
+    if result.status is LocalisationStatus.NOT_CONVERGED:
+        return {"status": result.status, "message": result.message}
+    return {"status": LocalisationStatus.NOT_CONVERGED, "message": NO_FIELD}
 
 
 def drive_prior(drive: Drive, options: TileOptions) -> FieldPrior:

@@ -101,6 +101,7 @@ def localisation_record(
         poses=_poses(result.trajectory),
         odometry=_odometry(solution.drive, result.odometry),
         start=None if result.start is None else _start(result.start),
+        explored=result.explored,
         truth=truth,
         picture=map_picture(told.field_map, result.trajectory.p),
         sources=_sources(result, told),

@@ -8,7 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from l2m_gtsam.metric_results import Fit, MapPicture, Normalised, Record, Row, Rows, Series
-from l2m_gtsam.slam_results import DriftFigures, LocalisationStatus, SensorUse, StartVerdict
+from l2m_gtsam.slam_results import (
+    DriftFigures,
+    Explored,
+    LocalisationStatus,
+    SensorUse,
+    StartVerdict,
+)
 from l2m_gtsam.validation_results import ChiSquare, NamedSource
 
 POSE_FREEDOM = 6
@@ -240,6 +246,8 @@ class LocalisationRecord(Record):
         At key poses.
     start
         Where it was looked for; absent where it was given.
+    explored
+        How the field was found; absent where there was a map.
     truth
         Absent where none was given.
     picture
@@ -263,6 +271,7 @@ class LocalisationRecord(Record):
     poses: tuple[PoseRecord, ...]
     odometry: tuple[OdometryRecord, ...]
     start: StartRecord | None
+    explored: Explored | None
     truth: TruthRecord | None
     picture: MapPicture
     sources: tuple[NamedSource, ...]

@@ -147,8 +147,24 @@ class StartSearch:
 
 
 @dataclass(frozen=True)
+class Explored(Record):
+    """What became of a place without a map.
+
+    Attributes
+    ----------
+    tiles
+        That its field was laid out on.
+    returned
+        Share of the key poses in tiles that had been left before: loops are closed there.
+    """
+
+    tiles: int
+    returned: float
+
+
+@dataclass(frozen=True)
 class LocalisationResult:
-    """A drive localised in a magnetic map.
+    """A drive localised in a magnetic map, or in the field that it met.
 
     Attributes
     ----------
@@ -170,6 +186,8 @@ class LocalisationResult:
         Sources with hashes; absent when the data did not come from files.
     start
         How the start was found; absent where it was known.
+    explored
+        How the field was found; absent where there was a map.
     """
 
     status: LocalisationStatus
@@ -184,3 +202,4 @@ class LocalisationResult:
     map: SourceFile | None
     calibration_source: SourceFile | None
     start: StartSearch | None = None
+    explored: Explored | None = None

@@ -82,7 +82,7 @@ def build_map_file(
         "config": config.model_dump(mode="json", include={"bag", "mapping"}),
         "version": version("l2m-gtsam"),
     }
-    return _save_map(out, field_map, provenance, None if scanned is None else scanned.lidar)
+    return write_map(out, field_map, provenance, None if scanned is None else scanned.lidar)
 
 
 def update_map_file(
@@ -138,7 +138,7 @@ def update_map_file(
         "updates": [*saved.updates, update],
         "frame": survey.recordings[0].trajectory.frame,
     }
-    return _save_map(out, updated, provenance, saved.state.lidar)
+    return write_map(out, updated, provenance, saved.state.lidar)
 
 
 def compare_map_kinds(
@@ -182,7 +182,7 @@ def plot_map_file(path: Path, out: Path, height: float | None, progress: Progres
     save_figure(map_figure(field_map, height), out)
 
 
-def _save_map(
+def write_map(
     out: Path, field_map: FieldMap, provenance: dict[str, Any], lidar: LidarMap | None
 ) -> BuiltMap:
     """Write a map with where it came from, besides what it says of itself."""

@@ -1,22 +1,29 @@
-"""Drives localised in a map: from files to files."""
+"""Drives localised in a map, or in the field that they meet: from files to files."""
 
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 from l2m_gtsam.batch.drives import METRICS_FILE
+from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.reports import REPORT_FILE
 from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.batch.slam_report import SLAM_FILE, write_slam_report
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import Recording
+from l2m_gtsam.data import Recording, SourceFile
 from l2m_gtsam.errors import MapError, OutputError
+from l2m_gtsam.explore import explore
 from l2m_gtsam.graph.slam.g2o import write_g2o
-from l2m_gtsam.localise import Localisation, Sources, localise
+from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.localise import Sources, localise
+from l2m_gtsam.maps.build import build_map
+from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.slam.errors import check_truth
+from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.slam_figures import Told, localisation_record
 from l2m_gtsam.slam_records import LocalisationRecord
 from l2m_gtsam.slam_results import LocalisationResult, LocalisationStatus
@@ -32,7 +39,8 @@ TRAJECTORY_FILE = "trajectory.tum"
 BAG_FILE = "trajectory.mcap"
 GRAPH_FILE = "graph.g2o"
 REFINED_FILE = "refined.yaml"
-FILES = (TRAJECTORY_FILE, BAG_FILE, GRAPH_FILE, SLAM_FILE, REFINED_FILE, REPORT_FILE)
+MAP_FILE = "map.npz"
+FILES = (TRAJECTORY_FILE, BAG_FILE, GRAPH_FILE, SLAM_FILE, REFINED_FILE, MAP_FILE, REPORT_FILE)
 NOWHERE = (LocalisationStatus.OUTSIDE_MAP, LocalisationStatus.NOT_HERE)
 
 
@@ -45,7 +53,7 @@ class SlamInput:
     bag
         A drive with odometry and magnetic readings.
     map
-        Map file.
+        Map file; without one the field is found with the poses.
     calibration
         A `calibration.yaml` of its sensors.
     truth
@@ -53,7 +61,7 @@ class SlamInput:
     """
 
     bag: Path
-    map: Path
+    map: Path | None
     calibration: Path
     truth: Path | None = None
 
@@ -68,16 +76,29 @@ class SlamOutcome:
 
 
 @dataclass(frozen=True)
-class _Made:
-    """A localisation with what it was made from and what is kept of it."""
+class _Found:
+    """A drive that was solved.
+
+    Attributes
+    ----------
+    recording
+        The drive.
+    result, solution
+        What came out, and of its graph.
+    field_map
+        That it was localised in, or that was made of what it met.
+    """
 
     recording: Recording
-    found: Localisation
-    record: LocalisationRecord
+    result: LocalisationResult
+    solution: Localised
+    field_map: FieldMap
 
 
 def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) -> SlamOutcome:
     """Localise a drive; write trajectory, graph, figures and, if it is refined, the calibration.
+
+    Without a map the field along the drive is written as one.
 
     Parameters
     ----------
@@ -97,7 +118,8 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
         drive turns out not to be in this map, or may have begun at several places of it.
     """
     _check_folder(out)
-    saved, calibration = SavedMap.read(given.map), read_calibration(given.calibration)
+    saved = None if given.map is None else SavedMap.read(given.map)
+    calibration = read_calibration(given.calibration)
     if (out / REFINED_FILE).exists() and given.calibration.samefile(out / REFINED_FILE):
         raise OutputError(f"{given.calibration}: is what is read; choose another --out")
     truth = None if given.truth is None else read_tum(given.truth)
@@ -105,23 +127,54 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     gap = config.slam.max_pose_gap_s
     if truth is not None:
         check_truth(truth, recording.trajectory, gap, str(given.truth))
+    source = source_file(given.calibration)
+    if saved is None:
+        found = _explored(recording, calibration, source, config, progress)
+    else:
+        found = _localised(recording, calibration, source, saved, config, progress)
+    options = config.model_dump(mode="json", include={"bag", "slam", "qa"})
+    truth_source = None if given.truth is None else source_file(given.truth)
+    told = Told(calibration, found.field_map, options, gap, truth, truth_source)
+    record = localisation_record(found.result, found.solution, told)
+    ensure_folder(out)
+    _write(found, record, out)
+    if saved is None:
+        _write_map(found, config, out)
+    verdict = write_slam_report(out / REPORT_FILE, record, config.qa)
+    return SlamOutcome(found.result, record, verdict)
+
+
+def _localised(
+    recording: Recording,
+    calibration: CalibrationResult,
+    source: SourceFile,
+    saved: SavedMap,
+    config: Config,
+    progress: Progress,
+) -> _Found:
     start = config.slam.start
     # A start that is given, or found, puts odometry of any frame into the map.
     is_given = start.position is not None and start.quaternion_xyzw is not None
-    anywhere = start.anywhere or is_given
-    field_map = saved.open(progress, [] if anywhere else [recording])
-    sources = Sources(source_file(given.map), source_file(given.calibration))
+    field_map = saved.open(progress, [] if start.anywhere or is_given else [recording])
+    sources = Sources(source_file(saved.path), source)
     found = localise(recording, field_map, calibration, config.slam, progress, sources)
     if found.result.status in NOWHERE:
-        raise MapError(f"{given.bag} in {given.map}: {found.result.message}")
-    options = config.model_dump(mode="json", include={"bag", "slam", "qa"})
-    truth_source = None if given.truth is None else source_file(given.truth)
-    told = Told(calibration, field_map, options, gap, truth, truth_source)
-    made = _Made(recording, found, localisation_record(found.result, found.solution, told))
-    ensure_folder(out)
-    _write(made, out)
-    verdict = write_slam_report(out / REPORT_FILE, made.record, config.qa)
-    return SlamOutcome(found.result, made.record, verdict)
+        raise MapError(f"{recording.source.path} in {saved.path}: {found.result.message}")
+    return _Found(recording, found.result, found.solution, field_map)
+
+
+def _explored(
+    recording: Recording,
+    calibration: CalibrationResult,
+    source: SourceFile,
+    config: Config,
+    progress: Progress,
+) -> _Found:
+    found = explore(recording, calibration, config.slam, progress, source)
+    progress("building the map", 0.0)
+    field_map = build_map(found.points, found.field, config.mapping.model)
+    progress("building the map", 1.0)
+    return _Found(recording, found.result, found.solution, field_map)
 
 
 def _check_folder(out: Path) -> None:
@@ -133,21 +186,30 @@ def _check_folder(out: Path) -> None:
         )
 
 
-def _write(made: _Made, out: Path) -> None:
-    result, odometry = made.found.result, made.recording.trajectory
+def _write(found: _Found, record: LocalisationRecord, out: Path) -> None:
+    result, odometry = found.result, found.recording.trajectory
     write_tum(out / TRAJECTORY_FILE, result.trajectory)
     velocity = twists(odometry, result.trajectory.stamp_ns)
     write_trajectory_bag(out / BAG_FILE, LocalisedMotion(result.trajectory, velocity, odometry))
     with atomic_path(out / GRAPH_FILE) as temporary:
-        write_g2o(temporary, made.found.solution)
+        write_g2o(temporary, found.solution)
     (out / REFINED_FILE).unlink(missing_ok=True)  # of an earlier run, which these files replace
     if result.calibration is not None:
         refined = replace(
-            result.calibration,
-            bag=result.bag,
-            bags=(),
-            map=result.map,
-            options=made.record.options,
+            result.calibration, bag=result.bag, bags=(), map=result.map, options=record.options
         )
         write_calibration(out / REFINED_FILE, refined)
-    write_slam(out / SLAM_FILE, made.record)
+    write_slam(out / SLAM_FILE, record)
+
+
+def _write_map(found: _Found, config: Config, out: Path) -> None:
+    """Write the field that a drive met as a map: its poses are those that were found."""
+    result = found.result
+    provenance = {
+        "bags": [vars(found.recording.source)],
+        "calibration": None if (used := result.calibration_source) is None else vars(used),
+        "frame": result.trajectory.frame,
+        "config": config.model_dump(mode="json", include={"bag", "slam", "mapping"}),
+        "version": version("l2m-gtsam"),
+    }
+    write_map(out / MAP_FILE, found.field_map, provenance, None)

@@ -13,11 +13,14 @@ def slam(
         Path,
         typer.Argument(metavar="BAG", help="Drive with odometry: ROS1 .bag, ROS2 folder, .mcap."),
     ],
-    map_path: Annotated[Path, typer.Option("--map", help="Map file made by `l2m map build`.")],
     calibration: Annotated[
         Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
     ],
     out: Annotated[Path, typer.Option("--out", help="Folder for the results.")],
+    map_path: Annotated[
+        Path | None,
+        typer.Option("--map", help="Map file; without one the field is found with the poses."),
+    ] = None,
     truth: Annotated[
         Path | None,
         typer.Option("--truth", help="True poses of the LiDAR in the map (TUM), to compare with."),
@@ -26,7 +29,7 @@ def slam(
         Path | None, typer.Option("--config", help="YAML configuration; see `slam` in it.")
     ] = None,
 ) -> None:
-    """Localise a drive in a magnetic map, from a start that is known or looked for."""
+    """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
     from l2m_gtsam.batch.slam import SlamInput, slam_bag
     from l2m_gtsam.config import load_config
     from l2m_gtsam.qa.slam_tables import drift_lines, slam_table, start_lines, truth_lines

@@ -126,6 +126,27 @@ def check_report(out: Path, folder: Path) -> None:
     assert "slam.json: not a localisation file" in complaint_here("report", out)
 
 
+def test_a_drive_without_a_map_makes_one(yard: Yard, known: Path, tmp_path: Path) -> None:
+    """The map that comes out is one that another drive can be localised in."""
+    out = tmp_path / "out"
+    config = configured(yard, tmp_path, start={"position_m": 0.02})
+    files = ("--calibration", known, "--config", config)
+    run = l2m("slam", yard.west, *files, "--out", out)
+    assert "tiles of field" in run.out
+    told = json.loads((out / "slam.json").read_text())
+    assert told["explored"]["tiles"] > 1
+    assert [each["role"] for each in told["sources"]] == ["drive", "calibration"]
+    assert "found together" in (out / "report.html").read_text()
+    again = l2m("slam", yard.west, *files, "--map", out / "map.npz", "--out", tmp_path / "again")
+    assert "localised: the map explains" in again.out
+    lost = configured(yard, tmp_path, start={"anywhere": True})
+    line = complaint_here(
+        "slam", yard.west, "--calibration", known, "--config", lost, "--out", tmp_path / "none"
+    )
+    assert "give one with --map" in line
+    assert not (tmp_path / "none").exists()
+
+
 def test_bad_input_is_one_line_and_writes_nothing(
     yard: Yard, field_map: Path, known: Path, tmp_path: Path
 ) -> None:
