@@ -1,7 +1,6 @@
 """Recording + calibration -> poses and the field along them, without a map. Pure."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -91,13 +90,14 @@ def explore(
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=HERE))
     progress("learning the field's prior", 0.0)
-    mapped = map_drive(drive, drive_prior(drive, options.tiles), options, progress)
+    prior = drive_prior(drive, options.tiles)
+    progress("learning the field's prior", 1.0)
+    mapped = map_drive(drive, prior, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
     result = localisation_result(drive, mapped.solution, calibration if refined else None)
     explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
     result = replace(
-        result,
-        **_ending(result, explored),
+        told(result, explored),
         notes=(*notes, *([] if explored.returned else [NOWHERE_TWICE])),
         bag=recording.source,
         calibration_source=calibration_source,
@@ -107,17 +107,17 @@ def explore(
     return Exploration(result, mapped.solution, points, field)
 
 
-def _ending(result: LocalisationResult, explored: Explored) -> dict[str, Any]:
-    """Return status and message: what is said of a map holds for the field that was met."""
+def told(result: LocalisationResult, explored: Explored) -> LocalisationResult:
+    """Return a result that says of the field that was met what it says of a map."""
     if result.status is LocalisationStatus.LOCALISED:
-        told = (
+        message = (
             f"{explored.tiles} tiles of field; {explored.returned:.0%} of the key poses lie where "
             "the vehicle had been before"
         )
-        return {"status": result.status, "message": told}
+        return replace(result, message=message)
     if result.status is LocalisationStatus.NOT_CONVERGED:
-        return {"status": result.status, "message": result.message}
-    return {"status": LocalisationStatus.NOT_CONVERGED, "message": NO_FIELD}
+        return result
+    return replace(result, status=LocalisationStatus.NOT_CONVERGED, message=NO_FIELD)
 
 
 def drive_prior(drive: Drive, options: TileOptions) -> FieldPrior:

@@ -110,7 +110,7 @@ def localise(
 def prepared(
     recording: Recording, calibration: CalibrationResult, options: SlamOptions
 ) -> tuple[Drive, tuple[str, ...]]:
-    """Return a recording as a drive of its calibrated sensors, and a note on each of the others.
+    """Return a recording as a drive of its calibrated sensors, and what is worth a warning.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def prepared(
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
     )
-    return drive, notes
+    return drive, (*(part.note for part in recording.parts if part.note), *notes)
 
 
 def usable_sensors(

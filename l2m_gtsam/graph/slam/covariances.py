@@ -5,6 +5,27 @@ import numpy as np
 
 from l2m_factors import D, T, X
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import CalibrationError
+
+
+def solved_marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals:
+    """Return the marginals of a solved graph.
+
+    Raises
+    ------
+    CalibrationError
+        GTSAM's Cholesky cannot factor it. Every variable has a prior or hangs on one, so that this
+        is a matter of scale.
+    """
+    try:
+        return gtsam.Marginals(graph, values)
+    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException has no Python type
+        if "ndetermina" not in str(error):
+            raise
+        raise CalibrationError(
+            "the covariances of the poses cannot be computed: those of odometry, start and "
+            "calibration are too many orders of magnitude apart"
+        ) from error
 
 
 def pose_covariances(marginals: gtsam.Marginals, count: int) -> FloatArray:

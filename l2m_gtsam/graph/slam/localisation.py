@@ -13,7 +13,11 @@ import numpy as np
 from l2m_factors import CarriedBatch, key_pose_factor
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.optimise import Ending, Optimizer, optimise
-from l2m_gtsam.graph.slam.covariances import pose_covariances, sensor_covariances
+from l2m_gtsam.graph.slam.covariances import (
+    pose_covariances,
+    sensor_covariances,
+    solved_marginals,
+)
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.factors import calibration_graph, odometry_graph
 from l2m_gtsam.graph.slam.following import Follower, follow
@@ -183,7 +187,7 @@ class Problem:
         graph = self.graph(sight, weights, rest, shared)
         optimised = optimise(graph, values, Optimizer.LM, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
-        marginals = gtsam.Marginals(graph, values)
+        marginals = solved_marginals(graph, values)
         sight = self.look(values)
         return Localised(
             drive=replace(self._drive, sensors=sensors),

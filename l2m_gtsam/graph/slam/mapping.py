@@ -15,7 +15,11 @@ import numpy as np
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.optimise import Ending, LinearSolver, Optimizer, optimise
-from l2m_gtsam.graph.slam.covariances import pose_covariances, sensor_covariances
+from l2m_gtsam.graph.slam.covariances import (
+    pose_covariances,
+    sensor_covariances,
+    solved_marginals,
+)
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.factors import calibration_graph, calibration_values, odometry_graph
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
@@ -128,8 +132,12 @@ class TiledProblem:
         for k, pose in enumerate(poses):
             values.insert(X(k), pose)
         sights = tiled.sights(values, sensors)
-        W = self._gathered(tiled, [sight.whitening(noise) for sight in sights])
-        weights = self._weights(tiled, sights, noise, mu)
+        whitenings = [sight.whitening(noise) for sight in sights]
+        W = self._gathered(tiled, whitenings)
+        pairs = zip(sights, whitenings, strict=True)
+        r2 = self._gathered(tiled, [sight.squared(each) for sight, each in pairs])
+        robust = self._options.robust
+        weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
         chosen = np.flatnonzero(weights > NOTHING)
         graph = tiled.graph(
             self._drive, noise, W * np.sqrt(weights)[:, None, None], chosen, free=self._free
@@ -148,7 +156,7 @@ class TiledProblem:
     def finished(self, solved: Solved) -> Mapped:
         """Return a solved stage with its covariances and residuals."""
         drive, sensors = self._drive, solved.sensors
-        marginals = gtsam.Marginals(solved.graph, solved.values)
+        marginals = solved_marginals(solved.graph, solved.values)
         tiled = solved.tiled.moved(drive, solved.poses, sensors)
         sights = tiled.sights(solved.values, sensors)
         squared = [sight.squared(sight.whitening(sensors.noise)) for sight in sights]
@@ -161,7 +169,7 @@ class TiledProblem:
                 if self._free
                 else sensors.covariance
             ),
-            sight=self._sight(solved, sights),
+            sight=self._sight(solved, tiled, sights),
             squared=self._gathered(tiled, squared),
             weights=solved.weights,
             bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
@@ -171,13 +179,6 @@ class TiledProblem:
         returns = tiled.anchoring.returns(way, AWAY_M)
         return Mapped(solution, len(tiled.tiles), returns)
 
-    def _weights(
-        self, tiled: TiledDrive, sights: list[Sight], noise: FloatArray, mu: float
-    ) -> FloatArray:
-        robust = self._options.robust
-        r2 = self._gathered(tiled, [sight.squared(sight.whitening(noise)) for sight in sights])
-        return np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
-
     def _gathered(self, tiled: TiledDrive, parts: list[FloatArray]) -> FloatArray:
         """Return what tiles say of their readings in the order of the drive's."""
         whole = np.zeros((len(self._drive.readings), *parts[0].shape[1:]))
@@ -185,10 +186,11 @@ class TiledProblem:
             whole[tile.rows] = part
         return whole
 
-    def _sight(self, solved: Solved, sights: list[Sight]) -> Sight:
-        """Return what the tiles say, with places in the map."""
-        drive, tiled = self._drive, solved.tiled
-        where = place(drive.readings, dict(enumerate(solved.poses)), solved.sensors)
-        variance = self._gathered(tiled, [sight.map_variance for sight in sights])
+    def _sight(self, solved: Solved, tiled: TiledDrive, sights: list[Sight]) -> Sight:
+        """Return what the tiles say, with places and axes of the map."""
+        where = place(self._drive.readings, dict(enumerate(solved.poses)), solved.sensors)
+        anchors = [solved.poses[tile.anchor].rotation().matrix() for tile in tiled.tiles]
+        pairs = zip(sights, anchors, strict=True)
+        variance = self._gathered(tiled, [each.map_variance @ (R**2).T for each, R in pairs])
         residual = self._gathered(tiled, [sight.residual for sight in sights])
         return Sight(where, np.ones(len(residual), bool), variance, residual)
