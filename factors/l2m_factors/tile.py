@@ -20,13 +20,12 @@ from typing import Protocol
 
 import gtsam
 import numpy as np
-import numpy.typing as npt
 
-from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals, carried_residuals
-from l2m_factors.field_map import FloatArray
+from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals
+from l2m_factors.field_map import FieldMap, FloatArray
+from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.keys import M, X
 from l2m_factors.motion import skew
-from l2m_factors.sensor_variables import SensorVariables
 from l2m_factors.shared_errors import whitened
 
 
@@ -76,8 +75,8 @@ class TilePlaces:
     x: FloatArray
 
 
-class TileBatch:
-    """Readings on key poses in one tile, evaluated together; see ``CarriedBatch``.
+class TileBatch(KeyPoseBatch):
+    """Readings on key poses in one tile.
 
     Parameters
     ----------
@@ -87,10 +86,8 @@ class TileBatch:
         a, the key pose that the tile is fixed to.
     field
         What the weights mean.
-    readings
-        N readings; sensor indices count from 0.
-    fixed
-        Calibrations that are no variables; without them as in ``CarriedBatch``.
+    readings, fixed
+        As of ``KeyPoseBatch``.
     """
 
     def __init__(
@@ -101,25 +98,8 @@ class TileBatch:
         readings: CarriedReadings,
         fixed: Calibrations | None = None,
     ) -> None:
-        self._number, self._anchor, self._field, self._readings = number, anchor, field, readings
-        self._variables = SensorVariables(readings, fixed)
-        numbers, self._slot = np.unique(readings.key_pose, return_inverse=True)
-        self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
-        self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
-        self._seen: dict[int, bytes] = {}
-        self._residuals: CarriedResiduals | None = None
-
-    def __len__(self) -> int:
-        return len(self._readings)
-
-    @property
-    def key_poses(self) -> list[int]:
-        """Numbers of the key poses that carry readings, ascending."""
-        return list(self._rows)
-
-    def rows_of(self, key_pose: int) -> npt.NDArray[np.int64]:
-        """Return the indices of the readings on a key pose."""
-        return self._rows[key_pose]
+        super().__init__(readings, fixed)
+        self._number, self._anchor, self._tile = number, anchor, field
 
     def keys_of(self, key_pose: int) -> list[int]:
         """Return the keys that the readings on a key pose depend on.
@@ -129,22 +109,11 @@ class TileBatch:
         poses = [] if key_pose == self._anchor else [X(key_pose), X(self._anchor)]
         return [*poses, M(self._number), *self._variables.keys(self._sensors[key_pose])]
 
-    def residuals(self, values: gtsam.Values, key_pose: int) -> CarriedResiduals:
-        """Return all residuals, evaluated anew if the variables of this key pose changed.
-
-        Those of key poses without values mean nothing, as when one factor is used alone.
-        """
-        stamp = self._stamp(values, key_pose)
-        if self._residuals is None or self._seen.get(key_pose) != stamp:
-            self._residuals = self._evaluated(values)
-            self._seen = {k: self._stamp(values, k) for k in self._present(values)}
-        return self._residuals
-
     def jacobians(
         self, residuals: CarriedResiduals, values: gtsam.Values, key_pose: int
     ) -> list[FloatArray]:
         """Return derivatives by each of ``keys_of`` of n readings, each of shape (n, 3, .)."""
-        rows, relative = self._rows[key_pose], self._relative(values, key_pose)
+        rows, relative = self._rows[key_pose], self._pose(values, key_pose)
         by_sensors = self._variables.jacobians(residuals.reading, rows)
         blocks = [self._by_weights(values, key_pose), *by_sensors]
         if key_pose == self._anchor:
@@ -155,7 +124,7 @@ class TileBatch:
     def places(self, values: gtsam.Values, key_pose: int) -> TilePlaces:
         """Return where the readings on a key pose are."""
         rows = self._rows[key_pose]
-        readings, relative = self._readings[rows], self._relative(values, key_pose)
+        readings, relative = self._readings[rows], self._pose(values, key_pose)
         known = self._variables.calibrations(values, self._sensors[key_pose])
         R_key_lidar, p = readings.lidar_at(known.offset)
         t_key = np.einsum("nij,nj->ni", R_key_lidar, known.t[readings.sensor]) + p
@@ -180,34 +149,25 @@ class TileBatch:
         where = self.places(values, key_pose)
         R = where.T_anchor_key.rotation().matrix() @ where.R_key_lidar
         C = self._variables.C(values, self._rows[key_pose])
-        return np.asarray(C @ R.transpose(0, 2, 1) @ self._field.features(where.x))
+        return np.asarray(C @ R.transpose(0, 2, 1) @ self._tile.features(where.x))
 
-    def _present(self, values: gtsam.Values) -> list[int]:
-        return [k for k in self._rows if k == self._anchor or values.exists(X(k))]
-
-    def _relative(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:
-        """Return the key pose in the anchor's frame."""
+    def _pose(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:
         if key_pose == self._anchor:
             return gtsam.Pose3()
         return values.atPose3(X(self._anchor)).between(values.atPose3(X(key_pose)))
 
-    def _stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
+    def _is_present(self, values: gtsam.Values, key_pose: int) -> bool:
+        return key_pose == self._anchor or bool(values.exists(X(key_pose)))
+
+    def _field(self, values: gtsam.Values) -> FieldMap:
+        return WeightedField(self._tile, values.atVector(M(self._number)))
+
+    def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
         own = values.atVector(M(self._number)).tobytes()
         if key_pose != self._anchor:
             own += values.atPose3(X(self._anchor)).matrix().tobytes()
             own += values.atPose3(X(key_pose)).matrix().tobytes()
-        return own + self._variables.stamp(values, self._sensors[key_pose])
-
-    def _evaluated(self, values: gtsam.Values) -> CarriedResiduals:
-        R, p = np.tile(np.eye(3), (len(self._rows), 1, 1)), np.zeros((len(self._rows), 3))
-        present = set(self._present(values))
-        for slot, k in enumerate(self._rows):
-            if k in present:
-                pose = self._relative(values, k)
-                R[slot], p[slot] = pose.rotation().matrix(), pose.translation()
-        sensors = self._variables.calibrations(values, self._variables.on(np.arange(len(self))))
-        field = WeightedField(self._field, values.atVector(M(self._number)))
-        return carried_residuals(self._readings, field, R[self._slot], p[self._slot], sensors)
+        return own
 
 
 def tile_factor(batch: TileBatch, key_pose: int, whitening: FloatArray) -> gtsam.CustomFactor:

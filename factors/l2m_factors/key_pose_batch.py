@@ -1,0 +1,92 @@
+"""Readings that hang on key poses, evaluated together and again only when variables change."""
+
+from abc import ABC, abstractmethod
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals, carried_residuals
+from l2m_factors.field_map import FieldMap
+from l2m_factors.sensor_variables import SensorVariables
+
+
+class KeyPoseBatch(ABC):
+    """What batches of readings on key poses have in common.
+
+    When a factor finds its variables changed, all readings of the batch are evaluated in one query
+    of the field. A batch is therefore what is linearised together: a whole drive, or a whole tile,
+    for an optimiser that moves all poses at once, one key pose for one that moves few of them
+    (iSAM2), which then pays for these alone.
+
+    Parameters
+    ----------
+    readings
+        N readings; sensor indices count from 0.
+    fixed
+        Calibrations that are no variables. Without them the factors depend on ``T(i)`` and
+        ``D(i)`` of each sensor that read at the key pose, and for readings with motion on
+        ``S(i)``.
+    """
+
+    def __init__(self, readings: CarriedReadings, fixed: Calibrations | None) -> None:
+        self._readings, self._variables = readings, SensorVariables(readings, fixed)
+        numbers, self._slot = np.unique(readings.key_pose, return_inverse=True)
+        self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
+        self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
+        self._seen: dict[int, bytes] = {}
+        self._residuals: CarriedResiduals | None = None
+
+    def __len__(self) -> int:
+        return len(self._readings)
+
+    @property
+    def key_poses(self) -> list[int]:
+        """Numbers of the key poses that carry readings, ascending."""
+        return list(self._rows)
+
+    def rows_of(self, key_pose: int) -> npt.NDArray[np.int64]:
+        """Return the indices of the readings on a key pose."""
+        return self._rows[key_pose]
+
+    def residuals(self, values: gtsam.Values, key_pose: int) -> CarriedResiduals:
+        """Return all residuals, evaluated anew if the variables of this key pose changed.
+
+        Those of key poses without values mean nothing, as when one factor is used alone.
+        """
+        stamp = self._stamp(values, key_pose)
+        if self._residuals is None or self._seen.get(key_pose) != stamp:
+            present = [k for k in self._rows if self._is_present(values, k)]
+            self._residuals = self._evaluated(values, present)
+            self._seen = {k: self._stamp(values, k) for k in present}
+        return self._residuals
+
+    @abstractmethod
+    def _pose(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:
+        """Return a key pose in the frame of the field."""
+
+    @abstractmethod
+    def _is_present(self, values: gtsam.Values, key_pose: int) -> bool:
+        """Return whether values have what ``_pose`` needs."""
+
+    @abstractmethod
+    def _field(self, values: gtsam.Values) -> FieldMap:
+        """Return the field."""
+
+    @abstractmethod
+    def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
+        """Return what pose and field depend on as bytes, which compare faster than arrays."""
+
+    def _stamp(self, values: gtsam.Values, key_pose: int) -> bytes:
+        of_sensors = self._variables.stamp(values, self._sensors[key_pose])
+        return self._own_stamp(values, key_pose) + of_sensors
+
+    def _evaluated(self, values: gtsam.Values, present: list[int]) -> CarriedResiduals:
+        R, p = np.tile(np.eye(3), (len(self._rows), 1, 1)), np.zeros((len(self._rows), 3))
+        slots = {k: slot for slot, k in enumerate(self._rows)}
+        for k in present:
+            pose = self._pose(values, k)
+            R[slots[k]], p[slots[k]] = pose.rotation().matrix(), pose.translation()
+        sensors = self._variables.calibrations(values, self._variables.on(np.arange(len(self))))
+        field = self._field(values)
+        return carried_residuals(self._readings, field, R[self._slot], p[self._slot], sensors)
