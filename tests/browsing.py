@@ -50,7 +50,7 @@ def missing(reason: str) -> None:
 def told_by(program: str, browser: str, *arguments: str | Path) -> dict[str, Any]:
     """Return what one of our programs for a browser tells."""
     run = subprocess.run(
-        ["node", PROGRAMS / program, *arguments],  # noqa: S607
+        ["node", PROGRAMS / program, *arguments],  # noqa: S607 - node is looked up, as a user would
         capture_output=True,
         text=True,
         env={**os.environ, "L2M_BROWSER": browser},

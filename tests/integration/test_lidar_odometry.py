@@ -53,7 +53,7 @@ def test_covariances_hold_and_accumulate(round_steps: list[ScanStep]) -> None:
     for k in range(1, len(found)):
         true = between(pose(QUICK, k - 1), pose(QUICK, k))
         steps.append(nees(difference(round_steps[k].step, true), round_steps[k].covariance))
-        poses.append(nees(error(found, QUICK, k), found.covariance[k]))  # type: ignore[index]
+        poses.append(nees(error(found, QUICK, k), found.covariance[k]))  # type: ignore[index]  # stated
     # The floor of 1 mm and 0.01 degrees is larger than the errors here: less than honest.
     assert np.mean(steps) < 8.0
     assert np.mean(poses) < 8.0

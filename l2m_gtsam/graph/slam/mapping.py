@@ -139,9 +139,9 @@ class TiledProblem:
         robust = self._options.robust
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
         chosen = np.flatnonzero(weights > NOTHING)
-        graph = tiled.graph(
-            self._drive, noise, W * np.sqrt(weights)[:, None, None], chosen, free=self._free
-        )
+        fixed = None if self._free else self._drive.sensors.fixed()
+        W = W * np.sqrt(weights)[:, None, None]
+        graph = tiled.graph(self._drive, noise, W, chosen, fixed)
         graph.push_back(self._odometry)
         if self._free:
             graph.push_back(calibration_graph(self._drive.sensors))

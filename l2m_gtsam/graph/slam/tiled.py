@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import FieldDoubt, M, TileBatch, doubt_factor, tile_factor
+from l2m_factors import Calibrations, FieldDoubt, M, TileBatch, doubt_factor, tile_factor
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
@@ -128,8 +128,7 @@ class TiledDrive:
         noise: FloatArray,
         whitening: FloatArray,
         chosen: IntArray,
-        *,
-        free: bool,
+        fixed: Calibrations | None,
     ) -> gtsam.NonlinearFactorGraph:
         """Return the factors of readings, and the prior of the tiles' weights.
 
@@ -143,11 +142,10 @@ class TiledDrive:
             Of the residuals of all its N readings, 1/uT, shape (N, 3, 3).
         chosen
             Readings that count.
-        free
-            Whether calibrations are variables.
+        fixed
+            Calibrations that are no variables; without them all are.
         """
         graph = gtsam.NonlinearFactorGraph()
-        fixed = None if free else drive.sensors.fixed()
         for tile in self.tiles:
             rows = np.intersect1d(tile.rows, chosen)
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
