@@ -1,0 +1,73 @@
+"""The last key poses of a drive, solved by iSAM2 as they come; all that was before is a prior."""
+
+import gtsam
+import numpy as np
+
+from l2m_factors import X
+from l2m_gtsam.data import FloatArray
+
+# Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
+# entries of C; never for H, in which readings are linear.
+RELINEARISE = {
+    "X": np.full(6, 0.01),
+    "T": np.full(3, 0.01),
+    "D": np.concatenate([np.full(9, 0.01), np.full(3, np.inf)]),
+}
+
+
+class Section:
+    """A stretch of a drive that is solved as it grows.
+
+    What it has learnt goes over to the next one as a Gaussian prior of the variables that both
+    have. GTSAM's fixed-lag smoothers, which let go of one pose after the other, hold such variables
+    where they were when the first one went; here calibrations stay free to be linearised anew.
+
+    Parameters
+    ----------
+    graph, values
+        What is known when it begins, and an estimate of its variables.
+    """
+
+    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        self._engine = _engine()
+        self.add(graph, values, 0)
+
+    def add(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, again: int) -> None:
+        """Add factors and new variables, and take so many more steps."""
+        self._engine.update(graph, values)
+        for _ in range(again):
+            self._engine.update()
+
+    def pose(self, number: int) -> gtsam.Pose3:
+        """Return a key pose of the section."""
+        return self._engine.calculateEstimatePose3(X(number))
+
+    def values(self) -> gtsam.Values:
+        """Return all its variables."""
+        return self._engine.calculateEstimate()
+
+    def some(self, keys: list[int]) -> gtsam.Values:
+        """Return some of its variables."""
+        return self._engine.calculateEstimate(keys)
+
+    def covariance(self, keys: list[int]) -> FloatArray:
+        """Return the joint covariance of some variables, in their order."""
+        return np.asarray(self._engine.jointMarginalCovariance(keys).fullMatrix())
+
+    def next(self, keys: list[int]) -> "Section":
+        """Return a section that begins with what this one knows of some of its variables."""
+        # As it was linearised; what has moved by more than a little was linearised anew.
+        told, at = self._engine.joint(keys), self._engine.getLinearizationPoint().extract(keys)
+        prior = gtsam.LinearContainerFactor.ConvertLinearGraph(told, at)
+        return Section(prior, self.some(keys))
+
+
+def _engine() -> gtsam.ISAM2:
+    """Return an empty graph that is solved as it grows."""
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for symbol, steps in RELINEARISE.items():
+        thresholds.insert((symbol, steps))
+    params = gtsam.ISAM2Params()
+    params.setRelinearizeThreshold(thresholds)
+    params.relinearizeSkip = 1
+    return gtsam.ISAM2(params)
