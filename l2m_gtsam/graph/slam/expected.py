@@ -1,7 +1,8 @@
-"""Readings on a key pose beside what is expected of them, on line."""
+"""What is read on a key pose, and what scans say of it, beside what is expected."""
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 
 from l2m_factors import CarriedReadings, CarriedResiduals, carried_residuals
@@ -10,6 +11,7 @@ from l2m_gtsam.graph.slam.belief import POSE, SENSOR, Belief, Evidence
 from l2m_gtsam.graph.slam.remembered import RememberedVariance
 from l2m_gtsam.graph.slam.sight import Sight, place
 from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.solve.noise import whitening
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
 
@@ -91,6 +93,14 @@ def evidence(
         J[(*at, columns_of(readings.sensor)[:, None])] = by_sensor
     r = np.einsum("nij,nj->ni", W, seen.reading.residual)
     return Evidence(r.ravel(), J.reshape(3 * n, -1))
+
+
+def fix_evidence(fix: gtsam.Pose3, covariance: FloatArray, belief: Belief) -> Evidence:
+    """Return a key pose's place in the map, with its covariance (6, 6), as evidence."""
+    W = whitening(covariance[None])[0]
+    J = np.zeros((POSE, len(belief.covariance)))
+    J[:, :POSE] = W
+    return Evidence(W @ gtsam.Pose3.Logmap(fix.between(belief.pose)), J)
 
 
 def columns_of(sensor: IntArray) -> IntArray:

@@ -20,12 +20,14 @@ from scipy.linalg import block_diag
 
 from l2m_factors import CarriedBatch, D, T, X, key_pose_factor
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.slam.belief import Belief
+from l2m_gtsam.graph.slam.belief import POSE, Belief
 from l2m_gtsam.graph.slam.drive import Drive, as_pose
-from l2m_gtsam.graph.slam.expected import evidence, passed
+from l2m_gtsam.graph.slam.expected import evidence, fix_evidence, passed
 from l2m_gtsam.graph.slam.factors import (
     calibration_graph,
     calibration_values,
+    link_factor,
+    link_pose,
     start_factor,
     step_factor,
 )
@@ -88,6 +90,11 @@ class Follower:
         self._drive, self._map, self._robust, self._free = drive, field_map, robust, free
         self._variance = RememberedVariance(field_map)
         self._ends = np.searchsorted(drive.readings.key_pose, np.arange(len(drive) + 1))
+        fixes = np.flatnonzero(drive.links.in_map)
+        self._fixes = fixes[np.argsort(drive.links.key_pose[fixes], kind="stable")]
+        self._fix_ends = np.searchsorted(
+            drive.links.key_pose[self._fixes], np.arange(len(drive) + 1)
+        )
         sensors = range(len(drive.sensors.names) if free else 0)
         self._calibrations = [key for i in sensors for key in (T(i), D(i))]
         self._length, self._first, self._past = section, 0, gtsam.Values()
@@ -99,6 +106,7 @@ class Follower:
             drift = self._drive.steps.covariance[number - 1]
             self._belief = self._belief.after(self._drive.step(number - 1), drift)
             self._waiting.graph.add(step_factor(self._drive, number - 1))
+        self._fix(number)
         self._read(number)
         if number > 0:
             self._waiting.values.insert(X(number), self._belief.pose)
@@ -127,6 +135,17 @@ class Follower:
         known = sensors.covariance if self._free else ()
         covariance = block_diag(start.covariance, *known)
         return Belief(as_pose(start.T_map_lidar), sensors, covariance)
+
+    def _fix(self, number: int) -> None:
+        """Take what scans say of a key pose's place in the map, as far as it passes for such."""
+        links, most = self._drive.links, self._robust.largest_of(POSE)
+        for row in self._fixes[self._fix_ends[number] : self._fix_ends[number + 1]].tolist():
+            covariance = self._belief.pose_covariance + links.covariance[row]
+            off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
+            if off @ np.linalg.solve(covariance, off) <= most:
+                seen = partial(fix_evidence, link_pose(links, row), links.covariance[row])
+                self._belief = self._belief.corrected(seen)
+                self._waiting.graph.add(link_factor(links, row))
 
     def _read(self, number: int) -> None:
         """Take the readings on a key pose as far as they pass for such."""
