@@ -8,10 +8,10 @@ import numpy as np
 from l2m_factors import CarriedReadings, CarriedResiduals, carried_residuals
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.slam.belief import POSE, SENSOR, Belief, Evidence
+from l2m_gtsam.graph.slam.factors import root_information
 from l2m_gtsam.graph.slam.remembered import RememberedVariance
 from l2m_gtsam.graph.slam.sight import Sight, place
 from l2m_gtsam.graph.view import QueryableMap
-from l2m_gtsam.solve.noise import whitening
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
 
@@ -97,7 +97,7 @@ def evidence(
 
 def fix_evidence(fix: gtsam.Pose3, covariance: FloatArray, belief: Belief) -> Evidence:
     """Return a key pose's place in the map, with its covariance (6, 6), as evidence."""
-    W = whitening(covariance[None])[0]
+    W = root_information(covariance)
     J = np.zeros((POSE, len(belief.covariance)))
     J[:, :POSE] = W
     return Evidence(W @ gtsam.Pose3.Logmap(fix.between(belief.pose)), J)
