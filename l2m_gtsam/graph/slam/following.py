@@ -128,7 +128,7 @@ class Follower:
         if self._free:
             graph.push_back(calibration_graph(self._drive.sensors))
             values.insert(calibration_values(self._drive.sensors))
-        return Section(graph, values)
+        return Section(graph, values, 0, self._calibrations)
 
     def _at_start(self) -> Belief:
         start, sensors = self._drive.start, self._drive.sensors
@@ -166,12 +166,11 @@ class Follower:
         waiting, self._waiting = self._waiting, Waiting()
         for factor in self._reading_factors(waiting):
             waiting.graph.add(factor)
-        self._section.add(waiting.graph, waiting.values, AGAIN)
+        self._section.add(waiting.graph, waiting.values, number, AGAIN)
         sensors, section = self._drive.sensors, self._section
         if self._free:
-            sensors = sensors_in(section.some(self._calibrations), sensors)
-        covariance = section.covariance([X(number), *self._calibrations])
-        self._belief = Belief(section.pose(number), sensors, covariance)
+            sensors = sensors_in(section.calibration(), sensors)
+        self._belief = Belief(section.pose(number), sensors, section.covariance(number))
         if number - self._first >= self._length:
             self._hand_over(number)
 
@@ -188,7 +187,7 @@ class Follower:
         """Begin a section with the last key pose of this one."""
         values = self._section.values()
         self._past.insert(values.extract([X(k) for k in range(self._first, last)]))
-        self._section = self._section.next([X(last), *self._calibrations])
+        self._section = self._section.next(last)
         self._first = last
 
 

@@ -5,6 +5,7 @@ import numpy as np
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.slam.belief import POSE
 
 # Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
 # entries of C; never for H, in which readings are linear.
@@ -26,40 +27,59 @@ class Section:
     ----------
     graph, values
         What is known when it begins, and an estimate of its variables.
+    last
+        Number of the key pose that it begins with.
+    calibrations
+        Keys of the calibrations that are variables.
     """
 
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        self._engine = _engine()
-        self.add(graph, values, 0)
+    def __init__(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        last: int,
+        calibrations: list[int],
+    ) -> None:
+        self._engine, self._calibrations = _engine(), calibrations
+        self.add(graph, values, last, 0)
 
-    def add(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, again: int) -> None:
-        """Add factors and new variables, and take so many more steps."""
-        self._engine.update(graph, values)
+    def add(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
+    ) -> None:
+        """Add factors and new variables up to a key pose, and take so many more steps."""
+        order = gtsam.KeyGroupMap()
+        for group, keys in enumerate((self._calibrations, [X(last)]), start=1):
+            for key in keys:
+                order.insert2(key, group)
+        self._engine.update(graph, values, constrainedKeys=order)
         for _ in range(again):
-            self._engine.update()
+            self._engine.update(constrainedKeys=order)
 
     def pose(self, number: int) -> gtsam.Pose3:
         """Return a key pose of the section."""
         return self._engine.calculateEstimatePose3(X(number))
 
+    def calibration(self) -> gtsam.Values:
+        """Return the calibrations."""
+        return self._engine.calculateEstimate(self._calibrations)
+
     def values(self) -> gtsam.Values:
         """Return all its variables."""
         return self._engine.calculateEstimate()
 
-    def some(self, keys: list[int]) -> gtsam.Values:
-        """Return some of its variables."""
-        return self._engine.calculateEstimate(keys)
+    def covariance(self, last: int) -> FloatArray:
+        """Return the joint covariance of the last key pose and the calibrations, in this order."""
+        keys = [*self._calibrations, X(last)]
+        joint = self._engine.jointMarginalCovariance(keys).fullMatrix()
+        return np.roll(joint, POSE, axis=(0, 1))
 
-    def covariance(self, keys: list[int]) -> FloatArray:
-        """Return the joint covariance of some variables, in their order."""
-        return np.asarray(self._engine.jointMarginalCovariance(keys).fullMatrix())
-
-    def next(self, keys: list[int]) -> "Section":
-        """Return a section that begins with what this one knows of some of its variables."""
+    def next(self, last: int) -> "Section":
+        """Return a section that begins with what this one knows of key pose and calibrations."""
+        keys = [*self._calibrations, X(last)]
         # As it was linearised; what has moved by more than a little was linearised anew.
         told, at = self._engine.joint(keys), self._engine.getLinearizationPoint().extract(keys)
         prior = gtsam.LinearContainerFactor.ConvertLinearGraph(told, at)
-        return Section(prior, self.some(keys))
+        return Section(prior, self._engine.calculateEstimate(keys), last, self._calibrations)
 
 
 def _engine() -> gtsam.ISAM2:
