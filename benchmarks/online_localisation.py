@@ -58,9 +58,7 @@ def laps(count: int) -> Trajectory:
     return Trajectory((1e9 * at).astype(np.int64), R, p, "map", "lidar")
 
 
-def followed(
-    drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: int = SECTION
-) -> Run:
+def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: int = SECTION) -> Run:
     """Follow a drive and take the time of each key pose."""
     follower = Follower(drawn.drive, field_map, RobustOptions(), free=free, section=section)
     count, warm = len(drawn.drive), len(drawn.drive) // 10

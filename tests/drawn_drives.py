@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import CarriedReadings
 from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform, Trajectory
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose
-from l2m_gtsam.graph.slam.odometry import OdometrySteps, odometry_steps
+from l2m_gtsam.graph.slam.odometry import odometry_steps
 from l2m_gtsam.graph.slam.options import DriftOptions
 from tests.slam_drives import Field
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.graph.slam.drive import KnownSensors
@@ -55,7 +54,8 @@ def vectors(sensors: KnownSensors) -> FloatArray:
 
 def squared(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return squared lengths of errors (N, k) in units of their covariances (N, k, k)."""
-    return np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    solved = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
+    return np.asarray(np.einsum("ni,ni->n", error, solved))
 
 
 def nees(

@@ -62,7 +62,7 @@ class Belief:
         if len(self.covariance) == POSE:
             return self.sensors.covariance
         at = POSE + SENSOR * np.arange(len(self.sensors.names))[:, None] + np.arange(SENSOR)
-        return self.covariance[at[:, :, None], at[:, None, :]]
+        return np.asarray(self.covariance[at[:, :, None], at[:, None, :]])
 
     def after(self, step: gtsam.Pose3, covariance: FloatArray) -> "Belief":
         """Return what is known of the next key pose by odometry, whose covariance is (6, 6)."""

@@ -51,7 +51,7 @@ def passed(
     seen, sensors = residuals_at(readings, field_map, belief), belief.sensors
     where = place(readings, {int(readings.key_pose[0]): belief.pose}, sensors)
     known = variance.at(where.x)
-    sight = Sight(where, np.isfinite(known).all(axis=1), known, seen.reading.residual)
+    sight = Sight(where, np.isfinite(known[:, 0]), known, seen.reading.residual)
     spread = spread_of(seen, readings.sensor, belief.covariance)
     r2 = sight.squared(sight.whitening(sensors.noise, more=spread))
     trust = WEIGHTS[robust.loss](r2, robust.largest, np.inf)

@@ -21,6 +21,7 @@ from scipy.linalg import block_diag
 from l2m_factors import CarriedBatch, D, T, X, key_pose_factor
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.slam.belief import POSE, Belief
+from l2m_gtsam.graph.slam.covariances import well_scaled
 from l2m_gtsam.graph.slam.drive import Drive, as_pose
 from l2m_gtsam.graph.slam.expected import evidence, fix_evidence, passed
 from l2m_gtsam.graph.slam.factors import (
@@ -101,7 +102,13 @@ class Follower:
         self._section, self._belief, self._waiting = self._begun(), self._at_start(), Waiting()
 
     def step(self, number: int) -> Belief:
-        """Add a key pose, and return what is known of it then; they come in order."""
+        """Add a key pose, and return what is known of it then; they come in order.
+
+        Raises
+        ------
+        CalibrationError
+            What is known of poses and sensors is too many orders of magnitude apart.
+        """
         if number > 0:
             drift = self._drive.steps.covariance[number - 1]
             self._belief = self._belief.after(self._drive.step(number - 1), drift)
@@ -111,7 +118,8 @@ class Follower:
         if number > 0:
             self._waiting.values.insert(X(number), self._belief.pose)
         if (number + 1) % GROUP == 0 or number == len(self._drive) - 1:
-            self._settle(number)
+            with well_scaled():
+                self._settle(number)
         return self._belief
 
     def values(self) -> gtsam.Values:
