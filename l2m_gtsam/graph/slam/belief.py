@@ -11,8 +11,11 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.slam.drive import KnownSensors
 
 POSE, SENSOR = 6, 15  # components of a pose and of a sensor's calibration
-ITERATIONS = 3  # the most linearisations of what is seen
-CLOSE = 0.01  # rad, m: a pose that moved by less need not be linearised anew
+HALVINGS = 8  # of a step
+ITERATIONS = 20  # the most linearisations of what is seen
+CLOSE = 0.01  # rad, m, or of an entry of C: what moved by less need not be linearised anew
+ROUNDING = 1e-10  # of a correlation
+LINEAR = 12  # the first component of a sensor that readings are linear in
 
 
 @dataclass(frozen=True)
@@ -73,17 +76,31 @@ class Belief:
         return Belief(self.pose.compose(step), self.sensors, moved)
 
     def corrected(self, seen: Callable[["Belief"], Evidence]) -> "Belief":
-        """Return what is known once something was seen, by an iterated Kalman update."""
-        delta, P = np.zeros(len(self.covariance)), self.covariance
+        """Return what is known once something was seen, by an iterated Kalman update.
+
+        A step that makes the squared residuals and the distance from this belief larger together
+        is halved: near a source a field bends so much that a whole one would lead away.
+        """
+        P, delta = self.covariance, np.zeros(len(self.covariance))
+        component = np.arange(len(P)) - POSE
+        bends = (component < 0) | (component % SENSOR < LINEAR)
+        found, solve = seen(self), None
         for _ in range(ITERATIONS):
-            found, last = seen(self.moved(delta)), delta
-            J = found.jacobian
-            crossed = P @ J.T
-            gain = cho_solve(cho_factor(J @ crossed + np.eye(len(J))), crossed.T).T
-            delta = gain @ (J @ last - found.residual)
-            if np.abs(delta - last)[:POSE].max() < CLOSE:
+            gain = gain_of(P, found.jacobian)
+            step = gain @ (found.jacobian @ delta - found.residual) - delta
+            if np.abs(step[bends]).max() < CLOSE:
+                delta = delta + step
                 break
-        return replace(self.moved(delta), covariance=P - gain @ crossed.T)
+            solve = solve or inverse_of(P)
+            before = cost(found, delta, solve)
+            for _ in range(HALVINGS):
+                beyond = seen(self.moved(delta + step))
+                if cost(beyond, delta + step, solve) <= before:
+                    break
+                step = 0.5 * step
+            delta, found = delta + step, beyond
+        gain = gain_of(P, found.jacobian)
+        return replace(self.moved(delta), covariance=P - gain @ found.jacobian @ P)
 
     def moved(self, delta: FloatArray) -> "Belief":
         """Return the belief elsewhere, by components as those of the covariance."""
@@ -94,3 +111,21 @@ class Belief:
                 sensors, t=sensors.t + by[:, :3], distortion=sensors.distortion + by[:, 3:]
             )
         return Belief(self.pose.retract(delta[:POSE]), sensors, self.covariance)
+
+
+def gain_of(P: FloatArray, J: FloatArray) -> FloatArray:
+    """Return Kalman's gain for white evidence of unit variance, shape (P, m)."""
+    crossed = P @ J.T
+    return np.asarray(cho_solve(cho_factor(J @ crossed + np.eye(len(J))), crossed.T).T)
+
+
+def inverse_of(P: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return what multiplies by the inverse of a covariance, rounding allowed for."""
+    sigma = np.sqrt(np.diag(P))
+    factor = cho_factor(P / np.outer(sigma, sigma) + ROUNDING * np.eye(len(P)))
+    return lambda delta: np.asarray(cho_solve(factor, delta / sigma) / sigma)
+
+
+def cost(found: Evidence, delta: FloatArray, solve: Callable[[FloatArray], FloatArray]) -> float:
+    """Return the squared distance from a belief and from what is seen, in sigmas."""
+    return float(delta @ solve(delta) + found.residual @ found.residual)

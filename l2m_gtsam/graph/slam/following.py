@@ -40,7 +40,8 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.solve.robust import RobustOptions
 
 SECTION = 200  # key poses that are solved together
-GROUP = 10  # key poses that come to iSAM2 together
+GROUP = 10  # key poses that come to iSAM2 together,
+EARLY = 30  # and the first so many one by one: in calibrations far off, readings are not linear
 AGAIN = 2  # more steps with each group, so that the next one starts from where this one converged
 
 
@@ -99,7 +100,8 @@ class Follower:
         sensors = range(len(drive.sensors.names) if free else 0)
         self._calibrations = [key for i in sensors for key in (T(i), D(i))]
         self._length, self._first, self._past = section, 0, gtsam.Values()
-        self._section, self._belief, self._waiting = self._begun(), self._at_start(), Waiting()
+        self._section = Section(self._calibrations)
+        self._belief, self._waiting = self._at_start(), self._opening()
 
     def step(self, number: int) -> Belief:
         """Add a key pose, and return what is known of it then; they come in order.
@@ -115,9 +117,8 @@ class Follower:
             self._waiting.graph.add(step_factor(self._drive, number - 1))
         self._fix(number)
         self._read(number)
-        if number > 0:
-            self._waiting.values.insert(X(number), self._belief.pose)
-        if (number + 1) % GROUP == 0 or number == len(self._drive) - 1:
+        self._waiting.values.insert(X(number), self._belief.pose)
+        if number < EARLY or (number + 1) % GROUP == 0 or number == len(self._drive) - 1:
             with well_scaled():
                 self._settle(number)
         return self._belief
@@ -128,15 +129,13 @@ class Follower:
         values.insert(self._section.values())
         return values
 
-    def _begun(self) -> Section:
-        """Return the first section: the start, and what is known of the sensors."""
-        start, graph, values = self._drive.start, gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.add(start_factor(start))
-        values.insert(X(0), as_pose(start.T_map_lidar))
+    def _opening(self) -> Waiting:
+        """Return what is known before the first key pose."""
+        waiting = Waiting()
+        waiting.graph.add(start_factor(self._drive.start))
         if self._free:
-            graph.push_back(calibration_graph(self._drive.sensors))
-            values.insert(calibration_values(self._drive.sensors))
-        return Section(graph, values, 0, self._calibrations)
+            waiting.graph.push_back(calibration_graph(self._drive.sensors))
+        return waiting
 
     def _at_start(self) -> Belief:
         start, sensors = self._drive.start, self._drive.sensors
@@ -174,6 +173,9 @@ class Follower:
         waiting, self._waiting = self._waiting, Waiting()
         for factor in self._reading_factors(waiting):
             waiting.graph.add(factor)
+        if self._free and number == 0:
+            # From the filter's estimate: linearised at values far off, readings would lead astray.
+            waiting.values.insert(calibration_values(self._belief.sensors))
         self._section.add(waiting.graph, waiting.values, number, AGAIN)
         sensors, section = self._drive.sensors, self._section
         if self._free:

@@ -25,23 +25,12 @@ class Section:
 
     Parameters
     ----------
-    graph, values
-        What is known when it begins, and an estimate of its variables.
-    last
-        Number of the key pose that it begins with.
     calibrations
         Keys of the calibrations that are variables.
     """
 
-    def __init__(
-        self,
-        graph: gtsam.NonlinearFactorGraph,
-        values: gtsam.Values,
-        last: int,
-        calibrations: list[int],
-    ) -> None:
+    def __init__(self, calibrations: list[int]) -> None:
         self._engine, self._calibrations = _engine(), calibrations
-        self.add(graph, values, last, 0)
 
     def add(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
@@ -79,7 +68,9 @@ class Section:
         # As it was linearised; what has moved by more than a little was linearised anew.
         told, at = self._engine.joint(keys), self._engine.getLinearizationPoint().extract(keys)
         prior = gtsam.LinearContainerFactor.ConvertLinearGraph(told, at)
-        return Section(prior, self._engine.calculateEstimate(keys), last, self._calibrations)
+        section = Section(self._calibrations)
+        section.add(prior, self._engine.calculateEstimate(keys), last, 0)
+        return section
 
 
 def _engine() -> gtsam.ISAM2:
