@@ -240,9 +240,10 @@ def _refined(
     if not matched.enough:
         return T
     told = matched.information(T)
-    before = np.diag(np.repeat([GICP_RAD, GICP_M], 3) ** -2.0)
+    before: FloatArray = np.diag(1 / np.square(np.repeat([GICP_RAD, GICP_M], 3)))
     step = plane_step(matched.points, T, matched.planes)
-    return perturbed(T, np.linalg.solve(told + before, told @ step))
+    moved = np.linalg.solve(told + before, told @ step)
+    return perturbed(T, np.asarray(moved, dtype=np.float64))
 
 
 def _judged(
