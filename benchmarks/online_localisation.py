@@ -23,7 +23,7 @@ from tests.drawn_drives import DrawnDrive, drawn_drive
 from tests.worlds import random_sensors
 
 SENSORS, RATE_HZ, SPEED = 12, 10, 0.8
-HOUR, SHORT = 36_000, 2_000  # key poses
+HOUR, SHORT = 36_000, 1_000  # key poses
 EXACT = np.full(15, 1e-6)
 WRONG = np.concatenate([np.full(3, 0.1), np.full(9, 0.1), np.full(3, 20.0)])
 
