@@ -1,6 +1,7 @@
 """Localisation on line: an hour in one hall, key pose by key pose, beside a graph that only grows.
 
-The peer is iSAM2 as it comes: the same factors, in one graph of the whole drive.
+The peer is iSAM2 as it comes: the same factors, in one graph of the whole drive. Times are those of
+processors, of all threads together: what else a machine does would count otherwise.
 """
 
 import resource
@@ -30,7 +31,10 @@ WRONG = np.concatenate([np.full(3, 0.1), np.full(9, 0.1), np.full(3, 20.0)])
 
 @dataclass(frozen=True)
 class Run:
-    """What each key pose cost in seconds, its error in metres, and how memory grew in MiB."""
+    """What each key pose cost in seconds, its error in metres, and how memory grew in MiB.
+
+    Memory counts from the end of the first tenth, where maps have been compiled.
+    """
 
     cost: FloatArray
     off: FloatArray
@@ -64,9 +68,9 @@ def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: in
     count, warm = len(drawn.drive), len(drawn.drive) // 10
     cost, off, memory = np.zeros(count), np.zeros(count), 0.0
     for number in range(count):
-        begin = time.perf_counter()
+        begin = time.process_time()
         belief = follower.step(number)
-        cost[number] = time.perf_counter() - begin
+        cost[number] = time.process_time() - begin
         off[number] = np.linalg.norm(belief.pose.translation() - drawn.p[number])
         if number == warm:
             memory = peak_mib()

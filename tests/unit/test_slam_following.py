@@ -22,6 +22,7 @@ from tests.slam_drives import rounds
 from tests.worlds import DipoleWorld, dipole_world, random_sensors
 
 NEAR = np.concatenate([np.full(3, 0.01), np.full(9, 0.01), np.full(3, 1.0)])
+FAR = np.concatenate([np.full(3, 0.1), np.full(9, 0.1), np.full(3, 20.0)])
 NOISE = 0.2  # uT
 WORLD = dipole_world(3)
 
@@ -57,11 +58,14 @@ class HalfMap:
         return replace(told, variance=np.tile(variance[:, None], 3), inside=inside)
 
 
-def drawn(seconds: float, sigma: FloatArray = NEAR) -> DrawnDrive:
+def thinned(seconds: float) -> Trajectory:
     truth, rows = rounds(seconds), slice(None, None, 2)
-    truth = Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
+    return Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
+
+
+def drawn(seconds: float) -> DrawnDrive:
     rng = np.random.default_rng(4)
-    return drawn_drive(WORLD, random_sensors(3, 2), truth, rng, sigma, NOISE, every=2)
+    return drawn_drive(WORLD, random_sensors(3, 2), thinned(seconds), rng, NEAR, NOISE, every=2)
 
 
 def followed(drive: Drive, world: QueryableMap = WORLD, section: int = 200) -> list[Belief]:
@@ -103,15 +107,16 @@ def solved_at_once(drive: Drive) -> Belief:
 
 @pytest.mark.parametrize("seconds", [3.0, 8.0])
 def test_a_drive_on_line_ends_where_its_graph_does(seconds: float) -> None:
-    """The filter alone (less than a group at the end), and what iSAM2 handed over before.
+    """Over four sections, or not quite two: what they handed over is all that is left of a drive.
 
-    A tenth of a sigma: variables are linearised anew where they moved by 0.01 rad, m or more.
+    It stays linearised where a section of ten key poses, a twentieth of the usual, had it at its
+    end: by that it may be off by a quarter of a sigma, and sigmas by three per cent.
     """
     drive = drawn(seconds).drive
     whole, last = solved_at_once(drive), followed(drive, section=10)[-1]
-    assert apart(last, whole) < 0.1
+    assert apart(last, whole) < 0.25
     sigmas = [np.sqrt(np.diag(each.covariance)) for each in (last, whole)]
-    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.02)
+    np.testing.assert_allclose(sigmas[0], sigmas[1], rtol=0.03)
 
 
 def test_the_filter_agrees_with_isam2_between_groups() -> None:
@@ -130,6 +135,24 @@ def test_the_filter_agrees_with_isam2_between_groups() -> None:
     )
     # Five linearisations of the filter, not repeated, beside converged ones.
     assert apart(followed(drive)[14], followed(short)[14]) < 0.2
+
+
+def test_a_field_that_bends_does_not_lead_astray() -> None:
+    """A sensor 0.6 m beside a dipole at the start, and 10 cm from where it is taken to be.
+
+    Whole steps of the filter led it 0.65 m away, and never back.
+    """
+    rng, world, sensors = np.random.default_rng(35), dipole_world(35), random_sensors(35, 3)
+    given = drawn_drive(world, sensors, thinned(4.0), rng, FAR, NOISE, every=3)
+    near = np.linalg.norm(
+        given.p[0] + given.R[0] @ given.calibration[0, :3] - world.positions, axis=1
+    )
+    assert near.min() < 0.7
+    for each in followed(given.drive, world):
+        found = np.hstack([each.sensors.t, each.sensors.distortion]) - given.calibration
+        for error, covariance in zip(found, each.calibration_covariance, strict=True):
+            # Chi squared of 15 degrees of freedom passes 37.7 once in 1,000.
+            assert error @ np.linalg.solve(covariance, error) < 37.7
 
 
 def test_what_a_key_pose_costs_does_not_grow() -> None:
