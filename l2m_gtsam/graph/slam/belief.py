@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -32,6 +33,36 @@ class Evidence:
 
     residual: FloatArray
     jacobian: FloatArray
+
+    @property
+    def squared(self) -> float:
+        """Squared length of the residual."""
+        return float(self.residual @ self.residual)
+
+
+class Distance:
+    """How far something is from its mean, in sigmas.
+
+    Parameters
+    ----------
+    covariance
+        Shape (P, P); it may be singular by rounding.
+    """
+
+    def __init__(self, covariance: FloatArray) -> None:
+        self._covariance, self._sigma = covariance, np.sqrt(np.diag(covariance))
+
+    @cached_property
+    def _factor(self) -> tuple[FloatArray, bool]:
+        """Of the correlations: needed only where a step is long."""
+        correlation = self._covariance / np.outer(self._sigma, self._sigma)
+        factor, lower = cho_factor(correlation + ROUNDING * np.eye(len(correlation)))
+        return np.asarray(factor), bool(lower)
+
+    def squared(self, delta: FloatArray) -> float:
+        """Return the squared distance of a difference, shape (P,)."""
+        u = delta / self._sigma
+        return float(u @ cho_solve(self._factor, u))
 
 
 @dataclass(frozen=True)
@@ -81,26 +112,27 @@ class Belief:
         A step that makes the squared residuals and the distance from this belief larger together
         is halved: near a source a field bends so much that a whole one would lead away.
         """
-        P, delta = self.covariance, np.zeros(len(self.covariance))
-        component = np.arange(len(P)) - POSE
+        P, delta, found = self.covariance, np.zeros(len(self.covariance)), seen(self)
+        component, distance = np.arange(len(P)) - POSE, Distance(P)
         bends = (component < 0) | (component % SENSOR < LINEAR)
-        found, solve = seen(self), None
         for _ in range(ITERATIONS):
             gain = gain_of(P, found.jacobian)
             step = gain @ (found.jacobian @ delta - found.residual) - delta
             if np.abs(step[bends]).max() < CLOSE:
-                delta = delta + step
-                break
-            solve = solve or inverse_of(P)
-            before = cost(found, delta, solve)
-            for _ in range(HALVINGS):
-                beyond = seen(self.moved(delta + step))
-                if cost(beyond, delta + step, solve) <= before:
+                return self._after(delta + step, gain, found)
+            before = distance.squared(delta) + found.squared
+            for shorter in step * 0.5 ** np.arange(HALVINGS)[:, None]:
+                there = seen(self.moved(delta + shorter))
+                if distance.squared(delta + shorter) + there.squared <= before:
                     break
-                step = 0.5 * step
-            delta, found = delta + step, beyond
-        gain = gain_of(P, found.jacobian)
-        return replace(self.moved(delta), covariance=P - gain @ found.jacobian @ P)
+            else:
+                break
+            delta, found = delta + shorter, there
+        return self._after(delta, gain_of(P, found.jacobian), found)
+
+    def _after(self, delta: FloatArray, gain: FloatArray, found: Evidence) -> "Belief":
+        left = self.covariance - gain @ (found.jacobian @ self.covariance)
+        return replace(self.moved(delta), covariance=left)
 
     def moved(self, delta: FloatArray) -> "Belief":
         """Return the belief elsewhere, by components as those of the covariance."""
@@ -117,15 +149,3 @@ def gain_of(P: FloatArray, J: FloatArray) -> FloatArray:
     """Return Kalman's gain for white evidence of unit variance, shape (P, m)."""
     crossed = P @ J.T
     return np.asarray(cho_solve(cho_factor(J @ crossed + np.eye(len(J))), crossed.T).T)
-
-
-def inverse_of(P: FloatArray) -> Callable[[FloatArray], FloatArray]:
-    """Return what multiplies by the inverse of a covariance, rounding allowed for."""
-    sigma = np.sqrt(np.diag(P))
-    factor = cho_factor(P / np.outer(sigma, sigma) + ROUNDING * np.eye(len(P)))
-    return lambda delta: np.asarray(cho_solve(factor, delta / sigma) / sigma)
-
-
-def cost(found: Evidence, delta: FloatArray, solve: Callable[[FloatArray], FloatArray]) -> float:
-    """Return the squared distance from a belief and from what is seen, in sigmas."""
-    return float(delta @ solve(delta) + found.residual @ found.residual)
