@@ -36,13 +36,22 @@ class Section:
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
     ) -> None:
         """Add factors and new variables up to a key pose, and take so many more steps."""
-        order = gtsam.KeyGroupMap()
-        for group, keys in enumerate((self._calibrations, [X(last)]), start=1):
-            for key in keys:
-                order.insert2(key, group)
+        order = self._last_ones(last)
         self._engine.update(graph, values, constrainedKeys=order)
         for _ in range(again):
             self._engine.update(constrainedKeys=order)
+
+    def _last_ones(self, last: int) -> gtsam.KeyGroupMap:
+        """Return which variables are eliminated last.
+
+        What is asked for at each key pose stands in the root of the tree then. The very last are
+        poses: Cholesky takes a part of a calibration that only its prior holds for undetermined.
+        """
+        order = gtsam.KeyGroupMap()
+        for key in self._calibrations:
+            order.insert2(key, 1)
+        order.insert2(X(last), 2 if self._calibrations else 1)  # no group may be empty
+        return order
 
     def pose(self, number: int) -> gtsam.Pose3:
         """Return a key pose of the section."""
