@@ -1,6 +1,6 @@
 """What a localisation rests on: odometry, readings on key poses, calibrations, a start."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -84,6 +84,17 @@ class Drive:
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
+
+    def until(self, count: int) -> "Drive":
+        """Return the drive as it is up to so many key poses."""
+        links = self.links.key_pose < count
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns[:count],
+            steps=self.steps.until(count - 1),
+            readings=self.readings[np.flatnonzero(self.readings.key_pose < count)],
+            links=self.links[links],
+        )
 
     def dead_reckoning(self) -> list[gtsam.Pose3]:
         """Return the key poses that odometry alone leads to from the start."""

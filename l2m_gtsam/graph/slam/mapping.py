@@ -5,6 +5,9 @@ solved together by Levenberg-Marquardt, in stages: at first readings count as if
 many times what it is, so that only the field's long waves speak, and a place that is come to again
 is recognised from as far off as odometry has drifted; then more finely. At each stage tiles are
 laid anew where the poses are by then, and readings that no tile explains lose their weight.
+
+Odometry drifts out of the reach of the longest waves, too. So the drive is first solved coarsely
+piece by piece: each begins where the one before has come out.
 """
 
 from dataclasses import dataclass, replace
@@ -39,6 +42,7 @@ from l2m_gtsam.solve.robust import WEIGHTS
 # How many times its noise a reading may be off, stage by stage, and how sharply good readings are
 # told from wrong ones (mu of ``solve.robust``).
 STAGES = ((16.0, 1.0), (4.0, 1.0), (1.0, 1.0), (1.0, np.inf), (1.0, np.inf))
+PIECE_M = 30.0  # of way: over it odometry drifts less than the longest waves are long
 AWAY_M = 5.0  # of way after which a tile that is entered again closes a loop
 
 
@@ -83,8 +87,8 @@ def map_drive(
     progress
         Called with a stage and the fraction of it that is done.
     """
+    poses, sensors = grown(drive, begin, prior, options, progress), drive.sensors
     problem = TiledProblem(drive, prior, options)
-    poses, sensors = begin, drive.sensors
     for stage, (scale, mu) in enumerate(STAGES[:-1]):
         progress("solving poses and field", stage / len(STAGES))
         solved = problem.solved(poses, sensors, scale, mu)
@@ -93,6 +97,29 @@ def map_drive(
     found = problem.finished(problem.solved(poses, sensors, scale, mu))
     progress("solving poses and field", 1.0)
     return found
+
+
+def grown(
+    drive: Drive,
+    begin: list[gtsam.Pose3],
+    prior: FieldPrior,
+    options: SlamOptions,
+    progress: Progress,
+) -> list[gtsam.Pose3]:
+    """Return the poses of a drive as far as they are found piece by piece.
+
+    The last piece is at the poses that follow from the one before it.
+    """
+    way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    poses = begin
+    for end in np.arange(PIECE_M, way[-1], PIECE_M):
+        progress("following the drive", float(end / way[-1]))
+        count = int(np.searchsorted(way, end))
+        part = TiledProblem(drive.until(count), prior, options)
+        solved = part.solved(poses[:count], drive.sensors, *STAGES[0])
+        shift = solved.poses[-1].compose(poses[count - 1].inverse())
+        poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
+    return poses
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,10 @@ class OdometrySteps:
     def __len__(self) -> int:
         return len(self.p)
 
+    def until(self, count: int) -> "OdometrySteps":
+        """Return so many first steps."""
+        return OdometrySteps(self.R[:count], self.p[:count], self.covariance[:count], self.stated)
+
 
 def key_pose_rows(trajectory: Trajectory, options: KeyPoseOptions) -> IntArray:
     """Return which poses of a trajectory are key poses, shape (K,), the first and last among them.
