@@ -153,7 +153,7 @@ def prepared(
         sensors=known_sensors(calibrated),
         links=linked(seen, odometry, rows, options.drift),
     )
-    return drive, (*(part.note for part in recording.parts if part.note), *notes)
+    return drive, (*(note for part in recording.parts for note in part.notes), *notes)
 
 
 def usable_sensors(
