@@ -11,6 +11,7 @@ from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.localisation import Localised
 from l2m_gtsam.graph.slam.pose_graph import PoseGraph
+from l2m_gtsam.graph.slam.slips import slip_notes
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.slam_results import (
     DriftFigures,
@@ -59,7 +60,7 @@ def localisation_result(
         drift=drift_figures(trajectory, odometry),
         sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
         calibration=None if refine is None else refined(refine, solution),
-        notes=(),
+        notes=slip_notes(drive, solution.poses),
         bag=None,
         map=None,
         calibration_source=None,
