@@ -1,4 +1,4 @@
-"""Magnetometers that are dead for a part of a drive: they repeat one value, or say nothing. Pure."""
+"""Magnetometers that are dead for a part of a drive: they repeat a value, or say nothing. Pure."""
 
 from dataclasses import dataclass, replace
 

@@ -71,7 +71,7 @@ def clock_jumps(stamps: StampBuffer) -> tuple[ClockJump, ...]:
     if len(record) <= 2 * LEAST_MESSAGES:
         return ()
     order = np.argsort(record, kind="stable")
-    record, delay = record[order], 1e-9 * (record - stamps.header())[order]
+    record, delay = record[order], np.asarray(1e-9 * (record - stamps.header())[order])
     change = np.diff(delay)
     least = LEAST_S + USUAL * float(np.median(np.abs(change)))
     found = list[ClockJump]()

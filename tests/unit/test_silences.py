@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FieldSeries, FloatArray, Recording
+from l2m_gtsam.data import FieldSeries, FloatArray, IntArray, Recording
 from l2m_gtsam.silences import heard, is_dead
 from tests.slam_drives import rounds, slam_drive
 from tests.worlds import dipole_world, random_sensors
@@ -21,7 +21,7 @@ def changed(field: FloatArray) -> Recording:
     return replace(RECORDING, series=(replace(first, field=field), second))
 
 
-def dead(series: FieldSeries) -> FloatArray:
+def dead(series: FieldSeries) -> IntArray:
     return np.flatnonzero(~np.isfinite(series.field).all(axis=1))
 
 

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.graph.slam.jumps import JumpOptions, Mended, rows_of, without_jumps
-from l2m_gtsam.graph.slam.options import DriftOptions
 from l2m_gtsam.graph.slam.odometry import drift_covariance
+from l2m_gtsam.graph.slam.options import DriftOptions
 from l2m_gtsam.pose_covariance import moved
 from l2m_gtsam.rigid import between, compose, difference
 from tests.slam_drives import RATE_HZ, rounds

@@ -214,7 +214,7 @@ class _Found:
 
     def sizes(self) -> FloatArray:
         """Return by how much steps differ in rad and m, shape (N, 2)."""
-        return np.linalg.norm(self.off.reshape(-1, 2, 3), axis=2)
+        return np.asarray(np.linalg.norm(self.off.reshape(-1, 2, 3), axis=2))
 
 
 def _found(trajectory: Trajectory, options: JumpOptions) -> _Found:
