@@ -129,6 +129,8 @@ def _verdict(solution: Localised) -> tuple[LocalisationStatus, str]:
     inside, used = solution.sight.inside, solution.used
     share = float(inside.mean())
     explained = float(used.sum() / max(inside.sum(), 1))
+    # What was read near a change says nothing for or against the rest of the map.
+    judged = float(used.sum() / max((inside & ~solution.near_changes).sum(), 1))
     chi2 = float(solution.squared[used].mean() / 3) if used.any() else np.inf
     told = f"the map explains {explained:.0%} of the readings"
     if share < LEAST_INSIDE:
@@ -137,7 +139,7 @@ def _verdict(solution: Localised) -> tuple[LocalisationStatus, str]:
             "does not begin where it is said to"
         )
         return LocalisationStatus.OUTSIDE_MAP, message
-    if explained < LEAST_EXPLAINED or max(chi2, solution.bent) > LARGEST_CHI2:
+    if judged < LEAST_EXPLAINED or max(chi2, solution.bent) > LARGEST_CHI2:
         message = (
             f"{told}, leaves {chi2:.1f} times the variance of their noise, and needs steps that "
             f"miss odometry by {solution.bent:.1f} times its variance: another place, a wrong "

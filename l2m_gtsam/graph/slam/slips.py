@@ -7,8 +7,8 @@ import gtsam
 import numpy as np
 from scipy.stats import chi2
 
-from l2m_gtsam.data import BoolArray
 from l2m_gtsam.graph.slam.drive import Drive
+from l2m_gtsam.graph.slam.runs import runs
 
 CHANCE = 1e-4  # that a step of an odometry that is as good as it states is told
 FREEDOM = 6
@@ -83,9 +83,3 @@ def slips(drive: Drive, poses: list[gtsam.Pose3]) -> Iterator[Slip]:
             angle_deg=float(np.rad2deg(np.linalg.norm(moved[:3]))),
             times=float(np.sqrt(squared[first:last].max() / FREEDOM)),
         )
-
-
-def runs(marked: BoolArray) -> list[tuple[int, int]]:
-    """Return first and past-the-last row of each run of marked rows."""
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]])))
-    return [(int(first), int(last)) for first, last in ends.reshape(-1, 2)]
