@@ -1,6 +1,6 @@
 """Jumps of odometry: found wherever they are, taken out, and never seen in a smooth drive."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,38 +13,13 @@ from l2m_gtsam.graph.slam.jumps import JumpOptions, Mended, rows_of, without_jum
 from l2m_gtsam.graph.slam.odometry import drift_covariance
 from l2m_gtsam.graph.slam.options import DriftOptions
 from l2m_gtsam.pose_covariance import moved
-from l2m_gtsam.rigid import between, compose, difference
+from l2m_gtsam.rigid import between, difference
+from tests.drive_faults import jumped, shift
 from tests.slam_drives import RATE_HZ, rounds
 
 OPTIONS = JumpOptions()
 # Headings are gradients of the way, which at its two ends are half a step off.
 DRIVE = rows_of(rounds(30), np.arange(1, 599))
-
-
-@dataclass(frozen=True)
-class Shift:
-    """A jump: its step, and where it leads in the frame of the pose that was due."""
-
-    row: int
-    T: RigidTransform
-
-
-def shift(row: int, metres: float, degrees: float, heading: float = 0.0) -> Shift:
-    R = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
-    t = metres * np.array([np.cos(heading), np.sin(heading), 0.0])
-    return Shift(row, RigidTransform(R, t))
-
-
-def jumped(trajectory: Trajectory, *shifts: Shift) -> Trajectory:
-    """Return a trajectory whose poses after some steps are all moved, rigidly."""
-    R, p = trajectory.R.copy(), trajectory.p.copy()
-    for each in shifts:
-        k = each.row + 1
-        due = RigidTransform(R[k], p[k])
-        carry = compose(compose(due, each.T), due.inverse())
-        R[k:] = carry.R @ R[k:]
-        p[k:] = p[k:] @ carry.R.T + carry.t
-    return replace(trajectory, R=R, p=p)
 
 
 def pose(trajectory: Trajectory, k: int) -> RigidTransform:

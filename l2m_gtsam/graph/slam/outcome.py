@@ -10,6 +10,7 @@ from l2m_gtsam.data import Distortion, Trajectory
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.misfit import explains_no_more
 from l2m_gtsam.graph.slam.pose_graph import PoseGraph
 from l2m_gtsam.graph.slam.slips import slip_notes
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
@@ -33,7 +34,11 @@ LARGEST_CHI2 = 4.0
 
 
 def localisation_result(
-    drive: Drive, solution: Localised, by_scans: PoseGraph, refine: CalibrationResult | None
+    drive: Drive,
+    solution: Localised,
+    by_scans: PoseGraph,
+    refine: CalibrationResult | None,
+    wrong: Localised | None = None,
 ) -> LocalisationResult:
     """Return what is told of a drive.
 
@@ -47,9 +52,11 @@ def localisation_result(
         Of odometry and scans alone.
     refine
         The calibration that was refined; none if it was fixed.
+    wrong
+        The drive in a map that is wrong for certain, if this one was held against such.
     """
     alone = drive.dead_reckoning()
-    status, message = _verdict(solution)
+    status, message = _verdict(solution, wrong)
     odometry = _trajectory(drive, alone)
     trajectory = replace(_trajectory(drive, solution.poses), covariance=solution.pose_covariance)
     return LocalisationResult(
@@ -125,7 +132,7 @@ def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCal
     )
 
 
-def _verdict(solution: Localised) -> tuple[LocalisationStatus, str]:
+def _verdict(solution: Localised, wrong: Localised | None) -> tuple[LocalisationStatus, str]:
     inside, used = solution.sight.inside, solution.used
     share = float(inside.mean())
     explained = float(used.sum() / max(inside.sum(), 1))
@@ -144,6 +151,12 @@ def _verdict(solution: Localised) -> tuple[LocalisationStatus, str]:
             f"{told}, leaves {chi2:.1f} times the variance of their noise, and needs steps that "
             f"miss odometry by {solution.bent:.1f} times its variance: another place, a wrong "
             "start, or a wrong calibration"
+        )
+        return LocalisationStatus.NOT_HERE, message
+    if wrong is not None and explains_no_more(solution, wrong):
+        message = (
+            f"{told}, hardly more than it does half turned, which is wrong for certain: another "
+            "place, a wrong start, or a wrong calibration"
         )
         return LocalisationStatus.NOT_HERE, message
     if solution.ending is not Ending.TOLERANCE:
