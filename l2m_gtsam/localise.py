@@ -18,7 +18,7 @@ from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose, carried
 from l2m_gtsam.graph.slam.jumps import without_jumps
 from l2m_gtsam.graph.slam.links import link_stamps, linked
 from l2m_gtsam.graph.slam.localisation import Localised, localise_drive
-from l2m_gtsam.graph.slam.misfit import is_doubtful, turned
+from l2m_gtsam.graph.slam.misfit import is_doubtful, wrong_maps
 from l2m_gtsam.graph.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
 from l2m_gtsam.graph.slam.outcome import localisation_result
@@ -107,9 +107,8 @@ def localise(
     by_scans = solve_pose_graph(drive, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
     solution = localise_drive(drive, solver_map, options, progress)
-    wrong = None
-    if is_doubtful(solution):
-        wrong = localise_drive(drive, turned(solution, solver_map), options, progress)
+    others = wrong_maps(drive, solver_map) if is_doubtful(solution) else ()
+    wrong = [localise_drive(drive, each, options, progress) for each in others]
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, wrong)

@@ -142,7 +142,7 @@ def test_without_any_sensor_odometry_goes_on_and_says_how_far_to_trust_it(
     assert result.notes[0].startswith("mag_00 is dead for 67% of the drive, longest from")
     assert pose_nees(drive.truth, result.trajectory).mean() < 12
     sigma = position_sigmas(result)
-    assert sigma[-1] > 2 * position_sigmas(plain)[-1]
+    assert sigma[-1] > 1.5 * position_sigmas(plain)[-1]
     nothing = replace(alone.recording.series[0], field=np.zeros((599, 3)))
     with pytest.raises(SyncError, match="mag_00: it has no readings, or repeats one value"):
         found(replaced(alone, {0: nothing}), calibrated(sensors[:1]))

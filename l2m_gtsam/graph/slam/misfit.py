@@ -5,9 +5,12 @@ a map may be rough, or a place changed here and there. The same drive in the sam
 which is wrong for certain, tells what chance explains.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.localisation import Localised
 from l2m_gtsam.graph.slam.mirror import HalfTurned
 from l2m_gtsam.graph.view import QueryableMap
@@ -40,16 +43,17 @@ def is_doubtful(solution: Localised) -> bool:
     return bool(np.isfinite(least) and least > DOUBTFUL)
 
 
-def turned(solution: Localised, field_map: QueryableMap) -> HalfTurned:
-    """Return the map half turned about the middle of where odometry has the drive."""
-    poses = solution.drive.dead_reckoning()
-    return HalfTurned(field_map, np.mean([pose.translation() for pose in poses], axis=0))
+def wrong_maps(drive: Drive, field_map: QueryableMap) -> tuple[HalfTurned, ...]:
+    """Return the map half turned about the middle of a drive, and about a place beside it."""
+    p = np.stack([pose.translation() for pose in drive.dead_reckoning()])
+    middle, extent = p.mean(axis=0), np.ptp(p, axis=0)
+    beside = np.where(np.arange(AXES) == np.argmax(extent[:2]), extent / 6, 0.0)
+    return HalfTurned(field_map, middle), HalfTurned(field_map, middle + beside)
 
 
-def explains_no_more(solution: Localised, wrong: Localised) -> bool:
-    """Return whether a drive fits a map hardly better than one that is wrong for certain."""
-    if wrong.sight.inside.sum() < LEAST * solution.sight.inside.sum():
-        return False
-    left = misfits(solution)
+def explains_no_more(solution: Localised, wrong: Sequence[Localised]) -> bool:
+    """Return whether a drive fits a map hardly better than one of some that are wrong."""
+    left, inside = misfits(solution), solution.sight.inside.sum()
     best = int(np.argmin(left))
-    return bool(left[best] > MUCH * misfits(wrong)[best])
+    others = [misfits(each)[best] for each in wrong if each.sight.inside.sum() >= LEAST * inside]
+    return any(bool(left[best] > MUCH * other) for other in others)

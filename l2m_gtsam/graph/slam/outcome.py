@@ -1,5 +1,6 @@
 """A solved drive as a result: figures, verdict, refined calibration."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
@@ -38,7 +39,7 @@ def localisation_result(
     solution: Localised,
     by_scans: PoseGraph,
     refine: CalibrationResult | None,
-    wrong: Localised | None = None,
+    wrong: Sequence[Localised] = (),
 ) -> LocalisationResult:
     """Return what is told of a drive.
 
@@ -53,7 +54,7 @@ def localisation_result(
     refine
         The calibration that was refined; none if it was fixed.
     wrong
-        The drive in a map that is wrong for certain, if this one was held against such.
+        The drive in maps that are wrong for certain, if this one was held against such.
     """
     alone = drive.dead_reckoning()
     status, message = _verdict(solution, wrong)
@@ -132,7 +133,7 @@ def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCal
     )
 
 
-def _verdict(solution: Localised, wrong: Localised | None) -> tuple[LocalisationStatus, str]:
+def _verdict(solution: Localised, wrong: Sequence[Localised]) -> tuple[LocalisationStatus, str]:
     inside, used = solution.sight.inside, solution.used
     share = float(inside.mean())
     explained = float(used.sum() / max(inside.sum(), 1))
@@ -153,7 +154,7 @@ def _verdict(solution: Localised, wrong: Localised | None) -> tuple[Localisation
             "start, or a wrong calibration"
         )
         return LocalisationStatus.NOT_HERE, message
-    if wrong is not None and explains_no_more(solution, wrong):
+    if explains_no_more(solution, wrong):
         message = (
             f"{told}, hardly more than it does half turned, which is wrong for certain: another "
             "place, a wrong start, or a wrong calibration"
