@@ -166,7 +166,8 @@ def _localised(
     sources = Sources(source_file(saved.path), source)
     found = localise(recording, field_map, calibration, config.slam, progress, sources, seen)
     if found.result.status in NOWHERE:
-        raise MapError(f"{recording.source.path} in {saved.path}: {found.result.message}")
+        told = "; ".join((found.result.message, *found.result.notes))
+        raise MapError(f"{recording.source.path} in {saved.path}: {told}")
     return _Found(recording, found.result, found.solution, field_map)
 
 

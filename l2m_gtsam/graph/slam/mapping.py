@@ -13,9 +13,8 @@ import gtsam
 import numpy as np
 
 from l2m_factors import X
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.optimise import Ending, LinearSolver, Optimizer, optimise
-from l2m_gtsam.graph.slam.changes import LEAST_LEFT, ROUNDS, Fit, changed
 from l2m_gtsam.graph.slam.covariances import (
     pose_covariances,
     sensor_covariances,
@@ -91,16 +90,7 @@ def map_drive(
         solved = problem.solved(poses, sensors, scale, mu)
         poses, sensors = solved.poses, solved.sensors
     scale, mu = STAGES[-1]
-    whole = solved = problem.solved(poses, sensors, scale, mu)
-    for _ in range(ROUNDS):
-        counts = solved.counts & ~changed(problem.fit(solved))[drive.readings.key_pose]
-        if np.array_equal(counts, solved.counts):
-            break
-        if np.mean(counts) < LEAST_LEFT:
-            solved = whole
-            break
-        solved = problem.solved(solved.poses, solved.sensors, scale, mu, counts)
-    found = problem.finished(solved)
+    found = problem.finished(problem.solved(poses, sensors, scale, mu))
     progress("solving poses and field", 1.0)
     return found
 
@@ -111,7 +101,6 @@ class Solved:
 
     tiled: TiledDrive
     graph: gtsam.NonlinearFactorGraph
-    counts: BoolArray
     weights: FloatArray
     values: gtsam.Values
     poses: list[gtsam.Pose3]
@@ -138,12 +127,7 @@ class TiledProblem:
         self._free = options.calibration is CalibrationUse.REFINED
 
     def solved(
-        self,
-        poses: list[gtsam.Pose3],
-        sensors: KnownSensors,
-        scale: float,
-        mu: float,
-        counts: BoolArray | None = None,
+        self, poses: list[gtsam.Pose3], sensors: KnownSensors, scale: float, mu: float
     ) -> Solved:
         """Lay tiles at these poses and solve for poses and weights.
 
@@ -155,11 +139,7 @@ class TiledProblem:
             How many times its noise a reading may be off.
         mu
             Stage of the graduation of the readings' weights.
-        counts
-            Which of them may count, shape (N,); all if not given.
         """
-        if counts is None:
-            counts = np.ones(len(self._drive.readings), dtype=np.bool_)
         tiled = TiledDrive.lay(self._drive, poses, sensors, self._prior)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
@@ -171,7 +151,7 @@ class TiledProblem:
         pairs = zip(sights, whitenings, strict=True)
         r2 = self._gathered(tiled, [sight.squared(each) for sight, each in pairs])
         robust = self._options.robust
-        weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu)) * counts
+        weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
         chosen = np.flatnonzero(weights > NOTHING)
         fixed = None if self._free else self._drive.sensors.fixed()
         W = W * np.sqrt(weights)[:, None, None]
@@ -186,22 +166,7 @@ class TiledProblem:
         )
         found = list(poses_in(end.values, len(poses)).values())
         after = sensors_in(end.values, sensors)
-        return Solved(tiled, graph, counts, weights, end.values, found, after, end.ending)
-
-    def fit(self, solved: Solved) -> Fit:
-        """Return how the readings that may count fit."""
-        readings, noise = self._drive.readings, solved.sensors.noise
-        tiled = solved.tiled.moved(self._drive, solved.poses, solved.sensors)
-        sights = tiled.sights(solved.values, solved.sensors)
-        squared = [sight.squared(sight.whitening(noise)) for sight in sights]
-        return Fit(
-            readings.key_pose,
-            readings.sensor,
-            solved.counts,
-            solved.weights > NOTHING,
-            self._gathered(tiled, squared),
-            np.stack([pose.translation() for pose in solved.poses]),
-        )
+        return Solved(tiled, graph, weights, end.values, found, after, end.ending)
 
     def finished(self, solved: Solved) -> Mapped:
         """Return a solved stage with its covariances and residuals."""
@@ -222,7 +187,7 @@ class TiledProblem:
             sight=self._sight(solved, tiled, sights),
             squared=self._gathered(tiled, squared),
             weights=solved.weights,
-            near_changes=~solved.counts,
+            near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
