@@ -23,6 +23,7 @@ from tests.worlds import dipole_world, random_sensors
 WORLD = dipole_world(1)
 SECONDS = 30
 HALF = 300  # readings
+STUDY = pytest.mark.study
 
 
 def found(
@@ -212,7 +213,10 @@ def test_fixes_that_stop_are_bridged_by_odometry_and_readings(
 # Another building.
 
 
-@pytest.mark.parametrize(("seed", "refined"), [(99, False), (7, False), (99, True)])
+@pytest.mark.parametrize(
+    ("seed", "refined"),
+    [(99, False), pytest.param(7, False, marks=STUDY), pytest.param(99, True, marks=STUDY)],
+)
 def test_another_building_is_not_here(
     drive: SlamDrive, sensors: tuple[KnownSensor, ...], seed: int, refined: bool
 ) -> None:
