@@ -17,9 +17,9 @@ from l2m_gtsam.graph.view import QueryableMap
 
 LARGEST = 21.0  # squared length of a whitened residual, of 10,000 with noise alone one is larger
 AXES = 3
-DOUBTFUL = 1.5  # times the variance of noise, above which a map is held against a wrong one
-# Of what the wrong map leaves. Measured: maps of other places 0.8 to 1.0, the right one 0.3, with
-# steel beside half of the way 0.6.
+LEAST_WAY_M = 10.0  # over less, poses bend to the right map and to wrong ones alike
+DOUBTFUL = 1.25  # times the variance of noise, above which a map is held against a wrong one
+# Of what the wrong map leaves. Measured: maps of other places 0.8 to 1.3, the right one 0.3.
 MUCH = 0.7
 LEAST = 0.5  # of the readings inside the map have to be inside the wrong one, too
 
@@ -27,20 +27,22 @@ LEAST = 0.5  # of the readings inside the map have to be inside the wrong one, t
 def misfits(solution: Localised) -> FloatArray:
     """Return mean squares of the sensors' whitened residuals, those rejected among them, (S,).
 
-    What is far off counts as the least that is rejected. Infinite where a sensor has no reading.
+    What is far off counts as the least that is rejected, what was read near a change not at all.
+    Infinite where a sensor has no reading.
     """
     left = np.full(len(solution.drive.sensors.names), np.inf)
+    judged = solution.sight.inside & ~solution.near_changes
     for sensor in range(len(left)):
-        own = solution.sight.inside & (solution.drive.readings.sensor == sensor)
+        own = judged & (solution.drive.readings.sensor == sensor)
         if own.any():
             left[sensor] = np.minimum(solution.squared[own], LARGEST).mean() / AXES
     return left
 
 
 def is_doubtful(solution: Localised) -> bool:
-    """Return whether no sensor's readings are explained down to noise."""
-    least = misfits(solution).min()
-    return bool(np.isfinite(least) and least > DOUBTFUL)
+    """Return whether a drive is long enough to tell, and no sensor is explained down to noise."""
+    least, way = misfits(solution).min(), np.linalg.norm(solution.drive.steps.p, axis=1).sum()
+    return bool(way >= LEAST_WAY_M and np.isfinite(least) and least > DOUBTFUL)
 
 
 def wrong_maps(drive: Drive, field_map: QueryableMap) -> tuple[HalfTurned, ...]:
