@@ -151,8 +151,9 @@ class Recording:
         What it was joined from, each in its own time, in order of time; empty for one drive.
     moved_ns
         What was added to the stamps of each drive so that none overlaps another, nanoseconds.
-    note
-        Where its poses come from, if the bag has none: a sentence.
+    notes
+        What is worth a warning, a sentence each: where its poses come from if the bag has none, or
+        a clock that was set.
     """
 
     trajectory: Trajectory
@@ -161,7 +162,7 @@ class Recording:
     scalars: tuple[ScalarSeries, ...] = ()
     drives: tuple["Recording", ...] = ()
     moved_ns: tuple[int, ...] = ()
-    note: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple["Recording", ...]:
