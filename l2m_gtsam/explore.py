@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Recording, SourceFile
@@ -12,10 +13,12 @@ from l2m_gtsam.graph.slam.localisation import Localised
 from l2m_gtsam.graph.slam.mapping import map_drive
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.graph.slam.outcome import localisation_result
+from l2m_gtsam.graph.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.graph.slam.sight import place
-from l2m_gtsam.localise import prepared
+from l2m_gtsam.localise import NO_SCANS, prepared
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.scans import ScanEvidence
 from l2m_gtsam.slam_results import Explored, LocalisationResult, LocalisationStatus
 
 NOWHERE_TWICE = (
@@ -56,6 +59,7 @@ def explore(
     options: SlamOptions,
     progress: Progress,
     calibration_source: SourceFile | None = None,
+    seen: ScanEvidence = NO_SCANS,
 ) -> Exploration:
     """Find where a vehicle was and what the field is there, from where its odometry begins.
 
@@ -72,6 +76,8 @@ def explore(
         Called with a stage and the fraction of it that is done.
     calibration_source
         For the record.
+    seen
+        Loops that the drive's scans close.
 
     Raises
     ------
@@ -86,15 +92,18 @@ def explore(
     """
     if options.start.anywhere:
         raise ConfigError("`slam.start.anywhere` looks for the start in a map: give one with --map")
-    drive, notes = prepared(recording, calibration, options)
+    drive, notes = prepared(recording, calibration, options, seen)
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=HERE))
     progress("learning the field's prior", 0.0)
-    prior = drive_prior(drive, options.tiles)
+    by_scans = solve_pose_graph(drive, options.robust.confidence)
+    drive = replace(drive, links=drive.links[by_scans.believed])
+    prior = drive_prior(drive, by_scans.poses, options.tiles)
     progress("learning the field's prior", 1.0)
-    mapped = map_drive(drive, prior, options, progress)
+    mapped = map_drive(drive, by_scans.poses, prior, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
-    result = localisation_result(drive, mapped.solution, calibration if refined else None)
+    kept = calibration if refined else None
+    result = localisation_result(drive, mapped.solution, by_scans, kept)
     explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
     result = replace(
         told(result, explored),
@@ -120,11 +129,11 @@ def told(result: LocalisationResult, explored: Explored) -> LocalisationResult:
     return replace(result, status=LocalisationStatus.NOT_CONVERGED, message=NO_FIELD)
 
 
-def drive_prior(drive: Drive, options: TileOptions) -> FieldPrior:
-    """Learn the prior of the field from the first part of a drive, by dead reckoning."""
+def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:
+    """Learn the prior of the field from the first part of a drive, at poses by odometry."""
     way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
     early = np.flatnonzero(way[drive.readings.key_pose] <= options.learn_over_m)
-    readings, poses = drive.readings[early], drive.dead_reckoning()
+    readings = drive.readings[early]
     where = place(
         readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
     )

@@ -15,17 +15,22 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError, SyncError
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose, carried
+from l2m_gtsam.graph.slam.links import link_stamps, linked
 from l2m_gtsam.graph.slam.localisation import Localised, localise_drive
-from l2m_gtsam.graph.slam.odometry import key_pose_rows, odometry_steps
+from l2m_gtsam.graph.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
 from l2m_gtsam.graph.slam.outcome import localisation_result
+from l2m_gtsam.graph.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.graph.slam.start_search import find_start, start_found
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.scans import ScanEvidence
 from l2m_gtsam.slam_results import LocalisationResult
 from l2m_gtsam.solve.noise import NOISE_RANGE
 from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
+
+NO_SCANS = ScanEvidence()
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,7 @@ def localise(
     options: SlamOptions,
     progress: Progress,
     sources: Sources | None = None,
+    seen: ScanEvidence = NO_SCANS,
 ) -> Localisation:
     """Find where a vehicle was in a magnetic map.
 
@@ -76,6 +82,8 @@ def localise(
         Called with a stage and the fraction of it that is done.
     sources
         Of map and calibration.
+    seen
+        What the drive's scans say of its poses.
 
     Raises
     ------
@@ -86,15 +94,17 @@ def localise(
     MapError
         The start was looked for, and is not the only one that fits, or none does.
     """
-    drive, notes = prepared(recording, calibration, options)
+    drive, notes = prepared(recording, calibration, options, seen)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     search = None
     if options.start.anywhere:
         search = find_start(drive, solver_map, options, progress)
         drive = replace(drive, start=start_found(search, options.start))
+    by_scans = solve_pose_graph(drive, options.robust.confidence)
+    drive = replace(drive, links=drive.links[by_scans.believed])
     solution = localise_drive(drive, solver_map, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
-    result = localisation_result(drive, solution, calibration if refined else None)
+    result = localisation_result(drive, solution, by_scans, calibration if refined else None)
     sources = sources or Sources()
     result = replace(
         result,
@@ -108,9 +118,17 @@ def localise(
 
 
 def prepared(
-    recording: Recording, calibration: CalibrationResult, options: SlamOptions
+    recording: Recording,
+    calibration: CalibrationResult,
+    options: SlamOptions,
+    seen: ScanEvidence = NO_SCANS,
 ) -> tuple[Drive, tuple[str, ...]]:
     """Return a recording as a drive of its calibrated sensors, and what is worth a warning.
+
+    Parameters
+    ----------
+    recording, calibration, options, seen
+        As of ``localise``.
 
     Raises
     ------
@@ -125,12 +143,15 @@ def prepared(
     calibrated, notes = usable_sensors(recording, calibration)
     readings = drive_readings(recording, calibrated, options)
     rows = key_pose_rows(odometry, options.key_poses)
+    if len(seen):
+        rows = with_rows_at(rows, odometry, link_stamps(seen))
     drive = Drive(
         stamp_ns=odometry.stamp_ns[rows],
         steps=odometry_steps(odometry, rows, options.drift),
         readings=carried(readings, odometry, rows, options.key_poses.readings),
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
+        links=linked(seen, odometry, rows, options.drift),
     )
     return drive, (*(part.note for part in recording.parts if part.note), *notes)
 

@@ -71,6 +71,26 @@ class Loop:
     covariance: FloatArray
 
 
+@dataclass(frozen=True)
+class ScanEvidence:
+    """What the scans of a drive say of its poses, beside odometry.
+
+    Attributes
+    ----------
+    fixes
+        Where single scans were taken in the map, in order of time. Their errors count as
+        independent.
+    loops
+        Where the vehicle came again, in order of the later time.
+    """
+
+    fixes: tuple[PoseFix, ...] = ()
+    loops: tuple[Loop, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.fixes) + len(self.loops)
+
+
 def taken_at_once(scan: Scan, twist: FloatArray) -> FloatArray:
     """Return the points of a scan as they were at its stamp, shape (N, 3), metres.
 

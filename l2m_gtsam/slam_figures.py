@@ -21,7 +21,7 @@ from l2m_gtsam.qa.metrics.curves import curves, series
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.fit import fit_figures, normalised_figures
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.qa.slam.errors import truth_record
+from l2m_gtsam.qa.slam.errors import Ways, truth_record
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.slam_records import (
     LocalisationRecord,
@@ -87,7 +87,8 @@ def localisation_record(
     """
     truth = None
     if told.truth is not None:
-        truth = truth_record(told.truth, result.trajectory, result.odometry, told.max_pose_gap_s)
+        ways = Ways(result.trajectory, result.odometry, result.by_scans)
+        truth = truth_record(told.truth, ways, told.max_pose_gap_s)
     now = result.calibration or told.calibration
     return LocalisationRecord(
         status=result.status,
@@ -102,6 +103,7 @@ def localisation_record(
         odometry=_odometry(solution.drive, result.odometry),
         start=None if result.start is None else _start(result.start),
         explored=result.explored,
+        scans=result.scans,
         truth=truth,
         picture=map_picture(told.field_map, result.trajectory.p),
         sources=_sources(result, told),

@@ -12,6 +12,7 @@ from l2m_gtsam.slam_results import (
     DriftFigures,
     Explored,
     LocalisationStatus,
+    ScanUse,
     SensorUse,
     StartVerdict,
 )
@@ -141,6 +142,8 @@ class TruthRecord(Record):
         How many.
     odometry, localised
         Errors of both; nothing is aligned.
+    by_scans
+        Errors of odometry and scans without magnetometers; absent without scans.
     nees
         Mean of the squared errors of localised poses in units of their covariances; 6 is honest.
     beyond_95
@@ -154,6 +157,7 @@ class TruthRecord(Record):
     poses: int
     odometry: PoseErrors
     localised: PoseErrors
+    by_scans: PoseErrors | None
     nees: float
     beyond_95: float
     path: Rows
@@ -248,6 +252,8 @@ class LocalisationRecord(Record):
         Where it was looked for; absent where it was given.
     explored
         How the field was found; absent where there was a map.
+    scans
+        What a LiDAR's scans were worth; absent without any.
     truth
         Absent where none was given.
     picture
@@ -272,6 +278,7 @@ class LocalisationRecord(Record):
     odometry: tuple[OdometryRecord, ...]
     start: StartRecord | None
     explored: Explored | None
+    scans: ScanUse | None
     truth: TruthRecord | None
     picture: MapPicture
     sources: tuple[NamedSource, ...]

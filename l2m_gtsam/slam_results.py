@@ -76,6 +76,26 @@ class SensorUse(Record):
         return self.readings - self.outside_map - self.rejected
 
 
+@dataclass(frozen=True)
+class ScanUse(Record):
+    """What a LiDAR's scans were worth beside odometry.
+
+    Attributes
+    ----------
+    fixes, loops
+        How many poses in the map, and returns to earlier places, counted.
+    rejected
+        How many more were not believed: they do not fit odometry and the others.
+    chi2_per_dof
+        Mean square of the whitened components by which the poses differ from them; 1 is consistent.
+    """
+
+    fixes: int
+    loops: int
+    rejected: int
+    chi2_per_dof: float
+
+
 class StartVerdict(StrEnum):
     """What a search for the start of a drive came to."""
 
@@ -188,6 +208,10 @@ class LocalisationResult:
         How the start was found; absent where it was known.
     explored
         How the field was found; absent where there was a map.
+    scans
+        What scans were worth; absent without any.
+    by_scans
+        Key poses by odometry and scans, without magnetometers; absent without scans.
     """
 
     status: LocalisationStatus
@@ -203,3 +227,5 @@ class LocalisationResult:
     calibration_source: SourceFile | None
     start: StartSearch | None = None
     explored: Explored | None = None
+    scans: ScanUse | None = None
+    by_scans: Trajectory | None = None

@@ -100,14 +100,14 @@ def _localised(saved: SavedMap, bag: Path, config: Config, progress: Progress) -
         if first is None:
             raise LidarError("no scan has points enough to be localised")
         cloud = Surface(mapped.points)
-        start = _start(first, cloud, mapped, options)
+        start = scan_start(first, cloud, mapped, options)
         frame = str(saved.state.provenance.get("frame") or "map")
         return localise_scans(chain([first], steps), cloud, start, options.localisation, frame)
     except LidarError as error:
         raise LidarError(f"{bag} on {saved.path}: {error}") from error
 
 
-def _start(
+def scan_start(
     first: ScanStep, cloud: Surface, mapped: LidarMap, options: LidarOptions
 ) -> RigidTransform:
     """Return where a drive begins: as it is said, else as the first scan fits."""

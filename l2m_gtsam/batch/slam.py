@@ -9,6 +9,7 @@ from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.reports import REPORT_FILE
+from l2m_gtsam.batch.scan_evidence import read_evidence
 from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.batch.slam_report import SLAM_FILE, write_slam_report
 from l2m_gtsam.config import Config
@@ -24,6 +25,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.slam.errors import check_truth
 from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.scans import ScanEvidence
 from l2m_gtsam.slam_figures import Told, localisation_record
 from l2m_gtsam.slam_records import LocalisationRecord
 from l2m_gtsam.slam_results import LocalisationResult, LocalisationStatus
@@ -124,15 +126,18 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
         raise OutputError(f"{given.calibration}: is what is read; choose another --out")
     truth = None if given.truth is None else read_tum(given.truth)
     recording = read_drive_or_follow(given.bag, config, progress)
+    scanned = read_evidence(given.bag, recording, saved, config, progress)
     gap = config.slam.max_pose_gap_s
     if truth is not None:
         check_truth(truth, recording.trajectory, gap, str(given.truth))
     source = source_file(given.calibration)
     if saved is None:
-        found = _explored(recording, calibration, source, config, progress)
+        found = _explored(recording, calibration, source, scanned.seen, config, progress)
     else:
-        found = _localised(recording, calibration, source, saved, config, progress)
-    options = config.model_dump(mode="json", include={"bag", "slam", "qa"})
+        found = _localised(recording, calibration, source, saved, scanned.seen, config, progress)
+    notes = (*scanned.notes, *found.result.notes)
+    found = replace(found, result=replace(found.result, notes=notes))
+    options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})
     truth_source = None if given.truth is None else source_file(given.truth)
     told = Told(calibration, found.field_map, options, gap, truth, truth_source)
     record = localisation_record(found.result, found.solution, told)
@@ -149,6 +154,7 @@ def _localised(
     calibration: CalibrationResult,
     source: SourceFile,
     saved: SavedMap,
+    seen: ScanEvidence,
     config: Config,
     progress: Progress,
 ) -> _Found:
@@ -157,7 +163,7 @@ def _localised(
     is_given = start.position is not None and start.quaternion_xyzw is not None
     field_map = saved.open(progress, [] if start.anywhere or is_given else [recording])
     sources = Sources(source_file(saved.path), source)
-    found = localise(recording, field_map, calibration, config.slam, progress, sources)
+    found = localise(recording, field_map, calibration, config.slam, progress, sources, seen)
     if found.result.status in NOWHERE:
         raise MapError(f"{recording.source.path} in {saved.path}: {found.result.message}")
     return _Found(recording, found.result, found.solution, field_map)
@@ -167,10 +173,11 @@ def _explored(
     recording: Recording,
     calibration: CalibrationResult,
     source: SourceFile,
+    seen: ScanEvidence,
     config: Config,
     progress: Progress,
 ) -> _Found:
-    found = explore(recording, calibration, config.slam, progress, source)
+    found = explore(recording, calibration, config.slam, progress, source, seen)
     progress("building the map", 0.0)
     field_map = build_map(found.points, found.field, config.mapping.model)
     progress("building the map", 1.0)

@@ -32,7 +32,13 @@ def slam(
     """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
     from l2m_gtsam.batch.slam import SlamInput, slam_bag
     from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.slam_tables import drift_lines, slam_table, start_lines, truth_lines
+    from l2m_gtsam.qa.slam_tables import (
+        drift_lines,
+        scan_lines,
+        slam_table,
+        start_lines,
+        truth_lines,
+    )
     from l2m_gtsam.qa.verdict_text import verdict_lines
 
     given = SlamInput(bag, map_path, calibration, truth)
@@ -40,7 +46,7 @@ def slam(
         done = slam_bag(given, load_config(config), out, progress)
     print_table(slam_table(done.result))
     lines = (*start_lines(done.result.start), *drift_lines(done.result))
-    for line in (*lines, *truth_lines(done.record.truth)):
+    for line in (*lines, *scan_lines(done.result.scans), *truth_lines(done.record.truth)):
         typer.echo(line)
     for line in verdict_lines(done.verdict):
         typer.echo(line)

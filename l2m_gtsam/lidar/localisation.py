@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -20,10 +20,10 @@ from l2m_gtsam.lidar.registration import (
     combined,
     register,
 )
-from l2m_gtsam.lidar.rigid import compose
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
 from l2m_gtsam.pose_covariance import moved
+from l2m_gtsam.rigid import compose
 from l2m_gtsam.scans import PoseFix
 
 
@@ -57,6 +57,8 @@ class ScanLocalisationOptions(Options):
     neighbouring poses share: it bends with the errors of the mapping drive's poses,"""
     cloud_deg: float = Field(default=0.05, ge=0)
     """and of the rotation in degrees."""
+    cloud_over_m: float = Field(default=5.0, gt=0)
+    """The way over which the cloud's errors are the same."""
 
     def of_cloud(self) -> FloatArray:
         """Return the covariance that the cloud's errors add to a pose, shape (6, 6)."""
@@ -123,6 +125,38 @@ def localise_scans(
     if not found.fixes:
         raise LidarError("no scan has points enough to be localised")
     return ScanLocalisation(tuple(found.fixes), found.trajectory(frame), dict(found.refused))
+
+
+def spaced(
+    fixes: tuple[PoseFix, ...], apart_m: float, options: ScanLocalisationOptions
+) -> tuple[PoseFix, ...]:
+    """Return fixes whose errors may count as independent.
+
+    One is kept per ``apart_m`` metres of way. Those that share an error of the cloud get it as many
+    times as there are of them, so that all together say no more than one of them without noise.
+
+    Parameters
+    ----------
+    fixes
+        In order of time, each with the cloud's errors once.
+    apart_m
+        Metres.
+    options
+        That they were made with.
+    """
+    kept = list(fixes[:1])
+    for fix in fixes[1:]:
+        if np.linalg.norm(fix.T_map_lidar.t - kept[-1].T_map_lidar.t) >= apart_m:
+            kept.append(fix)
+    places = np.reshape([each.T_map_lidar.t for each in kept], (-1, 3))
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    half = options.cloud_over_m / 2
+    near = np.searchsorted(way, way + half, side="right") - np.searchsorted(way, way - half)
+    more = options.of_cloud()
+    return tuple(
+        replace(each, covariance=each.covariance + (count - 1) * more)
+        for each, count in zip(kept, near.tolist(), strict=False)
+    )
 
 
 class _Localiser:

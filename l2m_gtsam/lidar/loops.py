@@ -10,9 +10,9 @@ from pydantic import Field
 from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.lidar.odometry import ScanStep
 from l2m_gtsam.lidar.registration import Refusal, RegistrationOptions, by_scan, register
-from l2m_gtsam.lidar.rigid import between
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
+from l2m_gtsam.rigid import between
 from l2m_gtsam.scans import Loop
 
 

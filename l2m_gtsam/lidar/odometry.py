@@ -21,10 +21,10 @@ from l2m_gtsam.lidar.registration import (
     register,
     unseen_covariance,
 )
-from l2m_gtsam.lidar.rigid import IDENTITY, between, compose, difference, perturbed
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
 from l2m_gtsam.pose_covariance import moved
+from l2m_gtsam.rigid import IDENTITY, between, compose, difference, perturbed
 from l2m_gtsam.scans import Scan, taken_at_once
 
 FRAME, CHILD_FRAME = "odom", "lidar"

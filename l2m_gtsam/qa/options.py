@@ -80,6 +80,9 @@ class SlamQaOptions(Options):
     steps: Limit = Limit(warn=2.0, fail=4.0)
     """Mean square of what steps between localised poses differ by from odometry's, in units of its
     covariance; 1 is consistent."""
+    scans: Limit = Limit(warn=0.2, fail=0.8)
+    """Share of the registrations of scans that contradict odometry and the others. Against the rest
+    of the graph they are judged by `steps`."""
     nees: Limit = Limit(warn=3.0, fail=10.0)
     """Normalised squared error of the poses against the truth, if one is given, per degree of
     freedom; 1 is honest. Poses of a drive err together, so that a drive counts as one."""

@@ -5,7 +5,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.slam_records import TruthRecord
-from l2m_gtsam.slam_results import LocalisationResult, StartSearch
+from l2m_gtsam.slam_results import LocalisationResult, ScanUse, StartSearch
 
 
 def slam_table(result: LocalisationResult) -> Table:
@@ -59,6 +59,17 @@ def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
     return tuple(lines)
 
 
+def scan_lines(scans: ScanUse | None) -> tuple[str, ...]:
+    """Return what scans were worth, a line; none without scans."""
+    if scans is None:
+        return ()
+    line = (
+        f"scans: {scans.fixes} fixes in the map and {scans.loops} loops counted (chi2 per dof "
+        f"{scans.chi2_per_dof:.2f}), {scans.rejected} were not believed"
+    )
+    return (line,)
+
+
 def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:
     """Return errors against the truth before and after, a line each; none without a truth."""
     if truth is None:
@@ -66,14 +77,21 @@ def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:
     before, after = truth.odometry, truth.localised
     errors = (
         f"against the truth at {truth.poses} key poses: odometry {1e3 * before.rms_m:.0f} mm rms, "
-        f"{1e3 * before.largest_m:.0f} mm at most; localised {1e3 * after.rms_m:.0f} mm rms, "
-        f"{1e3 * after.largest_m:.0f} mm at most ({_gone(truth)})"
+        f"{1e3 * before.largest_m:.0f} mm at most; {_scanned(truth)}localised "
+        f"{1e3 * after.rms_m:.0f} mm rms, {1e3 * after.largest_m:.0f} mm at most ({_gone(truth)})"
     )
     nees = (
         f"rotations {before.rms_deg:.2f} deg rms before, {after.rms_deg:.2f} deg after; NEES of "
         f"the poses {truth.nees:.1f}, 6 is honest"
     )
     return (errors, nees)
+
+
+def _scanned(truth: TruthRecord) -> str:
+    each = truth.by_scans
+    if each is None:
+        return ""
+    return f"with scans {1e3 * each.rms_m:.0f} mm rms, {1e3 * each.largest_m:.0f} mm at most; "
 
 
 def _gone(truth: TruthRecord) -> str:

@@ -57,7 +57,11 @@ class RobustOptions(Options):
     @property
     def largest(self) -> float:
         """Largest squared length of a whitened residual that passes for noise."""
-        return float(chi2.ppf(self.confidence, AXES))
+        return self.largest_of(AXES)
+
+    def largest_of(self, components: int) -> float:
+        """Return the same for residuals of so many components."""
+        return float(chi2.ppf(self.confidence, components))
 
 
 def truncated_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:

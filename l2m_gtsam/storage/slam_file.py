@@ -12,7 +12,7 @@ from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.record_file import read_record
 
 FORMAT: Literal["l2m-slam"] = "l2m-slam"
-VERSION: Literal[2] = 2
+VERSION: Literal[3] = 3
 LEGEND = {
     "poses": "T_map_lidar at key poses: stamp_ns, p in metres, quaternion_xyzw",
     "covariance": "of a right perturbation, T_true = T_map_lidar Exp(error): rotation (rad), then "
@@ -31,7 +31,7 @@ LEGEND = {
 @dataclass(frozen=True)
 class _Head(Record):
     format: Literal["l2m-slam"]
-    version: Literal[2]
+    version: Literal[3]
     legend: dict[str, str]
 
 

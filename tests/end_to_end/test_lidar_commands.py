@@ -14,8 +14,10 @@ from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
-from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.map_file import load_map, save_map
+from l2m_gtsam.storage.slam_file import read_slam
+from tests.calibrations import calibration, sensor
 from tests.end_to_end.conftest import complaint_here, l2m
 from tests.quick_maps import QUICK_HARMONIC
 
@@ -155,6 +157,61 @@ def test_a_bag_without_odometry_is_calibrated(hall: Scanned, tmp_path: Path) -> 
         # A coarse map of a small hall, 200 readings: centimetres, as with odometry.
         assert np.linalg.norm(sensor.t_lidar_mag - true.t_lidar_mag) < 0.04
         assert np.abs(sensor.distortion.H - true.distortion.H).max() < 1.0
+
+
+@pytest.fixture(scope="module")
+def known(hall: Scanned) -> Path:
+    path = hall.map.parent / "known.yaml"
+    entries = [
+        sensor(
+            each.sensor,
+            t_lidar_mag=each.t_lidar_mag,
+            distortion=each.distortion,
+            covariance=1e-6 * np.eye(15),
+            noise=0.1,
+            time_offset=None,
+        )
+        for each in hall.scenario.truth
+    ]
+    write_calibration(path, calibration(*entries))
+    return path
+
+
+def test_clouds_take_part_where_a_drive_has_odometry(
+    hall: Scanned, known: Path, tmp_path: Path
+) -> None:
+    bag, config = hall.drive.parent / "calibration_ros1.bag", tmp_path / "slam.yaml"
+    arguments = ("slam", bag, "--map", hall.map, "--calibration", known, "--config", config)
+    key_poses = {"distance_m": 0.5, "readings": 2}
+    config.write_text(json.dumps({"slam": {"key_poses": key_poses}}))
+    out = tmp_path / "out"
+    assert "loops counted" in l2m(*arguments, "--out", out).out
+    record = read_slam(out / "slam.json")
+    assert record.scans is not None
+    # A fix for each half a metre; all of them fit odometry, which has 3 mm noise here.
+    assert record.scans.fixes > 0.6 * record.drift.way_m / 0.5
+    assert record.scans.rejected == 0
+    assert record.scans.chi2_per_dof < 2
+    config.write_text(json.dumps({"slam": {"key_poses": key_poses, "scans": "ignored"}}))
+    assert "loops counted" not in l2m(*arguments, "--out", out).out
+    assert read_slam(out / "slam.json").scans is None
+
+
+def test_clouds_that_fit_nowhere_do_not_stop_a_drive(
+    hall: Scanned, known: Path, tmp_path: Path
+) -> None:
+    """The map's cloud is of another hall: the magnetometers go on alone, and it is told."""
+    bag, elsewhere = hall.drive.parent / "calibration_ros1.bag", tmp_path / "elsewhere.npz"
+    state = load_map(hall.map)
+    assert state.lidar is not None
+    moved = replace(state.lidar, points=state.lidar.points * [0.6, 1.7, 1.3])
+    save_map(elsewhere, replace(state, lidar=moved))
+    config = tmp_path / "slam.yaml"
+    config.write_text(json.dumps({"slam": {"key_poses": {"distance_m": 0.5, "readings": 2}}}))
+    arguments = ("slam", bag, "--map", elsewhere, "--calibration", known, "--config", config)
+    told = l2m(*arguments, "--out", tmp_path / "out").out
+    assert "point clouds take no part: the first scan does not fit the map's cloud" in told
+    assert read_slam(tmp_path / "out" / "slam.json").scans is None
 
 
 def test_a_hall_that_looks_the_same_from_both_ends(hall: Scanned, tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans
 from l2m_gtsam.lidar.loops import LoopOptions, find_loops
 from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, follow
 from l2m_gtsam.lidar.registration import Refusal
-from l2m_gtsam.lidar.rigid import between, difference, perturbed
 from l2m_gtsam.lidar.search import SearchOptions, find_start
 from l2m_gtsam.lidar.surface import Surface, smoothed
+from l2m_gtsam.rigid import between, difference, perturbed
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.lidar_rooms import ROOM, Room, round_trip, rows, scans, straight, swept
 

@@ -7,7 +7,7 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, accumulated, follow, odometry
-from l2m_gtsam.lidar.rigid import between, difference
+from l2m_gtsam.rigid import between, difference
 from l2m_gtsam.scans import Scan, taken_at_once
 from tests.lidar_rooms import CORRIDOR, ROOM, Room, round_trip, rows, scans, straight, swept
 

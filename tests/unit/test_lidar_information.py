@@ -12,7 +12,7 @@ from l2m_gtsam.lidar.information import (
     plane_information,
     tempered,
 )
-from l2m_gtsam.lidar.rigid import difference, perturbed
+from l2m_gtsam.rigid import difference, perturbed
 
 
 def unit(vectors: FloatArray) -> FloatArray:

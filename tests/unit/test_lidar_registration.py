@@ -14,8 +14,8 @@ from l2m_gtsam.lidar.registration import (
     by_scan,
     register,
 )
-from l2m_gtsam.lidar.rigid import difference, perturbed
 from l2m_gtsam.lidar.surface import Surface, smoothed
+from l2m_gtsam.rigid import difference, perturbed
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.lidar_rooms import CORRIDOR, ROOM, Room, round_trip, rows, scans, seen, straight
 

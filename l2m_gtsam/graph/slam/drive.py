@@ -1,12 +1,13 @@
 """What a localisation rests on: odometry, readings on key poses, calibrations, a start."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
 
 from l2m_factors import Calibrations, CarriedReadings
 from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
+from l2m_gtsam.graph.slam.links import Links
 from l2m_gtsam.graph.slam.odometry import OdometrySteps
 
 
@@ -70,6 +71,8 @@ class Drive:
         Of the first.
     sensors
         That read.
+    links
+        What scans say of key poses.
     """
 
     stamp_ns: IntArray
@@ -77,6 +80,7 @@ class Drive:
     readings: CarriedReadings
     start: StartPose
     sensors: KnownSensors
+    links: Links = field(default_factory=Links.none)
 
     def __len__(self) -> int:
         return len(self.stamp_ns)

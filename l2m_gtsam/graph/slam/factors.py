@@ -1,4 +1,4 @@
-"""The factors of a drive beside its readings: start, odometry, calibrations."""
+"""The factors of a drive beside its readings: start, odometry, scans, calibrations."""
 
 import gtsam
 import numpy as np
@@ -6,6 +6,7 @@ import numpy as np
 from l2m_factors import D, T, X, held_directions
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose, as_pose
+from l2m_gtsam.graph.slam.links import MAP, Links
 
 EXACT = 1e-9  # m, uT, or of an entry of C: what no reading can tell from nothing
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
@@ -21,6 +22,34 @@ def step_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
     """Return what odometry says from a key pose to the next."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     return gtsam.BetweenFactorPose3(X(number), X(number + 1), drive.step(number), noise)
+
+
+def link_pose(links: Links, number: int) -> gtsam.Pose3:
+    """Return where a scan has a key pose, in the map or in the frame of an earlier one."""
+    return gtsam.Pose3(gtsam.Rot3(links.R[number]), links.p[number])
+
+
+def link_factor(links: Links, number: int) -> gtsam.NonlinearFactor:
+    """Return what a scan says of a key pose."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(links.covariance[number])
+    pose = link_pose(links, number)
+    origin, key = int(links.origin[number]), X(int(links.key_pose[number]))
+    if origin == MAP:
+        return gtsam.PriorFactorPose3(key, pose, noise)
+    return gtsam.BetweenFactorPose3(X(origin), key, pose, noise)
+
+
+def link_graph(links: Links) -> gtsam.NonlinearFactorGraph:
+    """Return what scans say."""
+    graph = gtsam.NonlinearFactorGraph()
+    for number in range(len(links)):
+        graph.add(link_factor(links, number))
+    return graph
+
+
+def link_squared(links: Links, values: gtsam.Values) -> FloatArray:
+    """Return the squared lengths of the whitened residuals of links, shape (L,)."""
+    return np.array([2 * link_factor(links, n).error(values) for n in range(len(links))])
 
 
 def calibration_graph(sensors: KnownSensors) -> gtsam.NonlinearFactorGraph:

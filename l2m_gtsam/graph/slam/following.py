@@ -24,6 +24,8 @@ from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, as_pose
 from l2m_gtsam.graph.slam.factors import (
     calibration_graph,
     calibration_values,
+    link_factor,
+    link_pose,
     start_factor,
     step_factor,
 )
@@ -68,6 +70,8 @@ class Follower:
     def step(self, number: int) -> None:
         """Add a key pose; they come in order."""
         graph, values = self._begun() if number == 0 else self._gone_on(number)
+        for fix in self._fixes(number, values):
+            graph.add(fix)
         factor = self._readings(number, values)
         if factor is not None:
             graph.add(factor)
@@ -96,6 +100,20 @@ class Follower:
         last = self._engine.calculateEstimatePose3(X(number - 1))
         values.insert(X(number), last.compose(self._drive.step(number - 1)))
         return graph, values
+
+    def _fixes(self, number: int, added: gtsam.Values) -> list[gtsam.NonlinearFactor]:
+        """Return what scans say of a key pose's place in the map, as far as it passes for such."""
+        links, pose = self._drive.links, added.atPose3(X(number))
+        rows = np.flatnonzero(links.in_map & (links.key_pose == number))
+        if not len(rows):
+            return []
+        expected, most = self._predicted_covariance(number), self._robust.largest_of(6)
+        taken = []
+        for row in rows.tolist():
+            off = gtsam.Pose3.Logmap(pose.between(link_pose(links, row)))
+            if off @ np.linalg.solve(expected + links.covariance[row], off) <= most:
+                taken.append(link_factor(links, row))
+        return taken
 
     def _readings(self, number: int, added: gtsam.Values) -> gtsam.NonlinearFactor | None:
         """Return the factor of a key pose's readings as far as they pass for such."""

@@ -19,7 +19,12 @@ from l2m_gtsam.graph.slam.covariances import (
     solved_marginals,
 )
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
-from l2m_gtsam.graph.slam.factors import calibration_graph, odometry_graph
+from l2m_gtsam.graph.slam.factors import (
+    calibration_graph,
+    link_graph,
+    link_squared,
+    odometry_graph,
+)
 from l2m_gtsam.graph.slam.following import Follower, follow
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.graph.slam.shared import SharedMapErrors, errors_of
@@ -56,6 +61,8 @@ class Localised:
     bent
         Mean square of the whitened components by which the steps between the poses differ from
         odometry's; 1 is consistent.
+    link_squared
+        Squared lengths of the whitened residuals of what scans say, shape (L,).
     ending
         How the last optimisation ended.
     """
@@ -68,6 +75,7 @@ class Localised:
     squared: FloatArray
     weights: FloatArray
     bent: float
+    link_squared: FloatArray
     ending: Ending
 
     @property
@@ -114,7 +122,7 @@ class Problem:
 
     def __init__(self, drive: Drive, field_map: QueryableMap, options: SlamOptions) -> None:
         self._drive, self._map, self._options = drive, field_map, options
-        self._odometry = odometry_graph(drive)
+        self._odometry, self._links = odometry_graph(drive), link_graph(drive.links)
 
     @property
     def free(self) -> bool:
@@ -158,6 +166,7 @@ class Problem:
         """
         drive, graph = self._drive, gtsam.NonlinearFactorGraph()
         graph.push_back(self._odometry)
+        graph.push_back(self._links)
         if self.free:
             graph.push_back(calibration_graph(drive.sensors))
         rows = np.flatnonzero(weights > NOTHING)
@@ -202,5 +211,6 @@ class Problem:
             squared=sight.squared(sight.whitening(sensors.noise)),
             weights=weights * sight.inside,
             bent=2 * self._odometry.error(values) / (6 * len(self._drive)),
+            link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
         )

@@ -21,7 +21,13 @@ from l2m_gtsam.graph.slam.covariances import (
     solved_marginals,
 )
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
-from l2m_gtsam.graph.slam.factors import calibration_graph, calibration_values, odometry_graph
+from l2m_gtsam.graph.slam.factors import (
+    calibration_graph,
+    calibration_values,
+    link_graph,
+    link_squared,
+    odometry_graph,
+)
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
 from l2m_gtsam.graph.slam.localisation import NOTHING, Localised
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
@@ -55,13 +61,21 @@ class Mapped:
     returns: IntArray
 
 
-def map_drive(drive: Drive, prior: FieldPrior, options: SlamOptions, progress: Progress) -> Mapped:
+def map_drive(
+    drive: Drive,
+    begin: list[gtsam.Pose3],
+    prior: FieldPrior,
+    options: SlamOptions,
+    progress: Progress,
+) -> Mapped:
     """Find the poses of a drive and the field along it.
 
     Parameters
     ----------
     drive
         The drive.
+    begin
+        Its key poses by odometry and scans.
     prior
         Of the field.
     options
@@ -70,7 +84,7 @@ def map_drive(drive: Drive, prior: FieldPrior, options: SlamOptions, progress: P
         Called with a stage and the fraction of it that is done.
     """
     problem = TiledProblem(drive, prior, options)
-    poses, sensors = drive.dead_reckoning(), drive.sensors
+    poses, sensors = begin, drive.sensors
     for stage, (scale, mu) in enumerate(STAGES[:-1]):
         progress("solving poses and field", stage / len(STAGES))
         solved = problem.solved(poses, sensors, scale, mu)
@@ -109,7 +123,7 @@ class TiledProblem:
 
     def __init__(self, drive: Drive, prior: FieldPrior, options: SlamOptions) -> None:
         self._drive, self._prior, self._options = drive, prior, options
-        self._odometry = odometry_graph(drive)
+        self._odometry, self._links = odometry_graph(drive), link_graph(drive.links)
         self._free = options.calibration is CalibrationUse.REFINED
 
     def solved(
@@ -143,6 +157,7 @@ class TiledProblem:
         W = W * np.sqrt(weights)[:, None, None]
         graph = tiled.graph(self._drive, noise, W, chosen, fixed)
         graph.push_back(self._odometry)
+        graph.push_back(self._links)
         if self._free:
             graph.push_back(calibration_graph(self._drive.sensors))
             values.insert(calibration_values(sensors))
@@ -173,6 +188,7 @@ class TiledProblem:
             squared=self._gathered(tiled, squared),
             weights=solved.weights,
             bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
+            link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
         )
         way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))

@@ -59,6 +59,13 @@ def key_pose_rows(trajectory: Trajectory, options: KeyPoseOptions) -> IntArray:
     return np.array(rows)
 
 
+def with_rows_at(rows: IntArray, trajectory: Trajectory, stamp_ns: IntArray) -> IntArray:
+    """Return key poses, and beside them the poses that are nearest to these times."""
+    after = np.clip(np.searchsorted(trajectory.stamp_ns, stamp_ns), 1, len(trajectory) - 1)
+    early, late = trajectory.stamp_ns[after - 1], trajectory.stamp_ns[after]
+    return np.union1d(rows, after - (stamp_ns - early < late - stamp_ns))
+
+
 def odometry_steps(trajectory: Trajectory, rows: IntArray, options: DriftOptions) -> OdometrySteps:
     """Return what odometry says between key poses.
 
@@ -75,7 +82,7 @@ def odometry_steps(trajectory: Trajectory, rows: IntArray, options: DriftOptions
     R = R_back @ trajectory.R[rows[1:]]
     p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
     stated = _stated(trajectory, rows, R, p)
-    covariance = _drift(R, p, options) if stated is None else stated + _least(options)
+    covariance = drift_covariance(R, p, options) if stated is None else stated + _least(options)
     return OdometrySteps(R, p, covariance, stated is not None)
 
 
@@ -95,8 +102,16 @@ def _stated(
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.swapaxes(1, 2))
 
 
-def _drift(R: FloatArray, p: FloatArray, options: DriftOptions) -> FloatArray:
-    """Return covariances that grow with way and turning, shape (K - 1, 6, 6)."""
+def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> FloatArray:
+    """Return covariances of N steps that grow with their way and turning, shape (N, 6, 6).
+
+    Parameters
+    ----------
+    R, p
+        The steps, shapes (N, 3, 3) and (N, 3), metres.
+    options
+        How wrong odometry becomes.
+    """
     way, turn = np.linalg.norm(p, axis=1), Rotation.from_matrix(R).magnitude()
     over = options.over_m * way
     position = options.position_share**2 * over

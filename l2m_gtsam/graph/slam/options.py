@@ -17,6 +17,13 @@ class CalibrationUse(StrEnum):
     REFINED = "refined"
 
 
+class ScanUsage(StrEnum):
+    """What becomes of the point clouds of a drive that has odometry."""
+
+    USED = "used"
+    IGNORED = "ignored"
+
+
 class KeyPoseOptions(Options):
     """Which poses of a drive are variables."""
 
@@ -96,8 +103,12 @@ class SlamOptions(Options):
     """Where the drive begins."""
     calibration: CalibrationUse = CalibrationUse.FIXED
     """`fixed`, or `refined`: estimated with the poses, with its covariance as the prior."""
+    scans: ScanUsage = ScanUsage.USED
+    """`used`: point clouds, if the bag has any, are registered on the cloud of the map, or on each
+    other where places are come to again; or `ignored`."""
     robust: RobustOptions = RobustOptions()
-    """How readings are treated that the map does not explain."""
+    """How readings are treated that the map does not explain. Scans that do not fit odometry and
+    each other are left out with the same `confidence`."""
     tiles: TileOptions = TileOptions()
     """How the field is described where there is no map."""
     max_iterations: int = Field(default=50, ge=1)

@@ -10,11 +10,13 @@ from l2m_gtsam.data import Distortion, Trajectory
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.pose_graph import PoseGraph
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.slam_results import (
     DriftFigures,
     LocalisationResult,
     LocalisationStatus,
+    ScanUse,
     SensorUse,
 )
 from l2m_gtsam.solve.rotation import polar_rotation
@@ -30,7 +32,7 @@ LARGEST_CHI2 = 4.0
 
 
 def localisation_result(
-    drive: Drive, solution: Localised, refine: CalibrationResult | None
+    drive: Drive, solution: Localised, by_scans: PoseGraph, refine: CalibrationResult | None
 ) -> LocalisationResult:
     """Return what is told of a drive.
 
@@ -40,6 +42,8 @@ def localisation_result(
         As it was before.
     solution
         Of the graph.
+    by_scans
+        Of odometry and scans alone.
     refine
         The calibration that was refined; none if it was fixed.
     """
@@ -59,6 +63,21 @@ def localisation_result(
         bag=None,
         map=None,
         calibration_source=None,
+        scans=scan_use(solution, by_scans),
+        by_scans=_trajectory(drive, by_scans.poses) if len(by_scans.believed) else None,
+    )
+
+
+def scan_use(solution: Localised, by_scans: PoseGraph) -> ScanUse | None:
+    """Return what scans were worth; None where there were none."""
+    if not len(by_scans.believed):
+        return None
+    links, r2 = solution.drive.links, solution.link_squared
+    return ScanUse(
+        fixes=int(links.in_map.sum()),
+        loops=int((~links.in_map).sum()),
+        rejected=int((~by_scans.believed).sum()),
+        chi2_per_dof=float(r2.mean() / 6) if len(r2) else float("nan"),
     )
 
 

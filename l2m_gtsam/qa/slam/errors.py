@@ -67,20 +67,38 @@ def check_truth(truth: Trajectory, drive: Trajectory, max_pose_gap_s: float, nam
     )
 
 
-def truth_record(
-    truth: Trajectory, localised: Trajectory, odometry: Trajectory, max_pose_gap_s: float
-) -> TruthRecord | None:
+@dataclass(frozen=True)
+class Ways:
+    """What is compared with a truth, at the same key poses.
+
+    Attributes
+    ----------
+    localised
+        With covariances.
+    odometry
+        By odometry alone.
+    by_scans
+        By odometry and scans; None without scans.
+    """
+
+    localised: Trajectory
+    odometry: Trajectory
+    by_scans: Trajectory | None = None
+
+
+def truth_record(truth: Trajectory, ways: Ways, max_pose_gap_s: float) -> TruthRecord | None:
     """Return a localisation beside the truth; None if no key pose lies within it.
 
     Parameters
     ----------
     truth
         Poses of the lidar in the map, which are interpolated.
-    localised, odometry
-        Key poses, and what odometry alone makes of them; the first with covariances.
+    ways
+        Key poses.
     max_pose_gap_s
         Key poses between true ones further apart than this are not compared.
     """
+    localised, odometry, by_scans = ways.localised, ways.odometry, ways.by_scans
     there = has_pose(truth, localised.stamp_ns, max_pose_gap_s)
     if not there.any():
         return None
@@ -95,6 +113,7 @@ def truth_record(
         poses=int(there.sum()),
         odometry=before.figures(),
         localised=after.figures(),
+        by_scans=None if by_scans is None else compared(at, _only(by_scans, there)).figures(),
         nees=float(squared.mean()),
         beyond_95=float(np.mean(squared > chi2.ppf(0.95, POSE_FREEDOM))),
         path=rows(path),

@@ -9,7 +9,7 @@ from l2m_gtsam.qa.reasons.reason import Level, Reason, against
 from l2m_gtsam.qa.slam.course import HEADING, Course, course_of
 from l2m_gtsam.qa.slam.stretches import stretches
 from l2m_gtsam.slam_records import POSE_FREEDOM, LocalisationRecord, TruthRecord
-from l2m_gtsam.slam_results import LocalisationStatus
+from l2m_gtsam.slam_results import LocalisationStatus, ScanUse
 
 MANY = 3  # stretches that are told one by one
 EXACT = 1e-6  # m and degrees: nobody minds less
@@ -23,6 +23,7 @@ def on_whole(record: LocalisationRecord, options: SlamQaOptions) -> list[Reason]
         *_precision(course, options),
         *_start(course, options),
         *_steps(record, options),
+        *([] if record.scans is None else _scans(record.scans, options)),
         *([] if record.truth is None else _truth(record.truth, options)),
         *_changed(record, course),
         *(Reason(Level.WARN, f"{each.rstrip('.')}.") for each in record.notes),
@@ -119,6 +120,21 @@ def _steps(record: LocalisationRecord, options: SlamQaOptions) -> list[Reason]:
         "were bent until the readings fit."
     )
     return against(record.steps, options.steps, text)
+
+
+def _scans(scans: ScanUse, options: SlamQaOptions) -> list[Reason]:
+    """Return where scans and the rest do not go together."""
+    whole = scans.fixes + scans.loops + scans.rejected
+    text = (
+        f"{scans.rejected} of {whole} scan registrations were not believed: they contradict "
+        "odometry and the others."
+    )
+    fit = (
+        f"Poses differ from what scans say of them by {scans.chi2_per_dof:.1f} times the variance "
+        "that these state: readings and scans disagree about places."
+    )
+    some = [] if not scans.rejected else against(scans.rejected / whole, options.scans, text)
+    return [*some, *against(scans.chi2_per_dof, options.steps, fit)]
 
 
 def _truth(truth: TruthRecord, options: SlamQaOptions) -> list[Reason]:
