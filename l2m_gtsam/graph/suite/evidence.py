@@ -9,13 +9,12 @@ variances S of the waves and noise sigma,
 The last term is the price of a distortion that makes all fields small.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from l2m_gtsam.data import Distortion, FloatArray, Readings
+from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Evidence, evidence, normal_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
@@ -34,11 +33,15 @@ class SuiteWindow:
     ----------
     basis
         Waves.
+    middle
+        Mean of the readings' places when the waves were laid, in metres, shape (3,). Waves move with
+        it: their prior knows heights, and must not tell how high the sensors sit.
     readings
         As sensors read them, with the motion of the lidar, N in number.
     """
 
     basis: Basis
+    middle: FloatArray
     readings: Readings
 
 
@@ -122,25 +125,39 @@ def scored(window: SuiteWindow, sensors: FloatArray, prior: Hyperparameters) -> 
     """
     readings, basis, noise = window.readings, window.basis, prior.noise
     seen = undistorted(readings, sensors)
+    points = seen.points - seen.points.mean(axis=0) + window.middle
     log_variance = basis.prior(prior).log_variance
-    normal = normal_of(basis, TrainingSet(seen.points, seen.field, np.ones(len(readings))))
-    found = evidence(normal, log_variance, noise)
-    D = np.exp(0.5 * log_variance)
-    said, gradient = basis.field_and_gradient(seen.points, D * found.mean)
+    normal = normal_of(basis, TrainingSet(points, seen.field, np.ones(len(readings))))
+    found, D = evidence(normal, log_variance, noise), np.exp(0.5 * log_variance)
+    said, gradient = basis.field_and_gradient(points, D * found.mean)
     r = seen.field - said
-    J = _residual_slopes(readings, seen, gradient)
-    doubt = _doubt_slopes(basis, seen.points, D, found, noise)
-    columns = (SIZE * readings.sensor)[:, None] + np.arange(SIZE)
-    by_reading = -np.einsum("ni,nij->nj", r, J) / noise**2
-    by_reading -= np.einsum("ni,nij->nj", doubt, _place_slopes(readings, seen))
-    slope = np.bincount(columns.ravel(), by_reading.ravel(), minlength=sensors.size)
-    value = found.value
-    for i, each in enumerate(sensors):
-        count, matrix = np.count_nonzero(readings.sensor == i), each[C].reshape(3, 3)
-        value -= count * float(np.log(abs(np.linalg.det(matrix))))
-        slope[SIZE * i : SIZE * (i + 1)][C] -= count * np.linalg.inv(matrix).T.ravel()
-    information = _information(basis, seen.points, D, found, J, columns, sensors.size, noise)
-    return Scored(value, slope, information, (r,))
+    places = _wide(_place_slopes(readings, seen), readings.sensor, len(sensors))
+    places -= places.mean(axis=0)
+    J = _wide(_field_slopes(readings, seen), readings.sensor, len(sensors)) - gradient @ places
+    doubt = _doubt_slopes(basis, points, D, found, noise)
+    slope = -np.einsum("ni,nij->j", r, J) / noise**2 - np.einsum("ni,nij->j", doubt, places)
+    turned, price = _price(readings, sensors)
+    information = _information(basis, points, D, found, J, noise)
+    return Scored(found.value - price, slope - turned, information, (r,))
+
+
+def _price(readings: Readings, sensors: FloatArray) -> tuple[FloatArray, float]:
+    """Return the sum of all ``log |det C|`` by the sensors' parameters, (16 S,), and itself."""
+    slope, count = np.zeros(sensors.shape), np.bincount(readings.sensor, minlength=len(sensors))
+    matrices = sensors[:, C].reshape(-1, 3, 3)
+    slope[:, C] = (count[:, None, None] * np.linalg.inv(matrices).transpose(0, 2, 1)).reshape(-1, 9)
+    _, log_det = np.linalg.slogdet(matrices)
+    return slope.ravel(), float(count @ log_det)
+
+
+def _wide(own: FloatArray, sensor: IntArray, count: int) -> FloatArray:
+    """Return derivatives by the parameters of each reading's sensor by those of all sensors.
+
+    From shape (N, 3, 16) to (N, 3, 16 S).
+    """
+    wide = np.zeros((len(own), 3, count, SIZE))
+    wide[np.arange(len(own)), :, sensor] = own
+    return wide.reshape(len(own), 3, -1)
 
 
 def _place_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
@@ -153,15 +170,14 @@ def _place_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
     return J
 
 
-def _residual_slopes(readings: Readings, seen: Undistorted, gradient: FloatArray) -> FloatArray:
-    """Return derivatives of ``field - said`` by the sensors' parameters, shape (N, 3, 16)."""
-    J = -gradient @ _place_slopes(readings, seen)
-    by_C = -seen.turned[:, :, :, None] * seen.b[:, None, None, :]
-    J[:, :, C] += by_C.reshape(-1, 3, 9)
-    J[:, :, H] -= seen.turned
+def _field_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
+    """Return derivatives of the undistorted fields by the sensors' parameters, (N, 3, 16)."""
+    J = np.zeros((len(readings), 3, SIZE))
+    J[:, :, C] = -(seen.turned[:, :, :, None] * seen.b[:, None, None, :]).reshape(-1, 3, 9)
+    J[:, :, H] = -seen.turned
     if readings.motion is not None:
         w = readings.motion.twist_lidar[:, :3]
-        J[:, :, TAU] += np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, seen.b))
+        J[:, :, TAU] = np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, seen.b))
     return J
 
 
@@ -180,32 +196,20 @@ def _doubt_slopes(
         half = solve_triangular(found.factor, (F.reshape(-1, m) * D).T, lower=True)
         spread = solve_triangular(found.factor, half, trans=1, lower=True).T * D
         spread = spread.reshape(n, 3, m)
-        for axis in range(3):
-            step = np.zeros(3)
-            step[axis] = STEP_M
+        for axis, step in enumerate(STEP_M * np.eye(3)):
             dF = basis.features(points[at] + step) - basis.features(points[at] - step)
             slopes[at, axis] = np.einsum("nim,nim->n", spread, dF) / (2 * STEP_M * noise**2)
     return slopes
 
 
 def _information(
-    basis: Basis,
-    points: FloatArray,
-    D: FloatArray,
-    found: Evidence,
-    J: FloatArray,
-    columns: FloatArray,
-    size: int,
-    noise: float,
+    basis: Basis, points: FloatArray, D: FloatArray, found: Evidence, J: FloatArray, noise: float
 ) -> FloatArray:
     """Return ``J^T (sigma^2 I + F S F^T)^-1 J``, shape (16 S, 16 S)."""
-    own, shared = np.zeros((size, size)), np.zeros((len(D), size))
+    own, shared = np.zeros((J.shape[2],) * 2), np.zeros((len(D), J.shape[2]))
     for at in batches(len(points)):
-        n = len(points[at])
-        wide = np.zeros((n, 3, size))
-        np.put_along_axis(wide, np.broadcast_to(columns[at][:, None], (n, 3, SIZE)), J[at], axis=2)
-        wide = wide.reshape(-1, size)
-        own += wide.T @ wide
-        shared += basis.features(points[at]).reshape(-1, len(D)).T @ wide
+        flat = J[at].reshape(-1, J.shape[2])
+        own += flat.T @ flat
+        shared += basis.features(points[at]).reshape(-1, len(D)).T @ flat
     known = solve_triangular(found.factor, D[:, None] * shared / noise, lower=True)
     return np.asarray((own - known.T @ known) / noise**2)

@@ -24,7 +24,9 @@ class SuiteOptions(Options):
     """Parts of the survey that are looked at, spread over it."""
     readings: int = Field(default=3000, ge=100)
     """The most readings of one of them."""
-    rounds: int = Field(default=4, ge=1)
+    modes: int = Field(default=300, ge=50)
+    """About how many waves describe the field in one of them; time goes with the square."""
+    rounds: int = Field(default=6, ge=1)
     """How often strength and depth of the field's sources are learnt anew, at the most."""
     steps: int = Field(default=10, ge=1)
     """The most steps of the solve in one round."""

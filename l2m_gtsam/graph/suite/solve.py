@@ -7,14 +7,14 @@ learnt anew in rounds.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.suite.evidence import SIZE, C, Scored, SuiteWindow, scored
+from l2m_gtsam.graph.suite.evidence import SIZE, C, Scored, scored
 from l2m_gtsam.graph.suite.options import SuiteOptions
 from l2m_gtsam.graph.suite.windows import SuiteWindows, windows_over
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
@@ -194,7 +194,7 @@ class SuiteProblem:
         """Return the posterior: slope and value with what is assumed, information without."""
         readings = self._readings_at(sensors[:, -1])
         parts = [
-            scored(SuiteWindow(part.basis, readings[rows]), sensors, windows.prior)
+            scored(replace(part, readings=readings[rows]), sensors, windows.prior)
             for part, rows in zip(windows.parts, windows.rows, strict=True)
         ]
         total = reduce(add, parts)

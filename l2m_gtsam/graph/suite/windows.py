@@ -62,7 +62,7 @@ def windows_over(readings: Readings, sensors: FloatArray, options: SuiteOptions)
     seen, defaults = undistorted(readings, sensors), HarmonicOptions()
     raw = training_set(seen.points, seen.field)
     survey = merged(raw, defaults.merge, defaults.independent)
-    learning = LearningOptions(windows=options.windows, rough=0)
+    learning = LearningOptions(windows=options.windows, rough=0, modes=options.modes)
     share = defaults.mode_share
     prior = learn(survey, NO_SOURCES, defaults.tiling, share, learning).hyperparameters
     density = float(survey.weight.sum()) / surveyed_area(survey.points)
@@ -74,7 +74,7 @@ def windows_over(readings: Readings, sensors: FloatArray, options: SuiteOptions)
         own = TrainingSet(seen.points[rows], seen.field[rows], np.ones(len(rows)))
         centre = tiling.grid.centres[tile]
         basis = basis_of(own, centre, tiling.edge, resolution, [], np.empty(0))
-        parts.append(SuiteWindow(basis, readings[rows]))
+        parts.append(SuiteWindow(basis, own.points.mean(axis=0), readings[rows]))
         of.append(rows)
     return SuiteWindows(tuple(parts), tuple(of), prior)
 
