@@ -31,7 +31,8 @@ app = typer.Typer(
     add_completion=False,
 )
 map_app = typer.Typer(
-    help="Build, update, compare, describe and draw magnetic maps; calibrate a mapping suite.", no_args_is_help=True
+    help="Build, update, compare, describe and draw magnetic maps; calibrate a mapping suite.",
+    no_args_is_help=True,
 )
 app.add_typer(map_app, name="map")
 app.command()(study)

@@ -84,9 +84,7 @@ def calibrate_suite(
         Readings and poses do not overlap.
     """
     drive = suite_drive(recordings, options)
-    known = [
-        (assumed or {}).get(name, KnownSensor.ideal(name)) for name in drive.readings.sensors
-    ]
+    known = [(assumed or {}).get(name, KnownSensor.ideal(name)) for name in drive.readings.sensors]
     start = np.stack([_parameters(each) for each in known])
     solution = solve_suite(drive.at, start, options, progress)
     return _result(drive, solution, options)

@@ -90,7 +90,9 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     CalibrationError
         The file is missing or is not of this form.
     """
-    return {name: _known(name, entry) for name, entry in read_model(path, _KnownFile).sensors.items()}
+    return {
+        name: _known(name, entry) for name, entry in read_model(path, _KnownFile).sensors.items()
+    }
 
 
 def _known(name: str, entry: _Known) -> KnownSensor:

@@ -20,7 +20,12 @@ from tests.worlds import DipoleWorld
 
 CLOCK = 0.02  # seconds by which readings are late
 QUICK = SuiteOptions.model_validate(
-    {"sync": {"thin_distance_m": 0.05, "thin_angle_deg": 5.0}, "windows": 2, "readings": 600}
+    {
+        "sync": {"thin_distance_m": 0.05, "thin_angle_deg": 5.0},
+        "windows": 1,
+        "readings": 600,
+        "modes": 150,
+    }
 )
 
 
@@ -44,9 +49,7 @@ def tilted(drive: Trajectory, rng: np.random.Generator) -> Trajectory:
     return replace(drive, R=R, p=p)
 
 
-def surveyed(
-    seed: int, sensors: tuple[KnownSensor, ...], world: DipoleWorld
-) -> Recording:
+def surveyed(seed: int, sensors: tuple[KnownSensor, ...], world: DipoleWorld) -> Recording:
     """Return a survey with poses that are true and clocks that are late."""
     rng = np.random.default_rng(seed)
     truth = tilted(wandering(rng, 50.0, within=1.5), rng)
@@ -116,9 +119,7 @@ def test_a_drive_that_never_turns_says_what_it_does_not_tell() -> None:
     way = wandering(rng, 40.0, within=1.5)
     straight = replace(way, R=np.tile(np.eye(3), (len(way), 1, 1)))
     drive = slam_drive(strange_hall(4), truth, straight, rng, noise=0.1)
-    result = calibrate_suite(
-        [replace(drive.recording, trajectory=straight)], None, QUICK, quiet
-    )
+    result = calibrate_suite([replace(drive.recording, trajectory=straight)], None, QUICK, quiet)
     (doubt,) = result.doubts
     assert "t_lidar_mag x, t_lidar_mag y, t_lidar_mag z" in doubt
     assert "H x" in doubt

@@ -34,8 +34,8 @@ class SuiteWindow:
     basis
         Waves.
     middle
-        Mean of the readings' places when the waves were laid, in metres, shape (3,). Waves move with
-        it: their prior knows heights, and must not tell how high the sensors sit.
+        Mean of the readings' places when the waves were laid, in metres, shape (3,). Waves move
+        with it: their prior knows heights, and must not tell how high the sensors sit.
     readings
         As sensors read them, with the motion of the lidar, N in number.
     """

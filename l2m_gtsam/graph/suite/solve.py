@@ -147,9 +147,7 @@ class SuiteProblem:
         How sure that is.
     """
 
-    def __init__(
-        self, readings_at: ReadingsAt, assumed: FloatArray, options: SuiteOptions
-    ) -> None:
+    def __init__(self, readings_at: ReadingsAt, assumed: FloatArray, options: SuiteOptions) -> None:
         self._readings_at, self._assumed, self._options = readings_at, assumed, options
         self._information = prior_information(len(assumed), options)
 

@@ -79,9 +79,7 @@ def windows_over(readings: Readings, sensors: FloatArray, options: SuiteOptions)
     return SuiteWindows(tuple(parts), tuple(of), prior)
 
 
-def _dealt(
-    tiling: Tiling, points: FloatArray, options: SuiteOptions
-) -> list[tuple[int, IntArray]]:
+def _dealt(tiling: Tiling, points: FloatArray, options: SuiteOptions) -> list[tuple[int, IntArray]]:
     """Return tiles spread over a survey, with readings of which none belongs to two of them."""
     members = tiling.grid.members(points, tiling.overlap)
     tiles = spread_tiles(tiling, [len(rows) for rows in members], options.windows)
