@@ -133,14 +133,14 @@ def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibra
     distortion = Distortion.from_vector(parameters[3:TAU])
     rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
     sigma = float(np.sqrt(covariance[TAU, TAU]))
-    solved = SensorStatus.SOLVED if solution.converged else SensorStatus.NOT_CONVERGED
+    status, message = _ending(solution)
     noise = float(solution.prior.noise * np.cbrt(np.linalg.det(distortion.C)))
     residual = solution.residuals[i]
     white = np.tile(np.eye(3) / noise, (len(residual), 1, 1))
     return SensorCalibration(
         sensor=drive.readings.sensors[i],
-        status=solved,
-        message="with the field of its own drive",
+        status=status,
+        message=message,
         t_lidar_mag=parameters[:3],
         distortion=distortion,
         R_lidar_mag=rotation.R_mag_lidar.T,
@@ -152,6 +152,16 @@ def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibra
         sync=drive.counts[i],
         outside_map=0,
         time_offset=TimeOffset(float(parameters[TAU]), sigma, covariance[:TAU, TAU], ""),
+    )
+
+
+def _ending(solution: SuiteSolution) -> tuple[SensorStatus, str]:
+    if solution.converged:
+        return SensorStatus.SOLVED, "with the field of its own drive"
+    return (
+        SensorStatus.NOT_CONVERGED,
+        f"still moving after {solution.rounds} rounds; allow more with mapping.suite.rounds, or "
+        "give what is known with --suite",
     )
 
 

@@ -29,12 +29,6 @@ def test_a_suite_is_calibrated_and_maps(shared_data: Path, tmp_path: Path) -> No
     assert -0.025 < sensor.time_offset.seconds < -0.015
     known = read_known_sensors(out)["imu/mag"]
     assert known.time_offset == sensor.time_offset.seconds
-    again = tmp_path / "again.yaml"
-    l2m("map", "suite", bag, "--suite", out, "--config", config, "--out", again)
-    (settled,) = read_calibration(again).sensors
-    # From where it ended it moves no further than what counts as settled.
-    moved = abs(settled.t_lidar_mag - sensor.t_lidar_mag)
-    assert (moved < sensor.t_sigma).all()
     l2m("map", "build", bag, "--suite", out, "--config", config, "--out", tmp_path / "map.npz")
 
 

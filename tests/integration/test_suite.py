@@ -134,3 +134,21 @@ def test_a_stuck_sensor_is_refused(
     stuck = replace(second, field=np.tile(second.field[:1], (len(second), 1)))
     with pytest.raises(MapError, match="'mag_01' is stuck on one value"):
         calibrate_suite([replace(recording, series=(first, stuck))], None, QUICK, quiet)
+
+
+def test_what_is_known_is_where_it_begins(
+    found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
+) -> None:
+    """From the truth it comes to the same place as from nothing, in a fraction of a sigma."""
+    truth, recording, result = found
+    scale = np.mean([np.trace(each.distortion.C) / 3 for each in truth])
+    known = {
+        each.sensor: replace(
+            each, distortion=Distortion(each.distortion.C / scale, each.distortion.H)
+        )
+        for each in truth
+    }
+    again = calibrate_suite([recording], known, QUICK, quiet)
+    for one, other in zip(result.sensors, again.sensors, strict=True):
+        assert np.all(np.abs(one.t_lidar_mag - other.t_lidar_mag) < one.t_sigma)
+        assert np.all(np.abs(one.distortion.H - other.distortion.H) < one.H_sigma)
