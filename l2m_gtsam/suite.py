@@ -158,11 +158,11 @@ def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibra
 def _ending(solution: SuiteSolution) -> tuple[SensorStatus, str]:
     if solution.converged:
         return SensorStatus.SOLVED, "with the field of its own drive"
-    return (
-        SensorStatus.NOT_CONVERGED,
+    message = (
         f"still moving after {solution.rounds} rounds; allow more with mapping.suite.rounds, or "
-        "give what is known with --suite",
+        "give what is known with --suite"
     )
+    return SensorStatus.NOT_CONVERGED, message
 
 
 def _doubts(
