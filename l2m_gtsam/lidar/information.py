@@ -21,6 +21,9 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform
 NOISE_TIMES = 3.0
 # Neighbourhoods thicker than this share of their width are no planes: edges, bushes, people.
 FLAT = 0.35
+# Nor are those narrower than this share of it: a post, or one ring of a lidar, is a line, and any
+# plane fits it.
+NARROW = 0.3
 # Neighbours further apart are of different things: rings of a lidar far down a corridor make planes
 # across it, which move with the lidar and seem to hold it.
 WIDEST_M = 0.8
@@ -43,7 +46,7 @@ class Planes:
         (N, 2, 3).
     flatness
         Thickness over width of the neighbourhood that each was fitted to, shape (N,); infinite
-        where that is too wide for one plane.
+        where that is too wide for one plane, or a line.
     """
 
     point: FloatArray
@@ -81,7 +84,8 @@ def fitted_planes(point: FloatArray, neighbours: FloatArray) -> Planes:
     slope = np.minimum(sigma, 1.0)[:, :, None] * vectors[:, :, 1:].swapaxes(1, 2)
     flatness = np.sqrt(values[:, 0] / values[:, 2])
     width = np.linalg.norm(neighbours - point[:, None], axis=2).max(axis=1)
-    flatness[width > WIDEST_M] = np.inf
+    narrow = values[:, 1] < NARROW**2 * values[:, 2]
+    flatness[narrow | (width > WIDEST_M)] = np.inf
     return Planes(neighbours.mean(axis=1), vectors[:, :, 0], slope, flatness)
 
 
@@ -110,6 +114,18 @@ def plane_information(
     J = _jacobian(points, T, planes.normal)
     noise = np.vstack([_jacobian(points, T, planes.slope[:, k]) for k in (0, 1)])
     return _above_noise(_squared(J), _squared(noise)) / sigma**2
+
+
+def plane_step(points: FloatArray, T: RigidTransform, planes: Planes) -> FloatArray:
+    """Return the right perturbation that brings points nearest to their planes, shape (6,).
+
+    To first order, and in the sense of least squares; zero along what the planes do not hold.
+    Parameters are those of ``plane_information``.
+    """
+    J = _jacobian(points, T, planes.normal)
+    size = np.maximum(np.linalg.norm(J, axis=0), np.finfo(float).tiny)
+    step = np.linalg.lstsq(J / size, -distances(points, T, planes), rcond=1e-6)[0]
+    return np.asarray(step / size)
 
 
 def _jacobian(points: FloatArray, T: RigidTransform, vectors: FloatArray) -> FloatArray:

@@ -27,9 +27,12 @@ class LoopOptions(Options):
     """and between which so much way lies."""
     most: int = Field(default=2, ge=1)
     """The most earlier places that a scan is compared with, the nearest first."""
-    registration: RegistrationOptions = RegistrationOptions(reach_m=2.0, least_directions=6)
-    """How scans are registered. A loop has to be believed both ways, and to determine all six
-    directions: one part of a corridor looks like another."""
+    registration: RegistrationOptions = RegistrationOptions(
+        reach_m=2.0, least_share=0.6, least_directions=6
+    )
+    """How scans are registered. Single scans see less of each other than of a cloud. A loop has to
+    be believed both ways, and to determine all six directions: one part of a corridor looks like
+    another."""
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,6 @@ import numpy as np
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.maps.training import TrainingSet
 
-CORES = -1  # all of them
-
 
 class NearestReadings:
     """A map that costs nothing to make, to look for the region where a better one is asked.
@@ -28,8 +26,7 @@ class NearestReadings:
 
         Where it is not known the field is zero.
         """
-        near = self._readings.tree.query(points, distance_upper_bound=self._reach, workers=CORES)
-        away, row = near
+        away, row = self._readings.tree.query(points, distance_upper_bound=self._reach)
         known = np.isfinite(away)
         field = np.zeros((len(points), 3))
         field[known] = self._readings.field[np.asarray(row)[known]]

@@ -1,13 +1,12 @@
 """A world of magnetised bodies in a uniform field, computed exactly."""
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from magpylib.core import magnet_cuboid_Bfield
 
 from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.threads import in_threads
 
 MICROTESLA_PER_TESLA = 1e6
 PAIRS_PER_BATCH = 20_000  # of a body and a point: about 10 MB of intermediate arrays
@@ -59,8 +58,7 @@ class SteelWorld:
         -------
         Field in the map frame in microtesla, shape (P, 3).
         """
-        with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-            parts = list(pool.map(self._steel_field, self._batches(points)))
+        parts = in_threads(self._steel_field, self._batches(points))
         return np.asarray(self.earth + np.concatenate([np.zeros((0, 3)), *parts]))
 
     def inside(self, points: FloatArray) -> BoolArray:

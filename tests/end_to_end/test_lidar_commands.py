@@ -152,11 +152,11 @@ def test_a_bag_without_odometry_is_calibrated(hall: Scanned, tmp_path: Path) -> 
     result = read_calibration(tmp_path / "calibration.yaml")
     assert "poses are those of its point clouds" in result.notes[0]
     truth = {each.sensor: each for each in hall.scenario.truth}
-    for sensor in result.sensors:
-        true = truth[sensor.sensor]
+    for found in result.sensors:
+        true = truth[found.sensor]
         # A coarse map of a small hall, 200 readings: centimetres, as with odometry.
-        assert np.linalg.norm(sensor.t_lidar_mag - true.t_lidar_mag) < 0.04
-        assert np.abs(sensor.distortion.H - true.distortion.H).max() < 1.0
+        assert np.linalg.norm(found.t_lidar_mag - true.t_lidar_mag) < 0.04
+        assert np.abs(found.distortion.H - true.distortion.H).max() < 1.0
 
 
 @pytest.fixture(scope="module")

@@ -59,9 +59,7 @@ def found_by(
     drive: SlamDrive, known: tuple[KnownSensor, ...], seen: ScanEvidence
 ) -> LocalisationResult:
     world = dipole_world(1)
-    return localise(
-        drive.recording, world, calibrated(known), OPTIONS, quiet, seen=seen
-    ).result
+    return localise(drive.recording, world, calibrated(known), OPTIONS, quiet, seen=seen).result
 
 
 @pytest.fixture(scope="module")
@@ -107,16 +105,15 @@ def test_wrong_fixes_are_left_out_and_counted(
 
 
 def test_where_scans_slip_magnetometers_hold() -> None:
-    """A corridor that looks the same everywhere: a fix tells nothing along it."""
+    """A corridor that looks the same everywhere, along which odometry slips."""
     known, drive = drive_of(22, rounds(40), sensors=2)
-    # The walls are 3 m apart, and the drive is wider: they are moved out.
-    wide = Room(((-500.0, -4.5, 0.0), (500.0, 4.5, 2.8)))
+    wide = Room(((-4.5, -500.0, 0.0), (4.5, 500.0, 2.8)))
     seen = fixes(wide, drive)
     result = found_by(drive, known, seen)
     assert result.scans is not None
     assert result.by_scans is not None
     before = position_error(drive.truth, result.odometry)
-    assert position_error(drive.truth, result.by_scans) > 0.3 * before
+    assert position_error(drive.truth, result.by_scans) > 0.6 * before
     assert position_error(drive.truth, result.trajectory) < 0.05
     assert pose_nees(drive.truth, result.trajectory).mean() < 12
 

@@ -16,7 +16,7 @@ from l2m_gtsam.slam_records import (
     SensorRecord,
     Timeline,
 )
-from l2m_gtsam.slam_results import LocalisationStatus
+from l2m_gtsam.slam_results import LocalisationStatus, ScanUse
 from l2m_gtsam.validation_results import ChiSquare
 from tests.localised import record
 
@@ -198,3 +198,20 @@ def test_thresholds_are_those_of_the_options() -> None:
     )
     assert named["slam.position_sigma_m"].warn == 0.1
     assert "metres" in named["slam.position_sigma_m"].text
+
+
+def test_scans_that_contradict_odometry_are_told() -> None:
+    few = ScanUse(fixes=90, loops=0, rejected=10, chi2_per_dof=1.0)
+    assert judged(replace(good(), scans=few)).level is Level.PASS
+    many = judged(replace(good(), scans=replace(few, fixes=60, rejected=40)))
+    assert many.level is Level.WARN
+    assert any("40 of 100 scan registrations" in each.text for each in many.reasons)
+    none = judged(replace(good(), scans=ScanUse(0, 0, 12, float("nan"))))
+    assert none.level is Level.FAIL
+
+
+def test_poses_that_are_not_where_scans_say_are_told() -> None:
+    scans = ScanUse(fixes=90, loops=0, rejected=0, chi2_per_dof=4.5)
+    told = judged(replace(good(), scans=scans))
+    assert told.level is Level.FAIL
+    assert any("4.5 times the variance" in each.text for each in told.reasons)
