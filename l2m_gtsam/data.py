@@ -417,11 +417,14 @@ class KnownSensor:
         Position in the lidar frame in metres, shape (3,).
     distortion
         C and H.
+    time_offset
+        Of its clock in seconds: a reading's pose is that at stamp + offset.
     """
 
     sensor: str
     t_lidar_mag: FloatArray
     distortion: Distortion
+    time_offset: float = 0.0
 
     @classmethod
     def ideal(cls, sensor: str) -> "KnownSensor":
