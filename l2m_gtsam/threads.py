@@ -22,12 +22,13 @@ def in_threads(work: Callable[[In], Out], items: Iterable[In]) -> list[Out]:
     Each piece is too small for threads of its own in BLAS, which would only wait for each other:
     with them a warehouse took three times as long.
     """
-    threads = min(int(environ.get(THREADS) or cpu_count() or 1), MOST_THREADS)
+    pieces = list(items)
+    threads = min(int(environ.get(THREADS) or cpu_count() or 1), MOST_THREADS, len(pieces))
     with _libraries().limit(limits=1, user_api="blas"):
-        if threads == 1:
-            return [work(item) for item in items]
+        if threads <= 1:
+            return [work(piece) for piece in pieces]
         with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(work, items))
+            return list(pool.map(work, pieces))
 
 
 @lru_cache(maxsize=1)

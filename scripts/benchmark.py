@@ -13,6 +13,7 @@ MODULES = (
     "global_start",
     "one_key",
     "map_uncertainty",
+    "online_localisation",
 )
 
 for name in MODULES:

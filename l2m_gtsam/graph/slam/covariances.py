@@ -1,5 +1,8 @@
 """Covariances of poses and sensors from a solved graph."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import gtsam
 import numpy as np
 
@@ -8,8 +11,9 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 
 
-def solved_marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals:
-    """Return the marginals of a solved graph.
+@contextmanager
+def well_scaled() -> Iterator[None]:
+    """Say in one line why GTSAM cannot solve what is done inside.
 
     Raises
     ------
@@ -18,7 +22,7 @@ def solved_marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) ->
         is a matter of scale.
     """
     try:
-        return gtsam.Marginals(graph, values)
+        yield
     except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException has no Python type
         if "ndetermina" not in str(error):
             raise
@@ -26,6 +30,12 @@ def solved_marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) ->
             "the covariances of the poses cannot be computed: those of odometry, start and "
             "calibration are too many orders of magnitude apart"
         ) from error
+
+
+def solved_marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Marginals:
+    """Return the marginals of a solved graph; see ``well_scaled``."""
+    with well_scaled():
+        return gtsam.Marginals(graph, values)
 
 
 def pose_covariances(marginals: gtsam.Marginals, count: int) -> FloatArray:

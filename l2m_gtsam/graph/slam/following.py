@@ -1,26 +1,29 @@
-"""Follow a drive from its start, key pose by key pose, with iSAM2.
+"""Follow a drive from its start, key pose by key pose.
 
 Odometry drifts out of the reach of a descent within some tens of metres; followed from where the
 drive begins, each key pose is found from the last, which the map has corrected already. There it
 is known how far a reading may be off, and one that is further counts for nothing: a field that a
 door adds to all sensors would otherwise be taken for a turn.
+
+A Kalman filter takes each key pose as it comes; iSAM2 takes them by the dozen, linearises anew what
+has moved, and tells the filter what it found. What a key pose costs, and the memory that is needed
+beside the poses, does not grow with the drive: it is solved section by section.
 """
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
 
 import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from l2m_factors import (
-    CarriedBatch,
-    CarriedReadings,
-    D,
-    T,
-    X,
-    carried_residuals,
-    key_pose_factor,
-)
-from l2m_gtsam.data import FloatArray, RigidTransform
-from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, as_pose
+from l2m_factors import CarriedBatch, D, T, X, key_pose_factor
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.graph.slam.belief import POSE, Belief
+from l2m_gtsam.graph.slam.covariances import well_scaled
+from l2m_gtsam.graph.slam.drive import Drive, as_pose
+from l2m_gtsam.graph.slam.expected import evidence, fix_evidence, passed
 from l2m_gtsam.graph.slam.factors import (
     calibration_graph,
     calibration_values,
@@ -29,20 +32,35 @@ from l2m_gtsam.graph.slam.factors import (
     start_factor,
     step_factor,
 )
-from l2m_gtsam.graph.slam.sight import look, place, sensors_in
+from l2m_gtsam.graph.slam.remembered import RememberedVariance
+from l2m_gtsam.graph.slam.section import Section
+from l2m_gtsam.graph.slam.sight import sensors_in
 from l2m_gtsam.graph.view import QueryableMap
-from l2m_gtsam.pose_covariance import moved
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
+from l2m_gtsam.solve.robust import RobustOptions
 
-# Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
-# entries of C; never for H, in which readings are linear.
-RELINEARISE = {
-    "X": np.full(6, 0.01),
-    "T": np.full(3, 0.01),
-    "D": np.concatenate([np.full(9, 0.01), np.full(3, np.inf)]),
-}
-AGAIN = 2  # more steps at each key pose, so that the next starts from where this one converged
+SECTION = 200  # key poses that are solved together
+GROUP = 10  # key poses that come to iSAM2 together,
+EARLY = 30  # and the first so many one by one: in calibrations far off, readings are not linear
+AGAIN = 2  # more steps with each group, so that the next one starts from where this one converged
+
+
+@dataclass
+class Waiting:
+    """Key poses that the filter has taken and iSAM2 has not.
+
+    Attributes
+    ----------
+    graph, values
+        Odometry and key poses.
+    rows, whitening
+        Readings on them that passed: which, shapes (n,), and whitening matrices (n, 3, 3).
+    """
+
+    graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+    rows: list[IntArray] = field(default_factory=list)
+    whitening: list[FloatArray] = field(default_factory=list)
 
 
 class Follower:
@@ -58,141 +76,129 @@ class Follower:
         Which readings pass where a pose is predicted.
     free
         Whether calibrations are variables.
+    section
+        Key poses that are solved together.
     """
 
     def __init__(
-        self, drive: Drive, field_map: QueryableMap, robust: RobustOptions, *, free: bool
+        self,
+        drive: Drive,
+        field_map: QueryableMap,
+        robust: RobustOptions,
+        *,
+        free: bool,
+        section: int = SECTION,
     ) -> None:
         self._drive, self._map, self._robust, self._free = drive, field_map, robust, free
-        self._engine = _engine()
+        self._variance = RememberedVariance(field_map)
         self._ends = np.searchsorted(drive.readings.key_pose, np.arange(len(drive) + 1))
+        fixes = np.flatnonzero(drive.links.in_map)
+        self._fixes = fixes[np.argsort(drive.links.key_pose[fixes], kind="stable")]
+        self._fix_ends = np.searchsorted(
+            drive.links.key_pose[self._fixes], np.arange(len(drive) + 1)
+        )
+        sensors = range(len(drive.sensors.names) if free else 0)
+        self._calibrations = [key for i in sensors for key in (T(i), D(i))]
+        self._length, self._first, self._past = section, 0, gtsam.Values()
+        self._section = Section(self._calibrations)
+        self._belief, self._waiting = self._at_start(), self._opening()
 
-    def step(self, number: int) -> None:
-        """Add a key pose; they come in order."""
-        graph, values = self._begun() if number == 0 else self._gone_on(number)
-        for fix in self._fixes(number, values):
-            graph.add(fix)
-        factor = self._readings(number, values)
-        if factor is not None:
-            graph.add(factor)
-        self._engine.update(graph, values)
-        for _ in range(AGAIN if factor is not None else 0):
-            self._engine.update()
+    def step(self, number: int) -> Belief:
+        """Add a key pose, and return what is known of it then; they come in order.
+
+        Raises
+        ------
+        CalibrationError
+            What is known of poses and sensors is too many orders of magnitude apart.
+        """
+        if number > 0:
+            drift = self._drive.steps.covariance[number - 1]
+            self._belief = self._belief.after(self._drive.step(number - 1), drift)
+            self._waiting.graph.add(step_factor(self._drive, number - 1))
+        self._fix(number)
+        self._read(number)
+        self._waiting.values.insert(X(number), self._belief.pose)
+        if number < EARLY or (number + 1) % GROUP == 0 or number == len(self._drive) - 1:
+            with well_scaled():
+                self._settle(number)
+        return self._belief
 
     def values(self) -> gtsam.Values:
-        """Return all variables."""
-        return self._engine.calculateEstimate()
+        """Return all variables, as their sections have them."""
+        values = gtsam.Values(self._past)
+        values.insert(self._section.values())
+        return values
 
-    def _begun(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Return what the first key pose adds beside its readings."""
-        start, graph, values = self._drive.start, gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.add(start_factor(start))
-        values.insert(X(0), as_pose(start.T_map_lidar))
+    def _opening(self) -> Waiting:
+        """Return what is known before the first key pose."""
+        waiting = Waiting()
+        waiting.graph.add(start_factor(self._drive.start))
         if self._free:
-            graph.push_back(calibration_graph(self._drive.sensors))
-            values.insert(calibration_values(self._drive.sensors))
-        return graph, values
+            waiting.graph.push_back(calibration_graph(self._drive.sensors))
+        return waiting
 
-    def _gone_on(self, number: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """Return what a later key pose adds beside its readings."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        graph.add(step_factor(self._drive, number - 1))
-        last = self._engine.calculateEstimatePose3(X(number - 1))
-        values.insert(X(number), last.compose(self._drive.step(number - 1)))
-        return graph, values
+    def _at_start(self) -> Belief:
+        start, sensors = self._drive.start, self._drive.sensors
+        known = sensors.covariance if self._free else ()
+        covariance = block_diag(start.covariance, *known)
+        return Belief(as_pose(start.T_map_lidar), sensors, covariance)
 
-    def _fixes(self, number: int, added: gtsam.Values) -> list[gtsam.NonlinearFactor]:
-        """Return what scans say of a key pose's place in the map, as far as it passes for such."""
-        links, pose = self._drive.links, added.atPose3(X(number))
-        rows = np.flatnonzero(links.in_map & (links.key_pose == number))
-        if not len(rows):
-            return []
-        expected, most = self._predicted_covariance(number), self._robust.largest_of(6)
-        taken = []
-        for row in rows.tolist():
-            off = gtsam.Pose3.Logmap(pose.between(link_pose(links, row)))
-            if off @ np.linalg.solve(expected + links.covariance[row], off) <= most:
-                taken.append(link_factor(links, row))
-        return taken
+    def _fix(self, number: int) -> None:
+        """Take what scans say of a key pose's place in the map, as far as it passes for such."""
+        links, most = self._drive.links, self._robust.largest_of(POSE)
+        for row in self._fixes[self._fix_ends[number] : self._fix_ends[number + 1]].tolist():
+            covariance = self._belief.pose_covariance + links.covariance[row]
+            off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
+            if off @ np.linalg.solve(covariance, off) <= most:
+                seen = partial(fix_evidence, link_pose(links, row), links.covariance[row])
+                self._belief = self._belief.corrected(seen)
+                self._waiting.graph.add(link_factor(links, row))
 
-    def _readings(self, number: int, added: gtsam.Values) -> gtsam.NonlinearFactor | None:
-        """Return the factor of a key pose's readings as far as they pass for such."""
+    def _read(self, number: int) -> None:
+        """Take the readings on a key pose as far as they pass for such."""
         rows = np.arange(self._ends[number], self._ends[number + 1])
         if not len(rows):
-            return None
-        readings, sensors = self._drive.readings[rows], self._sensors(number)
-        pose = added.atPose3(X(number))
-        sight = look(self._map, place(readings, {number: pose}, sensors), sensors)
-        unsure = self._unsure(number, readings, pose, sensors)
-        r2 = sight.squared(sight.whitening(sensors.noise, more=unsure))
-        trust = WEIGHTS[self._robust.loss](r2, self._robust.largest, np.inf)
-        taken = np.flatnonzero(sight.inside & (trust > 0))
-        if not len(taken):
-            return None
-        W = sight.whitening(sensors.noise) * np.sqrt(trust)[:, None, None]
-        fixed = None if self._free else sensors.fixed()
-        return key_pose_factor(CarriedBatch(self._map, readings[taken], fixed), number, W[taken])
+            return
+        readings = self._drive.readings[rows]
+        good = passed(readings, self._map, self._variance, self._belief, self._robust)
+        if not len(good.rows):
+            return
+        seen = partial(evidence, readings[good.rows], self._map, good.whitening)
+        self._belief = self._belief.corrected(seen)
+        self._waiting.rows.append(rows[good.rows])
+        self._waiting.whitening.append(good.whitening)
 
-    def _unsure(
-        self, number: int, readings: CarriedReadings, pose: gtsam.Pose3, sensors: KnownSensors
-    ) -> FloatArray:
-        """Return what a predicted pose, and sensors, add to the covariance of residuals, uT^2.
-
-        Shape (n, 3, 3). Errors of poses and sensors count as independent here, which takes
-        readings for good a little too easily.
-        """
-        n = len(readings)
-        R, p = np.tile(pose.rotation().matrix(), (n, 1, 1)), np.tile(pose.translation(), (n, 1))
-        seen = carried_residuals(readings, self._map, R, p, sensors.fixed())
-        covariance = spread_by(seen.de_dX, self._predicted_covariance(number))
+    def _settle(self, number: int) -> None:
+        """Give iSAM2 the key poses that wait, and take from it what is known of the last."""
+        waiting, self._waiting = self._waiting, Waiting()
+        for factor in self._reading_factors(waiting):
+            waiting.graph.add(factor)
+        if self._free and number == 0:
+            # From the filter's estimate: linearised at values far off, readings would lead astray.
+            waiting.values.insert(calibration_values(self._belief.sensors))
+        self._section.add(waiting.graph, waiting.values, number, AGAIN)
+        sensors, section = self._drive.sensors, self._section
         if self._free:
-            by_sensor = np.concatenate([seen.reading.de_dt, seen.reading.de_dD], axis=2)
-            known = self._sensor_covariances(number)[readings.sensor]
-            covariance += spread_by(by_sensor, known)
-        return covariance
+            sensors = sensors_in(section.calibration(), sensors)
+        self._belief = Belief(section.pose(number), sensors, section.covariance(number))
+        if number - self._first >= self._length:
+            self._hand_over(number)
 
-    def _predicted_covariance(self, number: int) -> FloatArray:
-        """Return the covariance of a key pose before its readings, shape (6, 6)."""
-        if number == 0:
-            return self._drive.start.covariance
-        steps, last = self._drive.steps, self._engine.marginalCovariance(X(number - 1))
-        step = RigidTransform(steps.R[number - 1], steps.p[number - 1])
-        return np.asarray(moved(last[None], step)[0] + steps.covariance[number - 1])
+    def _reading_factors(self, waiting: Waiting) -> Iterator[gtsam.NonlinearFactor]:
+        if not waiting.rows:
+            return
+        readings = self._drive.readings[np.concatenate(waiting.rows)]
+        fixed = None if self._free else self._drive.sensors.fixed()
+        batch = CarriedBatch(self._map, readings, fixed)
+        for key_pose, W in zip(batch.key_poses, waiting.whitening, strict=True):
+            yield key_pose_factor(batch, key_pose, W)
 
-    def _sensor_covariances(self, number: int) -> FloatArray:
-        """Return the covariances of the sensors so far, shape (S, 15, 15)."""
-        known = self._drive.sensors.covariance
-        if number == 0:
-            return known
-        marginal = self._engine.marginalCovariance
-        return np.stack([block_diag(marginal(T(i)), marginal(D(i))) for i in range(len(known))])
-
-    def _sensors(self, number: int) -> KnownSensors:
-        """Return the sensors as they are known when a key pose is added."""
-        known = self._drive.sensors
-        if not self._free or number == 0:
-            return known
-        so_far = gtsam.Values()
-        for i in range(len(known.names)):
-            so_far.insert(T(i), self._engine.calculateEstimatePoint3(T(i)))
-            so_far.insert(D(i), self._engine.calculateEstimateVector(D(i)))
-        return sensors_in(so_far, known)
-
-
-def spread_by(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return ``J P J^T``, shape (n, 3, 3)."""
-    return np.asarray(jacobian @ covariance @ jacobian.transpose(0, 2, 1))
-
-
-def _engine() -> gtsam.ISAM2:
-    """Return an empty graph that is solved as it grows."""
-    thresholds = gtsam.ISAM2ThresholdMap()
-    for symbol, steps in RELINEARISE.items():
-        thresholds.insert((symbol, steps))
-    params = gtsam.ISAM2Params()
-    params.setRelinearizeThreshold(thresholds)
-    params.relinearizeSkip = 1
-    return gtsam.ISAM2(params)
+    def _hand_over(self, last: int) -> None:
+        """Begin a section with the last key pose of this one."""
+        values = self._section.values()
+        self._past.insert(values.extract([X(k) for k in range(self._first, last)]))
+        self._section = self._section.next(last)
+        self._first = last
 
 
 def follow(follower: Follower, count: int, progress: Progress) -> gtsam.Values:

@@ -1,0 +1,93 @@
+"""The last key poses of a drive, solved by iSAM2 as they come; all that was before is a prior."""
+
+import gtsam
+import numpy as np
+
+from l2m_factors import X
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.slam.belief import POSE
+
+# Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
+# entries of C; never for H, in which readings are linear.
+RELINEARISE = {
+    "X": np.full(6, 0.01),
+    "T": np.full(3, 0.01),
+    "D": np.concatenate([np.full(9, 0.01), np.full(3, np.inf)]),
+}
+
+
+class Section:
+    """A stretch of a drive that is solved as it grows.
+
+    What it has learnt goes over to the next one as a Gaussian prior of the variables that both
+    have. GTSAM's fixed-lag smoothers, which let go of one pose after the other, hold such variables
+    where they were when the first one went; here calibrations stay free to be linearised anew.
+
+    Parameters
+    ----------
+    calibrations
+        Keys of the calibrations that are variables.
+    """
+
+    def __init__(self, calibrations: list[int]) -> None:
+        self._engine, self._calibrations = _engine(), calibrations
+
+    def add(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
+    ) -> None:
+        """Add factors and new variables up to a key pose, and take so many more steps."""
+        order = self._last_ones(last)
+        self._engine.update(graph, values, constrainedKeys=order)
+        for _ in range(again):
+            self._engine.update(constrainedKeys=order)
+
+    def _last_ones(self, last: int) -> gtsam.KeyGroupMap:
+        """Return which variables are eliminated last.
+
+        What is asked for at each key pose stands in the root of the tree then. The very last are
+        poses: Cholesky takes a part of a calibration that only its prior holds for undetermined.
+        """
+        order = gtsam.KeyGroupMap()
+        for key in self._calibrations:
+            order.insert2(key, 1)
+        order.insert2(X(last), 2 if self._calibrations else 1)  # no group may be empty
+        return order
+
+    def pose(self, number: int) -> gtsam.Pose3:
+        """Return a key pose of the section."""
+        return self._engine.calculateEstimatePose3(X(number))
+
+    def calibration(self) -> gtsam.Values:
+        """Return the calibrations."""
+        return self._engine.calculateEstimate(self._calibrations)
+
+    def values(self) -> gtsam.Values:
+        """Return all its variables."""
+        return self._engine.calculateEstimate()
+
+    def covariance(self, last: int) -> FloatArray:
+        """Return the joint covariance of the last key pose and the calibrations, in this order."""
+        keys = [*self._calibrations, X(last)]
+        joint = self._engine.jointMarginalCovariance(keys).fullMatrix()
+        return np.roll(joint, POSE, axis=(0, 1))
+
+    def next(self, last: int) -> "Section":
+        """Return a section that begins with what this one knows of key pose and calibrations."""
+        keys = [*self._calibrations, X(last)]
+        # As it was linearised; what has moved by more than a little was linearised anew.
+        told, at = self._engine.joint(keys), self._engine.getLinearizationPoint().extract(keys)
+        prior = gtsam.LinearContainerFactor.ConvertLinearGraph(told, at)
+        section = Section(self._calibrations)
+        section.add(prior, self._engine.calculateEstimate(keys), last, 0)
+        return section
+
+
+def _engine() -> gtsam.ISAM2:
+    """Return an empty graph that is solved as it grows."""
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for symbol, steps in RELINEARISE.items():
+        thresholds.insert((symbol, steps))
+    params = gtsam.ISAM2Params()
+    params.setRelinearizeThreshold(thresholds)
+    params.relinearizeSkip = 1
+    return gtsam.ISAM2(params)

@@ -1,0 +1,120 @@
+"""Whether poses and calibrations found on line err as much as they say, from values far off."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.graph.slam.drive import KnownSensors
+from l2m_gtsam.graph.slam.following import Follower
+from l2m_gtsam.graph.slam.localisation import localise_drive
+from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.solve.robust import RobustOptions
+from tests.drawn_drives import DrawnDrive, drawn_drive
+from tests.slam_drives import rounds
+from tests.worlds import dipole_world, random_sensors
+
+DRIVES, SENSORS, SECONDS = 50, 3, 60
+RATE, EVERY = 2, 3  # every other pose of the drive, every third of these a key pose
+FAR = np.concatenate([np.full(3, 0.1), np.full(9, 0.1), np.full(3, 20.0)])
+REFINED = SlamOptions(calibration=CalibrationUse.REFINED)
+
+
+@dataclass(frozen=True)
+class Nees:
+    """Mean squared errors in units of their covariances: of poses (6) and of calibrations (15)."""
+
+    poses: float
+    calibration: float
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """NEES on line and of all poses solved together, and how far apart both end.
+
+    ``apart`` has the distance of the calibrations in the sigmas of the latter, shape (S, 15).
+    """
+
+    on_line: Nees
+    batch: Nees
+    apart: FloatArray
+
+
+def thinned(truth: Trajectory) -> Trajectory:
+    rows = slice(None, None, RATE)
+    return Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
+
+
+def vectors(sensors: KnownSensors) -> FloatArray:
+    """Return (t, C row by row, H) of sensors, shape (S, 15)."""
+    return np.hstack([sensors.t, sensors.distortion])
+
+
+def squared(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return squared lengths of errors (N, k) in units of their covariances (N, k, k)."""
+    solved = np.linalg.solve(covariance, error[:, :, None])[:, :, 0]
+    return np.asarray(np.einsum("ni,ni->n", error, solved))
+
+
+def nees(
+    drawn: DrawnDrive,
+    poses: list[gtsam.Pose3],
+    pose_covariance: FloatArray,
+    sensors: KnownSensors,
+    covariance: FloatArray,
+) -> Nees:
+    truth = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    off = np.stack(
+        [gtsam.Pose3.Logmap(pose.between(each)) for pose, each in zip(poses, truth, strict=True)]
+    )
+    wrong = drawn.calibration - vectors(sensors)
+    return Nees(
+        float(squared(off, pose_covariance).mean()), float(squared(wrong, covariance).mean())
+    )
+
+
+def one_drive(seed: int) -> Outcome:
+    rng, world = np.random.default_rng(seed), dipole_world(seed)
+    sensors, truth = random_sensors(seed, SENSORS), thinned(rounds(SECONDS))
+    drawn = drawn_drive(world, sensors, truth, rng, FAR, every=EVERY)
+    follower = Follower(drawn.drive, world, RobustOptions(), free=True)
+    beliefs = [follower.step(number) for number in range(len(drawn.drive))]
+    last = beliefs[-1]
+    on_line = nees(
+        drawn,
+        [each.pose for each in beliefs],
+        np.stack([each.pose_covariance for each in beliefs]),
+        last.sensors,
+        last.calibration_covariance,
+    )
+    solved = localise_drive(drawn.drive, world, REFINED, lambda _stage, _share: None)
+    covariance = solved.calibration_covariance
+    batch = nees(drawn, solved.poses, solved.pose_covariance, solved.drive.sensors, covariance)
+    sigma = np.sqrt(np.einsum("sii->si", covariance))
+    apart = np.abs(vectors(last.sensors) - vectors(solved.drive.sensors)) / sigma
+    print(
+        f"drive {seed}: NEES on line {on_line.poses:.2f} {on_line.calibration:.2f}, "
+        f"batch {batch.poses:.2f} {batch.calibration:.2f}, apart {apart.max():.2f}",
+        flush=True,
+    )
+    return Outcome(on_line, batch, apart)
+
+
+@pytest.mark.study
+def test_errors_on_line_are_as_large_as_told() -> None:
+    """NEES of 6 (poses) and 15 (calibrations) is honest; poses of a drive count as one figure.
+
+    The mean of 50 drives has to be within three of its standard errors of that.
+    """
+    outcomes = [one_drive(seed) for seed in range(DRIVES)]
+    for found in ([each.on_line for each in outcomes], [each.batch for each in outcomes]):
+        for figures, honest in (
+            (np.array([each.poses for each in found]), 6.0),
+            (np.array([each.calibration for each in found]), 15.0),
+        ):
+            error = figures.std(ddof=1) / np.sqrt(len(figures))
+            print(f"{figures.mean():.2f} +- {error:.2f}, honest {honest}")
+            assert abs(figures.mean() - honest) < 3 * error
+    assert max(each.apart.max() for each in outcomes) < 1.0
