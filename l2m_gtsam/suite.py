@@ -123,7 +123,7 @@ def _result(drive: SuiteDrive, solution: SuiteSolution, options: SuiteOptions) -
         options=options.model_dump(mode="json"),
         versions={"l2m-gtsam": version("l2m-gtsam")},
         bags=tuple(each.source for each in recording.drives),
-        notes=tuple(part.note for part in recording.parts if part.note),
+        notes=tuple(note for part in recording.parts for note in part.notes),
     )
 
 
