@@ -144,7 +144,7 @@ def calibrated(
         options=options.model_dump(mode="json"),
         versions={name: version(name) for name in VERSIONED},
         bags=tuple(drive.source for drive in recording.drives),
-        notes=tuple(drive.note for drive in recording.parts if drive.note),
+        notes=tuple(note for drive in recording.parts for note in drive.notes),
     )
     return Calibrated(result, solution, field_map, solver_map)
 

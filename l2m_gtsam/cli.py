@@ -15,6 +15,7 @@ from l2m_gtsam.commands.fleet import batch
 from l2m_gtsam.commands.report import report
 from l2m_gtsam.commands.slam import slam
 from l2m_gtsam.commands.study import study
+from l2m_gtsam.commands.suite import suite
 from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
 from l2m_gtsam.commands.validate import validate
 from l2m_gtsam.errors import L2MError
@@ -30,7 +31,8 @@ app = typer.Typer(
     add_completion=False,
 )
 map_app = typer.Typer(
-    help="Build, update, compare, describe and draw magnetic maps.", no_args_is_help=True
+    help="Build, update, compare, describe and draw magnetic maps; calibrate a mapping suite.",
+    no_args_is_help=True,
 )
 app.add_typer(map_app, name="map")
 app.command()(study)
@@ -39,6 +41,7 @@ exports.register(app)
 app.command()(report)
 app.command()(validate)
 app.command()(slam)
+map_app.command("suite")(suite)
 
 BagArgument = Annotated[
     Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")

@@ -11,6 +11,7 @@ from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.graph.prior_options import PriorOptions
 from l2m_gtsam.graph.slam.options import SlamOptions
+from l2m_gtsam.graph.suite.options import SuiteOptions
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, ScanStartOptions
 from l2m_gtsam.lidar.loops import LoopOptions
 from l2m_gtsam.lidar.odometry import OdometryOptions
@@ -46,6 +47,8 @@ class MappingOptions(Options):
     """How scans become the cloud that is saved with the map; their topic is `lidar.topic`."""
     compare: CompareOptions = CompareOptions()
     """How `l2m map compare` holds readings out."""
+    suite: SuiteOptions = SuiteOptions()
+    """How `l2m map suite` calibrates the sensors that map."""
 
 
 class CalibrationOptions(Options):
@@ -117,7 +120,7 @@ class Config(Options):
     bag: BagOptions = BagOptions()
     """What is read from a recording."""
     mapping: MappingOptions = MappingOptions()
-    """`l2m map build`, `l2m map update` and `l2m map compare`."""
+    """`l2m map build`, `l2m map update`, `l2m map compare` and `l2m map suite`."""
     calibration: CalibrationOptions = CalibrationOptions()
     """`l2m calibrate`, and `l2m plan` before it."""
     plan: PlanOptions = PlanOptions()

@@ -151,8 +151,9 @@ class Recording:
         What it was joined from, each in its own time, in order of time; empty for one drive.
     moved_ns
         What was added to the stamps of each drive so that none overlaps another, nanoseconds.
-    note
-        Where its poses come from, if the bag has none: a sentence.
+    notes
+        What is worth a warning, a sentence each: where its poses come from if the bag has none, or
+        a clock that was set.
     """
 
     trajectory: Trajectory
@@ -161,7 +162,7 @@ class Recording:
     scalars: tuple[ScalarSeries, ...] = ()
     drives: tuple["Recording", ...] = ()
     moved_ns: tuple[int, ...] = ()
-    note: str = ""
+    notes: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple["Recording", ...]:
@@ -416,11 +417,14 @@ class KnownSensor:
         Position in the lidar frame in metres, shape (3,).
     distortion
         C and H.
+    time_offset
+        Of its clock in seconds: a reading's pose is that at stamp + offset.
     """
 
     sensor: str
     t_lidar_mag: FloatArray
     distortion: Distortion
+    time_offset: float = 0.0
 
     @classmethod
     def ideal(cls, sensor: str) -> "KnownSensor":

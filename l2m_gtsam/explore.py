@@ -107,7 +107,7 @@ def explore(
     explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
     result = replace(
         told(result, explored),
-        notes=(*notes, *([] if explored.returned else [NOWHERE_TWICE])),
+        notes=(*notes, *result.notes, *([] if explored.returned else [NOWHERE_TWICE])),
         bag=recording.source,
         calibration_source=calibration_source,
         explored=explored,

@@ -15,8 +15,10 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import CalibrationError, SyncError
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose, carried
+from l2m_gtsam.graph.slam.jumps import without_jumps
 from l2m_gtsam.graph.slam.links import link_stamps, linked
 from l2m_gtsam.graph.slam.localisation import Localised, localise_drive
+from l2m_gtsam.graph.slam.misfit import is_doubtful, wrong_maps
 from l2m_gtsam.graph.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
 from l2m_gtsam.graph.slam.outcome import localisation_result
@@ -26,11 +28,13 @@ from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.scans import ScanEvidence
+from l2m_gtsam.silences import heard, is_dead
 from l2m_gtsam.slam_results import LocalisationResult
 from l2m_gtsam.solve.noise import NOISE_RANGE
-from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
+from l2m_gtsam.sync import SyncOptions, synchronise, with_offsets
 
 NO_SCANS = ScanEvidence()
+DEAD = "it has no readings, or repeats one value"
 
 
 @dataclass(frozen=True)
@@ -103,8 +107,11 @@ def localise(
     by_scans = solve_pose_graph(drive, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
     solution = localise_drive(drive, solver_map, options, progress)
+    others = wrong_maps(drive, solver_map) if is_doubtful(solution) else ()
+    wrong = [localise_drive(drive, each, options, progress) for each in others]
     refined = options.calibration is CalibrationUse.REFINED
-    result = localisation_result(drive, solution, by_scans, calibration if refined else None)
+    kept = calibration if refined else None
+    result = localisation_result(drive, solution, by_scans, kept, wrong)
     sources = sources or Sources()
     result = replace(
         result,
@@ -135,25 +142,28 @@ def prepared(
     CalibrationError
         No sensor of the recording is calibrated.
     SyncError
-        Readings and poses do not overlap, or there are fewer than two poses.
+        Readings and poses do not overlap, there are fewer than two poses, or all sensors are dead.
     """
-    odometry = recording.trajectory
-    if len(odometry) < 2:
+    if len(recording.trajectory) < 2:
         raise SyncError(f"{recording.source.path}: odometry of one pose; two or more are needed")
-    calibrated, notes = usable_sensors(recording, calibration)
-    readings = drive_readings(recording, calibrated, options)
-    rows = key_pose_rows(odometry, options.key_poses)
+    mended = without_jumps(recording.trajectory, options.jumps)
+    odometry = mended.trajectory
+    alive = heard(replace(recording, trajectory=odometry))
+    calibrated, left_out = usable_sensors(alive.recording, calibration)
+    readings = drive_readings(alive.recording, calibrated, options)
+    rows = np.union1d(key_pose_rows(odometry, options.key_poses), mended.rows)
     if len(seen):
         rows = with_rows_at(rows, odometry, link_stamps(seen))
     drive = Drive(
         stamp_ns=odometry.stamp_ns[rows],
-        steps=odometry_steps(odometry, rows, options.drift),
+        steps=odometry_steps(odometry, rows, options.drift, mended.jumps),
         readings=carried(readings, odometry, rows, options.key_poses.readings),
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
         links=linked(seen, odometry, rows, options.drift),
     )
-    return drive, (*(part.note for part in recording.parts if part.note), *notes)
+    recorded = (note for part in recording.parts for note in part.notes)
+    return drive, (*recorded, *mended.notes(), *left_out, *alive.notes)
 
 
 def usable_sensors(
@@ -165,9 +175,11 @@ def usable_sensors(
     ------
     CalibrationError
         There is none.
+    SyncError
+        Those that are have no readings.
     """
     entries = {each.sensor: each for each in calibration.sensors}
-    usable, notes = [], []
+    usable, notes, dead = [], list[str](), list[str]()
     for series in recording.series:
         entry = entries.get(series.sensor)
         if entry is None:
@@ -177,8 +189,13 @@ def usable_sensors(
         elif entry.moving:
             numbers = ", ".join(each.name for each in entry.moving)
             notes.append(f"{series.sensor} is left out: a part of its readings follows {numbers}")
+        elif is_dead(series):
+            dead.append(series.sensor)
         else:
             usable.append(entry)
+    notes += [f"{each} is left out: {DEAD}" for each in dead]
+    if dead and not usable:
+        raise SyncError(f"{recording.source.path}: {', '.join(dead)}: {DEAD}")
     if not usable:
         sensors = ", ".join(series.sensor for series in recording.series)
         raise CalibrationError(
@@ -227,10 +244,7 @@ def drive_readings(
     )
     largest = float(np.abs(offset).max())
     readings = synchronise(replace(recording, series=chosen), sync, largest).readings
-    alive = readings.select(~np.isin(readings.sensor, stuck_sensors(readings)))
-    if not len(alive):
-        raise SyncError(f"{recording.source.path}: every sensor is stuck on one value")
-    return with_offsets(alive, recording.trajectory, offset)
+    return with_offsets(readings, recording.trajectory, offset)
 
 
 def start_pose(odometry: Trajectory, options: StartPoseOptions) -> StartPose:

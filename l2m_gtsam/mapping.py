@@ -12,7 +12,7 @@ from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise
+from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
 
 
 def map_recordings(
@@ -126,9 +126,12 @@ def suite_readings(
         raise MapError(msg)
     points, fields = [], []
     for recording in recordings:
-        readings = synchronise(recording, sync).readings
+        known = [_known(series.sensor, suite, recording) for series in recording.series]
+        offset = np.array([each.time_offset for each in known])
+        readings = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0))).readings
         _refuse_stuck(readings, recording)
-        known = [_known(name, suite, recording) for name in readings.sensors]
+        if offset.any():
+            readings = with_offsets(readings, recording.trajectory, offset)
         points.append(sensor_positions(readings, known))
         fields.append(map_fields(readings, known))
     return checked_readings(np.concatenate(points), np.concatenate(fields))

@@ -40,11 +40,20 @@ def moved(covariance: FloatArray, T_body_other: RigidTransform) -> FloatArray:
     T_body_other
         The other body in the first one's frame.
     """
-    # T Exp(error) T_body_other = T T_body_other Exp(adjoint @ error)
-    R, t = T_body_other.R, T_body_other.t
-    lever = np.cross(np.eye(3), t)  # the matrix [t]x
-    adjoint = np.block([[R.T, np.zeros((3, 3))], [-R.T @ lever, R.T]])
+    adjoint = carried_back(T_body_other.R[None], T_body_other.t[None])[0]
     return np.asarray(adjoint @ covariance @ adjoint.T)
+
+
+def carried_back(R: FloatArray, p: FloatArray) -> FloatArray:
+    """Return what a right perturbation of a frame makes of poses in it, shape (K, 6, 6).
+
+    ``T0 Exp(d) T = T0 T Exp(A d)`` for T of rotations (K, 3, 3) and positions (K, 3) in metres.
+    """
+    A = np.zeros((len(p), 6, 6))
+    back = R.transpose(0, 2, 1)
+    A[:, :3, :3] = A[:, 3:, 3:] = back
+    A[:, 3:, :3] = -back @ np.cross(np.eye(3), p[:, None])  # the matrices [p]x
+    return A
 
 
 def _exchanged(covariance: FloatArray, turn: FloatArray) -> FloatArray:

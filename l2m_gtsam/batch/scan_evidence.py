@@ -10,6 +10,7 @@ from l2m_gtsam.carried_scans import carried_scans
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording, RigidTransform
 from l2m_gtsam.errors import LidarError
+from l2m_gtsam.graph.slam.jumps import without_jumps
 from l2m_gtsam.graph.slam.options import ScanUsage
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.loops import find_loops
@@ -71,7 +72,8 @@ def read_evidence(
 def _loops(bag: Path, recording: Recording, config: Config, progress: Progress) -> ScanEvidence:
     options, scans = config.lidar.loops, bag_scans(bag, config, progress)
     edge = options.registration.edge
-    steps = carried_scans(scans, recording.trajectory, edge, config.slam)
+    mended = without_jumps(recording.trajectory, config.slam.jumps)
+    steps = carried_scans(scans, mended, edge, config.slam)
     return ScanEvidence(loops=find_loops(steps, options).loops)
 
 
@@ -80,7 +82,8 @@ def _fixes(
 ) -> ScanEvidence:
     options, scans = _localisation(config), bag_scans(bag, config, progress)
     edge = options.registration.edge
-    steps = carried_scans(scans, recording.trajectory, edge, config.slam)
+    mended = without_jumps(recording.trajectory, config.slam.jumps)
+    steps = carried_scans(scans, mended, edge, config.slam)
     first = next(steps, None)
     if first is None:
         raise LidarError("no scan has points enough, at a time that has odometry")

@@ -20,7 +20,8 @@ from l2m_gtsam.lidar.odometry import ScanStep, follow, odometry
 from l2m_gtsam.lidar.search import find_start
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.storage.bag import check_clocks, has_poses, read_fields
+from l2m_gtsam.storage.bag import has_poses, read_fields
+from l2m_gtsam.storage.clocks import check_clocks
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.scan_topic import ScanTopic, has_clouds
 
@@ -50,7 +51,7 @@ def read_drive_on(saved: SavedMap, bag: Path, config: Config, progress: Progress
         f"fit the cloud of {saved.path}"
     )
     scalars = read_numbers(bag, config, progress)
-    return Recording(found.trajectory, series, source_file(bag), scalars, note=note)
+    return Recording(found.trajectory, series, source_file(bag), scalars, notes=(note,))
 
 
 def read_drive_or_follow(bag: Path, config: Config, progress: Progress) -> Recording:
@@ -72,7 +73,7 @@ def read_drive_or_follow(bag: Path, config: Config, progress: Progress) -> Recor
     poses = replace(poses, frame=config.bag.frame or poses.frame)
     check_clocks(bag, poses, series)
     note = f"{bag}: poses are odometry by its point clouds, which drifts"
-    return Recording(poses, series, source_file(bag), note=note)
+    return Recording(poses, series, source_file(bag), notes=(note,))
 
 
 def bag_scans(bag: Path, config: Config, progress: Progress) -> ScanTopic:

@@ -17,6 +17,7 @@ from l2m_gtsam.data import Recording, SourceFile
 from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.explore import explore
 from l2m_gtsam.graph.slam.g2o import write_g2o
+from l2m_gtsam.graph.slam.jumps import without_jumps
 from l2m_gtsam.graph.slam.localisation import Localised
 from l2m_gtsam.localise import Sources, localise
 from l2m_gtsam.maps.build import build_map
@@ -142,7 +143,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     told = Told(calibration, found.field_map, options, gap, truth, truth_source)
     record = localisation_record(found.result, found.solution, told)
     ensure_folder(out)
-    _write(found, record, out)
+    _write(found, record, config, out)
     if saved is None:
         _write_map(found, config, out)
     verdict = write_slam_report(out / REPORT_FILE, record, config.qa)
@@ -165,7 +166,8 @@ def _localised(
     sources = Sources(source_file(saved.path), source)
     found = localise(recording, field_map, calibration, config.slam, progress, sources, seen)
     if found.result.status in NOWHERE:
-        raise MapError(f"{recording.source.path} in {saved.path}: {found.result.message}")
+        told = "; ".join((found.result.message, *found.result.notes))
+        raise MapError(f"{recording.source.path} in {saved.path}: {told}")
     return _Found(recording, found.result, found.solution, field_map)
 
 
@@ -193,10 +195,11 @@ def _check_folder(out: Path) -> None:
         )
 
 
-def _write(found: _Found, record: LocalisationRecord, out: Path) -> None:
+def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path) -> None:
     result, odometry = found.result, found.recording.trajectory
     write_tum(out / TRAJECTORY_FILE, result.trajectory)
-    velocity = twists(odometry, result.trajectory.stamp_ns)
+    steady = without_jumps(odometry, config.slam.jumps).trajectory
+    velocity = twists(steady, result.trajectory.stamp_ns)
     write_trajectory_bag(out / BAG_FILE, LocalisedMotion(result.trajectory, velocity, odometry))
     with atomic_path(out / GRAPH_FILE) as temporary:
         write_g2o(temporary, found.solution)

@@ -137,7 +137,7 @@ def scanned_place(
         )
     points = smoothed(points)
     R, p = _along([each.trajectory for each in recordings])
-    notes = [each.note for each in recordings if each.note]
+    notes = [note for each in recordings for note in each.notes]
     provenance = {"topics": topics, "points": len(points), "edge": options.edge, **_counts(clouds)}
     provenance |= {"notes": notes} if notes else {}
     return ScannedPlace(LidarMap(points, R, p), provenance)

@@ -160,6 +160,8 @@ class _Follower:
         surface = Surface(points, self._options.registration.edge)
         predicted = self._kiss.follow(points, perturbed(IDENTITY, seconds * self.twist))
         placed = self._registered(surface, compose(self._last.T, predicted))
+        if placed is None:  # after a pause the lidar may have stood still meanwhile
+            placed = self._registered(surface, self._last.T)
         estimate = self._unknown(predicted, seconds) if placed is None else placed
         step = between(self._last.T, estimate.T)
         covariance = moved(self._last.covariance[None], step)[0] + estimate.covariance
@@ -180,8 +182,13 @@ class _Follower:
         return None
 
     def _unknown(self, predicted: RigidTransform, seconds: float) -> PoseEstimate:
-        """Return what is left without a registration: the prediction, and little trust in it."""
+        """Return what is left without a registration: the prediction, and little trust in it.
+
+        The motion that is predicted may as well have ended when the last scan was taken.
+        """
         covariance = unseen_covariance(self._options.registration) * max(1.0, seconds) ** 2
+        motion = difference(IDENTITY, predicted)
+        covariance = covariance + np.outer(motion, motion)
         return PoseEstimate(compose(self._last.T, predicted), covariance)
 
     def _advance(self, placed: _Placed, believed: bool) -> None:

@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 from rosbags.interfaces import Connection
 
-from l2m_gtsam.data import FieldSeries, IntArray, Recording, Trajectory
+from l2m_gtsam.data import FieldSeries, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.pose_covariance import moved
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
+from l2m_gtsam.storage.clocks import check_clocks, check_stamps, clock_notes
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.messages import (
     FIELD_TYPE,
@@ -18,6 +19,7 @@ from l2m_gtsam.storage.messages import (
     TF_TYPES,
     FieldBuffer,
     PoseBuffer,
+    StampBuffer,
     header_ns,
 )
 from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
@@ -30,21 +32,20 @@ from l2m_gtsam.storage.selection import (
 from l2m_gtsam.storage.tf import Link, ancestors, compose
 from l2m_gtsam.storage.units import MICROTESLA_PER, fault, is_turning, strength
 
-# Clocks further apart than this are different clocks, not a late start.
-OTHER_CLOCK_NS = 3_600_000_000_000
-
 
 @dataclass
 class Buffers:
     """Everything that one pass over a bag collects.
 
     Fields by topic and frame, poses of a topic by frame and child frame, links of tf by
-    parent and child.
+    parent and child; both times of messages by topic of a field, and by ends of poses and links.
     """
 
     fields: dict[tuple[str, str], FieldBuffer] = field(default_factory=dict)
     poses: dict[tuple[str, str], PoseBuffer] = field(default_factory=dict)
     links: dict[tuple[str, str], PoseBuffer] = field(default_factory=dict)
+    field_times: dict[str, StampBuffer] = field(default_factory=dict)
+    pose_times: dict[tuple[str, str], StampBuffer] = field(default_factory=dict)
 
 
 def read_recording(path: Path, options: BagOptions, progress: Progress | None = None) -> Recording:
@@ -73,7 +74,7 @@ def read_recording(path: Path, options: BagOptions, progress: Progress | None = 
     series = _all_series(path, buffers, fields, options)
     trajectory = _trajectory(path, buffers, options)
     check_clocks(path, trajectory, series)
-    return Recording(trajectory, series, source_file(path))
+    return Recording(trajectory, series, source_file(path), notes=_clocks(path, buffers, options))
 
 
 def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:
@@ -151,6 +152,7 @@ def _add_field(buffers: Buffers, message: Message, options: BagOptions) -> None:
     frame = content.header.frame_id
     if (topic, frame) not in buffers.fields:
         buffers.fields[topic, frame] = FieldBuffer(topic, frame)
+    buffers.field_times.setdefault(topic, StampBuffer()).add(header_ns(content), message.record_ns)
     buffer = buffers.fields[topic, frame]
     buffer.add(_stamp(message, content, options), content.magnetic_field)
 
@@ -161,6 +163,7 @@ def _add_pose(buffers: Buffers, message: Message, options: BagOptions) -> None:
     ends = content.header.frame_id, pose.child_frame or "lidar"
     if ends not in buffers.poses:
         buffers.poses[ends] = PoseBuffer(*ends)
+    buffers.pose_times.setdefault(ends, StampBuffer()).add(header_ns(content), message.record_ns)
     buffer = buffers.poses[ends]
     stamp = _stamp(message, content, options)
     buffer.add(stamp, pose.position, pose.orientation, pose.covariance)
@@ -173,8 +176,20 @@ def _add_transforms(buffers: Buffers, message: Message, options: BagOptions) -> 
         if (parent, child) not in buffers.links:
             buffers.links[parent, child] = PoseBuffer(parent, child, static=static)
         buffer = buffers.links[parent, child]
+        times = buffers.pose_times.setdefault((parent, child), StampBuffer())
+        times.add(header_ns(item), message.record_ns)
         stamp = _stamp(message, item, options)
         buffer.add(stamp, item.transform.translation, item.transform.rotation)
+
+
+def _clocks(path: Path, buffers: Buffers, options: BagOptions) -> tuple[str, ...]:
+    """Return what is worth a warning of the clocks behind header stamps, where these count."""
+    if options.stamps is Stamps.RECORD:
+        return ()
+    chain = () if options.tf is None else _needed(buffers, options.tf)
+    links = [key for key, link in buffers.links.items() if key[1] in chain and not link.static]
+    poses = [buffers.pose_times[each] for each in links or buffers.poses]
+    return clock_notes(path, poses, buffers.field_times)
 
 
 def _stamp(message: Message, stamped: object, options: BagOptions) -> int:
@@ -187,7 +202,7 @@ def _trajectory(path: Path, buffers: Buffers, options: BagOptions) -> Trajectory
         tracked = _composed(path, buffers, options.tf) if options.tf else _single(path, buffers)
     except ValueError as error:
         raise BagError(f"{path}: poses: {error}") from error
-    _check_stamps(path, "poses", tracked.stamp_ns)
+    check_stamps(path, "poses", tracked.stamp_ns)
     fixed, covariance = options.tracked_to_lidar.rigid(), tracked.covariance
     return replace(
         tracked,
@@ -211,9 +226,7 @@ def _single(path: Path, buffers: Buffers) -> Trajectory:
 
 def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:
     """Return the poses of a chain; a fault in a link beside it does not matter."""
-    frame, child_frame = chain.frame.lstrip("/"), chain.child_frame.lstrip("/")
-    parents = {child: parent for parent, child in buffers.links}
-    needed = ancestors(parents, frame) | ancestors(parents, child_frame)
+    needed = _needed(buffers, chain)
     links: dict[str, Link] = {}
     for (parent, child), buffer in buffers.links.items():
         if child in needed and child in links:
@@ -225,7 +238,18 @@ def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:
         except ValueError:
             if child in needed:
                 raise
-    return compose(links, frame, child_frame, chain.max_gap_s, str(path))
+    return compose(links, *_ends(chain), chain.max_gap_s, str(path))
+
+
+def _ends(chain: TfChain) -> tuple[str, str]:
+    return chain.frame.lstrip("/"), chain.child_frame.lstrip("/")
+
+
+def _needed(buffers: Buffers, chain: TfChain) -> set[str]:
+    """Return the frames from both ends of a chain up to where their trees begin."""
+    parents = {child: parent for parent, child in buffers.links}
+    frame, child_frame = _ends(chain)
+    return ancestors(parents, frame) | ancestors(parents, child_frame)
 
 
 def _all_series(
@@ -259,30 +283,7 @@ def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> 
     """Return one sensor's readings in uT, in order of time."""
     order = np.argsort(buffer.stamps(), kind="stable")
     stamps, values = buffer.stamps()[order], buffer.field()[order] * MICROTESLA_PER[options.units]
-    _check_stamps(path, f"topic {buffer.topic}", stamps)
+    check_stamps(path, f"topic {buffer.topic}", stamps)
     if wrong := fault(strength(values), is_turning(values), options.units):
         raise UnitsError(f"{path}: topic {buffer.topic}: {wrong}")
     return FieldSeries(name, buffer.topic, buffer.frame, stamps, values)
-
-
-def _check_stamps(path: Path, what: str, stamps: IntArray) -> None:
-    if len(stamps) and stamps[-1] == 0:
-        raise BagError(
-            f"{path}: {what}: all header stamps are 0; use the record time instead with "
-            "`bag.stamps: record`"
-        )
-
-
-def check_clocks(path: Path, poses: Trajectory, series: tuple[FieldSeries, ...]) -> None:
-    """Raise a BagError if poses and readings have different clocks."""
-    for each in series:
-        if not len(each) or not len(poses):
-            continue
-        apart = max(each.stamp_ns[0] - poses.stamp_ns[-1], poses.stamp_ns[0] - each.stamp_ns[-1])
-        if apart > OTHER_CLOCK_NS:
-            raise BagError(
-                f"{path}: topic {each.topic} runs from {each.stamp_ns[0] * 1e-9:.3f} to "
-                f"{each.stamp_ns[-1] * 1e-9:.3f} s, the poses from {poses.stamp_ns[0] * 1e-9:.3f} "
-                f"to {poses.stamp_ns[-1] * 1e-9:.3f} s: their header stamps are of different "
-                "clocks (simulated and record time?); try `bag.stamps: record`"
-            )

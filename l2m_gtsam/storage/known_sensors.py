@@ -12,12 +12,19 @@ from l2m_gtsam.storage.file_model import Lenient, Matrix, Vector, read_model
 from l2m_gtsam.storage.yaml_file import write_yaml
 
 
+class _Clock(Lenient):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    seconds: float = Field(default=0.0, ge=-10, le=10)
+
+
 class _Known(Lenient):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
     t_lidar_mag: Vector
     C: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     H: Vector = (0.0, 0.0, 0.0)
+    time_offset: _Clock | None = None
 
     @field_validator("C")
     @classmethod
@@ -65,6 +72,7 @@ def write_known_sensors(
             "t_lidar_mag": sensor.t_lidar_mag.tolist(),
             "C": sensor.distortion.C.tolist(),
             "H": sensor.distortion.H.tolist(),
+            **({"time_offset": {"seconds": sensor.time_offset}} if sensor.time_offset else {}),
         }
         for sensor in sensors
     }
@@ -74,8 +82,8 @@ def write_known_sensors(
 def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     """Return the sensors of a truth, of a mapping suite or of a calibration, by name.
 
-    Without C and H an entry is free of distortion: C = I, H = 0. Sensors that a calibration could
-    not solve are left out.
+    Without C and H an entry is free of distortion: C = I, H = 0; without a time offset its clock is
+    that of the poses. Sensors that a calibration could not solve are left out.
 
     Raises
     ------
@@ -83,6 +91,11 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
         The file is missing or is not of this form.
     """
     return {
-        name: KnownSensor(name, np.array(s.t_lidar_mag), Distortion(np.array(s.C), np.array(s.H)))
-        for name, s in read_model(path, _KnownFile).sensors.items()
+        name: _known(name, entry) for name, entry in read_model(path, _KnownFile).sensors.items()
     }
+
+
+def _known(name: str, entry: _Known) -> KnownSensor:
+    distortion = Distortion(np.array(entry.C), np.array(entry.H))
+    seconds = 0.0 if entry.time_offset is None else entry.time_offset.seconds
+    return KnownSensor(name, np.array(entry.t_lidar_mag), distortion, seconds)

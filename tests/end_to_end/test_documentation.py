@@ -24,7 +24,7 @@ NOT_RUN = {
     "docs/fleet.md": 1,
     "docs/lidar.md": 2,
     "docs/report.md": 1,
-    "docs/slam.md": 1,
+    "docs/slam.md": 2,
     "docs/studies/README.md": 2,
 }
 MESSAGE = re.compile(r"\*\*`` (.+?) ``\*\*", re.DOTALL)

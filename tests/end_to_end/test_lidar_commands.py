@@ -115,7 +115,7 @@ def test_poses_of_a_drive_come_from_its_clouds(hall: Scanned) -> None:
     """Errors of millimetres, no larger than their sigmas say."""
     saved, config = SavedMap.read(hall.map), load_config(hall.config)
     found = read_drive_on(saved, hall.drive, config, lambda stage, share: None)
-    assert "poses are those of its point clouds" in found.note
+    assert "poses are those of its point clouds" in found.notes[0]
     trajectory = found.trajectory
     assert trajectory.frame == "map"
     true = hall.scenario.calibration.motion.at(trajectory.stamp_ns)
@@ -132,7 +132,7 @@ def test_where_there_is_no_map_clouds_give_odometry(hall: Scanned, tmp_path: Pat
         "/odometry", hall.drive.parent / "calibration_ros1.bag", tmp_path / "b.bag", 6.0
     )
     found = read_drive_or_follow(begin, Config(), lambda stage, share: None)
-    assert "odometry by its point clouds" in found.note
+    assert "odometry by its point clouds" in found.notes[0]
     assert (found.trajectory.frame, len(found.series)) == ("odom", 1)
     true = hall.scenario.calibration.motion.at(found.trajectory.stamp_ns)
     way = np.einsum("ji,nj->ni", true.R[0], true.p - true.p[0])

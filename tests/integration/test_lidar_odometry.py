@@ -105,6 +105,23 @@ def test_scans_without_points_and_missing_ones() -> None:
     assert np.linalg.norm(error(found, true, len(found) - 1, kept[-1])[3:]) < 0.01
 
 
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_pause_in_which_the_motion_changed(share: float) -> None:
+    """Four seconds without a scan, in which the lidar stands still, or is half as fast."""
+    true = rows(round_trip(100), [*range(0, 30, 2), *range(30 + round(40 * share), 60, 2)])
+    later = np.where(np.arange(len(true)) < 15, 0, round(4e9 * (1 - share)))
+    true = replace(true, stamp_ns=true.stamp_ns + later)
+    steps = list(follow(scans(ROOM, true, np.random.default_rng(3)), OPTIONS))
+    last = len(true) - 1
+    covariance = accumulated(steps).covariance
+    assert covariance is not None
+    off = error(accumulated(steps), true, last)
+    if share == 0.0:
+        assert all(step.believed for step in steps)
+        assert np.linalg.norm(off[3:]) < 0.01
+    assert nees(off, covariance[last]) < 12.0
+
+
 def test_no_scan_no_pose() -> None:
     assert len(odometry([], OPTIONS)) == 0
     empty = Scan(0, np.zeros((0, 3)))

@@ -8,6 +8,7 @@ import pytest
 from l2m_gtsam.carried_scans import carried_scans
 from l2m_gtsam.data import KnownSensor, RigidTransform, Trajectory
 from l2m_gtsam.explore import explore
+from l2m_gtsam.graph.slam.jumps import Mended, without_jumps
 from l2m_gtsam.graph.slam.options import SlamOptions
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.loops import LoopOptions, find_loops
@@ -32,6 +33,11 @@ REGISTRATION = RegistrationOptions(unseen_m=1e3, unseen_deg=1e3)
 EVERY = 15  # poses: a scan each 0.75 s
 
 
+def mended(drive: SlamDrive) -> Mended:
+    """Return a drive's odometry, which does not jump."""
+    return without_jumps(drive.recording.trajectory, OPTIONS.jumps)
+
+
 def drive_of(
     seed: int, truth: Trajectory, sensors: int = 1
 ) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
@@ -48,7 +54,7 @@ def fixes(room: Room, drive: SlamDrive, seed: int = 5) -> ScanEvidence:
         for k, scan in enumerate(scans(room, mapping, rng))
     ]
     cloud = Surface(smoothed(thinned_cloud(np.concatenate(points), 0.1)))
-    steps = carried_scans(scans(room, seen, rng), drive.recording.trajectory, 0.25, OPTIONS)
+    steps = carried_scans(scans(room, seen, rng), mended(drive), 0.25, OPTIONS)
     options = ScanLocalisationOptions(registration=REGISTRATION)
     start = RigidTransform(seen.R[0], seen.p[0])
     found = localise_scans(steps, cloud, start, options)
@@ -123,7 +129,7 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     known, drive = drive_of(23, laps(75), sensors=2)
     rng, truth = np.random.default_rng(6), drive.truth
     seen = rows(truth, range(1, len(truth), EVERY))
-    steps = carried_scans(scans(ROOM, seen, rng), drive.recording.trajectory, 0.25, OPTIONS)
+    steps = carried_scans(scans(ROOM, seen, rng), mended(drive), 0.25, OPTIONS)
     loops = ScanEvidence(loops=find_loops(steps, LoopOptions()).loops)
     assert len(loops) > 10
     found = explore(drive.recording, calibrated(known), OPTIONS, quiet, seen=loops).result
@@ -140,5 +146,5 @@ def test_a_corridor_closes_no_loop() -> None:
     _, drive = drive_of(24, rounds(40))
     seen = rows(drive.truth, range(1, len(drive.truth), EVERY))
     found = scans(CORRIDOR, replace(seen, p=seen.p * [1.0, 0.3, 1.0]), np.random.default_rng(7))
-    steps = carried_scans(found, drive.recording.trajectory, 0.25, OPTIONS)
+    steps = carried_scans(found, mended(drive), 0.25, OPTIONS)
     assert find_loops(steps, LoopOptions()).loops == ()

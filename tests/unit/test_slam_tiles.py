@@ -112,3 +112,11 @@ def test_waves_stay_within_their_number() -> None:
 def test_a_prior_is_not_learnt_from_nothing() -> None:
     with pytest.raises(MapError, match="training readings"):
         field_prior(np.zeros((3, 3)), np.ones((3, 3)), OPTIONS)
+
+
+def test_a_side_too_weak_for_any_wave_is_left_out() -> None:
+    """A ceiling so far off that readings could tell none of its waves."""
+    weak = FieldPrior(Hyperparameters(), Resolution(4.0, 0.1), OPTIONS)
+    tile = WaveTile.about(weak, np.eye(3), places(3))
+    assert len(tile) == len(WaveTile.about(PRIOR, np.eye(3), places(3)).basis.families[1]) + 3
+    assert tile.features(places(4)).shape == (200, 3, len(tile))

@@ -10,8 +10,9 @@ from l2m_gtsam.graph.slam.options import SlamOptions
 from l2m_gtsam.graph.slam.start_fit import WindowFit
 from l2m_gtsam.graph.slam.start_prior import Beforehand
 from l2m_gtsam.graph.slam.start_roots import root_of, steps_root
-from l2m_gtsam.graph.slam.start_window import Window, carried_back, window_of
+from l2m_gtsam.graph.slam.start_window import Window, window_of
 from l2m_gtsam.localise import prepared
+from l2m_gtsam.pose_covariance import carried_back
 from tests.slam_drives import SlamDrive, calibrated, slam_drive
 from tests.surveyed_worlds import SurveyedWorld, strange_hall, surveyed, wandering
 from tests.worlds import random_sensors

@@ -13,6 +13,7 @@ import numpy as np
 from l2m_factors import CarriedBatch, key_pose_factor
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.optimise import Ending, Optimizer, optimise
+from l2m_gtsam.graph.slam.changes import LEAST_LEFT, ROUNDS, Fit, changed
 from l2m_gtsam.graph.slam.covariances import (
     pose_covariances,
     sensor_covariances,
@@ -58,6 +59,8 @@ class Localised:
         Squared lengths of their whitened residuals, shape (N,).
     weights
         How far each reading counts, shape (N,); zero outside of the map.
+    near_changes
+        Which do not because of where they are: others about them do not fit, shape (N,).
     bent
         Mean square of the whitened components by which the steps between the poses differ from
         odometry's; 1 is consistent.
@@ -74,6 +77,7 @@ class Localised:
     sight: Sight
     squared: FloatArray
     weights: FloatArray
+    near_changes: BoolArray
     bent: float
     link_squared: FloatArray
     ending: Ending
@@ -91,20 +95,32 @@ def localise_drive(
     problem = Problem(drive, field_map, options)
     follower = Follower(drive, field_map, options.robust, free=problem.free)
     values = follow(follower, len(drive), progress)
-    weights, ending = np.ones(len(drive.readings)), Ending.TOLERANCE
+    counts = np.ones(len(drive.readings), dtype=np.bool_)
     for round_, mu in enumerate(GRADUATION):
         progress("solving all poses", round_ / len(GRADUATION))
-        sight = problem.look(values)
-        weights = problem.weights(sight, mu)
-        optimised = optimise(
-            problem.graph(sight, weights, sight.map_variance, None),
-            values,
-            Optimizer.LM,
-            options.max_iterations,
-        )
-        values, ending = optimised.values, optimised.ending
+        solved = problem.solved(values, counts, mu)
+        values = solved.values
+    whole = solved
+    for _ in range(ROUNDS):
+        left_out = changed(problem.fit(solved, counts))[drive.readings.key_pose]
+        if not (left_out & counts).any():
+            break
+        counts = counts & ~left_out
+        if np.mean(counts) < LEAST_LEFT:  # this is no change of a place, but another one
+            solved, counts = whole, np.ones_like(counts)
+            break
+        solved = problem.solved(solved.values, counts, np.inf)
     progress("solving all poses", 1.0)
-    return problem.finished(values, weights, ending)
+    return replace(problem.finished(solved), near_changes=~counts)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A round: variables, how far each reading counted, and how the optimiser ended."""
+
+    values: gtsam.Values
+    weights: FloatArray
+    ending: Ending
 
 
 class Problem:
@@ -143,6 +159,37 @@ class Problem:
         """Return how far each reading counts at a stage of the graduation, shape (N,)."""
         robust, r2 = self._options.robust, sight.squared(sight.whitening(self._drive.sensors.noise))
         return np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu) * sight.inside)
+
+    def solved(self, values: gtsam.Values, counts: BoolArray, mu: float) -> Solved:
+        """Solve for everything, with readings weighted as they fit now.
+
+        Parameters
+        ----------
+        values
+            Where to start.
+        counts
+            Which readings may count, shape (N,).
+        mu
+            Stage of the graduation.
+        """
+        sight = self.look(values)
+        weights = self.weights(sight, mu) * counts
+        graph = self.graph(sight, weights, sight.map_variance, None)
+        end = optimise(graph, values, Optimizer.LM, self._options.max_iterations)
+        return Solved(end.values, weights, end.ending)
+
+    def fit(self, solved: Solved, counts: BoolArray) -> Fit:
+        """Return how the readings that may count fit."""
+        sight, readings = self.look(solved.values), self._drive.readings
+        poses = poses_in(solved.values, len(self._drive)).values()
+        return Fit(
+            readings.key_pose,
+            readings.sensor,
+            sight.inside & counts,
+            solved.weights > NOTHING,
+            sight.squared(sight.whitening(self.sensors(solved.values).noise)),
+            np.stack([pose.translation() for pose in poses]),
+        )
 
     def graph(
         self,
@@ -184,10 +231,11 @@ class Problem:
             graph.add(shared.prior())
         return graph
 
-    def finished(self, values: gtsam.Values, weights: FloatArray, ending: Ending) -> Localised:
+    def finished(self, solved: Solved) -> Localised:
         """Solve once more with the map's errors as variables, and take the covariances."""
+        values, ending = solved.values, solved.ending
         sight = self.look(values)
-        weights = weights * sight.inside
+        weights = solved.weights * sight.inside
         shared = None
         if (weights > NOTHING).any():
             shared = SharedMapErrors.over(errors_of(self._map), sight)
@@ -210,6 +258,7 @@ class Problem:
             sight=sight,
             squared=sight.squared(sight.whitening(sensors.noise)),
             weights=weights * sight.inside,
+            near_changes=np.zeros(len(weights), dtype=np.bool_),
             bent=2 * self._odometry.error(values) / (6 * len(self._drive)),
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,

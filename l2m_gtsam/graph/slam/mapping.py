@@ -214,6 +214,7 @@ class TiledProblem:
             sight=self._sight(solved, tiled, sights),
             squared=self._gathered(tiled, squared),
             weights=solved.weights,
+            near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,

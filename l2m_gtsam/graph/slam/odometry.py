@@ -4,12 +4,14 @@ Where a recording states covariances of its poses that grow as odometry's do,
 ``P' = Ad P Ad^T + Q``, the step's covariance is Q. Otherwise it follows from way and turning.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
+from l2m_gtsam.graph.slam.jumps import Jump
 from l2m_gtsam.graph.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.pose_covariance import moved
 
@@ -70,7 +72,9 @@ def with_rows_at(rows: IntArray, trajectory: Trajectory, stamp_ns: IntArray) -> 
     return np.union1d(rows, after - (stamp_ns - early < late - stamp_ns))
 
 
-def odometry_steps(trajectory: Trajectory, rows: IntArray, options: DriftOptions) -> OdometrySteps:
+def odometry_steps(
+    trajectory: Trajectory, rows: IntArray, options: DriftOptions, jumps: Sequence[Jump] = ()
+) -> OdometrySteps:
     """Return what odometry says between key poses.
 
     Parameters
@@ -81,13 +85,19 @@ def odometry_steps(trajectory: Trajectory, rows: IntArray, options: DriftOptions
         Which are key poses, shape (K,).
     options
         How wrong odometry becomes.
+    jumps
+        That were taken out of the trajectory; key poses are next to them.
     """
     R_back = trajectory.R[rows[:-1]].transpose(0, 2, 1)
     R = R_back @ trajectory.R[rows[1:]]
     p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
     stated = _stated(trajectory, rows, R, p)
-    covariance = drift_covariance(R, p, options) if stated is None else stated + _least(options)
-    return OdometrySteps(R, p, covariance, stated is not None)
+    if stated is not None:  # with what is said of jumps
+        return OdometrySteps(R, p, stated + _least(options), stated=True)
+    covariance = drift_covariance(R, p, options)
+    for jump in jumps:
+        covariance[np.searchsorted(rows, jump.row)] += jump.covariance
+    return OdometrySteps(R, p, covariance, stated=False)
 
 
 def _stated(

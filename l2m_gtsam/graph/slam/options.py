@@ -5,6 +5,7 @@ from enum import StrEnum
 from pydantic import Field, model_validator
 
 from l2m_gtsam.graph.slam.field_prior import TileOptions
+from l2m_gtsam.graph.slam.jumps import JumpOptions
 from l2m_gtsam.graph.slam.start_options import StartSearchOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.robust import RobustOptions
@@ -99,6 +100,8 @@ class SlamOptions(Options):
     """Which poses are variables."""
     drift: DriftOptions = DriftOptions()
     """How far odometry is trusted."""
+    jumps: JumpOptions = JumpOptions()
+    """Which of its steps are not believed at all."""
     start: StartPoseOptions = StartPoseOptions()
     """Where the drive begins."""
     calibration: CalibrationUse = CalibrationUse.FIXED

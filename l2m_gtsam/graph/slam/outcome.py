@@ -1,5 +1,6 @@
 """A solved drive as a result: figures, verdict, refined calibration."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import gtsam
@@ -10,7 +11,9 @@ from l2m_gtsam.data import Distortion, Trajectory
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.misfit import explains_no_more
 from l2m_gtsam.graph.slam.pose_graph import PoseGraph
+from l2m_gtsam.graph.slam.slips import slip_notes
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.slam_results import (
     DriftFigures,
@@ -32,7 +35,11 @@ LARGEST_CHI2 = 4.0
 
 
 def localisation_result(
-    drive: Drive, solution: Localised, by_scans: PoseGraph, refine: CalibrationResult | None
+    drive: Drive,
+    solution: Localised,
+    by_scans: PoseGraph,
+    refine: CalibrationResult | None,
+    wrong: Sequence[Localised] = (),
 ) -> LocalisationResult:
     """Return what is told of a drive.
 
@@ -46,9 +53,11 @@ def localisation_result(
         Of odometry and scans alone.
     refine
         The calibration that was refined; none if it was fixed.
+    wrong
+        The drive in maps that are wrong for certain, if this one was held against such.
     """
     alone = drive.dead_reckoning()
-    status, message = _verdict(solution)
+    status, message = _verdict(solution, wrong)
     odometry = _trajectory(drive, alone)
     trajectory = replace(_trajectory(drive, solution.poses), covariance=solution.pose_covariance)
     return LocalisationResult(
@@ -59,7 +68,7 @@ def localisation_result(
         drift=drift_figures(trajectory, odometry),
         sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
         calibration=None if refine is None else refined(refine, solution),
-        notes=(),
+        notes=slip_notes(drive, solution.poses),
         bag=None,
         map=None,
         calibration_source=None,
@@ -124,10 +133,12 @@ def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCal
     )
 
 
-def _verdict(solution: Localised) -> tuple[LocalisationStatus, str]:
+def _verdict(solution: Localised, wrong: Sequence[Localised]) -> tuple[LocalisationStatus, str]:
     inside, used = solution.sight.inside, solution.used
     share = float(inside.mean())
     explained = float(used.sum() / max(inside.sum(), 1))
+    # What was read near a change says nothing for or against the rest of the map.
+    judged = float(used.sum() / max((inside & ~solution.near_changes).sum(), 1))
     chi2 = float(solution.squared[used].mean() / 3) if used.any() else np.inf
     told = f"the map explains {explained:.0%} of the readings"
     if share < LEAST_INSIDE:
@@ -136,11 +147,17 @@ def _verdict(solution: Localised) -> tuple[LocalisationStatus, str]:
             "does not begin where it is said to"
         )
         return LocalisationStatus.OUTSIDE_MAP, message
-    if explained < LEAST_EXPLAINED or max(chi2, solution.bent) > LARGEST_CHI2:
+    if judged < LEAST_EXPLAINED or max(chi2, solution.bent) > LARGEST_CHI2:
         message = (
             f"{told}, leaves {chi2:.1f} times the variance of their noise, and needs steps that "
             f"miss odometry by {solution.bent:.1f} times its variance: another place, a wrong "
             "start, or a wrong calibration"
+        )
+        return LocalisationStatus.NOT_HERE, message
+    if explains_no_more(solution, wrong):
+        message = (
+            f"{told}, hardly more than it does half turned, which is wrong for certain: another "
+            "place, a wrong start, or a wrong calibration"
         )
         return LocalisationStatus.NOT_HERE, message
     if solution.ending is not Ending.TOLERANCE:

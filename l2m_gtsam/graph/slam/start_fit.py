@@ -30,8 +30,9 @@ from l2m_gtsam.graph.slam.start_roots import (
     root_of,
     steps_root,
 )
-from l2m_gtsam.graph.slam.start_window import Window, carried_back
+from l2m_gtsam.graph.slam.start_window import Window
 from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.pose_covariance import carried_back
 from l2m_gtsam.slam_results import StartCandidate
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance
 

@@ -5,7 +5,8 @@ from scipy.linalg import solve_triangular
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.slam.shared import SharedMapErrors
-from l2m_gtsam.graph.slam.start_window import Window, carried_back
+from l2m_gtsam.graph.slam.start_window import Window
+from l2m_gtsam.pose_covariance import carried_back
 
 ROUNDING = 1e-12  # of a variance in m^2 or uT^2: as good as none
 

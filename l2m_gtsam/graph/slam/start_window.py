@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_factors import CarriedReadings, skew
+from l2m_factors import CarriedReadings
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, spread
 
@@ -172,15 +172,3 @@ def thinned(readings: CarriedReadings, most: int) -> IntArray:
     """Return rows of one reading of each sensor on each key pose, at most so many in all."""
     rows = spread(np.column_stack([readings.key_pose, readings.sensor]), 1)
     return np.asarray(rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64)])
-
-
-def carried_back(R: FloatArray, p: FloatArray) -> FloatArray:
-    """Return what a right perturbation of a frame makes of poses in it, shape (K, 6, 6).
-
-    ``T0 Exp(d) T = T0 T Exp(A d)`` for T of rotations (K, 3, 3) and positions (K, 3) in metres.
-    """
-    A = np.zeros((len(p), 6, 6))
-    back = R.transpose(0, 2, 1)
-    A[:, :3, :3] = A[:, 3:, 3:] = back
-    A[:, 3:, :3] = -back @ skew(p)
-    return A

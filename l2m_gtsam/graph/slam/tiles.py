@@ -62,7 +62,8 @@ class WaveTile:
         frame = TileFrame(R_anchor_level, R_anchor_level @ corner, size, high - low)
         floor = modes_up_to(FLOOR, size, 0.0, prior.resolution.floor)
         ceiling = modes_up_to(CEILING, size, frame.height, prior.resolution.ceiling)
-        basis = Basis(frame, (UniformField(UNIFORM_SIGMA), floor, ceiling))
+        waves = [side for side in (floor, ceiling) if len(side)]  # a weak side has none
+        basis = Basis(frame, (UniformField(UNIFORM_SIGMA), *waves))
         learnt = np.exp(0.5 * basis.prior(prior.hyperparameters).log_variance)
         wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
         return cls(basis, wider * learnt, prior)

@@ -1,0 +1,1 @@
+"""The sensors of a mapping suite, from their own drive through a field that nobody knows yet."""

@@ -1,0 +1,215 @@
+r"""How likely readings are for given sensors, whatever the field: its waves are integrated out.
+
+With the sensors' undistorted readings y in the map frame, features F at the sensors' places, prior
+variances S of the waves and noise sigma,
+
+.. math::
+    \log L = \log N(y; 0, \sigma^2 I + F S F^T) - \sum_k \log |\det C_k|
+
+The last term is the price of a distortion that makes all fields small.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.maps.harmonic.basis import Basis, batches
+from l2m_gtsam.maps.harmonic.evidence import Evidence, evidence, normal_of
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.training import TrainingSet
+
+SIZE = 16  # t, C row by row, H, time offset
+T, C, H, TAU = slice(0, 3), slice(3, 12), slice(12, 15), 15
+STEP_M = 1e-4  # of a central difference: features bend over centimetres
+
+
+@dataclass(frozen=True)
+class SuiteWindow:
+    """Readings of a part of a survey, and the waves that describe the field there.
+
+    Attributes
+    ----------
+    basis
+        Waves.
+    middle
+        Mean of the readings' places when the waves were laid, in metres, shape (3,). Waves move
+        with it: their prior knows heights, and must not tell how high the sensors sit.
+    readings
+        As sensors read them, with the motion of the lidar, N in number.
+    """
+
+    basis: Basis
+    middle: FloatArray
+    readings: Readings
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A log likelihood, its slope and the expected information about the S sensors.
+
+    Attributes
+    ----------
+    value
+        In nats.
+    slope
+        By (t, C row by row, H, time offset) of each sensor, shape (16 S,).
+    information
+        Shape (16 S, 16 S).
+    residuals
+        Of each window what the most likely field leaves of its readings, uT, shape (N, 3).
+    """
+
+    value: float
+    slope: FloatArray
+    information: FloatArray
+    residuals: tuple[FloatArray, ...]
+
+    def __add__(self, other: "Scored") -> "Scored":
+        return Scored(
+            self.value + other.value,
+            self.slope + other.slope,
+            self.information + other.information,
+            self.residuals + other.residuals,
+        )
+
+
+@dataclass(frozen=True)
+class Undistorted:
+    """Readings with their distortion undone.
+
+    Attributes
+    ----------
+    points
+        Where they were taken in the map in metres, shape (N, 3).
+    b
+        Field in the lidar frame in uT, shape (N, 3).
+    field
+        In the map frame, shape (N, 3).
+    turned
+        From the sensor's axes to the map's, ``R C^-1``, shape (N, 3, 3).
+    lever
+        From the lidar to the sensor in its frame in metres, shape (N, 3).
+    """
+
+    points: FloatArray
+    b: FloatArray
+    field: FloatArray
+    turned: FloatArray
+    lever: FloatArray
+
+
+def undistorted(readings: Readings, sensors: FloatArray) -> Undistorted:
+    """Return what sensors with these parameters, shape (S, 16), read; poses are as they are."""
+    R = readings.R_map_lidar
+    inverse = np.linalg.inv(sensors[:, C].reshape(-1, 3, 3))[readings.sensor]
+    b = np.einsum("nij,nj->ni", inverse, readings.field - sensors[readings.sensor, H])
+    lever = sensors[readings.sensor, T]
+    points = np.einsum("nij,nj->ni", R, lever) + readings.p_map_lidar
+    field = np.einsum("nij,nj->ni", R, b)
+    return Undistorted(points, b, field, R @ inverse, lever)
+
+
+def scored(window: SuiteWindow, sensors: FloatArray, prior: Hyperparameters) -> Scored:
+    """Return how likely a window's readings are.
+
+    Parameters
+    ----------
+    window
+        The window; poses of the readings are those at the sensors' clocks.
+    sensors
+        Parameters of S sensors, shape (S, 16).
+    prior
+        Of the field, and the noise.
+    """
+    readings, basis, noise = window.readings, window.basis, prior.noise
+    seen = undistorted(readings, sensors)
+    points = seen.points - seen.points.mean(axis=0) + window.middle
+    log_variance = basis.prior(prior).log_variance
+    normal = normal_of(basis, TrainingSet(points, seen.field, np.ones(len(readings))))
+    found, D = evidence(normal, log_variance, noise), np.exp(0.5 * log_variance)
+    said, gradient = basis.field_and_gradient(points, D * found.mean)
+    r = seen.field - said
+    places = _wide(_place_slopes(readings, seen), readings.sensor, len(sensors))
+    places -= places.mean(axis=0)
+    J = _wide(_field_slopes(readings, seen), readings.sensor, len(sensors)) - gradient @ places
+    doubt = _doubt_slopes(basis, points, D, found, noise)
+    slope = -np.einsum("ni,nij->j", r, J) / noise**2 - np.einsum("ni,nij->j", doubt, places)
+    turned, price = _price(readings, sensors)
+    information = _information(basis, points, D, found, J, noise)
+    return Scored(found.value - price, slope - turned, information, (r,))
+
+
+def _price(readings: Readings, sensors: FloatArray) -> tuple[FloatArray, float]:
+    """Return the sum of all ``log |det C|`` by the sensors' parameters, (16 S,), and itself."""
+    slope, count = np.zeros(sensors.shape), np.bincount(readings.sensor, minlength=len(sensors))
+    matrices = sensors[:, C].reshape(-1, 3, 3)
+    slope[:, C] = (count[:, None, None] * np.linalg.inv(matrices).transpose(0, 2, 1)).reshape(-1, 9)
+    _, log_det = np.linalg.slogdet(matrices)
+    return slope.ravel(), float(count @ log_det)
+
+
+def _wide(own: FloatArray, sensor: IntArray, count: int) -> FloatArray:
+    """Return derivatives by the parameters of each reading's sensor by those of all sensors.
+
+    From shape (N, 3, 16) to (N, 3, 16 S).
+    """
+    wide = np.zeros((len(own), 3, count, SIZE))
+    wide[np.arange(len(own)), :, sensor] = own
+    return wide.reshape(len(own), 3, -1)
+
+
+def _place_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
+    """Return derivatives of the sensors' places by their parameters, shape (N, 3, 16)."""
+    R, J = readings.R_map_lidar, np.zeros((len(readings), 3, SIZE))
+    J[:, :, T] = R
+    if readings.motion is not None:
+        w, v = readings.motion.twist_lidar[:, :3], readings.motion.twist_lidar[:, 3:]
+        J[:, :, TAU] = np.einsum("nij,nj->ni", R, v + np.cross(w, seen.lever))
+    return J
+
+
+def _field_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
+    """Return derivatives of the undistorted fields by the sensors' parameters, (N, 3, 16)."""
+    J = np.zeros((len(readings), 3, SIZE))
+    J[:, :, C] = -(seen.turned[:, :, :, None] * seen.b[:, None, None, :]).reshape(-1, 3, 9)
+    J[:, :, H] = -seen.turned
+    if readings.motion is not None:
+        w = readings.motion.twist_lidar[:, :3]
+        J[:, :, TAU] = np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, seen.b))
+    return J
+
+
+def _doubt_slopes(
+    basis: Basis, points: FloatArray, D: FloatArray, found: Evidence, noise: float
+) -> FloatArray:
+    """Return derivatives of half the log determinant by the readings' places, shape (N, 3).
+
+    ``d log det(sigma^2 I + F S F^T) / 2 = tr(Sigma F^T dF) / sigma^2`` with the weights'
+    posterior covariance Sigma.
+    """
+    slopes = np.empty_like(points)
+    for at in batches(len(points)):
+        F = basis.features(points[at])
+        n, _, m = F.shape
+        half = solve_triangular(found.factor, (F.reshape(-1, m) * D).T, lower=True)
+        spread = solve_triangular(found.factor, half, trans=1, lower=True).T * D
+        spread = spread.reshape(n, 3, m)
+        for axis, step in enumerate(STEP_M * np.eye(3)):
+            dF = basis.features(points[at] + step) - basis.features(points[at] - step)
+            slopes[at, axis] = np.einsum("nim,nim->n", spread, dF) / (2 * STEP_M * noise**2)
+    return slopes
+
+
+def _information(
+    basis: Basis, points: FloatArray, D: FloatArray, found: Evidence, J: FloatArray, noise: float
+) -> FloatArray:
+    """Return ``J^T (sigma^2 I + F S F^T)^-1 J``, shape (16 S, 16 S)."""
+    own, shared = np.zeros((J.shape[2],) * 2), np.zeros((len(D), J.shape[2]))
+    for at in batches(len(points)):
+        flat = J[at].reshape(-1, J.shape[2])
+        own += flat.T @ flat
+        shared += basis.features(points[at]).reshape(-1, len(D)).T @ flat
+    known = solve_triangular(found.factor, D[:, None] * shared / noise, lower=True)
+    return np.asarray((own - known.T @ known) / noise**2)

@@ -1,0 +1,43 @@
+"""`l2m map suite` on a real bag, and on what it cannot work with."""
+
+import json
+from pathlib import Path
+
+from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.known_sensors import read_known_sensors
+from tests.end_to_end.conftest import complaint_here, l2m
+
+QUICK = {"sync": {"thin_distance_m": 0.05}, "windows": 1, "readings": 800, "modes": 120}
+
+
+def test_a_suite_is_calibrated_and_maps(shared_data: Path, tmp_path: Path) -> None:
+    """A handheld sensor that is 20 ms late; what it is found to be is what the map is made with."""
+    bag = shared_data / "bags" / "optitrack_run0_ros1.bag"
+    config, out = tmp_path / "quick.json", tmp_path / "made" / "suite.yaml"
+    named = {"fields": ["/imu/mag"], "poses": "/optitrack/pose"}
+    prior = {"floor_scale": 7.0, "floor_depth": 0.55, "noise": 0.12}
+    mapping = {"suite": QUICK, "model": {"harmonic": {"hyperparameters": prior}}}
+    config.write_text(json.dumps({"bag": named, "mapping": mapping}))
+    run = l2m("map", "suite", bag, "--config", config, "--out", out)
+    assert "imu/mag" in run.out
+    found = read_calibration(out)
+    (sensor,) = found.sensors
+    assert found.bag is not None
+    assert found.bag.path == str(bag)
+    assert found.options["mapping"]["suite"]["windows"] == 1
+    assert sensor.time_offset is not None
+    assert -0.025 < sensor.time_offset.seconds < -0.015
+    known = read_known_sensors(out)["imu/mag"]
+    assert known.time_offset == sensor.time_offset.seconds
+    l2m("map", "build", bag, "--suite", out, "--config", config, "--out", tmp_path / "map.npz")
+
+
+def test_what_cannot_be_done_is_said_in_one_line(shared_data: Path, tmp_path: Path) -> None:
+    bag, out = shared_data / "bags" / "optitrack_run0_ros1.bag", tmp_path / "suite.yaml"
+    assert "the name must end in .yaml" in complaint_here(
+        "map", "suite", bag, "--out", tmp_path / "suite.npz"
+    )
+    assert "is given twice" in complaint_here("map", "suite", bag, bag, "--out", out)
+    missing = complaint_here("map", "suite", tmp_path / "no.bag", "--out", out)
+    assert "no.bag" in missing
+    assert not out.exists()
