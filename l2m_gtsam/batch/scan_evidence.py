@@ -14,6 +14,7 @@ from l2m_gtsam.graph.slam.jumps import without_jumps
 from l2m_gtsam.graph.slam.options import ScanUsage
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.loops import find_loops
+from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.localise import NO_SCANS, start_pose
 from l2m_gtsam.progress import Progress
@@ -21,8 +22,9 @@ from l2m_gtsam.rigid import compose
 from l2m_gtsam.scans import ScanEvidence
 from l2m_gtsam.storage.scan_topic import has_clouds
 
-# In m and degrees: along what a scan does not show a fix says nothing, nor do a thousand of them.
-UNSEEN = {"unseen_m": 1e3, "unseen_deg": 1e3}
+# Along what a scan does not show a fix says nothing, nor do some hundreds of them; more than this
+# beside the millimetres of what it shows would drown in rounding.
+UNSEEN = {"unseen_m": 100.0, "unseen_deg": 100.0}
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,9 @@ def _fixes(
     if config.slam.start.anywhere:
         start = scan_start(first, cloud, mapped, config.lidar)
     else:
-        start = compose(_map_odom(recording, config), first.T_odom_lidar)
+        known = start_pose(recording.trajectory, config.slam.start)
+        T_map_odom = _map_odom(recording, known.T_map_lidar)
+        start = PoseEstimate(compose(T_map_odom, first.T_odom_lidar), known.covariance)
     found = localise_scans(chain([first], steps), cloud, start, options)
     return ScanEvidence(fixes=spaced(found.fixes, config.slam.key_poses.distance_m, options))
 
@@ -103,8 +107,7 @@ def _localisation(config: Config) -> ScanLocalisationOptions:
     )
 
 
-def _map_odom(recording: Recording, config: Config) -> RigidTransform:
-    """Return where the frame of odometry lies in the map if the drive begins as it is said to."""
+def _map_odom(recording: Recording, T_map_lidar: RigidTransform) -> RigidTransform:
+    """Return where the frame of odometry lies in the map if its first pose is this."""
     odometry = recording.trajectory
-    first = RigidTransform(odometry.R[0], odometry.p[0])
-    return compose(start_pose(odometry, config.slam.start).T_map_lidar, first.inverse())
+    return compose(T_map_lidar, RigidTransform(odometry.R[0], odometry.p[0]).inverse())

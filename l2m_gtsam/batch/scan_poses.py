@@ -12,11 +12,12 @@ from l2m_gtsam.batch.opening import (
     read_numbers,
 )
 from l2m_gtsam.config import Config, LidarOptions, PoseSource
-from l2m_gtsam.data import LidarMap, Recording, RigidTransform
+from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import BagError, LidarError
 from l2m_gtsam.joining import joined
 from l2m_gtsam.lidar.localisation import ScanLocalisation, localise_scans
 from l2m_gtsam.lidar.odometry import ScanStep, follow, odometry
+from l2m_gtsam.lidar.registration import PoseEstimate, unseen_covariance
 from l2m_gtsam.lidar.search import find_start
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.progress import Progress, counter
@@ -110,10 +111,11 @@ def _localised(saved: SavedMap, bag: Path, config: Config, progress: Progress) -
 
 def scan_start(
     first: ScanStep, cloud: Surface, mapped: LidarMap, options: LidarOptions
-) -> RigidTransform:
+) -> PoseEstimate:
     """Return where a drive begins: as it is said, else as the first scan fits."""
+    registration = options.localisation.registration
     if options.start is not None:
-        return options.start.rigid()
-    return find_start(
-        first.surface, cloud, mapped, options.search, options.localisation.registration
-    )
+        T = options.start.rigid()
+    else:
+        T = find_start(first.surface, cloud, mapped, options.search, registration)
+    return PoseEstimate(T, unseen_covariance(registration))

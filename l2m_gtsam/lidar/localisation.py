@@ -92,7 +92,7 @@ class ScanLocalisation:
 def localise_scans(
     steps: Iterable[ScanStep],
     cloud: Surface,
-    start: RigidTransform,
+    start: PoseEstimate,
     options: ScanLocalisationOptions,
     frame: str = "map",
 ) -> ScanLocalisation:
@@ -108,7 +108,7 @@ def localise_scans(
     cloud
         In the map frame.
     start
-        The lidar in the map at the first scan.
+        The lidar in the map at the first scan, and how well that is known.
     options
         How, and when a scan is refused.
     frame
@@ -169,20 +169,19 @@ class _Localiser:
         self.poses: list[PoseEstimate] = []
         self.refused: Counter[Refusal] = Counter()
 
-    def add(self, step: ScanStep, start: RigidTransform) -> None:
+    def add(self, step: ScanStep, start: PoseEstimate) -> None:
         options = self._options.registration
-        expected = None if self._last is None else self._expected(self._last, step)
-        guess = start if expected is None else expected.T
-        found = register(step.surface, self._cloud, guess, options)
+        expected = start if self._last is None else self._expected(self._last, step)
+        found = register(step.surface, self._cloud, expected.T, options)
         refusal = found.refusal(options)
-        if refusal is not None and expected is None:
-            raise LidarError(_not_at_start(start, found, refusal, options))
+        if refusal is not None and self._last is None:
+            raise LidarError(_not_at_start(start.T, found, refusal, options))
         if refusal is not None:
             self.refused[refusal] += 1
             self._last = expected
             return
-        fix = by_scan(found, guess, options)
-        self._last = fix if expected is None else combined(found, expected, options)
+        fix = by_scan(found, expected.T, options)
+        self._last = combined(found, expected, options)
         covariance = fix.covariance + self._options.of_cloud()
         self.fixes.append(PoseFix(step.stamp_ns, fix.T, covariance))
         self.poses.append(self._last)

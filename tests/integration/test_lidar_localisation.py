@@ -12,7 +12,7 @@ from l2m_gtsam.errors import LidarError
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans
 from l2m_gtsam.lidar.loops import LoopOptions, find_loops
 from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, follow
-from l2m_gtsam.lidar.registration import Refusal
+from l2m_gtsam.lidar.registration import PoseEstimate, Refusal, unseen_covariance
 from l2m_gtsam.lidar.search import SearchOptions, find_start
 from l2m_gtsam.lidar.surface import Surface, smoothed
 from l2m_gtsam.rigid import between, difference, perturbed
@@ -29,6 +29,11 @@ QUICK = SearchOptions(tried=6)
 
 def pose(trajectory: Trajectory, k: int) -> RigidTransform:
     return RigidTransform(trajectory.R[k], trajectory.p[k])
+
+
+def unsure(T: RigidTransform) -> PoseEstimate:
+    """Return a start of which little is known."""
+    return PoseEstimate(T, unseen_covariance(OPTIONS.registration))
 
 
 def cloud_of(room: Room) -> Surface:
@@ -49,7 +54,7 @@ def steps() -> list[ScanStep]:
 
 def test_a_drive_on_a_cloud(cloud: Surface, steps: list[ScanStep]) -> None:
     start = perturbed(pose(DRIVE, 0), np.array([0, 0, 0.1, 0.3, 0.2, -0.1]))
-    found = localise_scans(steps, cloud, start, OPTIONS, "hall")
+    found = localise_scans(steps, cloud, unsure(start), OPTIONS, "hall")
     assert (found.scans, found.refused) == (len(DRIVE), {})
     assert found.trajectory.frame == "hall"
     np.testing.assert_array_equal(found.trajectory.stamp_ns, DRIVE.stamp_ns)
@@ -73,7 +78,7 @@ def test_a_drive_on_a_cloud(cloud: Surface, steps: list[ScanStep]) -> None:
 def test_a_start_elsewhere_is_refused_in_one_line(cloud: Surface, steps: list[ScanStep]) -> None:
     start = RigidTransform(np.eye(3), np.array([3.8, -4.0, 1.0]))
     with pytest.raises(LidarError, match=r"does not fit the map's cloud at \(3.8, -4, 1\) m") as e:
-        localise_scans(steps[:1], cloud, start, OPTIONS)
+        localise_scans(steps[:1], cloud, unsure(start), OPTIONS)
     assert "lidar.start" in str(e.value)
     assert "\n" not in str(e.value)
 
@@ -87,7 +92,7 @@ def test_scans_of_another_room_are_counted_and_left_out(
         replace(step, surface=odd[0].surface) if 5 <= k < 8 else step
         for k, step in enumerate(steps)
     ]
-    found = localise_scans(mixed, cloud, pose(DRIVE, 0), OPTIONS)
+    found = localise_scans(mixed, cloud, unsure(pose(DRIVE, 0)), OPTIONS)
     assert found.refused == {Refusal.ELSEWHERE: 3}
     kept = [k for k in range(len(DRIVE)) if not 5 <= k < 8]
     np.testing.assert_array_equal(found.trajectory.stamp_ns, DRIVE.stamp_ns[kept])
@@ -98,7 +103,7 @@ def test_swept_scans_are_where_they_were_at_their_stamps(cloud: Surface) -> None
     """At 1 m/s a turn of 0.1 s would move them by 5 cm."""
     true, twist = straight(6, speed=1.0), np.array([0, 0, 0, 1.0, 0, 0])
     steps = follow(swept(ROOM, true, twist, 0.1), OdometryOptions())
-    found = localise_scans(steps, cloud, pose(true, 0), OPTIONS)
+    found = localise_scans(steps, cloud, unsure(pose(true, 0)), OPTIONS)
     error = np.linalg.norm(found.trajectory.p - true.p, axis=1)
     # The speed is that of the step before, wrong by centimetres per second.
     assert np.all(error < 0.006)
@@ -106,7 +111,7 @@ def test_swept_scans_are_where_they_were_at_their_stamps(cloud: Surface) -> None
 
 def test_no_scans() -> None:
     with pytest.raises(LidarError, match="no scan has points enough"):
-        localise_scans([], Surface(np.zeros((0, 3))), pose(DRIVE, 0), OPTIONS)
+        localise_scans([], Surface(np.zeros((0, 3))), unsure(pose(DRIVE, 0)), OPTIONS)
 
 
 def mapped(trajectory: Trajectory) -> LidarMap:

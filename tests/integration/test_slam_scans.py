@@ -12,7 +12,7 @@ from l2m_gtsam.graph.slam.jumps import Mended, without_jumps
 from l2m_gtsam.graph.slam.options import SlamOptions
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.loops import LoopOptions, find_loops
-from l2m_gtsam.lidar.registration import RegistrationOptions
+from l2m_gtsam.lidar.registration import PoseEstimate, RegistrationOptions
 from l2m_gtsam.lidar.surface import Surface, smoothed
 from l2m_gtsam.localise import localise
 from l2m_gtsam.rigid import compose
@@ -29,7 +29,7 @@ ROOM = Room(
     (((5.5, -4.0, 0.0), (6.0, -3.0, 3.5)), ((4.5, 4.5, 0.0), (5.5, 5.5, 2.0))),
 )
 OPTIONS = SlamOptions(key_poses=COARSE)
-REGISTRATION = RegistrationOptions(unseen_m=1e3, unseen_deg=1e3)
+REGISTRATION = RegistrationOptions(unseen_m=100.0, unseen_deg=100.0)
 EVERY = 15  # poses: a scan each 0.75 s
 
 
@@ -56,7 +56,7 @@ def fixes(room: Room, drive: SlamDrive, seed: int = 5) -> ScanEvidence:
     cloud = Surface(smoothed(thinned_cloud(np.concatenate(points), 0.1)))
     steps = carried_scans(scans(room, seen, rng), mended(drive), 0.25, OPTIONS)
     options = ScanLocalisationOptions(registration=REGISTRATION)
-    start = RigidTransform(seen.R[0], seen.p[0])
+    start = PoseEstimate(RigidTransform(seen.R[0], seen.p[0]), 1e-2 * np.eye(6))
     found = localise_scans(steps, cloud, start, options)
     return ScanEvidence(fixes=spaced(found.fixes, OPTIONS.key_poses.distance_m, options))
 
