@@ -39,9 +39,13 @@ def step_nees(true: Trajectory, mended: Mended) -> float:
     return total
 
 
-@given(faster=st.floats(0.05, 6.0), every=st.integers(1, 20))
+@given(faster=st.floats(0.05, 3.0), every=st.integers(1, 20))
 def test_smooth_drives_have_no_jumps(faster: float, every: int) -> None:
-    """At 3 cm/s to 3.6 m/s, at one pose per second to 120: as odometry came it is kept."""
+    """At 3 cm/s to 1.8 m/s, at one pose per 20 s to 60 per second: as odometry came it is kept.
+
+    At 3.6 m/s this drive itself turns by 800 deg/s^2 and takes its bends with 7 m/s^2, which is
+    more than the options let a vehicle do.
+    """
     way = (DRIVE.stamp_ns - DRIVE.stamp_ns[0]) / faster
     drive = rows_of(replace(DRIVE, stamp_ns=way.astype(np.int64)), np.arange(0, len(DRIVE), every))
     mended = without_jumps(drive, OPTIONS)
