@@ -1,7 +1,6 @@
 """Scans where a vehicle's odometry has them: one after another, as steps of a drive. Pure."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -71,10 +70,4 @@ def _around(trajectory: Trajectory, stamp_ns: int) -> Trajectory:
     first, last = np.searchsorted(trajectory.stamp_ns, ends)
     first = int(np.clip(first - 1, 0, max(len(trajectory) - 2, 0)))
     rows: IntArray = np.arange(first, min(max(int(last) + 1, first + 2), len(trajectory)))
-    return replace(
-        trajectory,
-        stamp_ns=trajectory.stamp_ns[rows],
-        R=trajectory.R[rows],
-        p=trajectory.p[rows],
-        covariance=None,
-    )
+    return trajectory[rows]

@@ -5,7 +5,7 @@ lidar frame to the map frame. Positions are in metres, magnetic field in microte
 integer nanoseconds.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -67,6 +67,15 @@ class Trajectory:
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> "Trajectory":
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns[rows],
+            R=self.R[rows],
+            p=self.p[rows],
+            covariance=None if self.covariance is None else self.covariance[rows],
+        )
 
 
 @dataclass(frozen=True)

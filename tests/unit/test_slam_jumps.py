@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
-from l2m_gtsam.graph.slam.jumps import JumpOptions, Mended, rows_of, without_jumps
+from l2m_gtsam.graph.slam.jumps import JumpOptions, Mended, without_jumps
 from l2m_gtsam.graph.slam.odometry import drift_covariance
 from l2m_gtsam.graph.slam.options import DriftOptions
 from l2m_gtsam.pose_covariance import moved
@@ -19,7 +19,7 @@ from tests.slam_drives import RATE_HZ, rounds
 
 OPTIONS = JumpOptions()
 # Headings are gradients of the way, which at its two ends are half a step off.
-DRIVE = rows_of(rounds(30), np.arange(1, 599))
+DRIVE = rounds(30)[np.arange(1, 599)]
 
 
 def pose(trajectory: Trajectory, k: int) -> RigidTransform:
@@ -47,7 +47,7 @@ def test_smooth_drives_have_no_jumps(faster: float, every: int) -> None:
     more than the options let a vehicle do.
     """
     way = (DRIVE.stamp_ns - DRIVE.stamp_ns[0]) / faster
-    drive = rows_of(replace(DRIVE, stamp_ns=way.astype(np.int64)), np.arange(0, len(DRIVE), every))
+    drive = replace(DRIVE, stamp_ns=way.astype(np.int64))[np.arange(0, len(DRIVE), every)]
     mended = without_jumps(drive, OPTIONS)
     assert mended.jumps == ()
     assert mended.left_out == 0
@@ -87,7 +87,7 @@ def test_sharp_turns_between_few_poses_are_no_jumps(rate_hz: int) -> None:
     p = np.vstack([np.zeros(3), np.cumsum(v[:, None] * ahead[:-1] * dt, axis=0)])
     stamps = np.arange(len(p)) * round(1e9 * dt)
     R = Rotation.from_rotvec(np.outer(angle, [0, 0, 1])).as_matrix()
-    drive = rows_of(Trajectory(stamps, R, p, "odom", "lidar"), np.arange(0, len(p), 10))
+    drive = Trajectory(stamps, R, p, "odom", "lidar")[np.arange(0, len(p), 10)]
     assert without_jumps(drive, OPTIONS).jumps == ()
 
 
@@ -151,9 +151,9 @@ def test_a_pose_that_lies_elsewhere_is_left_out() -> None:
 def test_a_gap_is_no_jump() -> None:
     """Two seconds without odometry while the vehicle goes on, stops, or turns."""
     kept = np.r_[0:200, 240 : len(DRIVE)]
-    gap = rows_of(DRIVE, kept)
+    gap = DRIVE[kept]
     assert without_jumps(gap, OPTIONS).jumps == ()
-    stopped = rows_of(replace(DRIVE, stamp_ns=DRIVE.stamp_ns.copy()), np.arange(len(DRIVE)))
+    stopped = DRIVE[np.arange(len(DRIVE))]
     stopped.stamp_ns[200:] += 2_000_000_000
     assert without_jumps(stopped, OPTIONS).jumps == ()
     # Beyond what it can accelerate to meanwhile it is one, and its place is known to a decimetre.
@@ -185,7 +185,7 @@ def test_what_is_stated_of_poses_goes_on_past_a_jump() -> None:
 
 @pytest.mark.parametrize("count", range(1, 6))
 def test_too_few_poses_have_no_jumps(count: int) -> None:
-    few = rows_of(DRIVE, np.arange(count))
+    few = DRIVE[np.arange(count)]
     assert len(without_jumps(few, OPTIONS).trajectory) == count
 
 

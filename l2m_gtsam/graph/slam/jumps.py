@@ -126,7 +126,7 @@ def without_jumps(trajectory: Trajectory, options: JumpOptions) -> Mended:
         return Mended(trajectory, (), 0)
     kept = np.arange(len(trajectory))
     for _ in range(ROUNDS):
-        part = rows_of(trajectory, kept)
+        part = trajectory[kept]
         found = _found(part, options)
         # Between two jumps in a row lies a pose that belongs to neither side.
         stray = np.flatnonzero(found.jumped[:-1] & found.jumped[1:]) + 1
@@ -136,18 +136,6 @@ def without_jumps(trajectory: Trajectory, options: JumpOptions) -> Mended:
     jumps = tuple(_jump(part, found, int(row)) for row in np.flatnonzero(found.jumped))
     mended = _mended(part, found, jumps) if jumps else part
     return Mended(mended, jumps, len(trajectory) - len(part))
-
-
-def rows_of(trajectory: Trajectory, rows: IntArray) -> Trajectory:
-    """Return some of the poses of a trajectory."""
-    covariance = trajectory.covariance
-    return replace(
-        trajectory,
-        stamp_ns=trajectory.stamp_ns[rows],
-        R=trajectory.R[rows],
-        p=trajectory.p[rows],
-        covariance=None if covariance is None else covariance[rows],
-    )
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ def truth_record(truth: Trajectory, ways: Ways, max_pose_gap_s: float) -> TruthR
     if not there.any():
         return None
     at = interpolated(truth, localised.stamp_ns[there])
-    before, after = (compared(at, _only(each, there)) for each in (odometry, localised))
+    before, after = (compared(at, each[there]) for each in (odometry, localised))
     covariance = localised.covariance
     unknown = np.full(len(at), np.nan)
     squared = unknown if covariance is None else after.squared(covariance[there])
@@ -113,23 +113,13 @@ def truth_record(truth: Trajectory, ways: Ways, max_pose_gap_s: float) -> TruthR
         poses=int(there.sum()),
         odometry=before.figures(),
         localised=after.figures(),
-        by_scans=None if by_scans is None else compared(at, _only(by_scans, there)).figures(),
+        by_scans=None if by_scans is None else compared(at, by_scans[there]).figures(),
         nees=float(squared.mean()),
         beyond_95=float(np.mean(squared > chi2.ppf(0.95, POSE_FREEDOM))),
         path=rows(path),
         odometry_m=row(_spread(before.distance, there)),
         localised_m=row(_spread(after.distance, there)),
         squared=row(_spread(squared, there), 3),
-    )
-
-
-def _only(trajectory: Trajectory, there: BoolArray) -> Trajectory:
-    return Trajectory(
-        trajectory.stamp_ns[there],
-        trajectory.R[there],
-        trajectory.p[there],
-        trajectory.frame,
-        trajectory.child_frame,
     )
 
 
