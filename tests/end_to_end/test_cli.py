@@ -19,7 +19,7 @@ from tests.browsing import (
     check_silence,
     look,
 )
-from tests.end_to_end.conftest import Demo, complaint, complaint_here, l2m
+from tests.end_to_end.conftest import Demo, complaint_here, l2m, l2m_process, one_line
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -139,7 +139,7 @@ def test_bad_bags_and_topics(demo: Demo, tmp_path: Path) -> None:
     out = tmp_path / "out"
 
     def calibrate(bag: Path, *more: str | Path) -> str:
-        return complaint("calibrate", bag, "--map", demo.map, "--out", out, *more)
+        return complaint_here("calibrate", bag, "--map", demo.map, "--out", out, *more)
 
     assert "nowhere.bag: no such file" in calibrate(tmp_path / "nowhere.bag")
     truncated = tmp_path / "cut.mcap"
@@ -170,8 +170,8 @@ def test_bad_maps(demo: Demo, tmp_path: Path) -> None:
         (tmp_path / "nowhere.npz", "no such"),
     ):
         for line in (
-            complaint("calibrate", demo.drive, "--map", path, "--out", out),
-            complaint("map", "info", path),
+            complaint_here("calibrate", demo.drive, "--map", path, "--out", out),
+            complaint_here("map", "info", path),
         ):
             assert reason in line
             assert str(path) in line
@@ -180,7 +180,7 @@ def test_bad_maps(demo: Demo, tmp_path: Path) -> None:
 
 def test_a_map_of_another_place(demo: Demo, shared_data: Path, tmp_path: Path) -> None:
     bag = shared_data / "bags" / "optitrack_run1_ros1.bag"
-    line = complaint("calibrate", bag, "--map", demo.map, "--out", tmp_path / "out")
+    line = complaint_here("calibrate", bag, "--map", demo.map, "--out", tmp_path / "out")
     assert "map.npz does not cover the drive" in line
     assert not (tmp_path / "out").exists()
 
@@ -195,7 +195,7 @@ def test_wrong_units_are_refused_and_overridden(demo: Demo, tmp_path: Path) -> N
         reading = make.magnetic(stamp, [0.2 + 0.001 * k, 0.1, -0.4])
         entries.append(Entry("/mag", "sensor_msgs/MagneticField", stamp, reading))
     bag = write(tmp_path, "mcap", entries)
-    line = complaint("map", "build", bag, "--out", tmp_path / "m.npz")
+    line = complaint_here("map", "build", bag, "--out", tmp_path / "m.npz")
     assert "likely gauss: set the option `units: gauss`" in line
     assert not (tmp_path / "m.npz").exists()
 
@@ -204,19 +204,24 @@ def test_suite_without_the_sensor(demo: Demo, tmp_path: Path) -> None:
     suite = tmp_path / "suite.yaml"
     suite.write_text("sensors: {other: {t_lidar_mag: [0, 0, 0]}}\n")
     mapping = demo.folder / "mapping_mcap"
-    line = complaint("map", "build", mapping, "--suite", suite, "--out", tmp_path / "m.npz")
+    line = complaint_here("map", "build", mapping, "--suite", suite, "--out", tmp_path / "m.npz")
     assert "does not list the sensor 'suite_00'; it lists other" in line
 
 
 def test_an_output_that_cannot_be_written(demo: Demo, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    line = complaint("calibrate", demo.drive, "--map", demo.map, "--out", tmp_path / "file")
+    line = complaint_here("calibrate", demo.drive, "--map", demo.map, "--out", tmp_path / "file")
     assert "is a file, --out needs a folder" in line
     assert (tmp_path / "file").read_text() == "in the way"
 
 
+def test_a_process_ends_with_one_line(tmp_path: Path) -> None:
+    run = l2m_process("inspect", tmp_path / "nowhere.bag", fails=True)
+    assert "nowhere.bag: no such file" in one_line(run)
+
+
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
-    run = l2m("inspect", tmp_path / "nowhere.bag", "--debug", fails=True)
+    run = l2m_process("inspect", tmp_path / "nowhere.bag", "--debug", fails=True)
     assert "Traceback" in run.err
     assert "BagError" in run.err
 
@@ -235,5 +240,5 @@ def test_options_of_a_simulation_that_are_not_understood(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("kind", ["ros3", ""])
 def test_an_unknown_bag_kind(tmp_path: Path, kind: str) -> None:
-    line = complaint("simulate", "--out", tmp_path / "s", "--kind", kind)
+    line = complaint_here("simulate", "--out", tmp_path / "s", "--kind", kind)
     assert "accepted: ros1, sqlite3, mcap" in line
