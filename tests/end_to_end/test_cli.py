@@ -58,63 +58,10 @@ def test_demo_ends_with_truth_and_estimate(demo: Demo) -> None:
         assert picture.width > 1000
 
 
-def test_another_container_gives_the_same_calibration(
-    demo: Demo, tmp_path: Path, repository: Path
-) -> None:
-    """Simulated again with the same seed, as ROS1, with the example configuration: same bits."""
-    l2m("simulate", "--out", tmp_path, "--kind", "ros1")
-    config = repository / "configs" / "warehouse.yaml"
-    bag = tmp_path / "calibration_ros1.bag"
-    out = l2m("calibrate", bag, "--map", demo.map, "--config", config, "--out", tmp_path / "r").out
-    assert out.count("solved") == 12
-    a = read_calibration(demo.folder / "calibration.yaml")
-    b = read_calibration(tmp_path / "r" / "calibration.yaml")
-    for x, y in zip(a.sensors, b.sensors, strict=True):
-        np.testing.assert_array_equal(x.t_lidar_mag, y.t_lidar_mag)
-        np.testing.assert_array_equal(x.covariance, y.covariance)
-    assert (tmp_path / "truth.yaml").read_text() == (demo.folder / "truth.yaml").read_text()
-
-
 def test_the_report_of_the_warehouse_is_seen(demo: Demo, browser: str, tmp_path: Path) -> None:
     looked = look(browser, demo.folder / "report.html", tmp_path)
     check_silence(looked)
     check_figures(looked, 4 + 8 * 12)  # of vehicle and map, and of each sensor
-    check_phone(looked)
-    check_accessibility(looked)
-
-
-@pytest.fixture(scope="module")
-def optitrack(
-    shared_data: Path, tmp_path_factory: pytest.TempPathFactory, repository: Path
-) -> Path:
-    """Folder of a map of one real run, and of the calibration of another."""
-    folder = tmp_path_factory.mktemp("optitrack")
-    bags, config = shared_data / "bags", repository / "configs" / "optitrack.yaml"
-    survey, map_path = bags / "optitrack_run0_ros2_sqlite", folder / "map.npz"
-    l2m("map", "build", survey, "--config", config, "--out", map_path)
-    wanted = ("--config", config, "--out", folder / "result", "--rerun", folder / "view.rrd")
-    run = l2m("calibrate", bags / "optitrack_run1_ros1.bag", "--map", map_path, *wanted)
-    assert str(folder / "view.rrd") in run.out
-    return folder
-
-
-def test_optitrack_configuration_on_real_bags(optitrack: Path, shared_data: Path) -> None:
-    map_path = optitrack / "map.npz"
-    assert "sliding_gp" in l2m("map", "info", map_path).out
-    l2m("map", "plot", map_path, "--out", optitrack / "map.png")
-    assert (optitrack / "map.png").stat().st_size > 10_000
-    assert (optitrack / "view.rrd").stat().st_size > 10_000
-    result = read_calibration(optitrack / "result" / "calibration.yaml")
-    assert result["imu/mag"].status is SensorStatus.SOLVED
-    assert result.bag is not None
-    assert result.bag.path == str(shared_data / "bags" / "optitrack_run1_ros1.bag")
-    assert result.options["bag"]["poses"] == "/optitrack/pose"
-
-
-def test_the_report_of_a_real_bag_is_seen(optitrack: Path, browser: str, tmp_path: Path) -> None:
-    looked = look(browser, optitrack / "result" / "report.html", tmp_path)
-    check_silence(looked)
-    check_figures(looked, 4 + 8)
     check_phone(looked)
     check_accessibility(looked)
 
