@@ -58,7 +58,7 @@ class Dialect:
 
     @cached_property
     def _counts_messages(self) -> bool:
-        """Whether headers have a counter; looked at once, as it takes half the time of a message."""
+        """Whether headers have a counter; to look takes as long as to write a message."""
         return "seq" in signature(self.store.types["std_msgs/msg/Header"]).parameters
 
 
