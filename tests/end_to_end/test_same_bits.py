@@ -18,7 +18,7 @@ QUICK = {"mapping": {"model": {"harmonic": QUICK_HARMONIC | {"hyperparameters": 
 def test_another_container_gives_the_same_calibration(tmp_path: Path, repository: Path) -> None:
     """Simulated again by another process, as ROS1, with the example configuration: same bits."""
     options, quick = tmp_path / "hall.yaml", tmp_path / "quick.yaml"
-    options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
+    options.write_text(json.dumps(SMALL_HALL | {"array": {"count": 1}}))  # JSON is YAML
     quick.write_text(json.dumps(QUICK))
     one, other = tmp_path / "one", tmp_path / "other"
     l2m_process("simulate", "--options", options, "--out", one, "--kind", "mcap")
@@ -32,9 +32,9 @@ def test_another_container_gives_the_same_calibration(tmp_path: Path, repository
     example = ("--config", repository / "configs" / "warehouse.yaml")
     l2m("calibrate", one / "calibration_mcap", *field_map, "--out", one)
     out = l2m("calibrate", other / "calibration_ros1.bag", *field_map, *example, "--out", other).out
-    assert out.count("solved") == 2
+    assert out.count("solved") == 1
     a, b = (read_calibration(folder / "calibration.yaml") for folder in (one, other))
-    assert [each.status for each in a.sensors] == [SensorStatus.SOLVED] * 2
+    assert [each.status for each in a.sensors] == [SensorStatus.SOLVED]
     for x, y in zip(a.sensors, b.sensors, strict=True):
         np.testing.assert_array_equal(x.t_lidar_mag, y.t_lidar_mag)
         np.testing.assert_array_equal(x.covariance, y.covariance)

@@ -75,7 +75,8 @@ def test_the_survey_itself_is_map_enough_to_look_on() -> None:
 
 def test_sensors_that_share_no_pose_are_looked_for_one_by_one() -> None:
     readings = drive(2, SENSORS, WORLD, count=400, noise=0.2)
-    found = find_starts(readings, WORLD, np.array([1.0, 1.0, 0.2]), OPTIONS)
+    near = OPTIONS.model_copy(update={"search_radius": 2.0})
+    found = find_starts(readings, WORLD, np.array([1.0, 1.0, 0.2]), near)
     assert errors(found).max() < NEAR
 
 
@@ -112,7 +113,8 @@ def test_several_searches_at_once_find_what_each_finds_alone() -> None:
 def test_overlapping_searches_look_at_the_same_places() -> None:
     """A sensor well inside both balls is found at one place, not at two that are near."""
     readings, centres = together(), np.array([[0.31, -0.17, 0.08], [-0.24, 0.05, -0.33]])
-    first, second = (find_starts(readings, WORLD, centre, OPTIONS) for centre in centres)
+    near = OPTIONS.model_copy(update={"search_radius": 1.5})
+    first, second = (find_starts(readings, WORLD, centre, near) for centre in centres)
     for one, other in zip(first, second, strict=True):
         assert one is not None
         assert other is not None
