@@ -1,6 +1,7 @@
 """The demonstration on disk, made once for all tests of the command line."""
 
 import io
+import json
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.cli import main
+from tests.end_to_end.halls import SMALL_HALL
 
 TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
 
@@ -98,6 +100,8 @@ class Demo:
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """Run the demonstration with its defaults."""
+    """Run the demonstration in a small hall."""
     folder = tmp_path_factory.mktemp("demo")
-    return Demo(folder, l2m_process("demo", "--out", folder).out)
+    options = folder / "hall.yaml"
+    options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
+    return Demo(folder, l2m_process("demo", "--options", options, "--out", folder).out)

@@ -8,24 +8,9 @@ import numpy as np
 from l2m_gtsam.results import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.end_to_end.conftest import l2m, l2m_process
+from tests.end_to_end.halls import SMALL_HALL
 from tests.quick_maps import QUICK_HARMONIC
 
-# The tutorial's: small, with steel to be mapped.
-HALL = {
-    "floor_plan": {
-        "length": 11.0,
-        "width": 6.4,
-        "rack_rows": 1,
-        "rack_depth": 1.4,
-        "blocks": 1,
-        "cross_aisle": 3.4,
-    },
-    "suite": {"lateral": [-0.3, 0.3], "heights": [-0.5, 0.0]},
-    "array": {"count": 2},
-    "mapping_sampling": {"field_rate": 5.0},
-    "calibration_sampling": {"field_rate": 4.0},
-    "calibration_route": {"turns": 1},
-}
 PRIOR = {"floor_scale": 4.0, "floor_depth": 0.6, "noise": 0.1}
 QUICK = {"mapping": {"model": {"harmonic": QUICK_HARMONIC | {"hyperparameters": PRIOR}}}}
 
@@ -33,7 +18,7 @@ QUICK = {"mapping": {"model": {"harmonic": QUICK_HARMONIC | {"hyperparameters": 
 def test_another_container_gives_the_same_calibration(tmp_path: Path, repository: Path) -> None:
     """Simulated again by another process, as ROS1, with the example configuration: same bits."""
     options, quick = tmp_path / "hall.yaml", tmp_path / "quick.yaml"
-    options.write_text(json.dumps(HALL))  # JSON is YAML
+    options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
     quick.write_text(json.dumps(QUICK))
     one, other = tmp_path / "one", tmp_path / "other"
     l2m_process("simulate", "--options", options, "--out", one, "--kind", "mcap")
