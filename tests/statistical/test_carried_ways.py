@@ -75,7 +75,7 @@ def test_walks_of_odometry_between_key_poses_are_told(sensors: int) -> None:
 
     NEES is 6 where sigmas are true; drives count as one figure each, and their mean has to be
     within three of its standard errors. Nothing that the readings know may be lost: errors are
-    those of key poses at each reading, within 5 %.
+    those of key poses at each reading, within 3 %, on line, where a step is taken at once, 10 %.
     """
     figures = np.array(
         [
@@ -97,4 +97,5 @@ def test_walks_of_odometry_between_key_poses_are_told(sensors: int) -> None:
         print(f"{sensors} sensors, {name}: NEES {nees.mean():.2f} +- {error:.2f}, {rms:.1f} mm")
         assert abs(nees.mean() - 6) < 3 * error
     rms = np.sqrt(np.mean(figures[:, :, 1] ** 2, axis=0))
-    np.testing.assert_allclose(rms[:2], rms[2:], rtol=0.05)
+    assert rms[0] < 1.03 * rms[2]
+    assert rms[1] < 1.1 * rms[3]
