@@ -9,7 +9,7 @@ from l2m_gtsam.data import FloatArray, Recording, SourceFile
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.field_prior import FieldPrior, TileOptions, field_prior
-from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.graph.slam.mapping import map_drive
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.graph.slam.outcome import localisation_result

@@ -17,7 +17,8 @@ from l2m_gtsam.errors import CalibrationError, SyncError
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose, carried
 from l2m_gtsam.graph.slam.jumps import without_jumps
 from l2m_gtsam.graph.slam.links import link_stamps, linked
-from l2m_gtsam.graph.slam.localisation import Localised, localise_drive
+from l2m_gtsam.graph.slam.localisation import localise_drive
+from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.graph.slam.misfit import is_doubtful, wrong_maps
 from l2m_gtsam.graph.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions, StartPoseOptions

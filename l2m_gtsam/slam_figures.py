@@ -13,7 +13,7 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Sourc
 from l2m_gtsam.graph.coverage import UncertainMap
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.factors import root_information
-from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.pose_covariance import moved, to_ros
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
@@ -230,7 +230,7 @@ def sensor_evidence(solution: Localised, inside: IntArray) -> SensorEvidence:
     R, field, residual = at.R_map_lidar[inside], at.field[inside], sight.residual[inside]
     H = drive.sensors.distortion[at.sensor[inside], 9:]
     b = np.asarray(np.linalg.solve(C, (residual + field - H)[:, :, None])[:, :, 0], dtype=float)
-    W = sight.whitening(drive.sensors.noise)[inside]
+    W = sight.whitening(drive.sensors.noise, more=solution.way_share)[inside]
     readings = Readings(
         sensors=drive.sensors.names,
         sensor=at.sensor[inside],
@@ -247,7 +247,7 @@ def sensor_evidence(solution: Localised, inside: IntArray) -> SensorEvidence:
         b_lidar=b,
         residual=residual,
         map_share=map_covariance(C, R, sight.map_variance[inside]),
-        pose_share=np.zeros((len(inside), 3, 3)),
+        pose_share=solution.way_share[inside],
         white=np.einsum("nij,nj->ni", W, residual),
     )
 

@@ -10,7 +10,7 @@ from l2m_factors.check import assert_jacobians_match
 from l2m_factors.doubt import FieldDoubt, doubt_factor
 from l2m_factors.field_map import FieldMap
 from l2m_factors.keys import D, M, P, Q, S, T, X
-from l2m_factors.motion import PoseMotion, moved, skew
+from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import CarriedBatch, key_pose_factor
 from l2m_factors.priors import (
     distance_prior,
@@ -27,7 +27,9 @@ from l2m_factors.shared_errors import (
     shared_error,
     uncertain_block_factor,
 )
+from l2m_factors.step import StepError
 from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor
+from l2m_factors.whitening import Whitening
 
 __all__ = [
     "BatchedReadings",
@@ -46,11 +48,13 @@ __all__ = [
     "ReadingResiduals",
     "S",
     "SharedError",
+    "StepError",
     "T",
     "TileBatch",
     "TileField",
     "TilePlaces",
     "WeightedField",
+    "Whitening",
     "X",
     "assert_jacobians_match",
     "block_factor",
@@ -66,6 +70,7 @@ __all__ = [
     "pose_errors_prior",
     "reading_factor",
     "reading_residuals",
+    "rotation_matrices",
     "rotation_prior",
     "shared_error",
     "skew",

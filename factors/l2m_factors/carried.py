@@ -1,7 +1,8 @@
 r"""Magnetic readings taken from poses that are variables: ``X(k)``.
 
 A reading hangs on a key pose ``(R_k, p_k)`` by a fixed transform, from odometry: the lidar at the
-reading stands at ``(R, p)`` in the key pose's frame. With
+reading stands at ``(R, p)`` in the key pose's frame (what the error of that way does to it is in
+``step``). With
 
 .. math::
     t' = R t + p, \quad x = R_k t' + p_k, \quad b = R^T R_k^T B(x), \quad e = C b + H - z
@@ -40,6 +41,9 @@ class CarriedReadings:
         Rotations from the lidar at the reading to the key pose, shape (N, 3, 3).
     p_key_lidar
         Positions of the lidar at the reading in the frame of the key pose, metres, shape (N, 3).
+    fraction
+        How much of the step to key pose k + 1 lies behind each, from 0 to 1, shape (N,): as much
+        of the step's error is in the way here.
     field
         Measured field in the sensor's frame in microtesla, shape (N, 3).
     motion
@@ -50,6 +54,7 @@ class CarriedReadings:
     sensor: npt.NDArray[np.int64]
     R_key_lidar: FloatArray
     p_key_lidar: FloatArray
+    fraction: FloatArray
     field: FloatArray
     motion: PoseMotion | None = None
 
@@ -65,6 +70,7 @@ class CarriedReadings:
             self.sensor[rows],
             self.R_key_lidar[rows],
             self.p_key_lidar[rows],
+            self.fraction[rows],
             self.field[rows],
             motion,
         )

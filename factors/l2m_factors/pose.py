@@ -9,7 +9,9 @@ from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals
 from l2m_factors.field_map import FieldMap, FloatArray
 from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.keys import X
-from l2m_factors.shared_errors import SharedError, shared_error, whitened
+from l2m_factors.shared_errors import SharedError, shared_error
+from l2m_factors.step import Slots, StepError
+from l2m_factors.whitening import Whitening
 
 
 class CarriedBatch(KeyPoseBatch):
@@ -71,13 +73,14 @@ class CarriedBatch(KeyPoseBatch):
 def key_pose_factor(
     batch: CarriedBatch,
     key_pose: int,
-    whitening: FloatArray,
+    whitening: Whitening,
     errors: Sequence[SharedError] = (),
+    step: StepError | None = None,
 ) -> gtsam.CustomFactor:
     """Return one factor for the readings of all sensors on a key pose.
 
-    It is on ``X(k)``, on the calibrations unless the batch has them fixed, and on the weights of
-    the errors.
+    It is on ``X(k)``, on the calibrations unless the batch has them fixed, on the weights of the
+    errors, and, if its readings are known to lie between two key poses, on ``X(k+1)``.
 
     Parameters
     ----------
@@ -86,13 +89,17 @@ def key_pose_factor(
     key_pose
         Number k of the key pose.
     whitening
-        For each of its n readings the matrix W that makes the noise of ``W e`` white with unit
-        variance, in 1/uT, shape (n, 3, 3).
+        Of its n readings.
     errors
         What its readings share with others, as of ``uncertain_block_factor``.
+    step
+        What they feel of the error of the step to the next key pose; nothing without.
     """
     rows = batch.rows_of(key_pose)
-    keys = [*batch.keys_of(key_pose), *(each.key for each in errors)]
+    terms = [] if step is None else [step]
+    of_errors = [each.key for each in errors]
+    of_steps = [key for each in terms for key in each.keys]
+    slots = Slots([*batch.keys_of(key_pose), *of_errors, *of_steps])
 
     def error(
         _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -103,11 +110,13 @@ def key_pose_factor(
         if errors:
             more = shared_error(errors, values)
             e = e + np.einsum("nij,nj->ni", C, more)
+        for each in terms:
+            e = e + each.residual(values)
         if jacobians is not None:
             blocks = batch.jacobians(residuals, key_pose, more)
             blocks += [C @ each.features for each in errors]
-            for slot, block in enumerate(blocks):
-                jacobians[slot] = whitened(whitening, block)
-        return whitened(whitening, e[:, :, None]).ravel()
+            blocks += [block for each in terms for block in each.jacobians(values)]
+            slots.fill(jacobians, whitening, blocks)
+        return whitening(e[:, :, None]).ravel()
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3 * len(rows)), keys, error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3 * len(rows)), slots.keys, error)

@@ -26,7 +26,8 @@ from l2m_factors.field_map import FieldMap, FloatArray
 from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.keys import M, X
 from l2m_factors.motion import skew
-from l2m_factors.shared_errors import whitened
+from l2m_factors.step import Slots, StepError
+from l2m_factors.whitening import Whitening
 
 
 class TileField(Protocol):
@@ -170,11 +171,14 @@ class TileBatch(KeyPoseBatch):
         return own
 
 
-def tile_factor(batch: TileBatch, key_pose: int, whitening: FloatArray) -> gtsam.CustomFactor:
+def tile_factor(
+    batch: TileBatch, key_pose: int, whitening: Whitening, step: StepError | None = None
+) -> gtsam.CustomFactor:
     """Return one factor for the readings of all sensors on a key pose in an unknown field.
 
-    It is on ``X(k)``, the anchor ``X(a)``, the weights ``M(b)``, and on the calibrations unless
-    the batch has them fixed.
+    It is on ``X(k)``, the anchor ``X(a)``, the weights ``M(b)``, on the calibrations unless the
+    batch has them fixed, and, if its readings are known to lie between two key poses, on
+    ``X(k+1)``.
 
     Parameters
     ----------
@@ -183,19 +187,25 @@ def tile_factor(batch: TileBatch, key_pose: int, whitening: FloatArray) -> gtsam
     key_pose
         Number k of the key pose.
     whitening
-        For each of its n readings the matrix W that makes the noise of ``W e`` white with unit
-        variance, in 1/uT, shape (n, 3, 3).
+        Of its n readings.
+    step
+        What they feel of the error of the step to the next key pose; nothing without.
     """
     rows = batch.rows_of(key_pose)
+    terms = [] if step is None else [step]
+    slots = Slots([*batch.keys_of(key_pose), *(key for each in terms for key in each.keys)])
 
     def error(
         _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
     ) -> FloatArray:
         residuals = batch.residuals(values, key_pose)
+        e = residuals.reading.residual[rows]
+        for each in terms:
+            e = e + each.residual(values)
         if jacobians is not None:
-            for slot, block in enumerate(batch.jacobians(residuals, values, key_pose)):
-                jacobians[slot] = whitened(whitening, block)
-        return whitened(whitening, residuals.reading.residual[rows][:, :, None]).ravel()
+            blocks = batch.jacobians(residuals, values, key_pose)
+            blocks += [block for each in terms for block in each.jacobians(values)]
+            slots.fill(jacobians, whitening, blocks)
+        return whitening(e[:, :, None]).ravel()
 
-    noise = gtsam.noiseModel.Unit.Create(3 * len(rows))
-    return gtsam.CustomFactor(noise, batch.keys_of(key_pose), error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3 * len(rows)), slots.keys, error)

@@ -18,7 +18,7 @@ from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.explore import explore
 from l2m_gtsam.graph.slam.g2o import write_g2o
 from l2m_gtsam.graph.slam.jumps import without_jumps
-from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.localise import Sources, localise
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap

@@ -20,12 +20,13 @@ from l2m_factors import (
     PoseMotion,
     S,
     SharedError,
+    StepError,
     T,
+    Whitening,
     X,
     assert_jacobians_match,
     key_pose_factor,
 )
-from l2m_gtsam.data import FloatArray
 from tests.factors.test_reading import CountingWorld, random_values
 from tests.worlds import dipole_world
 
@@ -41,6 +42,7 @@ def random_carried(seed: int, key_poses: int = 2, each: int = 4) -> CarriedReadi
         sensor=np.arange(n) % SENSORS,
         R_key_lidar=Rotation.from_rotvec(rng.normal(0, 0.3, (n, 3))).as_matrix(),
         p_key_lidar=rng.normal(0, 0.3, (n, 3)),
+        fraction=rng.uniform(size=n),
         field=rng.normal(0, 30, (n, 3)),
     )
 
@@ -74,29 +76,78 @@ def calibrations(values: gtsam.Values) -> Calibrations:
     )
 
 
-def whitenings(seed: int, n: int) -> FloatArray:
-    return np.random.default_rng(seed).normal(size=(n, 3, 3)) + 3 * np.eye(3)
+def whitenings(seed: int, n: int) -> Whitening:
+    """Return random ones, with two errors that the readings have in common."""
+    rng = np.random.default_rng(seed)
+    own = rng.normal(size=(n, 3, 3)) + 3 * np.eye(3)
+    return Whitening.with_errors(own, rng.normal(size=(n, 3, 2)))
+
+
+def step_error(seed: int, n: int, values: gtsam.Values) -> StepError:
+    """Return what the readings on key pose 1 feel of a step to 2 that is off by decimetres."""
+    rng = np.random.default_rng(seed + 2)
+    off = gtsam.Pose3.Expmap(rng.normal(0, 0.2, 6))
+    way = values.atPose3(X(1)).between(values.atPose3(X(2)))
+    return StepError(1, way.compose(off), rng.normal(0, 20, (n, 3, 6)))
 
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 10_000))
 def test_jacobians_match_central_differences(seed: int) -> None:
-    """By pose, place, distortion, time offset and the map's error; 1e-6 of the largest entry."""
-    world, values, readings = dipole_world(seed), values_for(seed), random_carried(seed)
+    """By pose, place, distortion, time offset, errors of map and step: 1e-6 of the largest."""
+    world, values, readings = dipole_world(seed), values_for(seed, 3), random_carried(seed)
+    step = step_error(seed, 4, values)
     timed = moving(readings, seed)
     features = np.random.default_rng(seed).normal(size=(4, 3, MODES))
     shared = [SharedError(M(7), features)]
     W = whitenings(seed, 4)
     fixed = calibrations(values)
-    for batch, errors in (
-        (CarriedBatch(world, readings), []),
-        (CarriedBatch(world, timed), shared),
-        (CarriedBatch(world, timed, fixed), shared),
-        (CarriedBatch(world, readings, fixed), []),
+    for batch, errors, way in (
+        (CarriedBatch(world, readings), [], None),
+        (CarriedBatch(world, timed), shared, step),
+        (CarriedBatch(world, timed, fixed), shared, None),
+        (CarriedBatch(world, readings, fixed), [], step),
     ):
-        factor = key_pose_factor(batch, 1, W, errors)
+        factor = key_pose_factor(batch, 1, W, errors, way)
         # Steps of 2e-5 leave 1e-8 of third derivatives; rounding of 50 uT is smaller yet.
         assert_jacobians_match(factor, values, rtol=1e-6, step=2e-5)
+
+
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 6), common=st.integers(0, 20))
+def test_whitening_makes_covariances_the_identity(seed: int, n: int, common: int) -> None:
+    """Beside the dense covariance, also with more errors than residuals.
+
+    Errors that say less than a thousandth of the noise's variance are left out.
+    """
+    rng = np.random.default_rng(seed)
+    own = rng.normal(size=(n, 3, 3)) + 3 * np.eye(3)
+    errors = rng.normal(size=(n, 3, common)) * 10.0 ** rng.uniform(-4, 2, common)
+    white = Whitening.with_errors(own, errors)
+    S, F = np.zeros((3 * n, 3 * n)), errors.reshape(3 * n, common)
+    for k, W in enumerate(own):
+        S[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.linalg.inv(W.T @ W)
+    half = white((S + F @ F.T).reshape(n, 3, 3 * n))
+    whole = white(half.T.reshape(n, 3, 3 * n))
+    # Beside a thousandth: rounding of covariances a million times as large as the noise.
+    np.testing.assert_allclose(whole, np.eye(3 * n), atol=2e-3)
+
+
+def test_what_is_known_of_a_step_shifts_the_readings() -> None:
+    """A step that is longer by 2 cm: a reading after half of it reads as one 1 cm ahead."""
+    world, values, fixed = dipole_world(7), values_for(7, 3), calibrations(values_for(7))
+    readings = replace(on(random_carried(7), 1), fraction=np.full(4, 0.5))
+    off, step = np.array([0, 0, 0, 0.02, 0, 0]), gtsam.Pose3(gtsam.Rot3(), [0.2, 0, 0])
+    ahead = replace(readings, p_key_lidar=readings.p_key_lidar + 0.5 * off[3:])
+    residuals = CarriedBatch(world, readings, fixed).residuals(values, 1)
+    values.update(X(2), values.atPose3(X(1)).compose(step).retract(off))
+    W = Whitening.independent(np.tile(np.eye(3), (4, 1, 1)))
+    slope = 0.5 * residuals.de_dX @ step.AdjointMap()
+    batch = CarriedBatch(world, readings, fixed)
+    found = key_pose_factor(batch, 1, W, step=StepError(1, step, slope)).unwhitenedError(values)
+    expected = CarriedBatch(world, ahead, fixed).residuals(values, 1).reading.residual
+    # 1 cm in a field that bends over decimetres: the shift is linear to some per cent.
+    change = np.linalg.norm(expected - residuals.reading.residual)
+    assert np.linalg.norm(found - expected.ravel()) < 0.1 * change
 
 
 @given(seed=st.integers(0, 10_000))
@@ -126,7 +177,7 @@ def graph_of(batch: CarriedBatch) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for k in batch.key_poses:
         W = np.broadcast_to(np.eye(3), (len(batch.rows_of(k)), 3, 3))
-        graph.add(key_pose_factor(batch, k, W))
+        graph.add(key_pose_factor(batch, k, Whitening.independent(W)))
     return graph
 
 

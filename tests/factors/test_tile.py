@@ -19,7 +19,6 @@ from l2m_factors import (
     key_pose_factor,
     tile_factor,
 )
-from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
@@ -28,6 +27,7 @@ from tests.factors.test_pose import (
     moving,
     on,
     random_carried,
+    step_error,
     values_for,
     whitenings,
 )
@@ -54,6 +54,19 @@ def batch_of(readings: CarriedReadings, anchor: int, values: gtsam.Values | None
     return TileBatch(TILE, anchor, BASIS, readings, fixed)
 
 
+@given(seed=st.integers(0, 10_000), free=st.booleans(), anchor=st.integers(0, 2))
+@settings(deadline=None, max_examples=20)
+def test_derivatives_by_a_step_are_those_of_finite_differences(
+    seed: int, free: bool, anchor: int
+) -> None:
+    """From the anchor, to it, or neither: what poses have in common adds up."""
+    readings, values = random_carried(seed, 2), tile_values(seed, 3)
+    batch = batch_of(readings, anchor, None if free else values)
+    n = len(batch.rows_of(1))
+    factor = tile_factor(batch, 1, whitenings(seed, n), step_error(seed, n, values))
+    assert_jacobians_match(factor, values)
+
+
 @given(seed=st.integers(0, 10_000), free=st.booleans(), timed=st.booleans())
 @settings(deadline=None, max_examples=20)
 def test_derivatives_are_those_of_finite_differences(seed: int, free: bool, timed: bool) -> None:
@@ -67,7 +80,7 @@ def test_derivatives_are_those_of_finite_differences(seed: int, free: bool, time
 
 def test_a_tile_whose_weights_are_known_is_a_map_in_the_frame_of_its_anchor() -> None:
     readings, values = random_carried(1), tile_values(1)
-    W: FloatArray = whitenings(1, 4)
+    W = whitenings(1, 4)
     unknown = tile_factor(batch_of(readings, 0, values), 1, W)
     relative = gtsam.Values()
     relative.insert(X(1), values.atPose3(X(0)).between(values.atPose3(X(1))))

@@ -50,9 +50,18 @@ def test_residuals_are_those_of_the_map_asked_again(index: int) -> None:
     seen = sensor_evidence(solution, rows)
     everything = DriveEvidence(seen.readings, np.ones(len(rows), dtype=bool), ~seen.used)
     again = asked_again(everything, calibration[solution.drive.sensors.names[index]], WORLD)
-    for name in ("place", "B_map", "b_lidar", "residual", "map_share", "white"):
-        # Rounding; fields are some 50 uT, whitened residuals up to some 200.
+    for name in ("place", "B_map", "b_lidar", "residual", "map_share"):
+        # Rounding; fields are some 50 uT.
         np.testing.assert_allclose(getattr(seen, name), getattr(again, name), rtol=0, atol=1e-8)
+    # Whitened residuals count what poses between key poses may be off, too.
+    own = solution.drive.sensors.noise[index] ** 2 * np.eye(3) + seen.map_share
+    e, S = seen.residual[:, :, None], own + seen.pose_share
+    whole = (e * np.linalg.solve(S, e)).sum(axis=(1, 2))
+    np.testing.assert_allclose((seen.white**2).sum(axis=1), whole, rtol=1e-9)
+    fractions = solution.drive.readings.fraction[rows]
+    between = (fractions > 0) & (fractions < 1)
+    assert np.linalg.eigvalsh(seen.pose_share[between]).max(axis=1).min() > 0
+    np.testing.assert_allclose(seen.pose_share[~between], 0, atol=1e-12)
 
 
 def test_every_reading_is_in_the_timeline() -> None:

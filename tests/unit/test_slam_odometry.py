@@ -112,8 +112,34 @@ def test_readings_hang_where_they_were() -> None:
     back = np.argsort(placed.field[:, 0])
     np.testing.assert_allclose(placed.p_map_lidar[back], readings.p_map_lidar, atol=1e-12)
     np.testing.assert_allclose(placed.R_map_lidar[back], readings.R_map_lidar, atol=1e-12)
-    # None hangs on a key pose that comes after it.
-    assert np.all(drive.stamp_ns[rows][hung.key_pose[back]] <= readings.stamp_ns)
+    # Each lies between its key pose and the next, and the more way lies behind it the later it is.
+    before, after = (drive.stamp_ns[rows][hung.key_pose[back] + each] for each in (0, 1))
+    assert np.all((before <= readings.stamp_ns) & (readings.stamp_ns <= after))
+    assert np.all((before < readings.stamp_ns) | (readings.stamp_ns == drive.stamp_ns[0]))
+    fraction, late = hung.fraction[back], (readings.stamp_ns - before) / (after - before)
+    # Along a rosette at a speed that hardly varies over 0.2 m.
+    np.testing.assert_allclose(fraction, late, atol=0.05)
+    assert np.all(fraction[readings.stamp_ns == after] == 1.0)
+
+
+def test_what_is_read_at_rest_is_behind_no_more_of_the_way() -> None:
+    """A vehicle that stands for ten seconds within a step, then turns on the spot."""
+    at = np.array([0.0, 1.0, 11.0, 12.0, 13.0])
+    x = np.array([0.0, 0.1, 0.1, 0.2, 0.2])
+    yaw = np.array([0.0, 0.0, 0.0, 0.0, 0.2])
+    R = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+    drive = Trajectory(
+        (1e9 * at).astype(np.int64), R, np.outer(x, [1.0, 0.0, 0.0]), "odom", "lidar"
+    )
+    stamps = (1e9 * np.array([0.0, 1.0, 6.0, 11.0, 12.0, 12.5, 13.0])).astype(np.int64)
+    n = len(stamps)
+    still = np.tile(np.eye(3), (n, 1, 1))
+    readings = Readings(
+        ("a",), np.zeros(n, np.int64), stamps, still, np.zeros((n, 3)), np.zeros((n, 3))
+    )
+    hung = carried(readings, drive, np.array([0, 4]), most=100)
+    # 0.2 m of way and 0.2 rad of turning at an arm of a metre; creeping for 13 s is 13 um.
+    np.testing.assert_allclose(hung.fraction, [0, 0.25, 0.25, 0.25, 0.5, 0.75, 1], atol=1e-4)
 
 
 @given(st.lists(st.integers(0, 3), min_size=1, max_size=60), st.integers(1, 5))

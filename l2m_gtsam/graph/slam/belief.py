@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Self
 
 import gtsam
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.slam.drive import KnownSensors
@@ -91,22 +92,32 @@ class Belief:
         return self.covariance[:POSE, :POSE]
 
     @property
+    def has_calibrations(self) -> bool:
+        """Whether calibrations are variables."""
+        return len(self.covariance) > POSE
+
+    @property
     def calibration_covariance(self) -> FloatArray:
         """Those of the sensors, shape (S, 15, 15); as they were given where they are constants."""
-        if len(self.covariance) == POSE:
+        if not self.has_calibrations:
             return self.sensors.covariance
         at = POSE + SENSOR * np.arange(len(self.sensors.names))[:, None] + np.arange(SENSOR)
         return np.asarray(self.covariance[at[:, :, None], at[:, None, :]])
 
-    def after(self, step: gtsam.Pose3, covariance: FloatArray) -> "Belief":
-        """Return what is known of the next key pose by odometry, whose covariance is (6, 6)."""
-        moved, back = self.covariance.copy(), step.inverse().AdjointMap()
-        moved[:POSE] = back @ moved[:POSE]
-        moved[:, :POSE] = moved[:, :POSE] @ back.T
-        moved[:POSE, :POSE] += covariance
-        return Belief(self.pose.compose(step), self.sensors, moved)
+    def departed(self, step: gtsam.Pose3, covariance: FloatArray) -> "Departed":
+        """Return what is known on the way to the next key pose.
 
-    def corrected(self, seen: Callable[["Belief"], Evidence]) -> "Belief":
+        Parameters
+        ----------
+        step
+            The way to it by odometry.
+        covariance
+            Of a right perturbation of it, shape (6, 6).
+        """
+        joint = block_diag(self.covariance, covariance)
+        return Departed(self.pose, self.sensors, joint, step)
+
+    def corrected(self, seen: Callable[[Self], Evidence]) -> Self:
         """Return what is known once something was seen, by an iterated Kalman update.
 
         A step that makes the squared residuals and the distance from this belief larger together
@@ -130,11 +141,17 @@ class Belief:
             delta, found = delta + shorter, there
         return self._after(delta, gain_of(P, found.jacobian), found)
 
-    def _after(self, delta: FloatArray, gain: FloatArray, found: Evidence) -> "Belief":
+    def _after(self, delta: FloatArray, gain: FloatArray, found: Evidence) -> Self:
         left = self.covariance - gain @ (found.jacobian @ self.covariance)
         return replace(self.moved(delta), covariance=left)
 
-    def moved(self, delta: FloatArray) -> "Belief":
+    def is_near(self, other: "Belief", most: float) -> bool:
+        """Return whether poses (rad, m), positions of sensors (m) and C differ by no more."""
+        parts = [other.pose.localCoordinates(self.pose), self.sensors.t - other.sensors.t]
+        parts.append((self.sensors.distortion - other.sensors.distortion)[:, :9])
+        return all(float(np.abs(part).max(initial=0.0)) <= most for part in parts)
+
+    def moved(self, delta: FloatArray) -> Self:
         """Return the belief elsewhere, by components as those of the covariance."""
         sensors = self.sensors
         if len(delta) > POSE:
@@ -142,7 +159,39 @@ class Belief:
             sensors = replace(
                 sensors, t=sensors.t + by[:, :3], distortion=sensors.distortion + by[:, 3:]
             )
-        return Belief(self.pose.retract(delta[:POSE]), sensors, self.covariance)
+        return replace(self, pose=self.pose.retract(delta[:POSE]), sensors=sensors)
+
+
+@dataclass(frozen=True)
+class Departed(Belief):
+    """What is known between a key pose and the next.
+
+    Attributes
+    ----------
+    pose, sensors
+        The key pose behind, and the sensors.
+    covariance
+        As that of a belief, and of a right perturbation of the step as the last six components.
+    step
+        From there to the next key pose.
+    """
+
+    step: gtsam.Pose3
+
+    @property
+    def has_calibrations(self) -> bool:
+        """Whether calibrations are variables."""
+        return len(self.covariance) > 2 * POSE
+
+    def moved(self, delta: FloatArray) -> Self:
+        """Return the belief elsewhere, by components as those of the covariance."""
+        return replace(super().moved(delta[:-POSE]), step=self.step.retract(delta[-POSE:]))
+
+    def arrived(self) -> Belief:
+        """Return what is known of the next key pose."""
+        J = np.eye(len(self.covariance) - POSE, len(self.covariance))
+        J[:POSE, :POSE], J[:POSE, -POSE:] = self.step.inverse().AdjointMap(), np.eye(POSE)
+        return Belief(self.pose.compose(self.step), self.sensors, J @ self.covariance @ J.T)
 
 
 def gain_of(P: FloatArray, J: FloatArray) -> FloatArray:

@@ -4,11 +4,15 @@ from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from l2m_factors import Calibrations, CarriedReadings
 from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.graph.slam.links import Links
 from l2m_gtsam.graph.slam.odometry import OdometrySteps
+
+ARM_M = 1.0  # a turn counts as much as the way at the end of such an arm,
+CREEP_M_S = 1e-6  # and time as much as a motion that is none, where there is no other
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,7 @@ class Drive:
     steps
         What odometry says between them.
     readings
-        On them, in order of key poses, N in number.
+        N in number, in order of key poses: each hangs on one, and lies between it and the next.
     start
         Of the first.
     sensors
@@ -92,7 +96,7 @@ class Drive:
             self,
             stamp_ns=self.stamp_ns[:count],
             steps=self.steps.until(count - 1),
-            readings=self.readings[np.flatnonzero(self.readings.key_pose < count)],
+            readings=self.readings[np.flatnonzero(self.readings.key_pose < count - 1)],
             links=self.links[links],
         )
 
@@ -118,6 +122,8 @@ def carried(
 ) -> CarriedReadings:
     """Hang readings on the key pose before each, and keep not too many.
 
+    One that is as late as a key pose hangs on the one before it: it is the end of that step.
+
     Parameters
     ----------
     readings
@@ -129,8 +135,8 @@ def carried(
     most
         Readings of a sensor on a key pose.
     """
-    key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns, side="right") - 1
-    key = np.clip(key, 0, len(rows) - 1)
+    key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns) - 1
+    key = np.clip(key, 0, len(rows) - 2)
     kept = spread(np.column_stack([key, readings.sensor]), most)
     readings, key = readings[kept], key[kept]
     R_back, p = trajectory.R[rows[key]].transpose(0, 2, 1), trajectory.p[rows[key]]
@@ -139,8 +145,21 @@ def carried(
         sensor=readings.sensor,
         R_key_lidar=R_back @ readings.R_map_lidar,
         p_key_lidar=np.einsum("nij,nj->ni", R_back, readings.p_map_lidar - p),
+        fraction=_fractions(trajectory, rows[key], rows[key + 1], readings.stamp_ns),
         field=readings.field,
     )
+
+
+def _fractions(
+    trajectory: Trajectory, first: IntArray, last: IntArray, stamp_ns: IntArray
+) -> FloatArray:
+    """Return how much of the motion from a first pose to a last is done at a time, shape (N,)."""
+    turn = Rotation.from_matrix(trajectory.R[:-1].transpose(0, 2, 1) @ trajectory.R[1:]).magnitude()
+    seconds = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
+    way = np.linalg.norm(np.diff(trajectory.p, axis=0), axis=1)
+    done = np.append(0.0, np.cumsum(way + ARM_M * turn + CREEP_M_S * np.diff(seconds)))
+    at = np.interp(1e-9 * (stamp_ns - trajectory.stamp_ns[0]), seconds, done)
+    return np.asarray(np.clip((at - done[first]) / (done[last] - done[first]), 0.0, 1.0))
 
 
 def spread(groups: IntArray, most: int) -> IntArray:

@@ -18,12 +18,20 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from l2m_factors import CarriedBatch, D, T, X, key_pose_factor
-from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.slam.belief import POSE, Belief
+from l2m_factors import (
+    CarriedBatch,
+    D,
+    StepError,
+    T,
+    Whitening,
+    X,
+    key_pose_factor,
+)
+from l2m_gtsam.data import IntArray
+from l2m_gtsam.graph.slam.belief import POSE, Belief, Departed
 from l2m_gtsam.graph.slam.covariances import well_scaled
 from l2m_gtsam.graph.slam.drive import Drive, as_pose
-from l2m_gtsam.graph.slam.expected import evidence, fix_evidence, passed
+from l2m_gtsam.graph.slam.expected import fix_evidence, passed, take
 from l2m_gtsam.graph.slam.factors import (
     calibration_graph,
     calibration_values,
@@ -32,9 +40,11 @@ from l2m_gtsam.graph.slam.factors import (
     start_factor,
     step_factor,
 )
+from l2m_gtsam.graph.slam.leg import Leg, LegView
 from l2m_gtsam.graph.slam.remembered import RememberedVariance
 from l2m_gtsam.graph.slam.section import Section
 from l2m_gtsam.graph.slam.sight import sensors_in
+from l2m_gtsam.graph.slam.ways import hung_anew
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.solve.robust import RobustOptions
@@ -45,6 +55,25 @@ EARLY = 30  # and the first so many one by one: in calibrations far off, reading
 AGAIN = 2  # more steps with each group, so that the next one starts from where this one converged
 
 
+@dataclass(frozen=True)
+class TakenLeg:
+    """Readings between two key poses that the filter took.
+
+    Attributes
+    ----------
+    rows
+        Which, shape (n,).
+    whitening
+        Of their residuals.
+    step
+        As the filter has it, and what they feel of its error.
+    """
+
+    rows: IntArray
+    whitening: Whitening
+    step: StepError
+
+
 @dataclass
 class Waiting:
     """Key poses that the filter has taken and iSAM2 has not.
@@ -53,14 +82,13 @@ class Waiting:
     ----------
     graph, values
         Odometry and key poses.
-    rows, whitening
-        Readings on them that passed: which, shapes (n,), and whitening matrices (n, 3, 3).
+    legs
+        Readings between them that passed.
     """
 
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
-    rows: list[IntArray] = field(default_factory=list)
-    whitening: list[FloatArray] = field(default_factory=list)
+    legs: list[TakenLeg] = field(default_factory=list)
 
 
 class Follower:
@@ -112,13 +140,12 @@ class Follower:
             What is known of poses and sensors is too many orders of magnitude apart.
         """
         if number > 0:
-            drift = self._drive.steps.covariance[number - 1]
-            self._belief = self._belief.after(self._drive.step(number - 1), drift)
-            self._waiting.graph.add(step_factor(self._drive, number - 1))
+            self._come_to(number)
         self._fix(number)
-        self._read(number)
         self._waiting.values.insert(X(number), self._belief.pose)
-        if number < EARLY or (number + 1) % GROUP == 0 or number == len(self._drive) - 1:
+        last = len(self._drive) - 1
+        # Not before there was a reading: calibrations far off have to come from the filter.
+        if 0 < number < EARLY or (number + 1) % GROUP == 0 or number == last:
             with well_scaled():
                 self._settle(number)
         return self._belief
@@ -154,26 +181,33 @@ class Follower:
                 self._belief = self._belief.corrected(seen)
                 self._waiting.graph.add(link_factor(links, row))
 
-    def _read(self, number: int) -> None:
-        """Take the readings on a key pose as far as they pass for such."""
+    def _come_to(self, number: int) -> None:
+        """Go on to a key pose from the one before, and take what was read on the way."""
+        before, steps = number - 1, self._drive.steps
+        belief = self._belief.departed(self._drive.step(before), steps.covariance[before])
+        self._belief = self._read(before, belief).arrived()
+        self._waiting.graph.add(step_factor(self._drive, before))
+
+    def _read(self, number: int, belief: Departed) -> Departed:
+        """Take the readings after a key pose as far as they pass for such."""
         rows = np.arange(self._ends[number], self._ends[number + 1])
         if not len(rows):
-            return
-        readings = self._drive.readings[rows]
-        good = passed(readings, self._map, self._variance, self._belief, self._robust)
+            return belief
+        view = LegView(Leg.of(self._drive, rows, number), self._map)
+        good = passed(view, self._variance, belief, self._robust)
         if not len(good.rows):
-            return
-        seen = partial(evidence, readings[good.rows], self._map, good.whitening)
-        self._belief = self._belief.corrected(seen)
-        self._waiting.rows.append(rows[good.rows])
-        self._waiting.whitening.append(good.whitening)
+            return belief
+        taken = take(view.of(good.rows), good.own, belief)
+        step = StepError(number, taken.belief.step, taken.by_step)
+        self._waiting.legs.append(TakenLeg(rows[good.rows], taken.whitening, step))
+        return taken.belief
 
     def _settle(self, number: int) -> None:
         """Give iSAM2 the key poses that wait, and take from it what is known of the last."""
         waiting, self._waiting = self._waiting, Waiting()
         for factor in self._reading_factors(waiting):
             waiting.graph.add(factor)
-        if self._free and number == 0:
+        if self._free and waiting.values.exists(X(0)):
             # From the filter's estimate: linearised at values far off, readings would lead astray.
             waiting.values.insert(calibration_values(self._belief.sensors))
         self._section.add(waiting.graph, waiting.values, number, AGAIN)
@@ -185,13 +219,15 @@ class Follower:
             self._hand_over(number)
 
     def _reading_factors(self, waiting: Waiting) -> Iterator[gtsam.NonlinearFactor]:
-        if not waiting.rows:
+        if not waiting.legs:
             return
-        readings = self._drive.readings[np.concatenate(waiting.rows)]
+        rows = np.concatenate([leg.rows for leg in waiting.legs])
+        steps = [leg.step.step for leg in waiting.legs for _ in leg.rows]
+        readings = hung_anew(self._drive, rows, steps)
         fixed = None if self._free else self._drive.sensors.fixed()
         batch = CarriedBatch(self._map, readings, fixed)
-        for key_pose, W in zip(batch.key_poses, waiting.whitening, strict=True):
-            yield key_pose_factor(batch, key_pose, W)
+        for leg in waiting.legs:
+            yield key_pose_factor(batch, leg.step.key_pose, leg.whitening, step=leg.step)
 
     def _hand_over(self, last: int) -> None:
         """Begin a section with the last key pose of this one."""

@@ -6,7 +6,7 @@ import gtsam
 
 from l2m_factors import X
 from l2m_gtsam.graph.slam.factors import step_factor
-from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.localised import Localised
 
 
 def write_g2o(path: Path, solution: Localised) -> None:

@@ -32,10 +32,11 @@ from l2m_gtsam.graph.slam.factors import (
     odometry_graph,
 )
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
-from l2m_gtsam.graph.slam.localisation import NOTHING, Localised
+from l2m_gtsam.graph.slam.localised import NOTHING, Localised
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.graph.slam.sight import Sight, place, poses_in, sensors_in
 from l2m_gtsam.graph.slam.tiled import TiledDrive
+from l2m_gtsam.graph.slam.ways import Ways
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.solve.robust import WEIGHTS
 
@@ -167,7 +168,8 @@ class TiledProblem:
         mu
             Stage of the graduation of the readings' weights.
         """
-        tiled = TiledDrive.lay(self._drive, poses, sensors, self._prior)
+        ways = Ways.along(self._drive, poses)
+        tiled = TiledDrive.lay(ways, poses, sensors, self._prior)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
         for k, pose in enumerate(poses):
@@ -175,14 +177,14 @@ class TiledProblem:
         sights = tiled.sights(values, sensors)
         whitenings = [sight.whitening(noise) for sight in sights]
         W = self._gathered(tiled, whitenings)
-        pairs = zip(sights, whitenings, strict=True)
-        r2 = self._gathered(tiled, [sight.squared(each) for sight, each in pairs])
+        r2 = self._squared(tiled, ways, sights, noise)
         robust = self._options.robust
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
         chosen = np.flatnonzero(weights > NOTHING)
         fixed = None if self._free else self._drive.sensors.fixed()
         W = W * np.sqrt(weights)[:, None, None]
-        graph = tiled.graph(self._drive, noise, W, chosen, fixed)
+        by_lidar = self._gathered(tiled, [sight.by_lidar for sight in sights])
+        graph = tiled.graph(ways, noise, W, by_lidar, chosen, fixed)
         graph.push_back(self._odometry)
         graph.push_back(self._links)
         if self._free:
@@ -199,9 +201,9 @@ class TiledProblem:
         """Return a solved stage with its covariances and residuals."""
         drive, sensors = self._drive, solved.sensors
         marginals = solved_marginals(solved.graph, solved.values)
-        tiled = solved.tiled.moved(drive, solved.poses, sensors)
+        ways = Ways.along(drive, solved.poses)
+        tiled = solved.tiled.moved(ways, solved.poses, sensors)
         sights = tiled.sights(solved.values, sensors)
-        squared = [sight.squared(sight.whitening(sensors.noise)) for sight in sights]
         solution = Localised(
             drive=replace(drive, sensors=sensors),
             poses=solved.poses,
@@ -211,8 +213,9 @@ class TiledProblem:
                 if self._free
                 else sensors.covariance
             ),
-            sight=self._sight(solved, tiled, sights),
-            squared=self._gathered(tiled, squared),
+            sight=self._sight(solved, ways, tiled, sights),
+            way_share=self._gathered(tiled, way_shares(tiled, ways, sights)),
+            squared=self._squared(tiled, ways, sights, sensors.noise),
             weights=solved.weights,
             near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
@@ -230,11 +233,26 @@ class TiledProblem:
             whole[tile.rows] = part
         return whole
 
-    def _sight(self, solved: Solved, tiled: TiledDrive, sights: list[Sight]) -> Sight:
+    def _squared(
+        self, tiled: TiledDrive, ways: Ways, sights: list[Sight], noise: FloatArray
+    ) -> FloatArray:
+        """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
+        pairs = zip(sights, way_shares(tiled, ways, sights), strict=True)
+        parts = [sight.squared(sight.whitening(noise, more=share)) for sight, share in pairs]
+        return self._gathered(tiled, parts)
+
+    def _sight(self, solved: Solved, ways: Ways, tiled: TiledDrive, sights: list[Sight]) -> Sight:
         """Return what the tiles say, with places and axes of the map."""
-        where = place(self._drive.readings, dict(enumerate(solved.poses)), solved.sensors)
+        where = place(ways.readings, dict(enumerate(solved.poses)), solved.sensors)
         anchors = [solved.poses[tile.anchor].rotation().matrix() for tile in tiled.tiles]
         pairs = zip(sights, anchors, strict=True)
         variance = self._gathered(tiled, [each.map_variance @ (R**2).T for each, R in pairs])
         residual = self._gathered(tiled, [sight.residual for sight in sights])
-        return Sight(where, np.ones(len(residual), bool), variance, residual)
+        by_lidar = self._gathered(tiled, [sight.by_lidar for sight in sights])
+        return Sight(where, np.ones(len(residual), bool), variance, residual, by_lidar)
+
+
+def way_shares(tiled: TiledDrive, ways: Ways, sights: list[Sight]) -> list[FloatArray]:
+    """Return of each tile what errors of the ways contribute to its residuals, (n, 3, 3)."""
+    pairs = zip(tiled.tiles, sights, strict=True)
+    return [ways.share(tile.rows, sight.by_lidar) for tile, sight in pairs]

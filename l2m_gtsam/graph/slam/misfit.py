@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.slam.drive import Drive
-from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.graph.slam.mirror import HalfTurned
 from l2m_gtsam.graph.view import QueryableMap
 
@@ -30,8 +30,12 @@ def misfits(solution: Localised) -> FloatArray:
     What is far off counts as the least that is rejected, what was read near a change not at all.
     Infinite where a sensor has no reading.
     """
+    return _misfits(solution, solution.sight.inside & ~solution.near_changes)
+
+
+def _misfits(solution: Localised, judged: BoolArray) -> FloatArray:
+    """Return those by some of the readings, (N,)."""
     left = np.full(len(solution.drive.sensors.names), np.inf)
-    judged = solution.sight.inside & ~solution.near_changes
     for sensor in range(len(left)):
         own = judged & (solution.drive.readings.sensor == sensor)
         if own.any():
@@ -55,7 +59,19 @@ def wrong_maps(drive: Drive, field_map: QueryableMap) -> tuple[HalfTurned, ...]:
 
 def explains_no_more(solution: Localised, wrong: Sequence[Localised]) -> bool:
     """Return whether a drive fits a map hardly better than one of some that are wrong."""
-    left, inside = misfits(solution), solution.sight.inside.sum()
-    best = int(np.argmin(left))
-    others = [misfits(each)[best] for each in wrong if each.sight.inside.sum() >= LEAST * inside]
-    return any(bool(left[best] > MUCH * other) for other in others)
+    inside, best = solution.sight.inside.sum(), int(np.argmin(misfits(solution)))
+    others = [each for each in wrong if each.sight.inside.sum() >= LEAST * inside]
+    return any(_fits_no_better(solution, each, best) for each in others)
+
+
+def _fits_no_better(solution: Localised, wrong: Localised, sensor: int) -> bool:
+    """Return whether the readings of a sensor fit hardly better than in a wrong map.
+
+    Those that neither map explains, as beside a door, tell nothing of which of them is right.
+    """
+    told = solution.used | wrong.used
+    left, other = (
+        _misfits(each, each.sight.inside & ~each.near_changes & told)[sensor]
+        for each in (solution, wrong)
+    )
+    return bool(left > MUCH * other)

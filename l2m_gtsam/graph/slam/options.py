@@ -31,7 +31,8 @@ class KeyPoseOptions(Options):
     distance_m: float = Field(default=0.2, gt=0)
     """A key pose is made after so much way,"""
     angle_deg: float = Field(default=10.0, gt=0, le=180)
-    """or after so much turning. Readings between key poses hang on the one before them."""
+    """or after so much turning. Readings lie between key poses, as far along as
+    odometry has them, and less surely so the further away both are."""
     readings: int = Field(default=8, ge=1)
     """The most readings of a sensor on a key pose, spread over its time: a vehicle that is parked
     reads one place again and again."""

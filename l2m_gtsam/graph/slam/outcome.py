@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import Distortion, Trajectory
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.drive import Drive
-from l2m_gtsam.graph.slam.localisation import Localised
+from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.graph.slam.misfit import explains_no_more
 from l2m_gtsam.graph.slam.pose_graph import PoseGraph
 from l2m_gtsam.graph.slam.slips import slip_notes

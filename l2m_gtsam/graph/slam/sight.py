@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from l2m_factors import CarriedReadings, D, MagneticReadings, T, X
+from l2m_factors import CarriedReadings, D, MagneticReadings, T, X, skew
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.slam.drive import KnownSensors
 from l2m_gtsam.graph.view import QueryableMap
@@ -53,12 +53,16 @@ class Sight:
         Of the map's field per axis of the map in uT^2, shape (N, 3); infinite outside.
     residual
         ``C b + H - z`` in uT, shape (N, 3); NaN outside.
+    by_lidar
+        Its derivative by a right perturbation of the lidar's pose, rotation in uT/rad before
+        translation in uT/m, shape (N, 3, 6); zero outside.
     """
 
     place: Place
     inside: BoolArray
     map_variance: FloatArray
     residual: FloatArray
+    by_lidar: FloatArray
 
     def whitening(
         self,
@@ -120,9 +124,14 @@ def place(
 def look(field_map: QueryableMap, where: Place, sensors: KnownSensors) -> Sight:
     """Ask the map, once for all readings."""
     sample, at = field_map.query(where.x), where.readings
-    b = np.einsum("nji,nj->ni", at.R_map_lidar, sample.field)
+    R_back = at.R_map_lidar.transpose(0, 2, 1)
+    b = np.einsum("nij,nj->ni", R_back, sample.field)
     predicted = np.einsum("nij,nj->ni", where.C, b) + sensors.distortion[at.sensor, 9:]
-    return Sight(where, sample.inside, sample.variance, predicted - at.field)
+    by_shift = R_back @ sample.gradient @ at.R_map_lidar
+    by_turn = skew(b) - by_shift @ skew(sensors.t[at.sensor])
+    by_lidar = where.C @ np.concatenate([by_turn, by_shift], axis=2)
+    by_lidar[~sample.inside] = 0.0
+    return Sight(where, sample.inside, sample.variance, predicted - at.field, by_lidar)
 
 
 def poses_in(values: gtsam.Values, count: int) -> dict[int, gtsam.Pose3]:

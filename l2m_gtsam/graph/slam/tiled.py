@@ -5,12 +5,21 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import Calibrations, FieldDoubt, M, TileBatch, doubt_factor, tile_factor
+from l2m_factors import (
+    Calibrations,
+    CarriedReadings,
+    FieldDoubt,
+    M,
+    TileBatch,
+    doubt_factor,
+    tile_factor,
+)
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
-from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
+from l2m_gtsam.graph.slam.drive import KnownSensors
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
 from l2m_gtsam.graph.slam.sight import Place, Sight, look, place
 from l2m_gtsam.graph.slam.tiles import Anchoring, WaveTile, anchored, level_axes
+from l2m_gtsam.graph.slam.ways import Ways
 
 
 @dataclass(frozen=True)
@@ -86,27 +95,28 @@ class TiledDrive:
 
     @classmethod
     def lay(
-        cls, drive: Drive, poses: list[gtsam.Pose3], sensors: KnownSensors, prior: FieldPrior
+        cls, ways: Ways, poses: list[gtsam.Pose3], sensors: KnownSensors, prior: FieldPrior
     ) -> "TiledDrive":
-        """Lay a drive out on tiles, with its key poses and sensors taken for these."""
+        """Lay a drive out on tiles, with ways, key poses and sensors taken for these."""
         R = np.stack([pose.rotation().matrix() for pose in poses])
         p = np.stack([pose.translation() for pose in poses])
         anchoring = anchored(R, p, prior.options.core)
         axes = level_axes(R)
-        owner = anchoring.tile[drive.readings.key_pose]
+        owner = anchoring.tile[ways.readings.key_pose]
         tiles = []
         for number, anchor in enumerate(anchoring.anchor.tolist()):
             rows = np.flatnonzero(owner == number)
             if len(rows):
-                where = _relative_place(drive, rows, poses, anchor, sensors)
+                where = _relative_place(ways.readings[rows], poses, anchor, sensors)
                 field = WaveTile.about(prior, R[anchor].T @ axes[anchor], where.x)
                 tiles.append(LaidTile(number, anchor, rows, field, where))
         return cls(anchoring, tuple(tiles))
 
-    def moved(self, drive: Drive, poses: list[gtsam.Pose3], sensors: KnownSensors) -> "TiledDrive":
+    def moved(self, ways: Ways, poses: list[gtsam.Pose3], sensors: KnownSensors) -> "TiledDrive":
         """Return the same tiles with their readings where these poses and sensors put them."""
+        own = ways.readings
         tiles = (
-            replace(tile, place=_relative_place(drive, tile.rows, poses, tile.anchor, sensors))
+            replace(tile, place=_relative_place(own[tile.rows], poses, tile.anchor, sensors))
             for tile in self.tiles
         )
         return TiledDrive(self.anchoring, tuple(tiles))
@@ -124,9 +134,10 @@ class TiledDrive:
 
     def graph(
         self,
-        drive: Drive,
+        ways: Ways,
         noise: FloatArray,
         whitening: FloatArray,
+        by_lidar: FloatArray,
         chosen: IntArray,
         fixed: Calibrations | None,
     ) -> gtsam.NonlinearFactorGraph:
@@ -134,12 +145,14 @@ class TiledDrive:
 
         Parameters
         ----------
-        drive
-            That was laid out.
+        ways
+            Of the drive that was laid out, when it was.
         noise
             Standard deviation of each sensor's noise in uT, shape (S,).
         whitening
-            Of the residuals of all its N readings, 1/uT, shape (N, 3, 3).
+            Of the residuals of all its N readings but for errors of the ways, 1/uT, (N, 3, 3).
+        by_lidar
+            Their derivatives by a right perturbation of the lidar's pose, shape (N, 3, 6).
         chosen
             Readings that count.
         fixed
@@ -151,26 +164,22 @@ class TiledDrive:
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
             graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
             if len(rows):
-                readings = drive.readings[rows]
+                readings = ways.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
                 doubt = tile.doubt(rows, noise)
                 for k in batch.key_poses:
-                    own = batch.rows_of(k)
-                    graph.add(tile_factor(batch, k, whitening[rows[own]]))
-                    factor = doubt_factor(batch, k, doubt[own])
+                    own = rows[batch.rows_of(k)]
+                    white = ways.whitening(own, whitening[own], by_lidar[own])
+                    graph.add(tile_factor(batch, k, white, ways.step_error(own, by_lidar[own])))
+                    factor = doubt_factor(batch, k, doubt[batch.rows_of(k)])
                     if factor is not None:
                         graph.add(factor)
         return graph
 
 
 def _relative_place(
-    drive: Drive,
-    rows: IntArray,
-    poses: list[gtsam.Pose3],
-    anchor: int,
-    sensors: KnownSensors,
+    readings: CarriedReadings, poses: list[gtsam.Pose3], anchor: int, sensors: KnownSensors
 ) -> Place:
-    readings = drive.readings[rows]
     origin = poses[anchor]
     own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
     return place(readings, own, sensors)

@@ -1,0 +1,84 @@
+r"""Readings between two key poses: what they feel of the error of odometry's step.
+
+A reading after a share s of the step from ``X(k)`` to ``X(k+1)`` stands at ``X(k) (R, p)`` if the
+step is Z. With ``d = Log(Z^{-1} X(k)^{-1} X(k+1))`` it stands elsewhere by ``s d``, and
+
+.. math::
+    e = e(X(k)) + G d
+
+with G the derivative of the residual by d where the graph is linearised. For the best result
+readings are hung anew, by the step as it is estimated then; there d is zero, and e is exact.
+"""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from l2m_factors.field_map import FloatArray
+from l2m_factors.keys import X
+from l2m_factors.whitening import Whitening
+
+
+@dataclass(frozen=True)
+class StepError:
+    """What n readings between a key pose and the next feel of the error of the step.
+
+    Attributes
+    ----------
+    key_pose
+        Number k of the key pose before them.
+    step
+        Z, the step by which they hang on it: the next key pose in its frame.
+    slope
+        G, by a right perturbation of the step, uT/rad and uT/m, shape (n, 3, 6).
+    """
+
+    key_pose: int
+    step: gtsam.Pose3
+    slope: FloatArray
+
+    @property
+    def keys(self) -> list[int]:
+        """The two key poses."""
+        return [X(self.key_pose), X(self.key_pose + 1)]
+
+    def residual(self, values: gtsam.Values) -> FloatArray:
+        """Return ``G d`` in uT, shape (n, 3)."""
+        off = gtsam.Pose3.Logmap(self.step.between(self._way(values)))
+        return np.asarray(self.slope @ off)
+
+    def jacobians(self, values: gtsam.Values) -> list[FloatArray]:
+        """Return its derivatives by the two key poses, shape (n, 3, 6) each."""
+        way = self._way(values)
+        off = self.step.between(way)
+        by_next = self.slope @ gtsam.Pose3.LogmapDerivative(off)
+        return [-by_next @ way.inverse().AdjointMap(), by_next]
+
+    def _way(self, values: gtsam.Values) -> gtsam.Pose3:
+        before, after = (values.atPose3(key) for key in self.keys)
+        return before.between(after)
+
+
+class Slots:
+    """The variables of a factor whose residual is a sum of terms that share some.
+
+    Parameters
+    ----------
+    keys
+        Of one block of derivatives after the other, some more than once.
+    """
+
+    def __init__(self, keys: list[int]) -> None:
+        self.keys = list(dict.fromkeys(keys))
+        self._slot = [self.keys.index(key) for key in keys]
+
+    def fill(
+        self, jacobians: list[FloatArray], whitening: Whitening, blocks: list[FloatArray]
+    ) -> None:
+        """Put in what whitening makes of the blocks, (n, 3, .) each; those of one key add up."""
+        sums: dict[int, FloatArray] = {}
+        for slot, block in zip(self._slot, blocks, strict=True):
+            sums[slot] = sums[slot] + block if slot in sums else block
+        for slot, block in sums.items():
+            jacobians[slot] = whitening(block)
