@@ -137,18 +137,19 @@ class WaveTile:
         taught
             Information of others about the weights, shape (m, m).
         """
-        root = 1 / np.sqrt(variance)
         known = np.eye(len(self)) + self.information(points, variance)
         lower = cholesky(known if taught is None else known + taught, lower=True)
-
-        def root_share(x: FloatArray) -> FloatArray:
-            seen = (self.features(x) * root[:, :, None]).reshape(-1, len(self))
-            spread = cho_solve((lower, True), seen.T)
-            return np.asarray(np.sqrt((spread**2).sum(axis=0).reshape(-1, AXES).sum(axis=1)))
-
+        spread = cho_solve((lower, True), np.eye(len(self)))
+        root = 1 / np.sqrt(variance)[:, :, None]
+        share = root * (self.features(points) @ spread)
+        value = np.sqrt(np.einsum("nam,nam->n", share, share))
+        by_features = root * (share @ spread) / value[:, None, None]
         steps = SIDE_M * np.eye(AXES)
-        slopes = [(root_share(points + s) - root_share(points - s)) / (2 * SIDE_M) for s in steps]
-        return FieldDoubt(points, root_share(points), np.stack(slopes, axis=1))
+        slopes = [
+            np.einsum("nam,nam->n", by_features, self.features(points + s)) for s in (*steps, *-steps)
+        ]
+        slope = (np.stack(slopes[:AXES], axis=1) - np.stack(slopes[AXES:], axis=1)) / (2 * SIDE_M)
+        return FieldDoubt(points, value, slope)
 
 
 @dataclass(frozen=True)
