@@ -21,12 +21,12 @@ from l2m_gtsam.graph.slam.joint_gaussian import (
     columns_of,
     local,
     part_of,
+    poses_among,
     retracted,
     slices_of,
-    turned,
 )
 
-CLOSE = 0.05  # squared length of a step in sigmas, of all variables together: as good as none
+CLOSE = 1.0  # squared length of a step in sigmas, of hundreds of variables together: the last one
 DAMPINGS = (0.0, 1e-4, 1e-2, 1.0, 100.0)  # of a step, in units of the diagonal, one after the other
 RISE = 1e-9  # of the cost, relative: rounding
 
@@ -59,12 +59,12 @@ class Prior:
     def quadratic(self, values: gtsam.Values) -> tuple[FloatArray, FloatArray]:
         """Return the cost's second derivative and gradient by perturbations of values."""
         away = local(self._known.values, values, self.sizes)
-
-        def by_now(rows: FloatArray) -> FloatArray:
-            return turned(rows, self.sizes, away, transposed_log_derivative)
-
-        gradient = by_now((self._information @ away)[:, None])[:, 0]
-        return by_now(by_now(self._information).T), gradient
+        H, g = self._information.copy(), self._information @ away
+        for own in poses_among(self.sizes):
+            by_now = gtsam.Pose3.LogmapDerivative(away[own])
+            H[own], g[own] = by_now.T @ H[own], by_now.T @ g[own]
+            H[:, own] = H[:, own] @ by_now
+        return H, g
 
 
 @dataclass(frozen=True)
@@ -128,12 +128,11 @@ def descended(
         The covariances of what is known are too many orders of magnitude apart.
     """
     cost = graph.error(values) + prior.cost(values)
-    for step in range(most + 1):
+    for step in range(1, most + 1):
         H, g = gathered(graph, prior, values, sizes)
         lower = factored(H)
         newton = cho_solve((lower, True), g, check_finite=False)
-        if float(g @ newton) < CLOSE or step == most:
-            break
+        length = float(g @ newton)
         for damping in DAMPINGS:
             if damping:
                 damped = factored(H + damping * np.diag(np.diag(H)))
@@ -141,10 +140,12 @@ def descended(
             there = retracted(values, sizes, -newton)
             reached = graph.error(there) + prior.cost(there)
             if reached <= cost * (1 + RISE):
+                values, cost = there, reached
                 break
         else:
             break
-        values, cost = there, reached
+        if length < CLOSE:
+            break
     return Descent(values, sizes, lower, step)
 
 
@@ -207,7 +208,3 @@ def inverse(lower: FloatArray) -> FloatArray:
     half, _ = dpotri(lower, lower=1)
     return np.asarray(np.tril(half) + np.tril(half, -1).T)
 
-
-def transposed_log_derivative(shift: FloatArray) -> FloatArray:
-    """Return what takes a gradient by a shift to one by a perturbation of the shifted pose."""
-    return np.asarray(gtsam.Pose3.LogmapDerivative(shift)).T

@@ -170,7 +170,11 @@ def turned(
 ) -> FloatArray:
     """Return rows (n, q) for n components, those of poses times a derivative at their shift."""
     found = rows.copy()
-    for key, own in slices_of(sizes).items():
-        if gtsam.symbolChr(key) == ord("X"):
-            found[own] = derivative(shift[own]) @ rows[own]
+    for own in poses_among(sizes):
+        found[own] = derivative(shift[own]) @ rows[own]
     return found
+
+
+def poses_among(sizes: Mapping[int, int]) -> list[slice]:
+    """Return the components of each pose among variables."""
+    return [own for key, own in slices_of(sizes).items() if gtsam.symbolChr(key) == ord("X")]

@@ -21,10 +21,11 @@ from l2m_gtsam.graph.slam.tiles import WaveTile, level_axes, tile_about
 from l2m_gtsam.solve.robust import WEIGHTS
 
 NOTHING = 1e-6  # a weight that is as good as none
-# How many times their noise readings that are new may be off, and how sharply good ones are told
-# from wrong ones: where the vehicle was just before, and where it comes to after having been away.
-AGAIN = ((16.0, 1.0), (4.0, 1.0), (1.0, 1.0), (1.0, np.inf))
-ONWARDS = ((4.0, 1.0), (1.0, 1.0), (1.0, np.inf))
+# How many times their noise readings that are new may be off, stage by stage: where the vehicle was
+# just before, and where it comes to after having been away.
+ONWARDS = (4.0, 1.0)
+AGAIN = (16.0, 4.0, 1.0)
+SOFT = 1.0  # how sharply good ones among them are told from wrong ones, mu of ``solve.robust``
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,9 @@ class OpenSection:
         self._weights = np.append(self._weights, np.ones(len(fresh)))
         self._last = last
         recent = np.arange(len(self._rows)) >= len(self._rows) - len(fresh)
-        for scale, mu in stages:
-            self._solve(np.where(recent, scale, 1.0), np.where(recent, mu, np.inf))
+        for scale in stages[:-1]:
+            self._solve(recent, scale, 1, False)
+        self._solve(recent, stages[-1], self._options.max_iterations, True)
         return self._belief()
 
     def closed(self) -> tuple[JointGaussian, tuple[ExploredTile, ...]]:
@@ -121,7 +123,7 @@ class OpenSection:
         """Return its variables."""
         return self._values
 
-    def _placed(self, new: range) -> tuple[tuple[float, float], ...]:
+    def _placed(self, new: range) -> tuple[float, ...]:
         """Predict key poses and lay them on tiles; return the stages to solve them in."""
         stages, core = ONWARDS, self._field_prior.options.core
         for k in new:
@@ -198,8 +200,9 @@ class OpenSection:
         noise = self._drive.sensors.noise[laid.place.readings.sensor, None]
         return noise**2 + laid.field.unresolved(laid.place.x)
 
-    def _solve(self, scale: FloatArray, mu: FloatArray) -> None:
+    def _solve(self, recent, times: float, most: int, last: bool) -> None:
         """Solve the section, with so many times the noise of each reading."""
+        scale, mu = np.where(recent, times, 1.0), np.where(recent, SOFT, np.inf)
         graph, noise, robust = gtsam.NonlinearFactorGraph(), self._drive.sensors.noise, self._options.robust
         for k in range(self._first, self._last):
             graph.add(step_factor(self._drive, k))
@@ -230,12 +233,12 @@ class OpenSection:
             readings = self._drive.readings[laid.rows[chosen]]
             batch = TileBatch(laid.number, laid.anchor, laid.field, readings, fixed)
             variance = self._variance(laid)[chosen] * own[chosen, None] ** 2
-            doubt = laid.field.doubt(laid.place.x[chosen], variance, self._tiles[laid.number].taught)
+            if last: doubt = laid.field.doubt(laid.place.x[chosen], variance, self._tiles[laid.number].taught)
             W = (W * np.sqrt(weights)[:, None, None])[chosen]
             for k in batch.key_poses:
                 mine = batch.rows_of(k)
                 graph.add(tile_factor(batch, k, W[mine]))
-                factor = doubt_factor(batch, k, doubt[mine])
+                factor = doubt_factor(batch, k, doubt[mine]) if last else None
                 if factor is not None:
                     graph.add(factor)
         if self._prior is None:
@@ -243,9 +246,9 @@ class OpenSection:
         kept = self._kept()
         between = [X(k) for k in range(self._first, self._last + 1) if X(k) not in kept]
         sizes = {key: self._size(key) for key in [*between, *kept]}
-        self._descent = descended(graph, self._prior, self._values, sizes, self._options.max_iterations)
+        self._descent = descended(graph, self._prior, self._values, sizes, most)
         self._values = self._descent.values
-        self.steps += self._descent.steps + 1
+        self.steps += self._descent.steps
 
     def _kept(self) -> list[int]:
         """Return the variables that outlive the section or began it, the last pose at the end."""
