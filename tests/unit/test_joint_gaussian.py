@@ -11,7 +11,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.slam.dense_descent import Prior, descended
 from l2m_gtsam.graph.slam.joint_gaussian import JointGaussian, conditioned, local, retracted
 
-ROUNDING = 1e-8  # of matrices of condition 1e4, and of the correlations that are kept apart by 1e-12
+ROUNDING = 1e-8  # of matrices of condition 1e4, with 1e-12 added to correlations
 
 
 def spread(rng: np.random.Generator, count: int) -> FloatArray:
@@ -33,7 +33,7 @@ def test_others_follow_as_if_all_had_been_solved_together(
     J[:, s] = rng.normal(size=(known + 2, known))
     posterior = np.linalg.inv(np.linalg.inv(P) + J.T @ J)
     mean = posterior @ J.T @ y
-    after = posterior[np.ix_(s, s)]
+    after = np.asarray(posterior[np.ix_(s, s)])
     found = conditioned(P, s, mean[s], after, after)
     np.testing.assert_allclose(found.shift, mean[r], atol=ROUNDING)
     np.testing.assert_allclose(found.covariance, posterior[np.ix_(r, r)], atol=ROUNDING)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_solve, cholesky
 from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.data import FloatArray
@@ -27,7 +27,7 @@ from l2m_gtsam.graph.slam.joint_gaussian import (
 )
 
 CLOSE = 1.0  # squared length of a step in sigmas, of hundreds of variables together: the last one
-DAMPINGS = (0.0, 1e-4, 1e-2, 1.0, 100.0)  # of a step, in units of the diagonal, one after the other
+DAMPINGS = (1e-4, 1e-2, 1.0, 100.0)  # of a step, in units of the diagonal, one after the other
 RISE = 1e-9  # of the cost, relative: rounding
 
 
@@ -93,9 +93,7 @@ class Descent:
         keys = list(self.sizes)[len(self.sizes) - count :]
         sizes = {key: self.sizes[key] for key in keys}
         start = len(self.lower) - sum(sizes.values())
-        return JointGaussian(
-            part_of(self.values, keys), sizes, inverse(self.lower[start:, start:])
-        )
+        return JointGaussian(part_of(self.values, keys), sizes, inverse(self.lower[start:, start:]))
 
 
 def descended(
@@ -107,7 +105,8 @@ def descended(
 ) -> Descent:
     """Minimise the cost of a graph and a prior, by Newton's method as Gauss has it.
 
-    A step that does not lessen the cost is damped.
+    A step that does not lessen the cost is damped. The information is that where the last step began:
+    it was short.
 
     Parameters
     ----------
@@ -127,26 +126,44 @@ def descended(
     CalibrationError
         The covariances of what is known are too many orders of magnitude apart.
     """
-    cost = graph.error(values) + prior.cost(values)
     for step in range(1, most + 1):
         H, g = gathered(graph, prior, values, sizes)
         lower = factored(H)
         newton = cho_solve((lower, True), g, check_finite=False)
-        length = float(g @ newton)
-        for damping in DAMPINGS:
-            if damping:
-                damped = factored(H + damping * np.diag(np.diag(H)))
-                newton = cho_solve((damped, True), g, check_finite=False)
-            there = retracted(values, sizes, -newton)
-            reached = graph.error(there) + prior.cost(there)
-            if reached <= cost * (1 + RISE):
-                values, cost = there, reached
-                break
-        else:
-            break
-        if length < CLOSE:
+        there = lessened(graph, prior, values, sizes, Quadratic(H, g, newton))
+        values = values if there is None else there
+        if there is None or float(g @ newton) < CLOSE:
             break
     return Descent(values, sizes, lower, step)
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """The cost about some values: second derivative, gradient, and the step to its least value."""
+
+    H: FloatArray
+    g: FloatArray
+    newton: FloatArray
+
+
+def lessened(
+    graph: gtsam.NonlinearFactorGraph,
+    prior: Prior,
+    values: gtsam.Values,
+    sizes: Mapping[int, int],
+    near: Quadratic,
+) -> gtsam.Values | None:
+    """Return values that cost less, by the longest step that does so; none if no step does."""
+    most = (graph.error(values) + prior.cost(values)) * (1 + RISE)
+    there = retracted(values, sizes, -near.newton)
+    if graph.error(there) + prior.cost(there) <= most:
+        return there
+    for damping in DAMPINGS:
+        lower = factored(near.H + damping * np.diag(np.diag(near.H)))
+        there = retracted(values, sizes, -cho_solve((lower, True), near.g, check_finite=False))
+        if graph.error(there) + prior.cost(there) <= most:
+            return there
+    return None
 
 
 def gathered(
@@ -163,26 +180,36 @@ def gathered(
     information, gradient = prior.quadratic(values)
     H[np.ix_(at, at)] = information
     g[at] = gradient
-    linear = graph.linearize(values)
-    for part in by_tile([linear.at(i) for i in range(linear.size())]):
-        keys = list(dict.fromkeys(key for factor in part for key in factor.keys()))
+    for part in by_tile(graph.linearize(values)):
+        keys = list(dict.fromkeys(key for factor in part for key in factor.keys))
         own, at = slices_of({key: sizes[key] for key in keys}), columns_of(slices, keys)
-        blocks = [factor.jacobian() for factor in part]
-        ends = np.cumsum([0, *(len(rhs) for _, rhs in blocks)])
-        J = np.zeros((ends[-1], len(at)))
-        for factor, start, end, (A, _) in zip(part, ends[:-1], ends[1:], blocks, strict=True):
-            J[start:end, columns_of(own, factor.keys())] = A
+        ends = np.cumsum([0, *(len(factor.b) for factor in part)])
+        J, b = np.zeros((ends[-1], len(at))), np.concatenate([factor.b for factor in part])
+        for factor, start, end in zip(part, ends[:-1], ends[1:], strict=True):
+            J[start:end, columns_of(own, factor.keys)] = factor.A
         H[np.ix_(at, at)] += J.T @ J
-        g[at] -= J.T @ np.concatenate([rhs for _, rhs in blocks])
+        g[at] -= J.T @ b
     return H, g
 
 
-def by_tile(factors: list[gtsam.JacobianFactor]) -> list[list[gtsam.JacobianFactor]]:
+@dataclass(frozen=True)
+class LinearFactor:
+    """A linearised factor: ``|A x - b|^2 / 2`` in the variables of these keys, one by one."""
+
+    keys: list[int]
+    A: FloatArray
+    b: FloatArray
+
+
+def by_tile(linear: gtsam.GaussianFactorGraph) -> list[list[LinearFactor]]:
     """Return factors with those together that have weights of one tile."""
-    groups: dict[int, list[gtsam.JacobianFactor]] = {}
-    for number, factor in enumerate(factors):
-        tiles = [key for key in factor.keys() if gtsam.symbolChr(key) == ord("M")]
-        groups.setdefault(tiles[0] if tiles else -1 - number, []).append(factor)
+    groups: dict[int, list[LinearFactor]] = {}
+    for number in range(linear.size()):
+        factor = linear.at(number)
+        keys = list(factor.keys())
+        tiles = [key for key in keys if gtsam.symbolChr(key) == ord("M")]
+        group = groups.setdefault(tiles[0] if tiles else -1 - number, [])
+        group.append(LinearFactor(keys, *factor.jacobian()))
     return list(groups.values())
 
 
@@ -207,4 +234,3 @@ def inverse(lower: FloatArray) -> FloatArray:
     """Return ``(L L^T)^-1``."""
     half, _ = dpotri(lower, lower=1)
     return np.asarray(np.tril(half) + np.tril(half, -1).T)
-

@@ -1,91 +1,143 @@
 """Poses and field of a drive through an unknown place, key pose by key pose.
 
 What is remembered is one Gaussian: of the field's weights, tile by tile, of the key poses that
-tiles are fixed to, of the last one, and of calibrations that are variables. It grows with the
-building and not with the drive.
+tiles are fixed to, of the last one, and of calibrations that are variables. The last stretch of the
+way is solved again as it grows, with what is remembered as its prior; at its end what was learnt
+goes over to all of the memory, and its other poses are let go. So both cost and memory grow with
+the building and not with the drive.
+
+That the errors of tiles hang together is what matters: tiles that are taken for independent, or
+for known, drift as odometry does, and sigmas do not tell.
 """
+
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
-from l2m_factors import D, T, X
 from l2m_gtsam.graph.slam.belief import Belief
+from l2m_gtsam.graph.slam.covariances import well_scaled
 from l2m_gtsam.graph.slam.drive import Drive, as_pose
-from l2m_gtsam.graph.slam.factors import calibration_values
+from l2m_gtsam.graph.slam.drive_prior import drive_prior
+from l2m_gtsam.graph.slam.field_memory import FieldMemory
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
-from l2m_gtsam.graph.slam.joint_gaussian import JointGaussian, part_of
-from l2m_gtsam.graph.slam.open_section import ExploredTile, OpenSection
+from l2m_gtsam.graph.slam.open_section import OpenSection
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 
-GROUP_M = 2.0  # of way after which what has come is solved
-SECTION_M = 10.0  # of way that is solved together
+GROUP_M, GROUP = 2.0, 20  # of way, or key poses, after which what has come is solved
+SECTION_M, SECTION = 10.0, 100  # the same of what is solved together
+
+
+@dataclass(frozen=True)
+class LetGo:
+    """A key pose that is no variable any more: where it was in the frame of its tile's anchor."""
+
+    anchor: int
+    T_anchor_key: gtsam.Pose3
 
 
 class Explorer:
     """A drive as far as it was followed through a place without a map.
 
+    Scans do not take part.
+
     Parameters
     ----------
     drive
         The drive.
-    prior
-        Of its field.
     options
-        How to solve.
+        How to solve. Less `tiles.modes` take far less time.
+    prior
+        Of the field; without it, it is learnt as the options say over the first metres, during
+        which poses are those of odometry.
     section_m
         Way that is solved together, metres.
     """
 
     def __init__(
-        self, drive: Drive, prior: FieldPrior, options: SlamOptions, section_m: float = SECTION_M
+        self,
+        drive: Drive,
+        options: SlamOptions,
+        prior: FieldPrior | None = None,
+        section_m: float = SECTION_M,
     ) -> None:
-        self._drive, self._prior, self._options = drive, prior, options
+        self._drive, self._options, self._section_m = drive, options, section_m
+        free = options.calibration is CalibrationUse.REFINED
+        self._memory = FieldMemory.at_start(drive, free=free)
         self._way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
-        self._section_m, self._solved_m, self._opened_m = section_m, -GROUP_M, 0.0
-        self.known = self._at_start()
-        sensors = drive.sensors
-        self._belief = Belief(
-            as_pose(drive.start.T_map_lidar), sensors, np.roll(self.known.covariance, 0)
-        )
-        self._section = self._opened((), 0)
-        self._past: dict[int, gtsam.Pose3] = {}
-        self._first = 0
+        self._first = self._solved = 0
+        self._past: list[LetGo] = []
+        self._belief = self._at_start()
+        self._section = None if prior is None else self._opened(prior)
+
+    @property
+    def memory(self) -> FieldMemory:
+        """What is remembered of all but the last stretch."""
+        return self._memory
 
     def step(self, number: int) -> Belief:
-        """Add a key pose, and return what is known of it then; they come in order."""
-        if number > 0:
-            drift = self._drive.steps.covariance[number - 1]
-            self._belief = self._belief.after(self._drive.step(number - 1), drift)
-        way = self._way[number]
-        if way - self._solved_m >= GROUP_M or number == len(self._drive) - 1:
-            self._belief = self._section.extend(number)
-            self._solved_m = way
-            if way - self._opened_m >= self._section_m:
-                self._hand_over(number)
+        """Add a key pose, and return what is known of it then; they come in order.
+
+        Raises
+        ------
+        CalibrationError
+            What is known is too many orders of magnitude apart.
+        MapError
+            There are too few readings to learn a prior of the field from.
+        """
+        pending = range(number, number + 1)
+        if self._section is None and self._is_learnt_by(number):
+            part = self._drive.until(number + 1)
+            prior = drive_prior(part, part.dead_reckoning(), self._options.tiles)
+            self._section, self._belief = self._opened(prior), self._at_start()
+            pending = range(number + 1)
+        for k in pending:
+            self._carry(k)
+            if self._section is not None and self._is_due(k):
+                with well_scaled():
+                    self._settle(self._section, k)
         return self._belief
 
     def poses(self) -> list[gtsam.Pose3]:
-        """Return all key poses up to the last one that was solved, as their sections have them."""
-        return []
+        """Return all key poses that were solved, where the anchors of their tiles are by now."""
+        if self._section is None:
+            return []
+        now = self._section
+        past = [now.pose(each.anchor).compose(each.T_anchor_key) for each in self._past]
+        return [*past, *(now.pose(k) for k in range(len(past), self._solved + 1))]
 
-    def _at_start(self) -> JointGaussian:
-        start, sensors = self._drive.start, self._drive.sensors
-        values = gtsam.Values()
-        sizes, blocks = {X(0): 6}, [start.covariance]
-        values.insert(X(0), as_pose(start.T_map_lidar))
-        if self._options.calibration is CalibrationUse.REFINED:
-            values.insert(calibration_values(sensors))
-            for i, covariance in enumerate(sensors.covariance):
-                sizes |= {T(i): 3, D(i): 12}
-                blocks.append(covariance)
-        return JointGaussian(values, sizes, block_diag(*blocks))
+    def _at_start(self) -> Belief:
+        start = as_pose(self._drive.start.T_map_lidar)
+        return Belief(start, self._drive.sensors, self._memory.known.covariance)
 
-    def _opened(self, tiles: tuple[ExploredTile, ...], first: int) -> OpenSection:
-        return OpenSection(self._drive, self._prior, self._options, self.known, tiles, first)
+    def _opened(self, prior: FieldPrior) -> OpenSection:
+        return OpenSection(self._drive, prior, self._options, self._memory, 0)
 
-    def _hand_over(self, last: int) -> None:
-        self.known, tiles = self._section.closed()
-        self.tiles = tiles
-        self._section = self._opened(tiles, last)
-        self._opened_m, self._first = self._way[last], last
+    def _is_learnt_by(self, number: int) -> bool:
+        """Return whether the prior can be learnt, or has to be, for nothing more will come."""
+        far = self._way[number] >= self._options.tiles.learn_over_m
+        return bool(far or number == len(self._drive) - 1)
+
+    def _is_due(self, number: int) -> bool:
+        way, count = self._way[number] - self._way[self._solved], number - self._solved
+        return bool(way >= GROUP_M or count >= GROUP or number == len(self._drive) - 1)
+
+    def _carry(self, number: int) -> None:
+        """Carry on by odometry what is known."""
+        if number > 0:
+            drift = self._drive.steps.covariance[number - 1]
+            self._belief = self._belief.after(self._drive.step(number - 1), drift)
+
+    def _settle(self, section: OpenSection, number: int) -> None:
+        """Solve the last stretch up to a key pose, and begin another one if it is long."""
+        self._belief, self._solved = section.extend(number), number
+        way, count = self._way[number] - self._way[self._first], number - self._first
+        if way >= self._section_m or count >= SECTION:
+            self._hand_over(section, number)
+
+    def _hand_over(self, section: OpenSection, last: int) -> None:
+        for k in range(len(self._past), last + 1):
+            anchor = section.tile(k).anchor
+            self._past.append(LetGo(anchor, section.pose(anchor).between(section.pose(k))))
+        self._memory, self._first = section.closed(), last
+        self._section = section.next(self._memory, last)

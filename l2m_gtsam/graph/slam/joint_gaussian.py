@@ -9,7 +9,6 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.slam.belief import POSE
 
 ROUNDING = 1e-12  # of a correlation
 
@@ -119,7 +118,9 @@ class JointGaussian:
         own = turned(cross[:, now].T, shared, shift, was)
         found = conditioned(self.covariance, s, shift, own, cross)
         moves = gtsam.Pose3.ExpmapDerivative
-        left = turned(turned(found.covariance, rest, found.shift, moves).T, rest, found.shift, moves)
+        left = turned(
+            turned(found.covariance, rest, found.shift, moves).T, rest, found.shift, moves
+        )
         across = turned(found.cross, rest, found.shift, moves)
         values = retracted(part_of(self.values, list(rest)), rest, found.shift)
         values.insert(after.values)
@@ -152,9 +153,7 @@ def local(origin: gtsam.Values, there: gtsam.Values, sizes: Mapping[int, int]) -
     return np.concatenate([by_key.at(key) for key in sizes])
 
 
-def retracted(
-    values: gtsam.Values, sizes: Mapping[int, int], step: FloatArray
-) -> gtsam.Values:
+def retracted(values: gtsam.Values, sizes: Mapping[int, int], step: FloatArray) -> gtsam.Values:
     """Return values moved by a perturbation of these variables, shape (n,)."""
     by_key = gtsam.VectorValues()
     for key, own in slices_of(sizes).items():

@@ -146,7 +146,8 @@ class WaveTile:
         by_features = root * (share @ spread) / value[:, None, None]
         steps = SIDE_M * np.eye(AXES)
         slopes = [
-            np.einsum("nam,nam->n", by_features, self.features(points + s)) for s in (*steps, *-steps)
+            np.einsum("nam,nam->n", by_features, self.features(points + step))
+            for step in (*steps, *-steps)
         ]
         slope = (np.stack(slopes[:AXES], axis=1) - np.stack(slopes[AXES:], axis=1)) / (2 * SIDE_M)
         return FieldDoubt(points, value, slope)

@@ -1,0 +1,146 @@
+"""Drives through places without a map, key pose by key pose."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
+from l2m_gtsam.explore import HERE
+from l2m_gtsam.graph.slam.belief import Belief
+from l2m_gtsam.graph.slam.drive import Drive
+from l2m_gtsam.graph.slam.exploring import Explorer
+from l2m_gtsam.graph.slam.options import SlamOptions
+from l2m_gtsam.localise import prepared
+from l2m_gtsam.results import CalibrationResult
+from tests.slam_drives import calibrated, laps, slam_drive
+from tests.worlds import dipole_world, random_sensors
+
+SMALL = (1.9, 1.4)  # radii of laps of 10 m
+TILES = {"core": 2.0, "modes": 60, "learn_over_m": 9.0}  # a small hall, and quick
+QUICK = {"key_poses": {"distance_m": 0.3, "readings": 2}, "tiles": TILES}
+
+
+@dataclass(frozen=True)
+class OnLine:
+    """What was known of each key pose when it came, and where it truly was."""
+
+    explorer: Explorer
+    drive: Drive
+    beliefs: list[Belief]
+    truth: list[gtsam.Pose3]
+    sizes: list[int]
+
+    def off(self, poses: list[gtsam.Pose3]) -> FloatArray:
+        """Return how far poses are off, in metres."""
+        pairs = zip(poses, self.truth, strict=True)
+        return np.array([np.linalg.norm(a.translation() - b.translation()) for a, b in pairs])
+
+    def nees(self) -> FloatArray:
+        errors = [
+            gtsam.Pose3.Logmap(belief.pose.between(true))
+            for belief, true in zip(self.beliefs, self.truth, strict=True)
+        ]
+        pairs = zip(errors, self.beliefs, strict=True)
+        return np.array([e @ np.linalg.solve(known.pose_covariance, e) for e, known in pairs])
+
+
+def rms(off: FloatArray) -> float:
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def on_line(
+    seed: int,
+    truth: Trajectory,
+    sensors: tuple[KnownSensor, ...],
+    known: CalibrationResult,
+    **options: object,
+) -> OnLine:
+    section = float(str(options.pop("section_m", 6.0)))
+    chosen = SlamOptions.model_validate({**QUICK, **options})
+    recorded = slam_drive(dipole_world(seed), sensors, truth, np.random.default_rng(seed))
+    drive, _ = prepared(recorded.recording, known, chosen)
+    drive = replace(drive, start=replace(drive.start, covariance=HERE))
+    explorer, beliefs, sizes = Explorer(drive, chosen, section_m=section), [], []
+    for number in range(len(drive)):
+        beliefs.append(explorer.step(number))
+        sizes.append(len(explorer.memory.known.covariance))
+    rows = np.searchsorted(truth.stamp_ns, drive.stamp_ns)
+    true = [gtsam.Pose3(gtsam.Rot3(truth.R[row]), truth.p[row]) for row in rows]
+    return OnLine(explorer, drive, beliefs, true, sizes)
+
+
+@pytest.fixture(scope="module")
+def round_and_round() -> OnLine:
+    """Three laps of 10 m, with odometry that slips by 1 % of the way."""
+    sensors = random_sensors(1, 6)
+    return on_line(1, laps(54, SMALL), sensors, calibrated(sensors))
+
+
+def test_laps_take_the_drift_out_while_they_are_driven(round_and_round: OnLine) -> None:
+    """After the first lap less than half of the drift is left, in the end a third of all poses'.
+
+    And sigmas cover it: poses of one drive err together, so that twice the six of one is allowed.
+    """
+    found, drift = round_and_round, round_and_round.off(round_and_round.drive.dead_reckoning())
+    third = len(drift) // 3
+    now = found.off([belief.pose for belief in found.beliefs])
+    assert rms(now[third:]) < 0.5 * rms(drift[third:])
+    assert rms(found.off(found.explorer.poses())) < rms(drift) / 3
+    assert found.nees().mean() < 12
+
+
+def test_what_is_remembered_grows_with_the_place_alone(round_and_round: OnLine) -> None:
+    """A lap and a half tell all tiles, to one at the rim; laps add nothing to that."""
+    sizes = np.array(round_and_round.sizes)
+    memory = round_and_round.explorer.memory
+    assert sizes[-1] - sizes[len(sizes) // 2] <= max(len(each.field) + 6 for each in memory.tiles)
+    kinds = [chr(gtsam.symbolChr(key)) for key in memory.known.sizes]
+    assert kinds.count("M") == len(memory.tiles)
+    assert kinds.count("X") <= len(memory.tiles) + 1  # anchors, and the last key pose
+
+
+def test_what_is_remembered_stays_a_covariance(round_and_round: OnLine) -> None:
+    P = round_and_round.explorer.memory.known.covariance
+    sigma = np.sqrt(np.diag(P))
+    assert np.linalg.eigvalsh(P / np.outer(sigma, sigma)).min() > 0
+
+
+def test_before_the_prior_is_learnt_poses_are_those_of_odometry(round_and_round: OnLine) -> None:
+    found, way = round_and_round, np.cumsum(np.linalg.norm(round_and_round.drive.steps.p, axis=1))
+    early = int(np.searchsorted(way, TILES["learn_over_m"]))
+    for belief, pose in zip(found.beliefs[:early], found.drive.dead_reckoning(), strict=False):
+        assert belief.pose.equals(pose, 1e-9)
+    assert not found.beliefs[early + 1].pose.equals(found.drive.dead_reckoning()[early + 1], 1e-3)
+
+
+def test_sections_know_what_one_section_would() -> None:
+    """Sections of 4 m and one of the whole drive, a lap and a bit: alike within sigmas."""
+    sensors = random_sensors(4, 3)
+    known, truth = calibrated(sensors), laps(22, SMALL)
+    short, whole = (on_line(4, truth, sensors, known, section_m=length) for length in (4.0, 1000.0))
+    last, other = short.beliefs[-1], whole.beliefs[-1]
+    apart = gtsam.Pose3.Logmap(other.pose.between(last.pose))
+    sigma = np.sqrt(np.diag(other.pose_covariance))
+    # Poses that were let go are held where they were linearised, robust weights as they were.
+    assert np.abs(apart / sigma).max() < 0.5
+    ratio = np.sqrt(np.diag(last.pose_covariance)) / sigma
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.3
+
+
+def test_a_calibration_is_refined_on_line() -> None:
+    """Places of sensors known to 5 cm: those to each other come out, and sigmas cover all."""
+    sensors = random_sensors(3, 4)
+    sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
+    rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
+    found = on_line(3, laps(36, SMALL), sensors, rough, calibration="refined").beliefs[-1]
+    ideal = np.stack([np.append(each.t_lidar_mag, each.distortion.vector()) for each in sensors])
+    start = np.stack([each.t_lidar_mag for each in rough.sensors]) - ideal[:, :3]
+    error = np.hstack([found.sensors.t, found.sensors.distortion]) - ideal
+    assert np.std(error[:, :3], axis=0).mean() < 0.6 * np.std(start, axis=0).mean()
+    covariance = found.calibration_covariance
+    nees = [e @ np.linalg.solve(P, e) for e, P in zip(error, covariance, strict=True)]
+    # Chi squared of 15 degrees of freedom passes 37.7 once in 1,000.
+    assert max(nees) < 37.7
