@@ -79,14 +79,11 @@ class Descent:
         Components of each, in order.
     lower
         Cholesky factor of the information about them, in this order, shape (n, n).
-    steps
-        That were taken.
     """
 
     values: gtsam.Values
     sizes: Mapping[int, int]
     lower: FloatArray
-    steps: int
 
     def last(self, count: int) -> JointGaussian:
         """Return what is known of the last variables, so many of them."""
@@ -105,8 +102,8 @@ def descended(
 ) -> Descent:
     """Minimise the cost of a graph and a prior, by Newton's method as Gauss has it.
 
-    A step that does not lessen the cost is damped. The information is that where the last step began:
-    it was short.
+    A step that does not lessen the cost is damped. The information is that where the last step
+    began, which was short.
 
     Parameters
     ----------
@@ -126,7 +123,7 @@ def descended(
     CalibrationError
         The covariances of what is known are too many orders of magnitude apart.
     """
-    for step in range(1, most + 1):
+    for _ in range(most):
         H, g = gathered(graph, prior, values, sizes)
         lower = factored(H)
         newton = cho_solve((lower, True), g, check_finite=False)
@@ -134,7 +131,7 @@ def descended(
         values = values if there is None else there
         if there is None or float(g @ newton) < CLOSE:
             break
-    return Descent(values, sizes, lower, step)
+    return Descent(values, sizes, lower)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from pydantic import Field
 
 from l2m_gtsam.graph.slam.belief import Belief
 from l2m_gtsam.graph.slam.covariances import well_scaled
@@ -23,9 +24,20 @@ from l2m_gtsam.graph.slam.field_memory import FieldMemory
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
 from l2m_gtsam.graph.slam.open_section import OpenSection
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.options import Options
 
-GROUP_M, GROUP = 2.0, 20  # of way, or key poses, after which what has come is solved
-SECTION_M, SECTION = 10.0, 100  # the same of what is solved together
+GROUP, SECTION = 20, 100  # key poses that are as good as these ways, for a vehicle that turns
+
+
+class ExploringOptions(Options):
+    """How an unknown field is followed on line; lengths in metres of way."""
+
+    group_m: float = Field(default=2.0, gt=0)
+    """After so much way what has come is solved; until then poses are carried on by odometry. Half
+    of it costs nearly twice the time."""
+    section_m: float = Field(default=10.0, gt=0)
+    """So much is solved together; before that everything but tiles is let go. A vehicle that comes
+    back as far off as odometry has drifted has to find its place within it."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +62,8 @@ class Explorer:
     prior
         Of the field; without it, it is learnt as the options say over the first metres, during
         which poses are those of odometry.
-    section_m
-        Way that is solved together, metres.
+    pace
+        How often, and how much together.
     """
 
     def __init__(
@@ -59,9 +71,10 @@ class Explorer:
         drive: Drive,
         options: SlamOptions,
         prior: FieldPrior | None = None,
-        section_m: float = SECTION_M,
+        pace: ExploringOptions | None = None,
     ) -> None:
-        self._drive, self._options, self._section_m = drive, options, section_m
+        self._drive, self._options = drive, options
+        self._pace = ExploringOptions() if pace is None else pace
         free = options.calibration is CalibrationUse.REFINED
         self._memory = FieldMemory.at_start(drive, free=free)
         self._way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
@@ -120,7 +133,7 @@ class Explorer:
 
     def _is_due(self, number: int) -> bool:
         way, count = self._way[number] - self._way[self._solved], number - self._solved
-        return bool(way >= GROUP_M or count >= GROUP or number == len(self._drive) - 1)
+        return bool(way >= self._pace.group_m or count >= GROUP or number == len(self._drive) - 1)
 
     def _carry(self, number: int) -> None:
         """Carry on by odometry what is known."""
@@ -132,7 +145,7 @@ class Explorer:
         """Solve the last stretch up to a key pose, and begin another one if it is long."""
         self._belief, self._solved = section.extend(number), number
         way, count = self._way[number] - self._way[self._first], number - self._first
-        if way >= self._section_m or count >= SECTION:
+        if way >= self._pace.section_m or count >= SECTION:
             self._hand_over(section, number)
 
     def _hand_over(self, section: OpenSection, last: int) -> None:
