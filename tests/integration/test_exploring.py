@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
+from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.explore import HERE
 from l2m_gtsam.graph.slam.belief import Belief
 from l2m_gtsam.graph.slam.drive import Drive
@@ -156,17 +157,23 @@ def test_sections_know_what_one_section_would() -> None:
     assert ratio.max() < 1.3
 
 
-def test_a_calibration_is_refined_on_line() -> None:
-    """Places of sensors known to 5 cm: those to each other come out, and sigmas cover all."""
-    sensors = random_sensors(3, 4)
-    sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
-    rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
-    found = on_line(3, laps(36, SMALL), sensors, rough, calibration="refined").beliefs[-1]
-    ideal = np.stack([np.append(each.t_lidar_mag, each.distortion.vector()) for each in sensors])
-    start = np.stack([each.t_lidar_mag for each in rough.sensors]) - ideal[:, :3]
-    error = np.hstack([found.sensors.t, found.sensors.distortion]) - ideal
-    assert np.std(error[:, :3], axis=0).mean() < 0.6 * np.std(start, axis=0).mean()
-    covariance = found.calibration_covariance
-    nees = [e @ np.linalg.solve(P, e) for e, P in zip(error, covariance, strict=True)]
-    # Chi squared of 15 degrees of freedom passes 37.7 once in 1,000.
-    assert max(nees) < 37.7
+def test_where_nothing_is_read_odometry_carries_on() -> None:
+    """A stretch of 7 m without readings, and spikes of 30 uT on the key poses before it."""
+    options, own = SlamOptions.model_validate(QUICK), random_sensors(5, 3)
+    drive, truth = prepared_drive(5, laps(32, SMALL), own, calibrated(own), options)
+    at = drive.readings.key_pose
+    spiked = np.where((at >= 34) & (at < 36), 30.0, 0.0)[:, None]
+    readings = replace(drive.readings, field=drive.readings.field + spiked)
+    kept = np.flatnonzero((at < 36) | (at > 60))
+    found = OnLine.over(replace(drive, readings=readings[kept]), truth, options, ExploringOptions())
+    sigma = [np.sqrt(np.trace(belief.pose_covariance[3:, 3:])) for belief in found.beliefs]
+    assert sigma[60] > 1.5 * sigma[34]
+    assert found.nees().mean() < 12
+    drift = found.off(drive.dead_reckoning())
+    assert rms(found.off([belief.pose for belief in found.beliefs])) < 1.2 * rms(drift)
+
+
+def test_calibrations_are_not_refined_on_line(round_and_round: OnLine) -> None:
+    refined = SlamOptions.model_validate({**QUICK, "calibration": "refined"})
+    with pytest.raises(ConfigError, match="works off line"):
+        Explorer(round_and_round.drive, refined)

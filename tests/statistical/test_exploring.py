@@ -64,7 +64,9 @@ def test_on_line_comes_near_to_all_poses_solved_together() -> None:
         assert each.on_line < 0.5 * each.odometry  # the first lap, where nothing helps, among it
         # Sigmas cover it; as poses of one drive err together, a drive may have twice the six.
         assert each.nees < 12
-    at_end, batch = (np.array([getattr(each, name) for each in found]) for name in ("at_end", "batch"))
+    at_end, batch = (
+        np.array([getattr(each, name) for each in found]) for name in ("at_end", "batch")
+    )
     assert rms(at_end) < 1.5 * rms(batch) + 0.01
 
 

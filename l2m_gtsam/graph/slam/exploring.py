@@ -1,10 +1,9 @@
 """Poses and field of a drive through an unknown place, key pose by key pose.
 
 What is remembered is one Gaussian: of the field's weights, tile by tile, of the key poses that
-tiles are fixed to, of the last one, and of calibrations that are variables. The last stretch of the
-way is solved again as it grows, with what is remembered as its prior; at its end what was learnt
-goes over to all of the memory, and its other poses are let go. So both cost and memory grow with
-the building and not with the drive.
+tiles are fixed to, and of the last one. The last stretch of the way is solved again as it grows,
+with what is remembered as its prior; at its end what was learnt goes over to all of the memory, and
+its other poses are let go. So both cost and memory grow with the building and not with the drive.
 
 That the errors of tiles hang together is what matters: tiles that are taken for independent, or
 for known, drift as odometry does, and sigmas do not tell.
@@ -16,6 +15,7 @@ import gtsam
 import numpy as np
 from pydantic import Field
 
+from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.slam.belief import Belief
 from l2m_gtsam.graph.slam.covariances import well_scaled
 from l2m_gtsam.graph.slam.drive import Drive, as_pose
@@ -51,7 +51,8 @@ class LetGo:
 class Explorer:
     """A drive as far as it was followed through a place without a map.
 
-    Scans do not take part.
+    Calibrations are as they are given, and scans do not take part. How high sensors sit is told by
+    what all readings of a tile determine together: those that were let go cannot be asked again.
 
     Parameters
     ----------
@@ -64,6 +65,11 @@ class Explorer:
         which poses are those of odometry.
     pace
         How often, and how much together.
+
+    Raises
+    ------
+    ConfigError
+        Calibrations are to be refined.
     """
 
     def __init__(
@@ -73,10 +79,14 @@ class Explorer:
         prior: FieldPrior | None = None,
         pace: ExploringOptions | None = None,
     ) -> None:
+        if options.calibration is CalibrationUse.REFINED:
+            raise ConfigError(
+                "`slam.calibration: refined` works off line where there is no map; on line give "
+                "`fixed`"
+            )
         self._drive, self._options = drive, options
         self._pace = ExploringOptions() if pace is None else pace
-        free = options.calibration is CalibrationUse.REFINED
-        self._memory = FieldMemory.at_start(drive, free=free)
+        self._memory = FieldMemory.at_start(drive)
         self._way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
         self._first = self._solved = 0
         self._past: list[LetGo] = []

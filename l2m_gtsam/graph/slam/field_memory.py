@@ -4,17 +4,13 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from scipy.linalg import block_diag
 
-from l2m_factors import D, T, X
+from l2m_factors import X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.slam.belief import POSE, SENSOR
+from l2m_gtsam.graph.slam.belief import POSE
 from l2m_gtsam.graph.slam.drive import Drive, as_pose
-from l2m_gtsam.graph.slam.factors import calibration_values, root_information
 from l2m_gtsam.graph.slam.joint_gaussian import JointGaussian
 from l2m_gtsam.graph.slam.tiles import WaveTile, level_axes, tile_about
-
-PLACE = SENSOR - 12  # components of t_lidar_mag
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class FieldMemory:
     Attributes
     ----------
     known
-        Of the last key pose, calibrations that are variables, the tiles' anchors and weights.
+        Of the last key pose, the tiles' anchors and weights.
     tiles
         By number.
     """
@@ -58,22 +54,11 @@ class FieldMemory:
     tiles: tuple[ExploredTile, ...] = field(default=())
 
     @classmethod
-    def at_start(cls, drive: Drive, *, free: bool) -> "FieldMemory":
-        """Return what is known before a drive, with calibrations as variables or without."""
-        values, sizes, blocks = gtsam.Values(), {X(0): POSE}, [drive.start.covariance]
+    def at_start(cls, drive: Drive) -> "FieldMemory":
+        """Return what is known before a drive."""
+        values = gtsam.Values()
         values.insert(X(0), as_pose(drive.start.T_map_lidar))
-        if free:
-            values.insert(calibration_values(drive.sensors))
-            for i, covariance in enumerate(drive.sensors.covariance):
-                sizes |= {T(i): PLACE, D(i): SENSOR - PLACE}
-                W = root_information(covariance)
-                blocks.append(np.asarray(np.linalg.inv(W.T @ W)))
-        return cls(JointGaussian(values, sizes, block_diag(*blocks)))
-
-    @property
-    def calibrations(self) -> list[int]:
-        """Keys of the calibrations that are variables."""
-        return [key for key in self.known.sizes if gtsam.symbolChr(key) in b"TD"]
+        return cls(JointGaussian(values, {X(0): POSE}, drive.start.covariance))
 
 
 def tile_of(pose: gtsam.Pose3, anchors: list[gtsam.Pose3], core: float) -> int:

@@ -5,17 +5,17 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from l2m_factors import Calibrations, M, X
+from l2m_factors import M, X
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.graph.slam.belief import POSE, Belief
 from l2m_gtsam.graph.slam.dense_descent import Descent, Prior, descended
-from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
+from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.factors import step_factor
 from l2m_gtsam.graph.slam.field_memory import ExploredTile, FieldMemory, tile_of
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
 from l2m_gtsam.graph.slam.joint_gaussian import part_of
 from l2m_gtsam.graph.slam.options import SlamOptions
-from l2m_gtsam.graph.slam.sight import Place, place, sensors_in
+from l2m_gtsam.graph.slam.sight import Place, place
 from l2m_gtsam.graph.slam.tile_readings import TileReadings
 from l2m_gtsam.graph.slam.tiled import LaidTile
 from l2m_gtsam.graph.slam.tiles import WaveTile, level_axes
@@ -48,8 +48,8 @@ class OpenSection:
         self._memory, self._tiles = memory, list(memory.tiles)
         self._first, self._last = first, first if first else -1
         self._begin = int(np.searchsorted(drive.readings.key_pose, self._last + 1))
-        self._shared = [X(first)]  # with the memory, beside calibrations
-        self._values = part_of(memory.known.values, [*memory.calibrations, X(first)])
+        self._shared = [X(first)]  # with the memory
+        self._values = part_of(memory.known.values, [X(first)])
         self._tile_of: dict[int, int] = {}
         self._counted: list[TileReadings] = []
         self._prior: Prior | None = None
@@ -66,7 +66,7 @@ class OpenSection:
         graph = self._graph(int(new[0]), stages[-1])
         for each in self._counted:
             tile = self._tiles[each.laid.number]
-            for factor in each.doubts(self._drive, self._fixed, tile):
+            for factor in each.doubts(self._drive, tile):
                 graph.add(factor)
         self._solve(graph, self._options.max_iterations)
         return self._belief()
@@ -94,14 +94,6 @@ class OpenSection:
     def tile(self, number: int) -> ExploredTile:
         """Return the tile that a key pose of the section lies in."""
         return self._tiles[self._tile_of[number]]
-
-    @property
-    def _fixed(self) -> Calibrations | None:
-        return None if self._memory.calibrations else self._drive.sensors.fixed()
-
-    @property
-    def _sensors(self) -> KnownSensors:
-        return sensors_in(self._values, self._drive.sensors)
 
     def _predict(self, new: IntArray, last: int) -> None:
         """Put new key poses where odometry leads."""
@@ -136,17 +128,19 @@ class OpenSection:
         return True
 
     def _waves(self, anchor: int) -> WaveTile:
-        """Return the waves of a tile about a key pose; readings in it tell their heights."""
-        R = self.pose(anchor).rotation().matrix()
+        """Return the waves of a tile about a key pose; sensors and readings tell their heights."""
+        R, rows = self.pose(anchor).rotation().matrix(), self._rows()
         level, options = R.T @ level_axes(R[None])[0], self._field_prior.options
-        x = self._place(self._rows(), anchor).x
+        x = self._drive.sensors.t
+        if len(rows):
+            x = np.vstack([x, self._place(rows, anchor).x])
         near = np.abs(x @ level[:, :2]).max(axis=1) <= options.edge / 2
         return WaveTile.about(self._field_prior, level, x[near] if near.any() else x)
 
     def _place(self, rows: IntArray, anchor: int) -> Place:
         readings, origin = self._drive.readings[rows], self.pose(anchor)
         own = {int(k): origin.between(self.pose(int(k))) for k in np.unique(readings.key_pose)}
-        return place(readings, own, self._sensors)
+        return place(readings, own, self._drive.sensors)
 
     def _graph(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
         """Return odometry, the prior of new tiles, and readings, those from ``new`` on scaled."""
@@ -163,13 +157,13 @@ class OpenSection:
             for number in np.unique(owner).tolist()
         ]
         for each in self._counted:
-            for factor in each.factors(self._drive, self._fixed):
+            for factor in each.factors(self._drive):
                 graph.add(factor)
         return graph
 
     def _weighed(self, tile: ExploredTile, rows: IntArray, new: int, scale: float) -> TileReadings:
         """Return the readings of a tile with their weights, by what it says of them by now."""
-        sensors, readings = self._sensors, self._drive.readings
+        sensors, readings = self._drive.sensors, self._drive.readings
         laid = LaidTile(tile.number, tile.anchor, rows, tile.field, self._place(rows, tile.anchor))
         recent = readings.key_pose[rows] >= new
         if not self._values.atVector(M(tile.number)).any():
@@ -183,8 +177,7 @@ class OpenSection:
     def _solve(self, graph: gtsam.NonlinearFactorGraph, most: int) -> None:
         """Solve for all variables of the section, in so many steps at most."""
         if self._prior is None:
-            shared = [*self._shared, *self._memory.calibrations]
-            self._prior = Prior(self._memory.known.marginal(shared))
+            self._prior = Prior(self._memory.known.marginal(self._shared))
         kept = self._kept()
         poses = [X(k) for k in range(self._first, self._last + 1)]
         order = [*(key for key in poses if key not in kept), *kept]
@@ -198,13 +191,12 @@ class OpenSection:
         last = X(self._last)
         own = dict.fromkeys([X(self._first), *(X(tile.anchor) for tile in tiles)])
         own.pop(last, None)
-        weights = [M(tile.number) for tile in tiles]
-        return [*own, *weights, *self._memory.calibrations, last]
+        return [*own, *(M(tile.number) for tile in tiles), last]
 
     def _size(self, key: int) -> int:
         if gtsam.symbolChr(key) == ord("M"):
             return len(self._tiles[gtsam.symbolIndex(key)].field)
-        return self._memory.known.sizes.get(key, POSE)
+        return POSE
 
     def _solved(self) -> Descent:
         if self._descent is None:
@@ -212,6 +204,5 @@ class OpenSection:
         return self._descent
 
     def _belief(self) -> Belief:
-        known = self._solved().last(1 + len(self._memory.calibrations))
-        covariance = np.roll(known.covariance, POSE, axis=(0, 1))
-        return Belief(self.pose(self._last), self._sensors, covariance)
+        known = self._solved().last(1)
+        return Belief(self.pose(self._last), self._drive.sensors, known.covariance)

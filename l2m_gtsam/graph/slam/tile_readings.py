@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from l2m_factors import Calibrations, TileBatch, doubt_factor, tile_factor
+from l2m_factors import TileBatch, doubt_factor, tile_factor
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.field_memory import ExploredTile
@@ -73,19 +73,17 @@ class TileReadings:
         variance = noise[:, None] ** 2 + laid.field.unresolved(laid.place.x)
         return cls(laid, chosen, W, variance[chosen] / weights[chosen, None])
 
-    def factors(self, drive: Drive, fixed: Calibrations | None) -> Iterator[gtsam.NonlinearFactor]:
-        """Yield what they say of poses and weights, with calibrations fixed or as variables."""
-        batch = self._batch(drive, fixed)
+    def factors(self, drive: Drive) -> Iterator[gtsam.NonlinearFactor]:
+        """Yield what they say of poses and weights."""
+        batch = self._batch(drive)
         for k in batch.key_poses:
             yield tile_factor(batch, k, self.whitening[batch.rows_of(k)])
 
-    def doubts(
-        self, drive: Drive, fixed: Calibrations | None, tile: ExploredTile
-    ) -> Iterator[gtsam.NonlinearFactor]:
+    def doubts(self, drive: Drive, tile: ExploredTile) -> Iterator[gtsam.NonlinearFactor]:
         """Yield what keeps poses from where the tile would take up more noise."""
         if not len(self.chosen):
             return
-        batch, x = self._batch(drive, fixed), self.laid.place.x[self.chosen]
+        batch, x = self._batch(drive), self.laid.place.x[self.chosen]
         doubt = self.laid.field.doubt(x, self.variance, tile.taught)
         for k in batch.key_poses:
             factor = doubt_factor(batch, k, doubt[batch.rows_of(k)])
@@ -96,6 +94,8 @@ class TileReadings:
         """Return what they tell of the tile's m weights, shape (m, m)."""
         return self.laid.field.information(self.laid.place.x[self.chosen], self.variance)
 
-    def _batch(self, drive: Drive, fixed: Calibrations | None) -> TileBatch:
+    def _batch(self, drive: Drive) -> TileBatch:
         readings = drive.readings[self.laid.rows[self.chosen]]
-        return TileBatch(self.laid.number, self.laid.anchor, self.laid.field, readings, fixed)
+        return TileBatch(
+            self.laid.number, self.laid.anchor, self.laid.field, readings, drive.sensors.fixed()
+        )
