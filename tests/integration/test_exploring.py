@@ -167,7 +167,7 @@ def test_where_nothing_is_read_odometry_carries_on() -> None:
     kept = np.flatnonzero((at < 36) | (at > 60))
     found = OnLine.over(replace(drive, readings=readings[kept]), truth, options, ExploringOptions())
     sigma = [np.sqrt(np.trace(belief.pose_covariance[3:, 3:])) for belief in found.beliefs]
-    assert sigma[60] > 1.5 * sigma[34]
+    assert sigma[60] > 1.3 * sigma[34]  # 7 m more of odometry: by its variance 1.4 times
     assert found.nees().mean() < 12
     drift = found.off(drive.dead_reckoning())
     assert rms(found.off([belief.pose for belief in found.beliefs])) < 1.2 * rms(drift)
