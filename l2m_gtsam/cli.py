@@ -22,6 +22,7 @@ from l2m_gtsam.errors import L2MError
 
 if TYPE_CHECKING:
     from l2m_gtsam.results import CalibrationResult
+    from l2m_gtsam.simulate.scenario import ScenarioOptions
 
 app = typer.Typer(
     name="l2m",
@@ -63,6 +64,13 @@ StructureOption = Annotated[
         metavar="CLOUD",
         help="What the LiDAR saw: .pcd, .ply or .npz in the map frame, or a PointCloud2 topic.",
     ),
+]
+ScenarioOption = Annotated[
+    Path | None, typer.Option("--options", help="YAML with the options of the simulation.")
+]
+SeedOption = Annotated[
+    int | None,
+    typer.Option(min=0, help="Of world, drives and sensors, instead of that in --options (1)."),
 ]
 MapFileOption = Annotated[Path, typer.Option("--out", help="Map file to write (.npz).")]
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
@@ -123,31 +131,22 @@ def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
 @app.command()
 def simulate(
     out: OutOption,
-    options: Annotated[
-        Path | None, typer.Option("--options", help="YAML with the options of the simulation.")
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(min=0, help="Of world, drives and sensors, instead of that in --options (1)."),
-    ] = None,
+    options: ScenarioOption = None,
+    seed: SeedOption = None,
     kind: Annotated[
         list[str] | None, typer.Option(help="ros1, sqlite3 or mcap; all three if not given.")
     ] = None,
 ) -> None:
     """Simulate a warehouse, a mapping drive and a calibration drive, and write them as bags."""
     from l2m_gtsam.batch.simulation import simulate_bags
-    from l2m_gtsam.config import load_options
     from l2m_gtsam.errors import ConfigError
     from l2m_gtsam.simulate.bag_writer import BagKind
-    from l2m_gtsam.simulate.scenario import ScenarioOptions
 
     known = [each.value for each in BagKind]
     if unknown := [each for each in kind or [] if each not in known]:
         msg = f"--kind: unknown bag kind {unknown[0]!r}; accepted: {', '.join(known)}"
         raise ConfigError(msg)
-    wanted = ScenarioOptions() if options is None else load_options(options, ScenarioOptions)
-    if seed is not None:
-        wanted = wanted.model_copy(update={"seed": seed})
+    wanted = _scenario(options, seed)
     with shown_progress() as progress:
         simulate_bags(out, wanted, [BagKind(k) for k in kind or known], progress)
     typer.echo(f"bags, suite.yaml, structure.ply and truth.yaml are in {out}")
@@ -246,15 +245,16 @@ def plan(
 @app.command()
 def demo(
     out: OutOption = Path("demo_out"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of world, drives and sensors.")] = 1,
+    options: ScenarioOption = None,
+    seed: SeedOption = None,
 ) -> None:
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     from l2m_gtsam.demo import run_demo
     from l2m_gtsam.qa.tables import honesty_note, truth_table
-    from l2m_gtsam.simulate.scenario import ScenarioOptions
 
+    wanted = _scenario(options, seed)
     with shown_progress() as progress:
-        outcome = run_demo(out, ScenarioOptions(seed=seed), progress)
+        outcome = run_demo(out, wanted, progress)
     print_table(truth_table(outcome.result, outcome.truth))
     typer.echo(honesty_note(outcome.result, outcome.truth))
     typer.echo(f"picture: {outcome.picture}; report: {outcome.report}; everything else is in {out}")
@@ -354,6 +354,15 @@ def map_plot(
     with shown_progress() as progress:
         plot_map_file(map_path, out, height, progress)
     typer.echo(f"written: {out}")
+
+
+def _scenario(options: Path | None, seed: int | None) -> "ScenarioOptions":
+    """Return what is simulated: the default, or that of a file; a seed stands above both."""
+    from l2m_gtsam.config import load_options
+    from l2m_gtsam.simulate.scenario import ScenarioOptions
+
+    wanted = ScenarioOptions() if options is None else load_options(options, ScenarioOptions)
+    return wanted if seed is None else wanted.model_copy(update={"seed": seed})
 
 
 def _place(text: str) -> tuple[float, float, float]:

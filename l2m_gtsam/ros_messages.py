@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from inspect import signature
 from typing import Any
 
@@ -36,9 +37,8 @@ class Dialect:
         """Return a header; only ROS1 counts messages in it."""
         seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
         stamp = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        Header = self.store.types["std_msgs/msg/Header"]
-        counter = {"seq": index} if "seq" in signature(Header).parameters else {}
-        return Header(**counter, stamp=stamp, frame_id=frame)
+        counter = {"seq": index} if self._counts_messages else {}
+        return self.make("std_msgs/msg/Header", **counter, stamp=stamp, frame_id=frame)
 
     def vector(self, values: FloatArray) -> Any:
         """Return a vector of three values."""
@@ -55,6 +55,11 @@ class Dialect:
     def quaternion(self, values: FloatArray) -> Any:
         """Return a rotation from x, y, z, w."""
         return self.make("geometry_msgs/msg/Quaternion", **named("xyzw", values))
+
+    @cached_property
+    def _counts_messages(self) -> bool:
+        """Whether headers have a counter; to look takes as long as to write a message."""
+        return "seq" in signature(self.store.types["std_msgs/msg/Header"]).parameters
 
 
 @dataclass(frozen=True)

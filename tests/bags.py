@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -31,12 +32,12 @@ class Ros:
         stamp = self(
             "builtin_interfaces/Time", sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS
         )
-        seq = (
-            {"seq": 0}
-            if "seq" in signature(self.store.types["std_msgs/msg/Header"]).parameters
-            else {}
-        )
+        seq = {"seq": 0} if self.counts_messages else {}
         return self("std_msgs/Header", **seq, stamp=stamp, frame_id=frame)
+
+    @cached_property
+    def counts_messages(self) -> bool:
+        return "seq" in signature(self.store.types["std_msgs/msg/Header"]).parameters
 
     def vector(self, values: Iterable[float], name: str = "Vector3") -> Any:
         x, y, z = (float(v) for v in values)

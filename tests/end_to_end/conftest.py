@@ -1,6 +1,7 @@
 """The demonstration on disk, made once for all tests of the command line."""
 
 import io
+import json
 import os
 import subprocess
 import sys
@@ -11,6 +12,9 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.cli import main
+from tests.end_to_end.halls import SMALL_HALL
+
+TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
 
 
 @dataclass(frozen=True)
@@ -22,37 +26,47 @@ class Finished:
     err: str
 
 
-def l2m(*arguments: str | Path, fails: bool = False, timeout: float = 600) -> Finished:
+def l2m(*arguments: str | Path) -> Finished:
+    """Run ``l2m`` in this process, which spares seconds of imports; it must end well."""
+    run = ended(*arguments)
+    if run.code:
+        pytest.fail(f"l2m {' '.join(map(str, arguments))}:\n{run.out}\n{run.err}")
+    return run
+
+
+def complaint_here(*arguments: str | Path) -> str:
+    """Run ``l2m`` on bad input in this process and return its one line."""
+    return one_line(ended(*arguments))
+
+
+def ended(*arguments: str | Path) -> Finished:
+    """Run ``l2m`` in this process, and return how it ended."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr(sys, "argv", ["l2m", *map(str, arguments)])
+        for name, value in TERMINAL.items():
+            patch.setenv(name, value)
+        with pytest.raises(SystemExit) as end:
+            main()
+    code = end.value.code
+    assert code is None or isinstance(code, int)
+    return Finished(code or 0, out.getvalue(), err.getvalue())
+
+
+def l2m_process(*arguments: str | Path, fails: bool = False, timeout: float = 600) -> Finished:
     """Run ``l2m`` as a user would, in a process of its own."""
     command = [sys.executable, "-c", "from l2m_gtsam.cli import main; main()"]
-    environment = {**os.environ, "COLUMNS": "200", "NO_COLOR": "1"}
     run = subprocess.run(
         [*command, *map(str, arguments)],
         capture_output=True,
         text=True,
-        env=environment,
+        env={**os.environ, **TERMINAL},
         check=False,
         timeout=timeout,
     )
     if bool(run.returncode) != fails:
         pytest.fail(f"l2m {' '.join(map(str, arguments))}:\n{run.stdout}\n{run.stderr}")
     return Finished(run.returncode, run.stdout, run.stderr)
-
-
-def complaint(*arguments: str | Path) -> str:
-    """Run ``l2m`` on bad input and return its one line; anything else fails the test."""
-    return one_line(l2m(*arguments, fails=True))
-
-
-def complaint_here(*arguments: str | Path) -> str:
-    """As ``complaint``, but in this process: an answer in no time to many bad inputs."""
-    out, err = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
-        patch.setattr(sys, "argv", ["l2m", *map(str, arguments)])
-        with pytest.raises(SystemExit) as end:
-            main()
-    assert isinstance(end.value.code, int)
-    return one_line(Finished(end.value.code, out.getvalue(), err.getvalue()))
 
 
 def one_line(run: Finished) -> str:
@@ -86,6 +100,8 @@ class Demo:
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """Run the demonstration with its defaults."""
+    """Run the demonstration in a small hall."""
     folder = tmp_path_factory.mktemp("demo")
-    return Demo(folder, l2m("demo", "--out", folder).out)
+    options = folder / "hall.yaml"
+    options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
+    return Demo(folder, l2m_process("demo", "--options", options, "--out", folder).out)

@@ -4,7 +4,6 @@ import contextlib
 import io
 import re
 import shlex
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,10 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from l2m_gtsam.cli import main
 from l2m_gtsam.config import Config
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.scenario import ScenarioOptions
+from tests.end_to_end.conftest import l2m
 
 LANGUAGES = ("sh", "bash", "python", "yaml", "text")
 FENCE = re.compile(r"^( *)```(\w*)(.*)$")
@@ -104,8 +103,6 @@ def run_page(page: Path, folder: Path) -> None:
     printed, names = "", dict[str, Any]()
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setenv("COLUMNS", "200")
-        patch.setenv("NO_COLOR", "1")
         for block in blocks(page):
             if block.not_run:
                 continue
@@ -152,17 +149,7 @@ def _run(command: list[str]) -> str:
     """Run one command, which must end well, and return what it printed."""
     name, *arguments = command
     assert name == "l2m", f"{shlex.join(command)}: mark it as not run, and say why"
-
-    out = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["l2m", *arguments])
-        with (
-            contextlib.redirect_stdout(out),
-            contextlib.redirect_stderr(out),
-            pytest.raises(SystemExit) as end,
-        ):
-            main()
-    assert not end.value.code, f"{shlex.join(command)}:\n{out.getvalue()}"
+    run = l2m(*arguments)
     if "--out" in arguments:
         assert Path(arguments[arguments.index("--out") + 1]).exists()
-    return out.getvalue()
+    return run.out + run.err

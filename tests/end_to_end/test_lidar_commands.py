@@ -19,25 +19,11 @@ from l2m_gtsam.storage.map_file import load_map, save_map
 from l2m_gtsam.storage.slam_file import read_slam
 from tests.calibrations import calibration, sensor
 from tests.end_to_end.conftest import complaint_here, l2m
+from tests.end_to_end.halls import SMALL_HALL
 from tests.quick_maps import QUICK_HARMONIC
 
-# The tutorial's hall with a lidar of few columns, which a driver has freed of motion.
-HALL = {
-    "floor_plan": {
-        "length": 11.0,
-        "width": 6.4,
-        "rack_rows": 1,
-        "rack_depth": 1.4,
-        "blocks": 1,
-        "cross_aisle": 3.4,
-    },
-    "suite": {"lateral": [-0.3, 0.3], "heights": [-0.5, 0.0]},
-    "array": {"count": 1},
-    "mapping_sampling": {"field_rate": 5.0},
-    "calibration_sampling": {"field_rate": 4.0},
-    "calibration_route": {"turns": 1},
-    "lidar": {"rate": 2.5, "columns": 120},
-}
+# With a lidar of few columns, which a driver has freed of motion.
+HALL = SMALL_HALL | {"array": {"count": 1}, "lidar": {"rate": 2.5, "columns": 120}}
 PRIOR = {"floor_scale": 4.0, "floor_depth": 0.6, "noise": 0.1}
 
 

@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.map_file import load_map
-from tests.end_to_end.conftest import complaint, complaint_here, l2m
+from tests.end_to_end.conftest import complaint_here, l2m, l2m_process
 from tests.end_to_end.yard import POST, Yard, make_yard, world
 from tests.quick_maps import QUICK_HARMONIC
 
@@ -165,7 +165,7 @@ def test_bad_structures_are_one_line(yard: Yard, tmp_path: Path) -> None:
     assert "cut.ply: not a usable point cloud" in build(truncated)
     assert "no topic '/lidar'; with clouds there are: /points" in build("/lidar")
     assert "topic /mag is of type sensor_msgs/msg/MagneticField" in build("/mag")
-    line = complaint("map", "compare", yard.west, "--structure", tmp_path / "nowhere.pcd")
+    line = complaint_here("map", "compare", yard.west, "--structure", tmp_path / "nowhere.pcd")
     assert "nowhere.pcd: no such point cloud" in line
     assert not out.parent.exists()
 
@@ -207,4 +207,4 @@ def test_bad_updates_leave_everything_as_it_was(yard: Yard, sliding: Path, tmp_p
 
 
 def test_the_version_is_told() -> None:
-    assert l2m("--version").out.startswith("l2m 0.")
+    assert l2m_process("--version").out.startswith("l2m 0.")

@@ -269,7 +269,7 @@ def test_a_given_start_is_not_looked_for(
 
 def test_a_second_place_is_named(world: DipoleWorld, sensors: tuple[KnownSensor, ...]) -> None:
     """With a margin that no field has every second place is one too many."""
-    search = StartOptions(search_radius=2.5, clear=1e6)
+    search = StartOptions(search_radius=1.8, clear=1e6)
     result = calibrate(recorded_drive(world, sensors[:1]), world, CalibrationOptions(search=search))
     (sensor,) = result.sensors
     assert sensor.status is SensorStatus.AMBIGUOUS

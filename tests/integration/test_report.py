@@ -46,6 +46,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return Made(found, metrics, folder)
 
 
+@pytest.fixture(scope="module")
+def reported(made: Made) -> tuple[Level, str]:
+    """The verdict and the page, made from the files."""
+    level = report_folder(made.folder, None).level
+    return level, (made.folder / REPORT_FILE).read_text()
+
+
 def test_residuals_are_those_of_the_graph(made: Made) -> None:
     """Evidence asks the map anew: the same numbers to rounding, rejected readings among them."""
     solution = made.calibrated.solution
@@ -73,18 +80,17 @@ def test_metrics_come_back_as_they_were(made: Made, tmp_path: Path) -> None:
     json.loads(again, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
 
 
-def test_the_report_needs_no_bag_and_no_map(made: Made) -> None:
-    """The same bytes from the files as from what the calibration had in memory."""
-    report_folder(made.folder, None)
-    from_files = (made.folder / REPORT_FILE).read_bytes()
+def test_the_report_needs_no_bag_and_no_map(
+    made: Made, reported: tuple[Level, str], tmp_path: Path
+) -> None:
+    """The same page from the files as from what the calibration had in memory."""
     result = read_calibration(made.folder / CALIBRATION_FILE)
-    write_report(made.folder, result, made.metrics, QaOptions())
-    assert (made.folder / REPORT_FILE).read_bytes() == from_files
+    write_report(tmp_path, result, made.metrics, QaOptions())
+    assert (tmp_path / REPORT_FILE).read_text() == reported[1]
 
 
-def test_the_page_has_all_that_a_person_looks_for(made: Made) -> None:
-    report_folder(made.folder, None)
-    page = (made.folder / REPORT_FILE).read_text()
+def test_the_page_has_all_that_a_person_looks_for(reported: tuple[Level, str]) -> None:
+    page = reported[1]
     assert page.count("<figure>") == 4 + 3 * 8
     for words in (
         "The environment has changed",
@@ -102,10 +108,9 @@ def test_the_page_has_all_that_a_person_looks_for(made: Made) -> None:
         assert words in page, words
 
 
-def test_the_page_asks_for_nothing(made: Made) -> None:
+def test_the_page_asks_for_nothing(reported: tuple[Level, str]) -> None:
     """No address but names of XML spaces, no script, and a policy that forbids both."""
-    report_folder(made.folder, None)
-    page = (made.folder / REPORT_FILE).read_text()
+    page = reported[1]
     assert "default-src 'none'" in page
     assert "<script" not in page
     addresses = set(re.findall(r"https?://[^\"' <]+", page))
@@ -117,8 +122,10 @@ def test_the_page_asks_for_nothing(made: Made) -> None:
     assert set(re.findall(r"url\(#([^)]+)\)", page)) <= set(names)
 
 
-def test_thresholds_come_from_the_configuration(made: Made, tmp_path: Path) -> None:
-    assert report_folder(made.folder, None).level is Level.WARN
+def test_thresholds_come_from_the_configuration(
+    made: Made, reported: tuple[Level, str], tmp_path: Path
+) -> None:
+    assert reported[0] is Level.WARN
     strict = tmp_path / "strict.yaml"
     strict.write_text("qa: {position_sigma_m: {warn: 1.0e-6, fail: 1.0e-5}}\n")
     assert report_folder(made.folder, strict).level is Level.FAIL

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from l2m_gtsam.batch.fleet_task import OUTCOME_FILE
-from tests.end_to_end.conftest import l2m
+from tests.end_to_end.conftest import l2m_process
 from tests.fleets import BROKEN, Place, make_place, vehicle
 
 pytestmark = pytest.mark.study
@@ -80,7 +80,7 @@ def test_two_hundred_bags_killed_at_half(tmp_path: Path) -> None:
 
     whole = tmp_path / "whole"
     begun = time.monotonic()
-    said = l2m(*arguments(place, bags, whole), timeout=TIMEOUT_S).out
+    said = l2m_process(*arguments(place, bags, whole), timeout=TIMEOUT_S).out
     print(f"whole: {time.monotonic() - begun:.0f} s; {said}")
     assert said.startswith(f"{drives} drives of {VEHICLES} vehicles: {drives - len(BROKEN)} cal")
     assert said.count("not calibrated: ") == len(BROKEN)
@@ -94,7 +94,7 @@ def test_two_hundred_bags_killed_at_half(tmp_path: Path) -> None:
     before = kill_at_half(arguments(place, bags, cut), cut)
     assert drives // 2 <= len(before) < drives
     stamps = {path: (cut / path).stat().st_mtime_ns for path in before}
-    said = l2m(*arguments(place, bags, cut), timeout=TIMEOUT_S).out
+    said = l2m_process(*arguments(place, bags, cut), timeout=TIMEOUT_S).out
     print(f"killed after {len(before)}; {said}")
     assert f"; {drives - len(before)} computed now" in said
     assert {path: (cut / path).stat().st_mtime_ns for path in before} == stamps

@@ -31,11 +31,16 @@ class Section:
 
     def __init__(self, calibrations: list[int]) -> None:
         self._engine, self._calibrations = _engine(), calibrations
+        self._told: set[int] = set()  # those of sensors that were heard
 
     def add(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
     ) -> None:
         """Add factors and new variables up to a key pose, and take so many more steps."""
+        for n in range(graph.size()):
+            keys = set(graph.at(n).keys())
+            if not keys.issubset(self._calibrations):
+                self._told |= keys.intersection(self._calibrations)
         order = self._last_ones(last)
         self._engine.update(graph, values, constrainedKeys=order)
         for _ in range(again):
@@ -48,9 +53,9 @@ class Section:
         poses: Cholesky takes a part of a calibration that only its prior holds for undetermined.
         """
         order = gtsam.KeyGroupMap()
-        for key in self._calibrations:
+        for key in self._told:
             order.insert2(key, 1)
-        order.insert2(X(last), 2 if self._calibrations else 1)  # no group may be empty
+        order.insert2(X(last), 2 if self._told else 1)  # no group may be empty
         return order
 
     def pose(self, number: int) -> gtsam.Pose3:

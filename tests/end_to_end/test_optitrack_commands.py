@@ -1,0 +1,52 @@
+"""Maps and calibrations of real bags, with the example configuration."""
+
+from pathlib import Path
+
+import pytest
+
+from l2m_gtsam.results import SensorStatus
+from l2m_gtsam.storage.calibration_file import read_calibration
+from tests.browsing import (
+    check_accessibility,
+    check_figures,
+    check_phone,
+    check_silence,
+    look,
+)
+from tests.end_to_end.conftest import l2m
+
+
+@pytest.fixture(scope="module")
+def optitrack(
+    shared_data: Path, tmp_path_factory: pytest.TempPathFactory, repository: Path
+) -> Path:
+    """Folder of a map of one real run, and of the calibration of another."""
+    folder = tmp_path_factory.mktemp("optitrack")
+    bags, config = shared_data / "bags", repository / "configs" / "optitrack.yaml"
+    survey, map_path = bags / "optitrack_run0_ros2_sqlite", folder / "map.npz"
+    l2m("map", "build", survey, "--config", config, "--out", map_path)
+    wanted = ("--config", config, "--out", folder / "result", "--rerun", folder / "view.rrd")
+    run = l2m("calibrate", bags / "optitrack_run1_ros1.bag", "--map", map_path, *wanted)
+    assert str(folder / "view.rrd") in run.out
+    return folder
+
+
+def test_optitrack_configuration_on_real_bags(optitrack: Path, shared_data: Path) -> None:
+    map_path = optitrack / "map.npz"
+    assert "sliding_gp" in l2m("map", "info", map_path).out
+    l2m("map", "plot", map_path, "--out", optitrack / "map.png")
+    assert (optitrack / "map.png").stat().st_size > 10_000
+    assert (optitrack / "view.rrd").stat().st_size > 10_000
+    result = read_calibration(optitrack / "result" / "calibration.yaml")
+    assert result["imu/mag"].status is SensorStatus.SOLVED
+    assert result.bag is not None
+    assert result.bag.path == str(shared_data / "bags" / "optitrack_run1_ros1.bag")
+    assert result.options["bag"]["poses"] == "/optitrack/pose"
+
+
+def test_the_report_of_a_real_bag_is_seen(optitrack: Path, browser: str, tmp_path: Path) -> None:
+    looked = look(browser, optitrack / "result" / "report.html", tmp_path)
+    check_silence(looked)
+    check_figures(looked, 4 + 8)
+    check_phone(looked)
+    check_accessibility(looked)
