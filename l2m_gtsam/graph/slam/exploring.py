@@ -59,7 +59,7 @@ class Explorer:
     drive
         The drive.
     options
-        How to solve. Less `tiles.modes` take far less time.
+        How to solve. Fewer `tiles.modes` take far less time.
     prior
         Of the field; without it, it is learnt as the options say over the first metres, during
         which poses are those of odometry.
