@@ -36,8 +36,8 @@ class ExploringOptions(Options):
     """After so much way what has come is solved; until then poses are carried on by odometry. Half
     of it costs nearly twice the time."""
     section_m: float = Field(default=10.0, gt=0)
-    """So much is solved together; before that everything but tiles is let go. A vehicle that comes
-    back as far off as odometry has drifted has to find its place within it."""
+    """So much is solved together; of what lies further back tiles alone are kept. A vehicle that
+    comes back as far off as odometry has drifted has to find its place within it."""
 
 
 @dataclass(frozen=True)
