@@ -2,19 +2,17 @@
 
 from dataclasses import dataclass, replace
 
-import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Recording, SourceFile
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.graph.slam.drive import Drive
-from l2m_gtsam.graph.slam.field_prior import FieldPrior, TileOptions, field_prior
+from l2m_gtsam.graph.slam.drive_prior import drive_prior
 from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.graph.slam.mapping import map_drive
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.graph.slam.outcome import localisation_result
 from l2m_gtsam.graph.slam.pose_graph import solve_pose_graph
-from l2m_gtsam.graph.slam.sight import place
 from l2m_gtsam.localise import NO_SCANS, prepared
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult
@@ -127,17 +125,6 @@ def told(result: LocalisationResult, explored: Explored) -> LocalisationResult:
     if result.status is LocalisationStatus.NOT_CONVERGED:
         return result
     return replace(result, status=LocalisationStatus.NOT_CONVERGED, message=NO_FIELD)
-
-
-def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:
-    """Learn the prior of the field from the first part of a drive, at poses by odometry."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
-    early = np.flatnonzero(way[drive.readings.key_pose] <= options.learn_over_m)
-    readings = drive.readings[early]
-    where = place(
-        readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
-    )
-    return field_prior(where.x, where.field(drive.sensors), options)
 
 
 def surveyed(drive: Drive, solution: Localised) -> tuple[FloatArray, FloatArray]:

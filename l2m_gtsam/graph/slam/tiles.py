@@ -118,7 +118,14 @@ class WaveTile:
             trust = 1 / np.maximum(off / LARGE, 1.0)
         return weights
 
-    def doubt(self, points: FloatArray, variance: FloatArray) -> FieldDoubt:
+    def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
+        """Return what readings say of the weights, shape (m, m); the parameters are ``doubt``'s."""
+        F = (self.features(points) / np.sqrt(variance)[:, :, None]).reshape(-1, len(self))
+        return np.asarray(F.T @ F)
+
+    def doubt(
+        self, points: FloatArray, variance: FloatArray, taught: FloatArray | None = None
+    ) -> FieldDoubt:
         """Return what readings contribute to the number of parameters that they determine.
 
         Parameters
@@ -127,19 +134,23 @@ class WaveTile:
             In the anchor's frame in metres, shape (N, 3).
         variance
             Of each reading's noise per axis in uT^2, shape (N, 3).
+        taught
+            Information of others about the weights, shape (m, m).
         """
-        root = 1 / np.sqrt(variance)
-        F = (self.features(points) * root[:, :, None]).reshape(-1, len(self))
-        lower = cholesky(F.T @ F + np.eye(len(self)), lower=True)
-
-        def root_share(x: FloatArray) -> FloatArray:
-            seen = (self.features(x) * root[:, :, None]).reshape(-1, len(self))
-            spread = cho_solve((lower, True), seen.T)
-            return np.asarray(np.sqrt((spread**2).sum(axis=0).reshape(-1, AXES).sum(axis=1)))
-
+        known = np.eye(len(self)) + self.information(points, variance)
+        lower = cholesky(known if taught is None else known + taught, lower=True)
+        spread = cho_solve((lower, True), np.eye(len(self)))
+        root = 1 / np.sqrt(variance)[:, :, None]
+        share = root * (self.features(points) @ spread)
+        value = np.sqrt(np.einsum("nam,nam->n", share, share))
+        by_features = root * (share @ spread) / value[:, None, None]
         steps = SIDE_M * np.eye(AXES)
-        slopes = [(root_share(points + s) - root_share(points - s)) / (2 * SIDE_M) for s in steps]
-        return FieldDoubt(points, root_share(points), np.stack(slopes, axis=1))
+        slopes = [
+            np.einsum("nam,nam->n", by_features, self.features(points + step))
+            for step in (*steps, *-steps)
+        ]
+        slope = (np.stack(slopes[:AXES], axis=1) - np.stack(slopes[AXES:], axis=1)) / (2 * SIDE_M)
+        return FieldDoubt(points, value, slope)
 
 
 @dataclass(frozen=True)
@@ -194,14 +205,28 @@ def anchored(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
     anchors, tile, axes = [0], np.zeros(len(p), dtype=np.int64), level_axes(R)
     for k in range(1, len(p)):
         at = np.array(anchors)
-        away = np.einsum("bji,bj->bi", axes[at], p[k] - p[at])[:, :2]
-        distance = np.abs(away).max(axis=1)
-        nearest = int(distance.argmin())
-        if distance[nearest] > core / 2:
-            nearest = len(anchors)
+        tile[k] = tile_about(p[k], axes[at], p[at], core)
+        if tile[k] == len(anchors):
             anchors.append(k)
-        tile[k] = nearest
     return Anchoring(np.array(anchors), tile)
+
+
+def tile_about(p: FloatArray, axes: FloatArray, anchors: FloatArray, core: float) -> int:
+    """Return the tile of B whose anchor is nearest; B where a place is in the core of none.
+
+    Parameters
+    ----------
+    p
+        The place in the map in metres, shape (3,).
+    axes, anchors
+        Of the tiles: level axes, shape (B, 3, 3), and where they are fixed, shape (B, 3), metres.
+    core
+        Of a tile in metres.
+    """
+    away = np.einsum("bji,bj->bi", axes, p - anchors)[:, :2]
+    distance = np.abs(away).max(axis=1)
+    nearest = int(distance.argmin())
+    return nearest if distance[nearest] <= core / 2 else len(anchors)
 
 
 def level_axes(R: FloatArray) -> FloatArray:
