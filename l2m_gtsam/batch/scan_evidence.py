@@ -11,7 +11,7 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording, RigidTransform
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.graph.slam.jumps import without_jumps
-from l2m_gtsam.graph.slam.options import ScanUsage
+from l2m_gtsam.graph.slam.options import Usage
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.loops import find_loops
 from l2m_gtsam.lidar.registration import PoseEstimate
@@ -60,7 +60,7 @@ def read_evidence(
     BagError
         The bag's clouds are not usable.
     """
-    if config.slam.scans is ScanUsage.IGNORED or not has_clouds(bag):
+    if config.slam.scans is Usage.IGNORED or not has_clouds(bag):
         return Scanned()
     try:
         mapped = None if saved is None else saved.state.lidar

@@ -1,12 +1,14 @@
 """Odometry that drifts: by how much, and whether its covariances say so."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.graph.slam.odometry import odometry_steps
-from l2m_gtsam.graph.slam.options import DriftOptions
+from l2m_gtsam.graph.slam.options import DriftOptions, Usage
 from l2m_gtsam.pose_covariance import moved
 from l2m_gtsam.simulate.odometry import OdometryOptions, OdometryOrigin, drifting
 from l2m_gtsam.simulate.sensors import NoiseOptions
@@ -170,3 +172,13 @@ def test_a_seed_gives_the_same_drift_and_another_another() -> None:
     assert one.R.tobytes() == again.R.tobytes()
     assert np.abs(one.p - other.p).max() > 0.01
     assert (one.frame, one.child_frame) == ("odom", "lidar")
+
+
+def test_what_odometry_states_may_be_left() -> None:
+    """Then steps are as sure as the options say, as if nothing were stated."""
+    odometry = drifting(loop(), OdometryOptions(), NoiseOptions(), np.random.default_rng(2))
+    rows = np.arange(0, len(odometry), 4)
+    left = odometry_steps(odometry, rows, DriftOptions(stated=Usage.IGNORED))
+    silent = odometry_steps(replace(odometry, covariance=None), rows, DriftOptions())
+    assert not left.stated
+    np.testing.assert_array_equal(left.covariance, silent.covariance)

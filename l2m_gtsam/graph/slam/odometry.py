@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
 from l2m_gtsam.graph.slam.jumps import Jump
-from l2m_gtsam.graph.slam.options import DriftOptions, KeyPoseOptions
+from l2m_gtsam.graph.slam.options import DriftOptions, KeyPoseOptions, Usage
 from l2m_gtsam.pose_covariance import moved
 
 # Rounding and interpolation may make a step's covariance a little less than nothing.
@@ -91,7 +91,7 @@ def odometry_steps(
     R_back = trajectory.R[rows[:-1]].transpose(0, 2, 1)
     R = R_back @ trajectory.R[rows[1:]]
     p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
-    stated = _stated(trajectory, rows, R, p)
+    stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
     if stated is not None:  # with what is said of jumps
         return OdometrySteps(R, p, stated + _least(options), stated=True)
     covariance = drift_covariance(R, p, options)

@@ -18,8 +18,8 @@ class CalibrationUse(StrEnum):
     REFINED = "refined"
 
 
-class ScanUsage(StrEnum):
-    """What becomes of the point clouds of a drive that has odometry."""
+class Usage(StrEnum):
+    """What becomes of something that a recording may have."""
 
     USED = "used"
     IGNORED = "ignored"
@@ -39,7 +39,7 @@ class KeyPoseOptions(Options):
 
 
 class DriftOptions(Options):
-    """How wrong odometry becomes, where the recording does not say.
+    """How wrong odometry becomes, where the recording does not say or is not asked.
 
     Errors of odometry's steps count as independent, so that sigmas grow with the root of the way.
     Shares are those after `over_m`: over less way than that the odometry is trusted less than a
@@ -54,6 +54,9 @@ class DriftOptions(Options):
     """and as a share of the turning itself."""
     over_m: float = Field(default=10.0, gt=0)
     """The way over which these hold."""
+    stated: Usage = Usage.USED
+    """Whether covariances that a recording states of its odometry count instead, where they grow
+    along the drive."""
     least_m: float = Field(default=0.001, gt=0)
     """No step is known better than this,"""
     least_deg: float = Field(default=0.02, gt=0)
@@ -107,7 +110,7 @@ class SlamOptions(Options):
     """Where the drive begins."""
     calibration: CalibrationUse = CalibrationUse.FIXED
     """`fixed`, or `refined`: estimated with the poses, with its covariance as the prior."""
-    scans: ScanUsage = ScanUsage.USED
+    scans: Usage = Usage.USED
     """`used`: point clouds, if the bag has any, are registered on the cloud of the map, or on each
     other where places are come to again; or `ignored`."""
     robust: RobustOptions = RobustOptions()
