@@ -10,11 +10,10 @@ from l2m_factors import TileBatch, Whitening, doubt_factor, tile_factor
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.field_memory import ExploredTile
+from l2m_gtsam.graph.slam.localised import NOTHING
 from l2m_gtsam.graph.slam.sight import Sight
 from l2m_gtsam.graph.slam.tiled import LaidTile
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
-
-NOTHING = 1e-6  # a weight that is as good as none
 
 
 @dataclass(frozen=True)
