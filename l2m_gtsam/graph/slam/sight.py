@@ -81,6 +81,16 @@ class Sight:
         more
             Covariance that residuals have beside, uT^2, shape (N, 3, 3).
         """
+        of_reading = noise[self.place.readings.sensor]
+        return self.whitening_of(of_reading, map_variance, more)
+
+    def whitening_of(
+        self,
+        noise: FloatArray,
+        map_variance: FloatArray | None = None,
+        more: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the same where each reading has a noise of its own, shape (N,)."""
         variance = self.map_variance if map_variance is None else map_variance
         W = np.zeros((len(self.inside), 3, 3))
         rows = np.flatnonzero(self.inside)
@@ -88,7 +98,7 @@ class Sight:
         share = map_covariance(self.place.C[rows], at.R_map_lidar[rows], variance[rows])
         if more is not None:
             share = share + more[rows]
-        W[rows] = whitening(reading_covariance(noise[at.sensor[rows]], share))
+        W[rows] = whitening(reading_covariance(noise[rows], share))
         return W
 
     def squared(self, W: FloatArray) -> FloatArray:

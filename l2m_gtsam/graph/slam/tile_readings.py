@@ -59,10 +59,7 @@ class TileReadings:
         robust
             How readings are treated that nothing explains.
         """
-        W = np.zeros((len(noise), 3, 3))
-        for each in np.unique(noise):  # ``Sight`` knows one noise for each sensor
-            own = noise == each
-            W[own] = sight.whitening(np.full(laid.place.readings.sensor.max() + 1, each))[own]
+        W = sight.whitening_of(noise)
         r2, weights = sight.squared(W), np.empty(len(mu))
         for stage in np.unique(mu):
             own = mu == stage
