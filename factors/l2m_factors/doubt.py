@@ -15,6 +15,10 @@ where features are larger and more of them can be fitted. So ``p / 2`` is added,
 with Sigma held: a residual ``|Sigma F(x)^T| / sigma`` of each reading, linear in its place about
 where the tile was laid, has the right slope there, and after a few rounds the mode is right.
 (Mallows' C_p, 1973, counts parameters in the same way.)
+
+Where the noise has but a share r of the variance that it is taken to have, weights take up no more
+than ``r p / 2`` of cost, and more than that pushes poses away from the sources. Mallows takes the
+noise from the residuals; so does who asks for a share of the doubt.
 """
 
 from dataclasses import dataclass
@@ -47,6 +51,16 @@ class FieldDoubt:
 
     def __getitem__(self, rows: npt.NDArray[np.int64]) -> "FieldDoubt":
         return FieldDoubt(self.at[rows], self.value[rows], self.slope[rows])
+
+    @property
+    def parameters(self) -> float:
+        """How many parameters the readings teach."""
+        return float(self.value @ self.value)
+
+    def share(self, of_noise: float) -> "FieldDoubt":
+        """Return the doubt where noise has this share of the variance that it was taken to have."""
+        root = float(np.sqrt(of_noise))
+        return FieldDoubt(self.at, root * self.value, root * self.slope)
 
 
 def doubt_factor(batch: TileBatch, key_pose: int, doubt: FieldDoubt) -> gtsam.CustomFactor | None:

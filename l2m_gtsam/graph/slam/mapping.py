@@ -180,11 +180,12 @@ class TiledProblem:
         r2 = self._squared(tiled, ways, sights, noise)
         robust = self._options.robust
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
+        doubts = tiled.doubts(noise, weights, self._own_squared(tiled, sights, whitenings))
         chosen = np.flatnonzero(weights > NOTHING)
         fixed = None if self._free else self._drive.sensors.fixed()
         W = W * np.sqrt(weights)[:, None, None]
         by_lidar = self._gathered(tiled, [sight.by_lidar for sight in sights])
-        graph = tiled.graph(ways, noise, W, by_lidar, chosen, fixed)
+        graph = tiled.graph(ways, doubts, W, by_lidar, chosen, fixed)
         graph.push_back(self._odometry)
         graph.push_back(self._links)
         if self._free:
@@ -240,6 +241,13 @@ class TiledProblem:
         pairs = zip(sights, way_shares(tiled, ways, sights), strict=True)
         parts = [sight.squared(sight.whitening(noise, more=share)) for sight, share in pairs]
         return self._gathered(tiled, parts)
+
+    def _own_squared(
+        self, tiled: TiledDrive, sights: list[Sight], whitenings: list[FloatArray]
+    ) -> FloatArray:
+        """Return squared lengths of residuals, each whitened by its noise alone, (N,)."""
+        pairs = zip(sights, whitenings, strict=True)
+        return self._gathered(tiled, [sight.squared(white) for sight, white in pairs])
 
     def _sight(self, solved: Solved, ways: Ways, tiled: TiledDrive, sights: list[Sight]) -> Sight:
         """Return what the tiles say, with places and axes of the map."""

@@ -17,8 +17,9 @@ from l2m_factors import (
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.graph.slam.drive import KnownSensors
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
+from l2m_gtsam.graph.slam.localised import NOTHING
 from l2m_gtsam.graph.slam.sight import Place, Sight, look, place
-from l2m_gtsam.graph.slam.tiles import Anchoring, WaveTile, anchored, level_axes
+from l2m_gtsam.graph.slam.tiles import AXES, Anchoring, WaveTile, anchored, level_axes
 from l2m_gtsam.graph.slam.ways import Ways
 
 
@@ -132,10 +133,31 @@ class TiledDrive:
         """Return what each tile says of its readings."""
         return [tile.sight(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
 
+    def doubts(
+        self, noise: FloatArray, weights: FloatArray, squared: FloatArray
+    ) -> tuple[FieldDoubt, ...]:
+        """Return what readings that count teach each tile, with noise as large as they show.
+
+        Parameters
+        ----------
+        noise
+            Standard deviation of each sensor's noise in uT, shape (S,).
+        weights
+            How far each of all N readings counts, shape (N,).
+        squared
+            Squared lengths of their residuals, whitened by noise alone, shape (N,).
+        """
+        chosen = np.flatnonzero(weights > NOTHING)
+        whole = [tile.doubt(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
+        freedom = AXES * weights.sum() - sum(each.parameters for each in whole)
+        share = weights @ squared / freedom if freedom > 0 else 1.0
+        # More than the noise is what poses that are still off leave.
+        return tuple(each.share(min(share, 1.0)) for each in whole)
+
     def graph(
         self,
         ways: Ways,
-        noise: FloatArray,
+        doubts: tuple[FieldDoubt, ...],
         whitening: FloatArray,
         by_lidar: FloatArray,
         chosen: IntArray,
@@ -147,8 +169,8 @@ class TiledDrive:
         ----------
         ways
             Of the drive that was laid out, when it was.
-        noise
-            Standard deviation of each sensor's noise in uT, shape (S,).
+        doubts
+            What readings that count teach each tile.
         whitening
             Of the residuals of all its N readings but for errors of the ways, 1/uT, (N, 3, 3).
         by_lidar
@@ -159,14 +181,13 @@ class TiledDrive:
             Calibrations that are no variables; without them all are.
         """
         graph = gtsam.NonlinearFactorGraph()
-        for tile in self.tiles:
+        for tile, doubt in zip(self.tiles, doubts, strict=True):
             rows = np.intersect1d(tile.rows, chosen)
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
             graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
             if len(rows):
                 readings = ways.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
-                doubt = tile.doubt(rows, noise)
                 for k in batch.key_poses:
                     own = rows[batch.rows_of(k)]
                     white = ways.whitening(own, whitening[own], by_lidar[own])
