@@ -10,6 +10,8 @@ from l2m_factors import D, T, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 
+TOGETHER = 200  # poses: the covariance of so many is 11 MB
+
 
 @contextmanager
 def well_scaled() -> Iterator[None]:
@@ -39,8 +41,25 @@ def solved_marginals(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) ->
 
 
 def pose_covariances(marginals: gtsam.Marginals, count: int) -> FloatArray:
-    """Return those of right perturbations of so many key poses, shape (K, 6, 6)."""
+    """Return those of right perturbations of so many key poses, shape (K, 6, 6).
+
+    One by one, along the elimination tree: quick where what all poses hang on is small.
+    """
     return np.stack([marginals.marginalCovariance(X(k)) for k in range(count)])
+
+
+def pose_covariances_together(marginals: gtsam.Marginals, count: int) -> FloatArray:
+    """Return the same by eliminating all the rest, once for many poses.
+
+    Quick where each way through the elimination tree leads through variables that all readings
+    share: 0.7 s instead of 27 s for 115 poses and six sensors that are refined without a map.
+    """
+    blocks: list[FloatArray] = []
+    for first in range(0, count, TOGETHER):
+        keys = [X(k) for k in range(first, min(first + TOGETHER, count))]
+        joint = marginals.jointMarginalCovariance(keys)
+        blocks.extend(joint.at(key, key) for key in keys)
+    return np.stack(blocks)
 
 
 def sensor_covariances(marginals: gtsam.Marginals, count: int) -> FloatArray:

@@ -20,6 +20,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.optimise import Ending, LinearSolver, Optimizer, optimise
 from l2m_gtsam.graph.slam.covariances import (
     pose_covariances,
+    pose_covariances_together,
     sensor_covariances,
     solved_marginals,
 )
@@ -202,13 +203,14 @@ class TiledProblem:
         """Return a solved stage with its covariances and residuals."""
         drive, sensors = self._drive, solved.sensors
         marginals = solved_marginals(solved.graph, solved.values)
+        of_poses = pose_covariances_together if self._free else pose_covariances
         ways = Ways.along(drive, solved.poses)
         tiled = solved.tiled.moved(ways, solved.poses, sensors)
         sights = tiled.sights(solved.values, sensors)
         solution = Localised(
             drive=replace(drive, sensors=sensors),
             poses=solved.poses,
-            pose_covariance=pose_covariances(marginals, len(drive)),
+            pose_covariance=of_poses(marginals, len(drive)),
             calibration_covariance=(
                 sensor_covariances(marginals, len(sensors.names))
                 if self._free
