@@ -94,7 +94,8 @@ def explore(
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=HERE))
     progress("learning the field's prior", 0.0)
-    by_scans = solve_pose_graph(drive, options.robust.confidence)
+    scaled = drive.with_scale_as_walk(options.drift.over_m)
+    by_scans = solve_pose_graph(scaled, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
     prior = drive_prior(drive, by_scans.poses, options.tiles)
     progress("learning the field's prior", 1.0)

@@ -105,7 +105,8 @@ def localise(
     if options.start.anywhere:
         search = find_start(drive, solver_map, options, progress)
         drive = replace(drive, start=start_found(search, options.start))
-    by_scans = solve_pose_graph(drive, options.robust.confidence)
+    scaled = drive.with_scale_as_walk(options.drift.over_m)
+    by_scans = solve_pose_graph(scaled, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
     solution = localise_drive(drive, solver_map, options, progress)
     others = wrong_maps(drive, solver_map) if is_doubtful(solution) else ()

@@ -96,6 +96,7 @@ def localisation_record(
         notes=(*result.notes, *([] if told.truth is None or truth else [NO_TRUTH])),
         drift=result.drift,
         steps=solution.bent,
+        scale=result.scale,
         map_errors_shared=isinstance(told.field_map, UncertainMap),
         sensors=tuple(_sensor(solution, now[use.sensor], use) for use in result.sensors),
         refined=_refined(told.calibration, result),
@@ -177,7 +178,14 @@ def odometry_covariance(drive: Drive) -> FloatArray:
     covariance, steps = [drive.start.covariance], drive.steps
     for R, p, more in zip(steps.R, steps.p, steps.covariance, strict=True):
         covariance.append(moved(covariance[-1][None], RigidTransform(R, p))[0] + more)
-    return np.stack(covariance)
+    if not steps.scale:
+        return np.stack(covariance)
+    alone = drive.dead_reckoning()
+    # A wrong scale moves a pose by its share of the way from the start to there.
+    away = [alone[0].translation() - pose.translation() for pose in alone]
+    shift = [pose.rotation().matrix().T @ each for pose, each in zip(alone, away, strict=True)]
+    by_scale = steps.scale * np.hstack([np.zeros((len(alone), 3)), np.stack(shift)])
+    return np.stack(covariance) + by_scale[:, :, None] * by_scale[:, None]
 
 
 def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[RefinedSensor, ...]:

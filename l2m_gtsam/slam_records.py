@@ -12,6 +12,7 @@ from l2m_gtsam.slam_results import (
     DriftFigures,
     Explored,
     LocalisationStatus,
+    OdometryScale,
     ScanUse,
     SensorUse,
     StartVerdict,
@@ -240,6 +241,8 @@ class LocalisationRecord(Record):
     steps
         Mean square of the whitened components by which the steps between localised poses differ
         from odometry's; 1 is consistent.
+    scale
+        Of odometry; absent where it counts as right.
     map_errors_shared
         Whether the map says how its errors at two places go together.
     sensors
@@ -271,6 +274,7 @@ class LocalisationRecord(Record):
     notes: tuple[str, ...]
     drift: DriftFigures
     steps: float
+    scale: OdometryScale | None
     map_errors_shared: bool
     sensors: tuple[SensorRecord, ...]
     refined: tuple[RefinedSensor, ...]

@@ -46,6 +46,22 @@ class DriftFigures(Record):
 
 
 @dataclass(frozen=True)
+class OdometryScale(Record):
+    """What odometry's scale came out as.
+
+    Attributes
+    ----------
+    longer
+        Share by which all ways are longer than odometry has them; negative: shorter.
+    sigma
+        Its standard deviation.
+    """
+
+    longer: float
+    sigma: float
+
+
+@dataclass(frozen=True)
 class SensorUse(Record):
     """What a sensor's readings were worth.
 
@@ -212,6 +228,8 @@ class LocalisationResult:
         What scans were worth; absent without any.
     by_scans
         Key poses by odometry and scans, without magnetometers; absent without scans.
+    scale
+        Of odometry; absent where it counts as right.
     """
 
     status: LocalisationStatus
@@ -229,3 +247,4 @@ class LocalisationResult:
     explored: Explored | None = None
     scans: ScanUse | None = None
     by_scans: Trajectory | None = None
+    scale: OdometryScale | None = None

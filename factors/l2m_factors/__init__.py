@@ -9,7 +9,7 @@ from l2m_factors.carried import (
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.doubt import FieldDoubt, doubt_factor
 from l2m_factors.field_map import FieldMap
-from l2m_factors.keys import D, M, P, Q, S, T, X
+from l2m_factors.keys import D, G, M, P, Q, S, T, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import CarriedBatch, key_pose_factor
 from l2m_factors.priors import (
@@ -20,6 +20,7 @@ from l2m_factors.priors import (
 )
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, field_rate, reading_residuals
+from l2m_factors.scaled_step import scaled_step_factor
 from l2m_factors.shared_errors import (
     SharedError,
     map_weights_prior,
@@ -40,6 +41,7 @@ __all__ = [
     "D",
     "FieldDoubt",
     "FieldMap",
+    "G",
     "M",
     "MagneticReadings",
     "P",
@@ -72,6 +74,7 @@ __all__ = [
     "reading_residuals",
     "rotation_matrices",
     "rotation_prior",
+    "scaled_step_factor",
     "shared_error",
     "skew",
     "tile_factor",

@@ -39,3 +39,8 @@ def Q(sensor: int) -> int:
     Three for each of K numbers, along the axes of the lidar.
     """
     return int(gtsam.symbol("Q", sensor))
+
+
+def G() -> int:
+    """Return the key of the share by which all ways are longer than odometry has them: double."""
+    return int(gtsam.symbol("G", 0))

@@ -12,7 +12,7 @@ from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.record_file import read_record
 
 FORMAT: Literal["l2m-slam"] = "l2m-slam"
-VERSION: Literal[3] = 3
+VERSION: Literal[4] = 4
 LEGEND = {
     "poses": "T_map_lidar at key poses: stamp_ns, p in metres, quaternion_xyzw",
     "covariance": "of a right perturbation, T_true = T_map_lidar Exp(error): rotation (rad), then "
@@ -21,6 +21,8 @@ LEGEND = {
     "and about them (deg)",
     "drift": "odometry alone less the localised poses, in m and deg",
     "chi2_per_dof": "mean square of whitened residuals; 1 is consistent",
+    "scale": "longer: share by which all ways are longer than odometry has them, with its sigma; "
+    "null where odometry's scale counts as right",
     "steps": "the same of what steps between poses differ by from odometry's",
     "truth": "errors against a trajectory that was given, nothing aligned; nees of 6 is honest",
     "start": "where the drive may have begun, looked for all over the map, the likeliest first; "
@@ -31,7 +33,7 @@ LEGEND = {
 @dataclass(frozen=True)
 class _Head(Record):
     format: Literal["l2m-slam"]
-    version: Literal[3]
+    version: Literal[4]
     legend: dict[str, str]
 
 

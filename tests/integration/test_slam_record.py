@@ -9,7 +9,7 @@ import pytest
 
 from l2m_factors import X
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.graph.slam.factors import odometry_graph
+from l2m_gtsam.graph.slam.factors import odometry_graph, scale_values
 from l2m_gtsam.graph.slam.sight import poses_in
 from l2m_gtsam.pose_covariance import to_ros
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
@@ -17,9 +17,23 @@ from l2m_gtsam.qa.metrics.evidence import sensor_evidence as asked_again
 from l2m_gtsam.qa.slam.course import course_of
 from l2m_gtsam.slam_figures import odometry_covariance, sensor_evidence
 from l2m_gtsam.slam_records import LocalisationRecord
+from l2m_gtsam.slam_results import OdometryScale
 from l2m_gtsam.storage.slam_file import read_slam, write_slam
 from tests.integration.test_slam import pose_nees, position_error
 from tests.localised import WORLD, driven, localised, record
+
+
+def test_odometry_with_a_scale_is_as_sure_as_its_graph() -> None:
+    drive = localised().solution.drive
+    drive = replace(drive, steps=replace(drive.steps, scale=0.03))
+    values = scale_values(drive)
+    for k, pose in enumerate(drive.dead_reckoning()):
+        values.insert(X(k), pose)
+    marginals = gtsam.Marginals(odometry_graph(drive), values)
+    found = odometry_covariance(drive)
+    for k in range(len(drive)):
+        expected = marginals.marginalCovariance(X(k))
+        np.testing.assert_allclose(found[k], expected, rtol=1e-6, atol=1e-9 * expected.max())
 
 
 def test_odometry_is_as_sure_as_its_graph() -> None:
@@ -104,7 +118,8 @@ def test_the_file_comes_back(tmp_path: Path) -> None:
     nothing = replace(told.sensors[0].use, rms=float("nan"), chi2_per_dof=float("nan"))
     dead = replace(told.sensors[0], use=nothing, fit=None, normalised=None, series=None)
     poses = (replace(told.poses[0], covariance=None), *told.poses[1:])
-    for each in (told, replace(told, sensors=(dead,), truth=None, refined=(), poses=poses)):
+    less = replace(told, sensors=(dead,), truth=None, refined=(), poses=poses)
+    for each in (told, less, replace(told, scale=OdometryScale(-0.011, 0.002))):
         write_slam(path, each)
         back = read_slam(path)
         write_slam(tmp_path / "again.json", back)

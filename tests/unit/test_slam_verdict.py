@@ -16,7 +16,7 @@ from l2m_gtsam.slam_records import (
     SensorRecord,
     Timeline,
 )
-from l2m_gtsam.slam_results import LocalisationStatus, ScanUse
+from l2m_gtsam.slam_results import LocalisationStatus, OdometryScale, ScanUse
 from l2m_gtsam.validation_results import ChiSquare
 from tests.localised import record
 
@@ -198,6 +198,16 @@ def test_thresholds_are_those_of_the_options() -> None:
     )
     assert named["slam.position_sigma_m"].warn == 0.1
     assert "metres" in named["slam.position_sigma_m"].text
+
+
+def test_a_scale_that_was_found_is_told() -> None:
+    """As what ways are; where it is no variable nothing is said of it."""
+    shorter = replace(good(), scale=OdometryScale(-0.0111, 0.0018))
+    told = "Ways are 1.11% (0.18%) shorter than odometry has them (1 sigma)."
+    assert told in texts(judged(shorter), Level.PASS)
+    longer = replace(good(), scale=OdometryScale(0.02, 0.001))
+    assert any("2.00% (0.10%) longer" in each for each in texts(judged(longer), Level.PASS))
+    assert not any("Ways are" in each for each in texts(judged(good()), Level.PASS))
 
 
 def test_scans_that_contradict_odometry_are_told() -> None:

@@ -6,9 +6,10 @@ from contextlib import contextmanager
 import gtsam
 import numpy as np
 
-from l2m_factors import D, T, X
+from l2m_factors import D, G, T, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.slam_results import OdometryScale
 
 TOGETHER = 200  # poses: the covariance of so many is 11 MB
 
@@ -60,6 +61,14 @@ def pose_covariances_together(marginals: gtsam.Marginals, count: int) -> FloatAr
         joint = marginals.jointMarginalCovariance(keys)
         blocks.extend(joint.at(key, key) for key in keys)
     return np.stack(blocks)
+
+
+def odometry_scale(marginals: gtsam.Marginals, values: gtsam.Values) -> OdometryScale | None:
+    """Return odometry's scale as it came out; None where it is no variable."""
+    if not values.exists(G()):
+        return None
+    variance = float(marginals.marginalCovariance(G())[0, 0])
+    return OdometryScale(values.atDouble(G()), float(np.sqrt(variance)))
 
 
 def sensor_covariances(marginals: gtsam.Marginals, count: int) -> FloatArray:

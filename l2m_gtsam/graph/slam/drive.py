@@ -107,9 +107,13 @@ class Drive:
             poses.append(poses[-1].compose(self.step(step)))
         return poses
 
-    def step(self, number: int) -> gtsam.Pose3:
-        """Return the way from a key pose to the next."""
-        return gtsam.Pose3(gtsam.Rot3(self.steps.R[number]), self.steps.p[number])
+    def step(self, number: int, longer: float = 0.0) -> gtsam.Pose3:
+        """Return the way from a key pose to the next, if ways are longer by so large a share."""
+        return gtsam.Pose3(gtsam.Rot3(self.steps.R[number]), (1 + longer) * self.steps.p[number])
+
+    def with_scale_as_walk(self, over_m: float) -> "Drive":
+        """Return the drive for those who do not estimate odometry's scale; see the steps."""
+        return replace(self, steps=self.steps.with_scale_as_walk(over_m))
 
 
 def as_pose(transform: RigidTransform) -> gtsam.Pose3:

@@ -84,6 +84,7 @@ class Explorer:
                 "`slam.calibration: refined` works off line where there is no map; on line give "
                 "`fixed`"
             )
+        drive = drive.with_scale_as_walk(options.drift.over_m)
         self._drive, self._options = drive, options
         self._pace = ExploringOptions() if pace is None else pace
         self._memory = FieldMemory.at_start(drive)

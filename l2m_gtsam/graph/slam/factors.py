@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 
-from l2m_factors import D, T, X, held_directions
+from l2m_factors import D, G, T, X, held_directions, scaled_step_factor
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors, StartPose, as_pose
 from l2m_gtsam.graph.slam.links import MAP, Links
@@ -18,10 +18,10 @@ def start_factor(start: StartPose) -> gtsam.NonlinearFactor:
     return gtsam.PriorFactorPose3(X(0), as_pose(start.T_map_lidar), noise)
 
 
-def step_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
-    """Return what odometry says from a key pose to the next."""
+def step_factor(drive: Drive, number: int, longer: float = 0.0) -> gtsam.NonlinearFactor:
+    """Return what odometry says from a key pose to the next, if ways are longer by this share."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
-    return gtsam.BetweenFactorPose3(X(number), X(number + 1), drive.step(number), noise)
+    return gtsam.BetweenFactorPose3(X(number), X(number + 1), drive.step(number, longer), noise)
 
 
 def link_pose(links: Links, number: int) -> gtsam.Pose3:
@@ -79,8 +79,23 @@ def calibration_values(sensors: KnownSensors) -> gtsam.Values:
 
 def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
     """Return start and odometry."""
-    graph = gtsam.NonlinearFactorGraph()
+    graph, sigma = gtsam.NonlinearFactorGraph(), drive.steps.scale
     graph.add(start_factor(drive.start))
     for number in range(len(drive.steps)):
-        graph.add(step_factor(drive, number))
+        if sigma:
+            noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
+            graph.add(scaled_step_factor(number, drive.step(number), noise))
+        else:
+            graph.add(step_factor(drive, number))
+    if sigma:
+        known = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+        graph.add(gtsam.PriorFactorDouble(G(), 0.0, known))
     return graph
+
+
+def scale_values(drive: Drive) -> gtsam.Values:
+    """Return odometry's scale as it is before anything is known of it, if it is a variable."""
+    values = gtsam.Values()
+    if drive.steps.scale:
+        values.insert(G(), 0.0)
+    return values

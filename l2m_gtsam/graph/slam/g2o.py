@@ -12,12 +12,12 @@ from l2m_gtsam.graph.slam.localised import Localised
 def write_g2o(path: Path, solution: Localised) -> None:
     """Write localised key poses as vertices and odometry as edges.
 
-    The format knows no magnetic readings and no prior. Numbers have six digits, as GTSAM writes
-    them.
+    The format knows no magnetic readings, no prior and no scale: ways are as long as they came
+    out. Numbers have six digits, as GTSAM writes them.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for number in range(len(solution.drive.steps)):
-        graph.add(step_factor(solution.drive, number))
+        graph.add(step_factor(solution.drive, number, solution.longer))
     for k, pose in enumerate(solution.poses):
         values.insert(X(k), pose)
     gtsam.writeG2o(graph, values, str(path))

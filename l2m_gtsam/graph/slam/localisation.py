@@ -11,6 +11,7 @@ import numpy as np
 
 from l2m_gtsam.graph.slam.changes import LEAST_LEFT, ROUNDS, changed
 from l2m_gtsam.graph.slam.drive import Drive
+from l2m_gtsam.graph.slam.factors import scale_values
 from l2m_gtsam.graph.slam.following import Follower, follow
 from l2m_gtsam.graph.slam.localised import Localised
 from l2m_gtsam.graph.slam.options import SlamOptions
@@ -27,8 +28,10 @@ def localise_drive(
 ) -> Localised:
     """Find the poses of a drive, and its sensors' calibration if that is to be refined."""
     problem = Problem(drive, field_map, options)
-    follower = Follower(drive, field_map, options.robust, free=problem.free)
+    followed = drive.with_scale_as_walk(options.drift.over_m)
+    follower = Follower(followed, field_map, options.robust, free=problem.free)
     values = follow(follower, len(drive), progress)
+    values.insert(scale_values(drive))
     counts = np.ones(len(drive.readings), dtype=np.bool_)
     for round_, mu in enumerate(GRADUATION):
         progress("solving all poses", round_ / len(GRADUATION))

@@ -9,6 +9,7 @@ from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.sight import Sight
+from l2m_gtsam.slam_results import OdometryScale
 
 NOTHING = 1e-6  # a weight that is as good as none
 
@@ -41,6 +42,8 @@ class Localised:
     bent
         Mean square of the whitened components by which the steps between the poses differ from
         odometry's; 1 is consistent.
+    scale
+        Of odometry; absent where it is no variable.
     link_squared
         Squared lengths of the whitened residuals of what scans say, shape (L,).
     ending
@@ -57,8 +60,14 @@ class Localised:
     weights: FloatArray
     near_changes: BoolArray
     bent: float
+    scale: OdometryScale | None
     link_squared: FloatArray
     ending: Ending
+
+    @property
+    def longer(self) -> float:
+        """Share by which ways are longer than odometry has them."""
+        return 0.0 if self.scale is None else self.scale.longer
 
     @property
     def used(self) -> BoolArray:

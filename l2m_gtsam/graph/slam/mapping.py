@@ -19,6 +19,7 @@ from l2m_factors import X
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.graph.optimise import Ending, LinearSolver, Optimizer, optimise
 from l2m_gtsam.graph.slam.covariances import (
+    odometry_scale,
     pose_covariances,
     pose_covariances_together,
     sensor_covariances,
@@ -31,6 +32,7 @@ from l2m_gtsam.graph.slam.factors import (
     link_graph,
     link_squared,
     odometry_graph,
+    scale_values,
 )
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
 from l2m_gtsam.graph.slam.localised import NOTHING, Localised
@@ -173,6 +175,7 @@ class TiledProblem:
         tiled = TiledDrive.lay(ways, poses, sensors, self._prior)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
+        values.insert(scale_values(self._drive))
         for k, pose in enumerate(poses):
             values.insert(X(k), pose)
         sights = tiled.sights(values, sensors)
@@ -222,6 +225,7 @@ class TiledProblem:
             weights=solved.weights,
             near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
+            scale=odometry_scale(marginals, solved.values),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
         )

@@ -5,7 +5,7 @@ Where a recording states covariances of its poses that grow as odometry's do,
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,19 +32,35 @@ class OdometrySteps:
         Of a right perturbation of the step, rotation (rad) before translation (m), (K - 1, 6, 6).
     stated
         Whether the recording says so.
+    scale
+        Standard deviation of a share by which all ways are too long or too short alike, beside
+        that; 0 where there is none.
     """
 
     R: FloatArray
     p: FloatArray
     covariance: FloatArray
     stated: bool
+    scale: float = 0.0
 
     def __len__(self) -> int:
         return len(self.p)
 
     def until(self, count: int) -> "OdometrySteps":
         """Return so many first steps."""
-        return OdometrySteps(self.R[:count], self.p[:count], self.covariance[:count], self.stated)
+        return replace(self, R=self.R[:count], p=self.p[:count], covariance=self.covariance[:count])
+
+    def with_scale_as_walk(self, over_m: float) -> "OdometrySteps":
+        """Return steps for those who do not estimate the scale.
+
+        Its errors count as independent, and come to what they are after so many metres.
+        """
+        way = np.linalg.norm(self.p, axis=1)[:, None]
+        along = np.einsum("nji,nj->ni", self.R, self.p) / np.maximum(way, np.finfo(float).tiny)
+        covariance = self.covariance.copy()
+        walk = self.scale * np.sqrt(over_m * way) * along
+        covariance[:, 3:, 3:] += walk[:, :, None] * walk[:, None]
+        return replace(self, covariance=covariance, scale=0.0)
 
 
 def key_pose_rows(trajectory: Trajectory, options: KeyPoseOptions) -> IntArray:
@@ -93,11 +109,11 @@ def odometry_steps(
     p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
     stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
     if stated is not None:  # with what is said of jumps
-        return OdometrySteps(R, p, stated + _least(options), stated=True)
+        return OdometrySteps(R, p, stated + _least(options), stated=True, scale=options.scale)
     covariance = drift_covariance(R, p, options)
     for jump in jumps:
         covariance[np.searchsorted(rows, jump.row)] += jump.covariance
-    return OdometrySteps(R, p, covariance, stated=False)
+    return OdometrySteps(R, p, covariance, stated=False, scale=options.scale)
 
 
 def _stated(

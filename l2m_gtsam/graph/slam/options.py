@@ -54,6 +54,10 @@ class DriftOptions(Options):
     """and as a share of the turning itself."""
     over_m: float = Field(default=10.0, gt=0)
     """The way over which these hold."""
+    scale: float = Field(default=0.0, ge=0, lt=1)
+    """Standard deviation of a share by which all ways are too long or too short alike, as those
+    of wheels are. It is estimated with the poses; the other sigmas are of what odometry errs
+    beside it, and with the wide ones that are the default it is not needed."""
     stated: Usage = Usage.USED
     """Whether covariances that a recording states of its odometry count instead, where they grow
     along the drive."""

@@ -68,12 +68,13 @@ def localisation_result(
         drift=drift_figures(trajectory, odometry),
         sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
         calibration=None if refine is None else refined(refine, solution),
-        notes=slip_notes(drive, solution.poses),
+        notes=slip_notes(drive, solution.poses, solution.longer),
         bag=None,
         map=None,
         calibration_source=None,
         scans=scan_use(solution, by_scans),
         by_scans=_trajectory(drive, by_scans.poses) if len(by_scans.believed) else None,
+        scale=solution.scale,
     )
 
 

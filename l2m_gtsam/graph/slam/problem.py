@@ -10,6 +10,7 @@ from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.graph.optimise import Ending, Optimizer, optimise
 from l2m_gtsam.graph.slam.changes import Fit
 from l2m_gtsam.graph.slam.covariances import (
+    odometry_scale,
     pose_covariances,
     pose_covariances_together,
     sensor_covariances,
@@ -223,6 +224,7 @@ class Problem:
             weights=weights * seen.sight.inside,
             near_changes=np.zeros(len(weights), dtype=np.bool_),
             bent=2 * self._odometry.error(values) / (6 * len(self._drive)),
+            scale=odometry_scale(marginals, values),
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
         )

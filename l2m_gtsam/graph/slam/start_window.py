@@ -160,7 +160,7 @@ def window_of(drive: Drive, way_m: float, most: int) -> Window:
         way_m=float(way[count - 1]),
         R=R[0].T @ R[:count],
         p=(p[:count] - p[0]) @ R[0],
-        covariance=drive.steps.covariance[: count - 1],
+        covariance=drive.steps.with_scale_as_walk(way_m).covariance[: count - 1],
         readings=own[thinned(own, most)],
         sensors=drive.sensors,
         R_odom_lidar=R[0],

@@ -9,7 +9,7 @@ from l2m_gtsam.qa.reasons.reason import Level, Reason, against
 from l2m_gtsam.qa.slam.course import HEADING, Course, course_of
 from l2m_gtsam.qa.slam.stretches import stretches
 from l2m_gtsam.slam_records import POSE_FREEDOM, LocalisationRecord, TruthRecord
-from l2m_gtsam.slam_results import LocalisationStatus, ScanUse
+from l2m_gtsam.slam_results import LocalisationStatus, OdometryScale, ScanUse
 
 MANY = 3  # stretches that are told one by one
 EXACT = 1e-6  # m and degrees: nobody minds less
@@ -29,6 +29,7 @@ def on_whole(record: LocalisationRecord, options: SlamQaOptions) -> list[Reason]
         *(Reason(Level.WARN, f"{each.rstrip('.')}.") for each in record.notes),
         *_sigmas(record),
         *_drift(record),
+        *([] if record.scale is None else _scale(record.scale)),
     ]
 
 
@@ -174,5 +175,13 @@ def _drift(record: LocalisationRecord) -> list[Reason]:
     text = (
         f"Odometry alone would have ended {drift.end_m:.2f} m and {drift.end_deg:.1f}° from the "
         f"localised poses, {drift.end_share:.1%} of the way."
+    )
+    return [Reason(Level.PASS, text)]
+
+
+def _scale(scale: OdometryScale) -> list[Reason]:
+    text = (
+        f"Ways are {abs(scale.longer):.2%} ({scale.sigma:.2%}) "
+        f"{'longer' if scale.longer >= 0 else 'shorter'} than odometry has them (1 sigma)."
     )
     return [Reason(Level.PASS, text)]
