@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
@@ -172,20 +173,21 @@ def _odometry(drive: Drive, at: Trajectory) -> tuple[OdometryRecord, ...]:
 def odometry_covariance(drive: Drive) -> FloatArray:
     """Return how sure odometry alone is of each key pose, shape (K, 6, 6).
 
-    Of right perturbations, rotation (rad) before translation (m): the start's, carried along, and
-    what each step adds.
+    Of right perturbations, rotation (rad) before translation (m): the start's, carried along, what
+    each step adds, and what a wrong scale does.
     """
     covariance, steps = [drive.start.covariance], drive.steps
     for R, p, more in zip(steps.R, steps.p, steps.covariance, strict=True):
         covariance.append(moved(covariance[-1][None], RigidTransform(R, p))[0] + more)
-    if not steps.scale:
-        return np.stack(covariance)
-    alone = drive.dead_reckoning()
-    # A wrong scale moves a pose by its share of the way from the start to there.
-    away = [alone[0].translation() - pose.translation() for pose in alone]
-    shift = [pose.rotation().matrix().T @ each for pose, each in zip(alone, away, strict=True)]
-    by_scale = steps.scale * np.hstack([np.zeros((len(alone), 3)), np.stack(shift)])
+    by_scale = steps.scale * _moved_by_scale(drive.dead_reckoning())
     return np.stack(covariance) + by_scale[:, :, None] * by_scale[:, None]
+
+
+def _moved_by_scale(poses: list[gtsam.Pose3]) -> FloatArray:
+    """Return the right perturbations of K poses by longer ways, (K, 6): each leaves the first."""
+    p0 = poses[0].translation()
+    shift = [each.rotation().matrix().T @ (each.translation() - p0) for each in poses]
+    return np.hstack([np.zeros((len(poses), 3)), np.stack(shift)])
 
 
 def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[RefinedSensor, ...]:

@@ -24,6 +24,12 @@ def step_factor(drive: Drive, number: int, longer: float = 0.0) -> gtsam.Nonline
     return gtsam.BetweenFactorPose3(X(number), X(number + 1), drive.step(number, longer), noise)
 
 
+def scaled_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
+    """Return the same where odometry's scale is a variable."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
+    return scaled_step_factor(number, drive.step(number), noise)
+
+
 def link_pose(links: Links, number: int) -> gtsam.Pose3:
     """Return where a scan has a key pose, in the map or in the frame of an earlier one."""
     return gtsam.Pose3(gtsam.Rot3(links.R[number]), links.p[number])
@@ -81,12 +87,9 @@ def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
     """Return start and odometry."""
     graph, sigma = gtsam.NonlinearFactorGraph(), drive.steps.scale
     graph.add(start_factor(drive.start))
+    one_step = scaled_factor if sigma else step_factor
     for number in range(len(drive.steps)):
-        if sigma:
-            noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
-            graph.add(scaled_step_factor(number, drive.step(number), noise))
-        else:
-            graph.add(step_factor(drive, number))
+        graph.add(one_step(drive, number))
     if sigma:
         known = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
         graph.add(gtsam.PriorFactorDouble(G(), 0.0, known))
