@@ -181,7 +181,7 @@ def _drift(record: LocalisationRecord) -> list[Reason]:
 
 def _scale(scale: OdometryScale) -> list[Reason]:
     text = (
-        f"Ways are {abs(scale.longer):.2%} ({scale.sigma:.2%}) "
-        f"{'longer' if scale.longer >= 0 else 'shorter'} than odometry has them (1 sigma)."
+        f"Ways are {abs(scale.longer):.2%} ± {scale.sigma:.2%} (1 sigma) "
+        f"{'longer' if scale.longer >= 0 else 'shorter'} than odometry has them."
     )
     return [Reason(Level.PASS, text)]
