@@ -206,7 +206,9 @@ def test_a_scale_that_was_found_is_told() -> None:
     told = "Ways are 1.11% ± 0.18% (1 sigma) shorter than odometry has them."
     assert told in texts(judged(shorter), Level.PASS)
     longer = replace(good(), scale=OdometryScale(0.02, 0.001))
-    assert any("2.00% ± 0.10% (1 sigma) longer" in each for each in texts(judged(longer), Level.PASS))
+    assert any(
+        "2.00% ± 0.10% (1 sigma) longer" in each for each in texts(judged(longer), Level.PASS)
+    )
     assert not any("Ways are" in each for each in texts(judged(good()), Level.PASS))
 
 
