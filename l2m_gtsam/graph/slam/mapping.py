@@ -251,7 +251,7 @@ class TiledProblem:
     def _own_squared(
         self, tiled: TiledDrive, sights: list[Sight], whitenings: list[FloatArray]
     ) -> FloatArray:
-        """Return squared lengths of residuals, each whitened by its noise alone, (N,)."""
+        """Return squared lengths of residuals as these make them white, without the ways, (N,)."""
         pairs = zip(sights, whitenings, strict=True)
         return self._gathered(tiled, [sight.squared(white) for sight, white in pairs])
 

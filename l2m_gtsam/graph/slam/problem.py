@@ -12,7 +12,6 @@ from l2m_gtsam.graph.slam.changes import Fit
 from l2m_gtsam.graph.slam.covariances import (
     odometry_scale,
     pose_covariances,
-    pose_covariances_together,
     sensor_covariances,
     solved_marginals,
 )
@@ -207,12 +206,11 @@ class Problem:
         optimised = optimise(graph, values, Optimizer.LM, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
         marginals = solved_marginals(graph, values)
-        of_poses = pose_covariances_together if self.free else pose_covariances
         seen = self.look(values)
         return Localised(
             drive=replace(self._drive, sensors=sensors),
             poses=list(poses_in(values, len(self._drive)).values()),
-            pose_covariance=of_poses(marginals, len(self._drive)),
+            pose_covariance=pose_covariances(marginals, len(self._drive)),
             calibration_covariance=(
                 sensor_covariances(marginals, len(sensors.names))
                 if self.free

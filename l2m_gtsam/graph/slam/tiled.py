@@ -145,7 +145,8 @@ class TiledDrive:
         weights
             How far each of all N readings counts, shape (N,).
         squared
-            Squared lengths of their residuals, whitened by noise alone, shape (N,).
+            Squared lengths of their residuals, whitened by noise and what waves left out hold,
+            shape (N,).
         """
         chosen = np.flatnonzero(weights > NOTHING)
         whole = [tile.doubt(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
