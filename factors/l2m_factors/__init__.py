@@ -23,10 +23,14 @@ from l2m_factors.residual import MagneticReadings, ReadingResiduals, field_rate,
 from l2m_factors.scaled_step import scaled_step_factor
 from l2m_factors.shared_errors import (
     SharedError,
+    UncertainReadings,
+    WhiteRows,
+    map_weights_information,
     map_weights_prior,
     pose_errors_prior,
     shared_error,
     uncertain_block_factor,
+    uncertain_reading_factor,
 )
 from l2m_factors.step import StepError
 from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor
@@ -55,7 +59,9 @@ __all__ = [
     "TileBatch",
     "TileField",
     "TilePlaces",
+    "UncertainReadings",
     "WeightedField",
+    "WhiteRows",
     "Whitening",
     "X",
     "assert_jacobians_match",
@@ -67,6 +73,7 @@ __all__ = [
     "field_rate",
     "held_directions",
     "key_pose_factor",
+    "map_weights_information",
     "map_weights_prior",
     "moved",
     "pose_errors_prior",
@@ -79,4 +86,5 @@ __all__ = [
     "skew",
     "tile_factor",
     "uncertain_block_factor",
+    "uncertain_reading_factor",
 ]

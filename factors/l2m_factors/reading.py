@@ -71,7 +71,7 @@ class BatchedReadings:
 
     def residuals(self, values: gtsam.Values, sensor: int) -> ReadingResiduals:
         """Return the residuals of all readings, evaluated anew if this sensor's values changed."""
-        if self._seen.get(sensor) != self._stamp(values, sensor):
+        if self._seen.get(sensor) != self.stamp(values, sensor):
             self._evaluate(values)
         return self._residuals
 
@@ -80,16 +80,16 @@ class BatchedReadings:
         by_D = [residuals.de_dD] if self._fixed is None else []
         return [residuals.de_dt, *by_D, *([residuals.de_dS] if self._timed else [])]
 
-    def _variables(self, sensor: int) -> list[int]:
-        distortion = [D(sensor)] if self._fixed is None else []
-        return [T(sensor), *distortion, *([S(sensor)] if self._timed else [])]
-
-    def _stamp(self, values: gtsam.Values, sensor: int) -> bytes:
+    def stamp(self, values: gtsam.Values, sensor: int) -> bytes:
         """Return the sensor's values as bytes, which compare faster than arrays."""
         stamp: bytes = values.atPoint3(T(sensor)).tobytes()
         if self._fixed is None:
             stamp += values.atVector(D(sensor)).tobytes()
         return stamp + struct.pack("d", values.atDouble(S(sensor))) if self._timed else stamp
+
+    def _variables(self, sensor: int) -> list[int]:
+        distortion = [D(sensor)] if self._fixed is None else []
+        return [T(sensor), *distortion, *([S(sensor)] if self._timed else [])]
 
     def _evaluate(self, values: gtsam.Values) -> None:
         # A sensor without values, as when one factor is used alone, is evaluated at zero; nobody
@@ -105,7 +105,7 @@ class BatchedReadings:
             if offset is not None:
                 offset[sensor] = values.atDouble(S(sensor))
         self._residuals = reading_residuals(self._readings, self._map, t, distortion, offset)
-        self._seen = {sensor: self._stamp(values, sensor) for sensor in present}
+        self._seen = {sensor: self.stamp(values, sensor) for sensor in present}
 
 
 def reading_factor(

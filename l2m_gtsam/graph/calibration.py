@@ -6,7 +6,6 @@ from enum import StrEnum
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from l2m_factors import (
     BatchedReadings,
@@ -22,7 +21,6 @@ from l2m_factors import (
     reading_factor,
 )
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.clusters import clusters_of, columns_among, columns_of, sensors_in
 from l2m_gtsam.graph.priors import HOLD_S, NO_PRIORS, Priors
 from l2m_gtsam.solve.noise import whitening
 from l2m_gtsam.solve.rank import Determinacy
@@ -178,56 +176,3 @@ def whitened_jacobian(
     """Return derivatives of a sensor's white residuals by (t, C by row, H, offset), (3 n, 16)."""
     jacobian, _ = block_factor(batch, sensor, W).linearize(values).jacobian()
     return np.asarray(jacobian)
-
-
-def variables(sensor: int) -> tuple[int, int, int]:
-    """Return the keys of a sensor in the order of its parameters: t, C row by row, H, offset."""
-    return T(sensor), D(sensor), S(sensor)
-
-
-class Covariances:
-    """Marginal covariances of a linear graph of sensors.
-
-    Where one direction is thousands of times better known than another, GTSAM's marginals, which
-    are made by Cholesky, call the system indeterminate; QR of the same factors still has it.
-
-    Parameters
-    ----------
-    graph, values
-        The graph and where it is linearised.
-    """
-
-    def __init__(self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
-        self._linear = graph.linearize(values)
-        self._marginals: gtsam.Marginals | None = None
-        try:
-            self._marginals = gtsam.Marginals(self._linear, values)
-        except RuntimeError as error:  # GTSAM's exception has no Python type
-            if "ndetermina" not in str(error):
-                raise
-
-    def among(self, sensors: tuple[int, ...]) -> FloatArray:
-        """Return that of all parameters of sensors that factors connect, (16 n, 16 n)."""
-        if self._marginals is None:
-            return covariance_by_qr(self._linear, sensors)
-        keys = list(columns_of(sensors))
-        joint = self._marginals.jointMarginalCovariance(keys)
-        return np.asarray(np.block([[joint.at(a, b) for b in keys] for a in keys]))
-
-
-def covariance_by_qr(linear: gtsam.GaussianFactorGraph, sensors: tuple[int, ...]) -> FloatArray:
-    """Return the marginal covariance of sensors that factors connect, by QR, (16 n, 16 n)."""
-    cluster = next(each for each in clusters_of(linear, sensors_in(linear)) if sensors[0] in each)
-    ordering = gtsam.Ordering()
-    for key in columns_of(cluster):
-        ordering.push_back(key)
-    own = gtsam.GaussianFactorGraph()
-    for index in range(linear.size()):
-        if set(linear.at(index).keys()) <= set(columns_of(cluster)):
-            own.push_back(linear.at(index))
-    jacobian, _ = own.jacobian(ordering)
-    scale = 1 / np.linalg.norm(jacobian, axis=0)
-    triangular = np.asarray(np.linalg.qr(jacobian * scale, mode="r"))
-    root = scale[:, None] * solve_triangular(triangular, np.eye(len(scale)))
-    at = columns_among(cluster, sensors)
-    return np.asarray(root[at] @ root[at].T)

@@ -5,21 +5,17 @@ what is left is compared with how large it would be if the prior were true, `I -
 prior's white rows J and the covariance P of the solution. That is the test of its innovation.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.marginals import JointCovariance
 from l2m_gtsam.graph.priors import Prior, prior_rows
 
 LARGEST = 4.0  # sigmas
 # Share of a prior's variance that is not its own doing; with less nothing else tells about it.
 TOLD = 1e-3
-
-JointCovariance = Callable[[tuple[int, ...]], FloatArray]
-"""Of all parameters of some connected sensors, in order, shape (16 n, 16 n)."""
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
+import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtri
 
-from l2m_factors import M, P
+from l2m_factors import M, P, map_weights_information, pose_errors_prior
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.moving_fields import MovingFields
@@ -105,7 +106,7 @@ class Coverage:
     tiles
         Number of weights of each tile.
     root_information
-        Square root of the information of all tiles' weights, shape (K, K).
+        Square root of the information of all tiles' weights, lower triangular, shape (K, K).
     knots
         Where pose errors are variables; absent where poses are taken for exact.
     seconds
@@ -128,6 +129,22 @@ class Coverage:
         knots = 0 if self.knots is None else len(self.knots.seconds)
         tiles = {M(tile): size for tile, size in self.tiles.items()}
         return tiles | {P(knot): POSE for knot in range(knots)} | self.moving.sizes
+
+    @property
+    def columns(self) -> dict[int, slice]:
+        """Where the weights of each key stand among all of them."""
+        ends = np.cumsum(list(self.sizes.values())).tolist()
+        pairs = zip(self.sizes.items(), ends, strict=True)
+        return {key: slice(end - size, end) for (key, size), end in pairs}
+
+    def prior(self) -> gtsam.NonlinearFactorGraph:
+        """Return the prior of all weights, which is linear in them."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(map_weights_information(self.tiles, self.root_information))
+        if self.knots is not None:
+            graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
+        graph.push_back(self.moving.prior())
+        return graph
 
 
 def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: float) -> Coverage:
@@ -162,8 +179,7 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
             first = rows[own[0]]
             where = int(readings.sensor[first]), tile, int(segment[first])
             groups.append(Group(*where, rows[own], features[own]))
-    lower = np.linalg.cholesky(told.covariance)
-    root = solve_triangular(lower, np.eye(len(lower)), lower=True)
+    root, _ = dtrtri(np.linalg.cholesky(told.covariance), lower=1)
     return Coverage(tuple(groups), rest, told.sizes(), root, knots, seconds)
 
 

@@ -12,8 +12,9 @@ import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_among, rows_in
+from l2m_gtsam.graph.marginals import clusters_of
 from l2m_gtsam.graph.priors import HOLD_S, Prior, Priors, prior_rows
+from l2m_gtsam.graph.sensor_columns import SENSOR, columns_among, rows_in
 from l2m_gtsam.solve.rank import PARAMETERS, Determinacy, RankOptions, timed_determinacy
 
 # Of the largest sigma of use: what is known of other sensors at least. It is as good as nothing.

@@ -14,7 +14,12 @@ from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.coverage import UncertainMap, cover
 from l2m_gtsam.graph.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.graph.priors import NO_PRIORS, Priors
-from l2m_gtsam.graph.uncertain import UncertainProblem, starting_values
+from l2m_gtsam.graph.uncertain import (
+    UncertainDrive,
+    UncertainProblem,
+    WeightsPrior,
+    starting_values,
+)
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
@@ -91,8 +96,7 @@ def stated_at(
     problem = joint_problem(view, field_map, estimate, options)
     if options.uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
         tests = problem.determinacies
-        lasts = options.pose_noise.correlation_s
-        solved = _uncertain(view, field_map, field_map, estimate, tests, lasts)
+        solved = _uncertain(view, field_map, field_map, estimate, tests, options)
         return Forecast(view, solved, Uncertainty.FULL)
     return Forecast(view, sensor_solutions(problem, estimate), Uncertainty.INDEPENDENT)
 
@@ -149,9 +153,11 @@ def _uncertain(
     errors: UncertainMap,
     estimate: Estimate,
     tests: dict[int, Determinacy],
-    correlation_s: float,
+    options: OneKeyOptions,
 ) -> tuple[SensorSolution, ...]:
     """Return the solutions with the map's error, of which nothing is known yet, in the graph."""
-    coverage = cover(view, errors, estimate, correlation_s)
-    values = starting_values(estimate, view.sensors, coverage)
-    return UncertainProblem(view, field_map, coverage, estimate, tests).solutions(values)
+    coverage = cover(view, errors, estimate, options.pose_noise.correlation_s)
+    values, prior = starting_values(estimate, view.sensors, coverage), WeightsPrior.of(coverage)
+    drive = UncertainDrive(view, field_map, prior)
+    problem = UncertainProblem(drive, estimate, tests, options.factors)
+    return problem.solutions(problem.linearised(values), values)

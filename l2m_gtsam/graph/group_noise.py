@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg.lapack import dtrtri
 
 from l2m_factors import M, P, SharedError
 from l2m_gtsam.data import FloatArray, Readings
@@ -68,9 +68,10 @@ class PoseShare:
 
     def bridge(self, group: Group) -> FloatArray:
         """Return the covariance of a group's readings that knots leave in uT^2, (3 n, 3 n)."""
-        CF = self.in_sensor[group.rows].reshape(-1, self.in_sensor.shape[2])
-        left = self.knots.bridge(self.seconds[group.rows])
-        return np.asarray((CF @ CF.T) * np.kron(left, np.ones((3, 3))))
+        n = len(group.rows)
+        CF = self.in_sensor[group.rows].reshape(3 * n, -1)
+        left = self.knots.bridge(self.seconds[group.rows])[:, None, :, None]
+        return np.asarray(((CF @ CF.T).reshape(n, 3, n, 3) * left).reshape(3 * n, 3 * n))
 
 
 def group_noise(
@@ -110,9 +111,11 @@ def group_noise(
         )
     left, whitenings = np.zeros_like(share), []
     for group in coverage.groups:
-        bridge, n = pose.bridge(group), len(group.rows)
-        whitenings.append(_inverse_root(bridge + block_diag(*own[group.rows])))
-        left[group.rows] = bridge.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        each, covariance = np.arange(len(group.rows)), pose.bridge(group)
+        blocks = covariance.reshape(len(each), 3, len(each), 3)  # a view
+        left[group.rows] = blocks[each, :, each]
+        blocks[each, :, each] += own[group.rows]
+        whitenings.append(_inverse_root(covariance))
     pairs = zip(shared, coverage.groups, strict=True)
     return GroupNoise(
         errors=tuple((*each, *pose.errors(group)) for each, group in pairs),
@@ -134,9 +137,9 @@ def pose_share(
 
 
 def _inverse_root(covariance: FloatArray) -> FloatArray:
-    """Return W with ``W S W^T = I``."""
-    lower = np.linalg.cholesky(covariance)
-    return np.asarray(solve_triangular(lower, np.eye(len(lower)), lower=True, check_finite=False))
+    """Return the lower triangular W with ``W S W^T = I``."""
+    inverse, _ = dtrtri(np.linalg.cholesky(covariance), lower=1)
+    return np.ascontiguousarray(inverse)
 
 
 def _mean_variance(covariance: FloatArray) -> FloatArray:

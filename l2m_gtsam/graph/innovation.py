@@ -14,7 +14,6 @@ from l2m_factors.shared_errors import whitened
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.calibration import Estimate, batch_readings
 from l2m_gtsam.graph.coverage import Coverage, NothingShared, UncertainMap, cover
-from l2m_gtsam.graph.elimination import weight_columns
 from l2m_gtsam.graph.group_noise import group_noise
 from l2m_gtsam.graph.view import QueryableMap, observe
 from l2m_gtsam.solve.alterations import PARAMETERS, Told, reduced
@@ -86,7 +85,7 @@ def told_by(
     noise = group_noise(view, field_map, coverage, estimate)
     J, e = _linearised(view.readings, field_map, estimate)
     by_number = _number_errors(view.readings, known.number_sigma)
-    C, at = estimate.C()[0], weight_columns(coverage.sizes)
+    C, at = estimate.C()[0], coverage.columns
     shared = sum(coverage.sizes.values())
     numbers = slice(shared, shared + by_number.shape[2])
     width = numbers.stop + PARAMETERS + 1
@@ -121,7 +120,7 @@ class _Collected:
 
 def priors_of(coverage: Coverage, width: int, numbers: slice) -> FloatArray:
     """Return white rows of what is known of the weights, shape (K, width)."""
-    at = weight_columns(coverage.sizes)
+    at = coverage.columns
     tiles = np.concatenate([np.arange(at[M(t)].start, at[M(t)].stop) for t in coverage.tiles])
     rows = np.zeros((numbers.stop, width))
     rows[: len(tiles), tiles] = coverage.root_information

@@ -1,6 +1,7 @@
 """The joint graph over ``T(i)``, ``D(i)`` and ``S(i)``: the finish of the solve, and how sure."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -9,19 +10,19 @@ from l2m_factors import BatchedReadings
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import (
-    Covariances,
     Estimate,
     batch_readings,
     prior_graph,
     reading_graph,
-    variables,
     whitened_jacobian,
 )
 from l2m_gtsam.graph.contradictions import Contradiction, contradictions
 from l2m_gtsam.graph.determined import determinacies
+from l2m_gtsam.graph.marginals import covariance_by_qr, joint_covariance
 from l2m_gtsam.graph.moving_fields import Correction
 from l2m_gtsam.graph.optimise import Ending, optimise, polish
 from l2m_gtsam.graph.pose_errors import error_of_poses
+from l2m_gtsam.graph.sensor_columns import keys_of
 from l2m_gtsam.graph.view import QueryableMap, View
 from l2m_gtsam.results import ResidualFigures
 from l2m_gtsam.solve.figures import residual_figures
@@ -61,9 +62,9 @@ class SensorSolution:
         What recorded numbers add to the readings, beyond what was taken off them; absent where it
         is no variable of the graph.
     shared_root
-        A root of what errors that sensors share, of map and poses, contribute to the covariance of
-        (t, C row by row, H), shape (15, K): two sensors that no factor connects have the covariance
-        ``root_a @ root_b.T`` in common. Absent where errors are not shared.
+        This sensor's rows, t, C row by row and H, of a root of the covariance of all sensors,
+        shape (15, K): two of them have the covariance ``root_a @ root_b.T`` in common, by errors
+        of map and poses. Absent where errors are not shared.
     """
 
     sensor: int
@@ -150,7 +151,7 @@ def joint_step(problem: JointProblem, estimate: Estimate, options: OneKeyOptions
     sensors = problem.view.sensors
     start = estimate.values(sensors)
     optimised = optimise(problem.graph, start, options.optimizer, options.joint_iterations)
-    values = polish(problem.graph, optimised.values, POLISHING_STEPS)
+    values = polish(problem.graph, optimised.values, POLISHING_STEPS).values
     after = estimate.updated(values, sensors)
     most = options.largest_offset_s
     after = replace(after, offset=np.clip(after.offset, -most, most))
@@ -174,16 +175,17 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
 def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
     """Return covariance and figures of every sensor at the optimum of its own weights."""
     values = estimate.values(problem.view.sensors)
-    covariances = Covariances(problem.graph, values)
-    missed = contradictions(estimate.priors.among(problem.view.sensors), values, covariances.among)
-    gradients = problem.graph.linearize(values).gradientAtZero()
+    linear = problem.graph.linearize(values)
+    among = joint_covariance(linear, values, partial(covariance_by_qr, linear))
+    missed = contradictions(estimate.priors.among(problem.view.sensors), values, among)
+    gradients = linear.gradientAtZero()
     W = whitening(problem.covariance)
     solutions = []
     for s in problem.view.sensors:
         rows, test = problem.batch.rows_of(s), problem.determinacies[s]
         residual = problem.batch.residuals(values, s).residual[rows]
-        covariance = covariances.among((s,))
-        gradient = np.concatenate([gradients.at(key) for key in variables(s)])
+        covariance = among((s,))
+        gradient = np.concatenate([gradients.at(key) for key in keys_of(s)])
         solutions.append(
             SensorSolution(
                 sensor=s,

@@ -11,6 +11,7 @@ the readings' poses are taken anew as it moves.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -140,14 +141,16 @@ def solve_one_key(
     errors = shared_errors(field_map, view.readings, options.uncertainty)
     if errors is None:
         return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
-    tell("map uncertainty", 0.0)
-    full = solve_uncertain(view, field_map, errors, joint.estimate, tests, options)
-    tell("map uncertainty", 1.0)
+    stage = partial(tell, "map uncertainty")
+    stage(0.0)
+    full = solve_uncertain(view, field_map, errors, joint.estimate, tests, options, stage)
+    stage(1.0)
     unshared = isinstance(errors, NothingShared)
     return replace(
         outcome,
         estimate=full.estimate,
         solved=full.solved,
+        ending=full.ending,
         settled=joint.settled and full.settled,
         uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
     )

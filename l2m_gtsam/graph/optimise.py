@@ -22,8 +22,8 @@ class Optimizer(StrEnum):
 class LinearSolver(StrEnum):
     """How each linear system is solved.
 
-    GTSAM's Cholesky gives up on directions 4,000 times weaker than others; QR does not mind, and
-    takes a few times as long where cliques are large.
+    GTSAM's Cholesky gives up on a clique whose last pivot is 4,000 times smaller than the one
+    before; QR does not mind, and takes a few times as long where cliques are large.
     """
 
     QR = "MULTIFRONTAL_QR"
@@ -60,20 +60,30 @@ def optimise(
     optimizer: Optimizer,
     max_iterations: int,
     solver: LinearSolver = LinearSolver.QR,
+    ordering: gtsam.Ordering | None = None,
 ) -> Optimised:
-    """Minimise a graph's error from a start, with at most so many linearisations."""
-    engine = _engine(graph, start, optimizer, max_iterations, solver)
+    """Minimise a graph's error from a start, with at most so many linearisations.
+
+    Variables are eliminated in an ordering; in GTSAM's own choice (COLAMD) without one.
+    """
+    engine = _engine(graph, start, optimizer, max_iterations, solver, ordering)
     try:
         values = engine.optimize()
-    except RuntimeError as error:  # GTSAM's IndeterminantLinearSystemException has no Python type
-        if "ndetermina" not in str(error):
+    except RuntimeError as error:
+        if not refused(error):
             raise
         return Optimised(start, Ending.SINGULAR)
     spent = engine.iterations() >= max_iterations
     return Optimised(values, Ending.ITERATION_LIMIT if spent else Ending.TOLERANCE)
 
 
-def polish(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, steps: int) -> gtsam.Values:
+def polish(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    steps: int,
+    solver: LinearSolver = LinearSolver.QR,
+    ordering: gtsam.Ordering | None = None,
+) -> Optimised:
     """Take Gauss-Newton steps to where the gradient vanishes, without asking the error.
 
     A map of blocks leaves small steps in the error where readings cross from block to block. A
@@ -81,17 +91,26 @@ def polish(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, steps: int) 
     gradient does not see them. A rise of the error beyond what such steps make is refused.
     """
     params = gtsam.GaussNewtonParams()
-    _limit(params, steps, LinearSolver.QR)
+    _limit(params, steps, solver, ordering)
     engine = gtsam.GaussNewtonOptimizer(graph, values, params)
     try:
         for _ in range(steps):
             engine.iterate()
-    except RuntimeError as error:  # as above
-        if "ndetermina" not in str(error):
+    except RuntimeError as error:
+        if not refused(error):
             raise
-        return values
+        return Optimised(values, Ending.SINGULAR)
     worst = (1 + SEAM_RISE) * graph.error(values) + SEAM_RISE
-    return engine.values() if graph.error(engine.values()) <= worst else values
+    good = graph.error(engine.values()) <= worst
+    return Optimised(engine.values() if good else values, Ending.TOLERANCE)
+
+
+def refused(error: RuntimeError) -> bool:
+    """Return whether GTSAM calls a linear system indeterminate.
+
+    Its IndeterminantLinearSystemException has no type in Python.
+    """
+    return "ndetermina" in str(error)
 
 
 def _engine(
@@ -100,20 +119,26 @@ def _engine(
     optimizer: Optimizer,
     max_iterations: int,
     solver: LinearSolver,
+    ordering: gtsam.Ordering | None,
 ) -> gtsam.NonlinearOptimizer:
     if optimizer is Optimizer.GN:
         gauss_newton = gtsam.GaussNewtonParams()
-        _limit(gauss_newton, max_iterations, solver)
+        _limit(gauss_newton, max_iterations, solver, ordering)
         return gtsam.GaussNewtonOptimizer(graph, start, gauss_newton)
     levenberg = gtsam.LevenbergMarquardtParams()
-    _limit(levenberg, max_iterations, solver)
+    _limit(levenberg, max_iterations, solver, ordering)
     return gtsam.LevenbergMarquardtOptimizer(graph, start, levenberg)
 
 
 def _limit(
-    params: gtsam.NonlinearOptimizerParams, max_iterations: int, solver: LinearSolver
+    params: gtsam.NonlinearOptimizerParams,
+    max_iterations: int,
+    solver: LinearSolver,
+    ordering: gtsam.Ordering | None,
 ) -> None:
     params.setMaxIterations(max_iterations)
     params.setRelativeErrorTol(TOLERANCE)
     params.setAbsoluteErrorTol(TOLERANCE)
     params.setLinearSolverType(solver.value)
+    if ordering is not None:
+        params.setOrdering(ordering)

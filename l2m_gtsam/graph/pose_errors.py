@@ -76,9 +76,22 @@ class PoseKnots:
 
     def weights(self, seconds: FloatArray) -> FloatArray:
         """Return what the knots before and after say of the error at each time, shape (N, 2)."""
+        return self._weights(*self._between(seconds))
+
+    def bridge(self, seconds: FloatArray) -> FloatArray:
+        """Return the covariance of what the knots leave open at times of one segment, (n, n)."""
+        after, spacing = self._between(seconds)
+        at_knots = np.column_stack([self._like(after), self._like(spacing - after)])
+        apart = np.abs(seconds[:, None] - seconds)
+        return np.asarray(self._like(apart) - self._weights(after, spacing) @ at_knots.T)
+
+    def _between(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the time since the knot before and that from it to the next, shapes (N,)."""
         segment = self.segment(seconds)
         spacing = self.spacing[segment]
-        after = np.clip(seconds - self.seconds[segment], 0.0, spacing)
+        return np.clip(seconds - self.seconds[segment], 0.0, spacing), spacing
+
+    def _weights(self, after: FloatArray, spacing: FloatArray) -> FloatArray:
         whole = -np.expm1(-2 * spacing / self.correlation_s)
         return np.column_stack(
             [
@@ -86,15 +99,6 @@ class PoseKnots:
                 for gap in (after, spacing - after)
             ]
         )
-
-    def bridge(self, seconds: FloatArray) -> FloatArray:
-        """Return the covariance of what the knots leave open at times of one segment, (n, n)."""
-        segment = self.segment(seconds)
-        spacing = self.spacing[segment]
-        after = np.clip(seconds - self.seconds[segment], 0.0, spacing)
-        at_knots = np.column_stack([self._like(after), self._like(spacing - after)])
-        apart = np.abs(seconds[:, None] - seconds)
-        return np.asarray(self._like(apart) - self.weights(seconds) @ at_knots.T)
 
     def _like(self, apart: FloatArray) -> FloatArray:
         return np.asarray(np.exp(-apart / self.correlation_s))

@@ -8,7 +8,7 @@ import numpy as np
 
 from l2m_factors import T, distance_prior, rotation_prior
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.clusters import SENSOR, columns_of
+from l2m_gtsam.graph.sensor_columns import SENSOR, columns_of
 
 AXES = "xyz"
 HOLD_S = 1e-6  # a time offset that is held: far below what any clock of a vehicle resolves

@@ -1,5 +1,7 @@
 """Readings that share errors of map and poses: derivatives, and none as a special case."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -13,13 +15,16 @@ from l2m_factors import (
     MagneticReadings,
     P,
     SharedError,
+    UncertainReadings,
     assert_jacobians_match,
     block_factor,
+    map_weights_information,
     map_weights_prior,
     pose_errors_prior,
     uncertain_block_factor,
+    uncertain_reading_factor,
 )
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from tests.factors.test_reading import as_magnetic, random_values, with_motion
 from tests.worlds import DipoleWorld, dipole_world, drive, random_sensors
 
@@ -45,6 +50,12 @@ def whitenings(seed: int, count: int) -> FloatArray:
     return np.random.default_rng(seed + 3).normal(size=(count, 3, 3)) + 3 * np.eye(3)
 
 
+def block_of(
+    batch: BatchedReadings, rows: IntArray, errors: list[SharedError], W: FloatArray
+) -> gtsam.CustomFactor:
+    return uncertain_block_factor(UncertainReadings(batch, rows, errors, W))
+
+
 def in_tile(tile: int, A: FloatArray) -> list[SharedError]:
     return [SharedError(M(tile), A)]
 
@@ -62,9 +73,9 @@ def test_jacobians_match_central_differences(seed: int, tile: int) -> None:
     poses = [*errors, SharedError(P(3), features(seed + 9, 3, 6))]
     dense = np.random.default_rng(seed).normal(size=(9, 9)) + 3 * np.eye(9)
     for factor in (
-        uncertain_block_factor(batch, rows, errors, W),
-        uncertain_block_factor(timed, rows, errors, W),
-        uncertain_block_factor(timed, rows, poses, dense),
+        block_of(batch, rows, errors, W),
+        block_of(timed, rows, errors, W),
+        block_of(timed, rows, poses, dense),
     ):
         assert_jacobians_match(factor, values, rtol=1e-6, step=2e-5)
 
@@ -74,7 +85,7 @@ def test_the_error_is_that_of_the_map_plus_its_error() -> None:
     world = dipole_world(1)
     readings, values = some_readings(1, world), with_weights(1, 2)
     rows, A, W = np.array([2, 0]), features(1, 2, 6), whitenings(1, 2)
-    factor = uncertain_block_factor(BatchedReadings(world, readings), rows, in_tile(2, A), W)
+    factor = block_of(BatchedReadings(world, readings), rows, in_tile(2, A), W)
     _, b = factor.linearize(values).jacobian()
     C, H = (part := values.atVector(gtsam.symbol("D", 0)))[:9].reshape(3, 3), part[9:]
     t, beta = values.atPoint3(gtsam.symbol("T", 0)), values.atVector(M(2))
@@ -93,7 +104,7 @@ def test_without_an_error_the_map_is_certain() -> None:
     batch, values = BatchedReadings(world, some_readings(2, world)), with_weights(2, 2)
     values.update(M(7), np.zeros(4))
     W, rows = whitenings(2, 10), np.arange(5, 10)
-    ours = uncertain_block_factor(batch, rows, in_tile(7, features(2, 5, 4)), W[rows])
+    ours = block_of(batch, rows, in_tile(7, features(2, 5, 4)), W[rows])
     plain = block_factor(batch, 1, W)
     assert ours.error(values) == pytest.approx(plain.error(values), rel=1e-12)
     A, b = ours.linearize(values).jacobian()
@@ -111,8 +122,7 @@ def test_weights_are_shared_by_the_sensors_of_a_tile() -> None:
         whitenings(3, 3),
     )
     first, second = (
-        uncertain_block_factor(batch, np.arange(start, start + 3), in_tile(2, A), W)
-        for start in (0, 5)
+        block_of(batch, np.arange(start, start + 3), in_tile(2, A), W) for start in (0, 5)
     )
     assert set(first.keys()) & set(second.keys()) == {M(2)}
 
@@ -121,10 +131,48 @@ def test_one_matrix_for_all_readings_is_as_good_as_one_for_each() -> None:
     world = dipole_world(2)
     batch, values = BatchedReadings(world, some_readings(2, world)), with_weights(2, 2)
     W, rows, errors = whitenings(2, 3), np.arange(5, 8), in_tile(7, features(2, 3, 4))
-    each = uncertain_block_factor(batch, rows, errors, W).linearize(values)
-    whole = uncertain_block_factor(batch, rows, errors, block_diag(*W)).linearize(values)
+    each = block_of(batch, rows, errors, W).linearize(values)
+    whole = block_of(batch, rows, errors, block_diag(*W)).linearize(values)
     for one, other in zip(each.jacobian(), whole.jacobian(), strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("dense", [False, True], ids=["each", "together"])
+def test_a_factor_for_each_reading_is_as_good_as_one_for_all(dense: bool) -> None:
+    """The same rows in another packing: to the last bit, also after a step and back."""
+    world = dipole_world(2)
+    batch, values = BatchedReadings(world, some_readings(2, world)), with_weights(2, 2)
+    W, rows, errors = whitenings(2, 3), np.arange(5, 8), in_tile(7, features(2, 3, 4))
+    if dense:
+        common = np.random.default_rng(0).normal(size=(9, 9))
+        W = np.linalg.inv(np.linalg.cholesky(block_diag(*W) + common @ common.T + 9 * np.eye(9)))
+    readings = UncertainReadings(batch, rows, errors, W)
+    each = [uncertain_reading_factor(readings, k) for k in range(3)]
+    moved = gtsam.Values(values)
+    moved.update(M(7), values.atVector(M(7)) + 1.0)
+    for at in (values, moved, values):
+        J, b = block_of(batch, rows, errors, W).linearize(at).jacobian()
+        parts = [factor.linearize(at).jacobian() for factor in each]
+        np.testing.assert_array_equal(np.concatenate([part[0] for part in parts]), J)
+        np.testing.assert_array_equal(np.concatenate([part[1] for part in parts]), b)
+        assert sum(factor.error(at) for factor in each) == pytest.approx(0.5 * b @ b, rel=1e-12)
+
+
+def test_a_reading_adds_to_those_before_it_only() -> None:
+    """Its factor, white together with others, does not change with a reading after it."""
+    world = dipole_world(2)
+    W = np.linalg.inv(np.linalg.cholesky(np.eye(9) + np.ones((9, 9))))
+    errors, values = in_tile(7, features(2, 3, 4)), with_weights(2, 2)
+    found = []
+    for shift in (0.0, 5.0):
+        readings = some_readings(2, world)
+        field = readings.field.copy()
+        field[7] += shift
+        batch = BatchedReadings(world, replace(readings, field=field))
+        group = UncertainReadings(batch, np.arange(5, 8), errors, W)
+        found.append([uncertain_reading_factor(group, k).error(values) for k in range(3)])
+    assert found[0][:2] == found[1][:2]
+    assert found[0][2] != found[1][2]
 
 
 def test_the_prior_of_pose_errors_is_a_chain_of_unit_variance() -> None:
@@ -154,3 +202,24 @@ def test_the_prior_is_that_of_the_covariance(seed: int) -> None:
     expected = 0.5 * beta @ np.linalg.solve(covariance, beta)
     assert factor.error(values) == pytest.approx(expected, rel=1e-9)
     assert_jacobians_match(factor, values)
+
+
+def test_the_prior_as_information_is_the_same() -> None:
+    """Error, and information with its gradient, of many tiles, more than parts; rounding."""
+    rng = np.random.default_rng(4)
+    sizes = {tile: 1 + tile % 3 for tile in range(11)}
+    count = sum(sizes.values())
+    root = np.tril(rng.normal(size=(count, count))) + 4 * np.eye(count)
+    values = gtsam.Values()
+    for tile, size in sizes.items():
+        values.insert(M(tile), rng.normal(size=size))
+    rows, squared = map_weights_prior(sizes, root), map_weights_information(sizes, root)
+    assert squared.error(values) == pytest.approx(rows.error(values), rel=1e-12)
+    graphs = []
+    for factor in (rows, squared):
+        graph = gtsam.GaussianFactorGraph()
+        graph.push_back(factor.linearize(values))
+        graphs.append(graph)
+    (H, eta), (other_H, other_eta) = (graph.hessian() for graph in graphs)
+    np.testing.assert_allclose(other_H, H, rtol=1e-12, atol=1e-11)
+    np.testing.assert_allclose(other_eta, eta, rtol=1e-11, atol=1e-10)

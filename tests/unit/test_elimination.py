@@ -1,5 +1,6 @@
-"""Block elimination of sensors and map weights against dense algebra."""
+"""Sensors and map weights together: LAPACK and the block elimination against dense algebra."""
 
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -8,7 +9,15 @@ import pytest
 
 from l2m_factors import D, M, S, T
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.elimination import Eliminated, Rows, eliminate
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.graph import joint_information as joint_rows
+from l2m_gtsam.graph.joint_information import (
+    JointInformation,
+    joint_information,
+    rows_of_factors,
+)
+from l2m_gtsam.graph.sensor_columns import columns_of, keys_of
+from tests.reference.elimination import Eliminated, Rows, eliminate
 
 JACOBIAN: Any = gtsam.JacobianFactor  # its stub lists one to three variables, each by itself
 
@@ -78,6 +87,39 @@ def problem(request: pytest.FixtureRequest) -> Problem:
 @pytest.fixture(scope="module")
 def solved(problem: Problem) -> Eliminated:
     return eliminate(problem.graph, SENSORS, SIZES)
+
+
+@pytest.fixture(scope="module")
+def joint(problem: Problem) -> JointInformation:
+    """The prior of the weights apart, all else as rows; weights are where they are."""
+    widths = np.cumsum([0, *SIZES.values()]).tolist()
+    weights = {key: slice(*at) for key, at in zip(SIZES, pairwise(widths), strict=True)}
+    first, own = widths[-1], columns_of(tuple(SENSORS))
+    columns = weights | {k: slice(first + at.start, first + at.stop) for k, at in own.items()}
+    owner = {key: sensor for sensor in SENSORS for key in keys_of(sensor)}
+    rows = rows_of_factors(problem.graph, columns, owner)
+    readings = [each for each in rows if set(each.columns.tolist()) - set(range(first))]
+    return joint_information(columns, readings, np.eye(first), np.zeros(first))
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_all_variables_together_give_what_elimination_does(
+    joint: JointInformation, solved: Eliminated, sensor: int
+) -> None:
+    """Covariance, remaining step and degrees of freedom; random rows are well conditioned."""
+    covariance = solved.covariance(sensor)
+    np.testing.assert_allclose(joint.among((sensor,)), covariance, atol=1e-12)
+    assert joint.sigmas(sensor) == pytest.approx(solved.sigmas(sensor), rel=1e-10)
+    assert joint.taken(sensor) == pytest.approx(solved.taken(sensor), rel=1e-10)
+    assert joint.among(tuple(SENSORS))[:16, :16] == pytest.approx(joint.among((SENSORS[0],)))
+
+
+def test_a_singular_system_is_one_clear_error() -> None:
+    """Two columns that are the same, known to no end."""
+    rows = [joint_rows.Rows(0, np.array([1, 2]), np.array([[1e9, 1e9]]), np.zeros(1))]
+    columns = {M(0): slice(0, 1), T(0): slice(1, 2), S(0): slice(2, 3)}
+    with pytest.raises(CalibrationError, match="orders of magnitude apart"):
+        joint_information(columns, rows, np.eye(1), np.zeros(1))
 
 
 @pytest.mark.parametrize("sensor", SENSORS)

@@ -12,7 +12,7 @@ information is safe:
     \mathrm{cov}(\delta_c) = R_c^{-1} (I + S_c \Lambda^{-1} S_c^T) R_c^{-T}
 
 A reading touches the weights of one tile and two knots, so that ``E^T E`` is made of small blocks.
-GTSAM's own sequential QR gives the same, but fills in and knows nothing of BLAS: it is far slower.
+This was the engine of the last graph before GTSAM became it; here it is the slow reference.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +23,8 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.clusters import SENSOR, clusters_of, columns_among, columns_of, rows_in
+from l2m_gtsam.graph.marginals import clusters_of
+from l2m_gtsam.graph.sensor_columns import SENSOR, columns_among, columns_of, rows_in
 
 NONE = np.empty(0, dtype=np.int64)
 SHARED = -1  # of rows that are no one sensor's
