@@ -12,8 +12,10 @@ from l2m_gtsam.qa.scene import calibration_scene
 from l2m_gtsam.repeat_results import Repeatability
 from l2m_gtsam.repeatability import compared_drives, compared_halves
 from l2m_gtsam.scene import Scene
+from l2m_gtsam.threads import one_blas_thread
 
 
+@one_blas_thread()
 def appraise(
     recording: Recording,
     calibrated: Calibrated,
@@ -51,6 +53,7 @@ def appraise(
     return metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
 
 
+@one_blas_thread()
 def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
     """Return what there is to see of a calibration in three dimensions.
 

@@ -37,6 +37,7 @@ from l2m_gtsam.slam_records import (
 from l2m_gtsam.slam_results import LocalisationResult, SensorUse, StartSearch
 from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
+from l2m_gtsam.threads import one_blas_thread
 from l2m_gtsam.validation_results import ChiSquare, NamedSource
 
 NO_TRUTH = "no key pose lies between two true ones that are near enough: nothing is compared"
@@ -72,6 +73,7 @@ class Told:
     truth_source: SourceFile | None = None
 
 
+@one_blas_thread()
 def localisation_record(
     result: LocalisationResult, solution: Localised, told: Told
 ) -> LocalisationRecord:
