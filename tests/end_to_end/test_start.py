@@ -7,9 +7,19 @@ import sys
 import pytest
 
 HEAVY = (
-    "dask", "gtsam", "jinja2", "l2m_gtsam.batch", "l2m_gtsam.config", "matplotlib", "numba", "numpy",
-    "rosbags", "ruamel", "scipy", "sklearn",
-)  # fmt: skip
+    "dask",
+    "gtsam",
+    "jinja2",
+    "l2m_gtsam.batch",
+    "l2m_gtsam.config",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "rosbags",
+    "ruamel",
+    "scipy",
+    "sklearn",
+)
 LOADED = f"import json, sys; print(json.dumps([each for each in {HEAVY} if each in sys.modules]))"
 # At the first bar it says what is loaded, and ends.
 AT_THE_FIRST_BAR = f"""

@@ -4,7 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from l2m_gtsam.metric_results import Normalised, Series
 from l2m_gtsam.qa.report.drawing import Drawing, Entry, legend
@@ -13,7 +12,6 @@ from l2m_gtsam.qa.report.figures.place import residual_figure
 from l2m_gtsam.qa.report.figures.statistics import chi_square_figure, sigmas_figure
 from l2m_gtsam.qa.report.panel import Box, Panel, Stroke, nice, numbers, spread
 from l2m_gtsam.qa.report.svg import VARIABLES, X, as_svg
-from l2m_gtsam.solve.chi_square import chance_beyond, density, quantile
 
 READINGS = 500
 MOST_ELEMENTS = 160  # axes with numbers, and a path for each layer or colour
@@ -112,11 +110,3 @@ def test_limits_of_nothing_and_of_one_value() -> None:
     assert spread(np.array([np.nan])) == pytest.approx((-0.05, 1.05))
     low, high = spread(np.array([3.0, 3.0]))
     assert low < 3 < high
-
-
-def test_chi_square_is_that_of_the_library() -> None:
-    share, values = np.linspace(0, 0.999, 20), np.linspace(0.1, 40, 20)
-    for freedom in (1, 3, 15):
-        np.testing.assert_allclose(quantile(share, freedom), chi2.ppf(share, freedom))
-        np.testing.assert_allclose(chance_beyond(values, freedom), chi2.sf(values, freedom))
-        np.testing.assert_allclose(density(values, freedom), chi2.pdf(values, freedom))
