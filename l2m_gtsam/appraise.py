@@ -12,8 +12,13 @@ from l2m_gtsam.qa.scene import calibration_scene
 from l2m_gtsam.repeat_results import Repeatability
 from l2m_gtsam.repeatability import compared_drives, compared_halves
 from l2m_gtsam.scene import Scene
+from l2m_gtsam.threads import one_blas_thread
+
+FIGURES = "figures"
+"""Stage of the figures of a calibration and its picture."""
 
 
+@one_blas_thread()
 def appraise(
     recording: Recording,
     calibrated: Calibrated,
@@ -47,10 +52,14 @@ def appraise(
         else:
             halves = compared_halves(calibrated, options, qa.half_readings)
         tell(stage, 1.0)
+    tell(FIGURES, 0.0)
     evidence, maps = _evidence(calibrated), _maps(calibrated)
-    return metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
+    metrics = metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
+    tell(FIGURES, 0.5)
+    return metrics
 
 
+@one_blas_thread()
 def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
     """Return what there is to see of a calibration in three dimensions.
 

@@ -35,6 +35,7 @@ from l2m_gtsam.results import (
 from l2m_gtsam.solve.disagreement import disagreements
 from l2m_gtsam.solve.explain import movement
 from l2m_gtsam.sync import stuck_readings
+from l2m_gtsam.threads import one_blas_thread
 from l2m_gtsam.verdicts import SolvedDrive, sensor_verdicts
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
@@ -94,6 +95,7 @@ def calibrate(
     return calibrated(recording, field_map, options, map_source, progress).result
 
 
+@one_blas_thread()
 def calibrated(
     recording: Recording,
     field_map: QueryableMap,

@@ -1,6 +1,7 @@
 """The command line: ``l2m``. Parsing and printing only; the work is done in ``batch``.
 
-Heavy modules are imported inside the commands, so that ``--help`` answers at once.
+Heavy modules are imported inside the commands, so that ``--help`` answers at once, and below the
+first bar, so that it stands there while they load.
 """
 
 import os
@@ -116,11 +117,11 @@ def options(
 @app.command()
 def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
     """Say what is in a bag and what would be used of it, and why."""
-    from l2m_gtsam.batch.drives import inspect_file
-    from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.tables import bag_table
-
     with shown_progress() as progress:
+        from l2m_gtsam.batch.drives import inspect_file
+        from l2m_gtsam.config import load_config
+        from l2m_gtsam.qa.tables import bag_table
+
         report = inspect_file(bag, load_config(config), progress)
     print_table(bag_table(report))
     for obstacle in report.obstacles:
@@ -138,16 +139,16 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate a warehouse, a mapping drive and a calibration drive, and write them as bags."""
-    from l2m_gtsam.batch.simulation import simulate_bags
-    from l2m_gtsam.errors import ConfigError
-    from l2m_gtsam.simulate.bag_writer import BagKind
-
-    known = [each.value for each in BagKind]
-    if unknown := [each for each in kind or [] if each not in known]:
-        msg = f"--kind: unknown bag kind {unknown[0]!r}; accepted: {', '.join(known)}"
-        raise ConfigError(msg)
-    wanted = _scenario(options, seed)
     with shown_progress() as progress:
+        from l2m_gtsam.batch.simulation import simulate_bags
+        from l2m_gtsam.errors import ConfigError
+        from l2m_gtsam.simulate.bag_writer import BagKind
+
+        known = [each.value for each in BagKind]
+        if unknown := [each for each in kind or [] if each not in known]:
+            msg = f"--kind: unknown bag kind {unknown[0]!r}; accepted: {', '.join(known)}"
+            raise ConfigError(msg)
+        wanted = _scenario(options, seed)
         simulate_bags(out, wanted, [BagKind(k) for k in kind or known], progress)
     typer.echo(f"bags, suite.yaml, structure.ply and truth.yaml are in {out}")
 
@@ -190,16 +191,16 @@ def calibrate(
     ] = None,
 ) -> None:
     """Calibrate every magnetometer of one drive or several; write a picture and a report, too."""
-    from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
-    from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
-    from l2m_gtsam.config import load_config, with_uncertainty
-    from l2m_gtsam.qa.verdict_text import verdict_lines
-
-    chosen = with_uncertainty(load_config(config), uncertainty)
     with shown_progress() as progress:
+        from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
+        from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
+        from l2m_gtsam.config import load_config, with_uncertainty
+        from l2m_gtsam.qa.verdict_text import verdict_lines
+
+        chosen = with_uncertainty(load_config(config), uncertainty)
         drives = [*(bags or ()), *(more or ())]
         result = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
-        verdict = report_folder(out, config)
+        verdict = report_folder(out, config, progress)
     _print_calibration(result, models)
     typer.echo("\n".join(verdict_lines(verdict)))
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
@@ -225,13 +226,13 @@ def plan(
     From poses and map alone: the bag needs no readings. Sensors of the bag are assumed where
     `calibration.start` puts them, else at the lidar, aligned with it and without distortion.
     """
-    from l2m_gtsam.batch.drives import plan_bag
-    from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.plan_tables import advice, held_plan_note, motion_table, plan_table
-    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
-
-    chosen, places = load_config(config), [_place(text) for text in at or []]
     with shown_progress() as progress:
+        from l2m_gtsam.batch.drives import plan_bag
+        from l2m_gtsam.config import load_config
+        from l2m_gtsam.qa.plan_tables import advice, held_plan_note, motion_table, plan_table
+        from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
+
+        chosen, places = load_config(config), [_place(text) for text in at or []]
         found = plan_bag(bag, map_path, chosen, places, progress)
     print_table(plan_table(found))
     if held := held_plan_note(found):
@@ -249,11 +250,11 @@ def demo(
     seed: SeedOption = None,
 ) -> None:
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
-    from l2m_gtsam.demo import run_demo
-    from l2m_gtsam.qa.tables import honesty_note, truth_table
-
-    wanted = _scenario(options, seed)
     with shown_progress() as progress:
+        from l2m_gtsam.demo import run_demo
+        from l2m_gtsam.qa.tables import honesty_note, truth_table
+
+        wanted = _scenario(options, seed)
         outcome = run_demo(out, wanted, progress)
     print_table(truth_table(outcome.result, outcome.truth))
     typer.echo(honesty_note(outcome.result, outcome.truth))
@@ -277,11 +278,11 @@ def map_build(
     ] = False,
 ) -> None:
     """Build a map from one or several bags of a calibrated mapping suite."""
-    from l2m_gtsam.batch.maps import build_map_file
-    from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.tables import map_table
-
     with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import build_map_file
+        from l2m_gtsam.config import load_config
+        from l2m_gtsam.qa.tables import map_table
+
         built = build_map_file(bags, out, load_config(config), suite, progress, structure, lidar)
     print_table(map_table(built.description))
     warn(built.description.summary.doubts)
@@ -300,11 +301,11 @@ def map_update(
 
     Where there are new readings, the scales of a harmonic map's tiles follow them.
     """
-    from l2m_gtsam.batch.maps import update_map_file
-    from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.tables import map_table
-
     with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import update_map_file
+        from l2m_gtsam.config import load_config
+        from l2m_gtsam.qa.tables import map_table
+
         updated = update_map_file(map_path, bags, out, load_config(config), suite, progress)
     print_table(map_table(updated.description))
     warn(updated.description.summary.doubts)
@@ -319,11 +320,11 @@ def map_compare(
     structure: StructureOption = None,
 ) -> None:
     """Say which kind of map predicts places best that it has not seen."""
-    from l2m_gtsam.batch.maps import compare_map_kinds
-    from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.comparison import comparison_table
-
     with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import compare_map_kinds
+        from l2m_gtsam.config import load_config
+        from l2m_gtsam.qa.comparison import comparison_table
+
         comparison = compare_map_kinds(bags, load_config(config), suite, structure, progress)
     print_table(comparison_table(comparison))
 
@@ -331,10 +332,10 @@ def map_compare(
 @map_app.command("info")
 def map_info(map_path: MapArgument) -> None:
     """Say what a map is made of and what it covers."""
-    from l2m_gtsam.batch.maps import describe_map_file
-    from l2m_gtsam.qa.tables import map_table
-
     with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import describe_map_file
+        from l2m_gtsam.qa.tables import map_table
+
         description = describe_map_file(map_path, progress)
     print_table(map_table(description))
     warn(description.summary.doubts)
@@ -349,9 +350,9 @@ def map_plot(
     ] = None,
 ) -> None:
     """Draw strength and uncertainty of a map at one height."""
-    from l2m_gtsam.batch.maps import plot_map_file
-
     with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import plot_map_file
+
         plot_map_file(map_path, out, height, progress)
     typer.echo(f"written: {out}")
 

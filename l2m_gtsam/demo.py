@@ -43,5 +43,5 @@ def run_demo(out: Path, options: ScenarioOptions, progress: Progress) -> Demonst
     cloud = str(out / STRUCTURE_FILE)
     build_map_file([mapping], map_path, config, out / SUITE_FILE, progress, cloud)
     result = calibrate_bag(drive, map_path, config, out, progress, scenario.truth)
-    report_folder(out, None)
+    report_folder(out, None, progress)
     return Demonstration(result, scenario.truth, out / OVERVIEW_FILE, out / REPORT_FILE)

@@ -18,6 +18,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.scans import ScanEvidence
 from l2m_gtsam.slam_results import Explored, LocalisationResult, LocalisationStatus
+from l2m_gtsam.threads import one_blas_thread
 
 NOWHERE_TWICE = (
     "no place was come to twice: readings of an unknown field take out little drift then"
@@ -51,6 +52,7 @@ class Exploration:
     field: FloatArray
 
 
+@one_blas_thread()
 def explore(
     recording: Recording,
     calibration: CalibrationResult,

@@ -33,6 +33,7 @@ from l2m_gtsam.silences import heard, is_dead
 from l2m_gtsam.slam_results import LocalisationResult
 from l2m_gtsam.solve.noise import NOISE_RANGE
 from l2m_gtsam.sync import SyncOptions, synchronise, with_offsets
+from l2m_gtsam.threads import one_blas_thread
 
 NO_SCANS = ScanEvidence()
 DEAD = "it has no readings, or repeats one value"
@@ -62,6 +63,7 @@ class Localisation:
     solution: Localised
 
 
+@one_blas_thread()
 def localise(
     recording: Recording,
     field_map: QueryableMap,

@@ -13,8 +13,10 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
+from l2m_gtsam.threads import one_blas_thread
 
 
+@one_blas_thread()
 def map_recordings(
     recordings: Sequence[Recording],
     suite: Mapping[str, KnownSensor] | None,
@@ -47,6 +49,7 @@ def map_recordings(
     return build_map(readings.points, readings.field, options.model, cloud)
 
 
+@one_blas_thread()
 def update_map(
     field_map: FieldMap,
     recordings: Sequence[Recording],
@@ -73,6 +76,7 @@ def update_map(
     return field_map.updated(readings.points, readings.field)
 
 
+@one_blas_thread()
 def compare_recordings(
     recordings: Sequence[Recording],
     suite: Mapping[str, KnownSensor] | None,
@@ -113,6 +117,7 @@ def compare_recordings(
     return compare_maps(readings.points, readings.field, options.compare, build)
 
 
+@one_blas_thread()
 def suite_readings(
     recordings: Sequence[Recording],
     suite: Mapping[str, KnownSensor] | None,

@@ -32,6 +32,7 @@ from l2m_gtsam.prepare import prepare
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
 from l2m_gtsam.solve.rotation import polar_rotation
+from l2m_gtsam.threads import one_blas_thread
 
 NANOSECONDS = 1e9
 BREAK_NS = 60_000_000_000  # between a drive and a motion that is added to it
@@ -79,6 +80,7 @@ class Task:
         return replace(self, t=self.t[[sensor]], priors=self.priors.of_one(sensor))
 
 
+@one_blas_thread()
 def plan(
     recording: Recording,
     field_map: QueryableMap,

@@ -17,11 +17,13 @@ from l2m_gtsam.metric_results import Halves
 from l2m_gtsam.qa.metrics.drives import compare_drives
 from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
 from l2m_gtsam.repeat_results import Repeatability
+from l2m_gtsam.threads import one_blas_thread
 
 STEPS = 3  # alternations from where the whole was found; the joint graph does the rest
 MORE = 4  # times as many readings of a drive as of a half
 
 
+@one_blas_thread()
 def compared_halves(
     calibrated: Calibrated, options: CalibrationOptions, each_half: int
 ) -> dict[str, Halves]:
@@ -55,6 +57,7 @@ def compared_halves(
     return {readings.sensors[index]: _compared(first, second, index) for index in solved}
 
 
+@one_blas_thread()
 def compared_drives(
     calibrated: Calibrated, recording: Recording, options: CalibrationOptions, each_half: int
 ) -> dict[str, Repeatability]:

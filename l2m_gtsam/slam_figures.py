@@ -7,7 +7,6 @@ from typing import Any
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from l2m_gtsam.calibrate import VERSIONED
 from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, SourceFile, Trajectory
@@ -35,8 +34,10 @@ from l2m_gtsam.slam_records import (
     Timeline,
 )
 from l2m_gtsam.slam_results import LocalisationResult, SensorUse, StartSearch
+from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
+from l2m_gtsam.threads import one_blas_thread
 from l2m_gtsam.validation_results import ChiSquare, NamedSource
 
 NO_TRUTH = "no key pose lies between two true ones that are near enough: nothing is compared"
@@ -72,6 +73,7 @@ class Told:
     truth_source: SourceFile | None = None
 
 
+@one_blas_thread()
 def localisation_record(
     result: LocalisationResult, solution: Localised, told: Told
 ) -> LocalisationRecord:
@@ -200,7 +202,7 @@ def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[Ref
 def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSensor:
     old, new = (np.append(each.t_lidar_mag, each.distortion.vector()) for each in (before, after))
     whitened = root_information(before.covariance) @ (new - old)
-    low, high = chi2.ppf(BAND, len(PARAMETERS))
+    low, high = quantile(BAND, len(PARAMETERS))
     return RefinedSensor(
         sensor=before.sensor,
         before=row(old, DIGITS),

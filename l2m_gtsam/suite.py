@@ -30,6 +30,7 @@ from l2m_gtsam.results import (
 from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.rotation import polar_rotation
 from l2m_gtsam.sync import stuck_sensors, synchronise, with_offsets
+from l2m_gtsam.threads import one_blas_thread
 
 REACH = 5.0  # standard deviations of a clock for which readings need poses around them
 UNTOLD = 0.5  # of the sigma that was assumed: a parameter known no better is told by nothing else
@@ -54,6 +55,7 @@ class SuiteDrive:
         return with_offsets(self.readings, self.recording.trajectory, offset)
 
 
+@one_blas_thread()
 def calibrate_suite(
     recordings: Sequence[Recording],
     assumed: Mapping[str, KnownSensor] | None,

@@ -1,10 +1,12 @@
 """Independent pieces of linear algebra, which leaves Python alone while it computes."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 from os import cpu_count, environ
-from typing import TypeVar
+from threading import Lock, local
+from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
@@ -16,22 +18,78 @@ In = TypeVar("In")
 Out = TypeVar("Out")
 
 
-def in_threads(work: Callable[[In], Out], items: Iterable[In]) -> list[Out]:
-    """Return the results in the order of the items.
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Give BLAS one thread inside, and afterwards what it had; to be used as a decorator, too.
 
-    Each piece is too small for threads of its own in BLAS, which would only wait for each other:
-    with them a warehouse took three times as long.
+    Blocks of a few hundred readings are too small for threads in BLAS, which would only wait for
+    each other: with them a calibration took seven times as long.
     """
+    _LIMIT.enter()
+    try:
+        yield
+    finally:
+        _LIMIT.leave()
+
+
+def in_threads(work: Callable[[In], Out], items: Iterable[In]) -> list[Out]:
+    """Return the results in the order of the items; BLAS has one thread meanwhile."""
     pieces = list(items)
     threads = min(int(environ.get(THREADS) or cpu_count() or 1), MOST_THREADS, len(pieces))
-    with _libraries().limit(limits=1, user_api="blas"):
+    with one_blas_thread():
         if threads <= 1:
             return [work(piece) for piece in pieces]
         with ThreadPoolExecutor(threads) as pool:
             return list(pool.map(work, pieces))
 
 
+class _Limit:
+    """Who is inside of the limit, and what BLAS had before the first came.
+
+    With some libraries the number of threads is one of the process, with others each thread of
+    Python has its own. So each thread restores what it saw, and the last one what the first saw.
+    """
+
+    def __init__(self) -> None:
+        self._own = local()
+        self._lock = Lock()
+        self._inside = 0
+        self._before: list[int] = []
+
+    def enter(self) -> None:
+        depth = getattr(self._own, "depth", 0)
+        if depth == 0:
+            with self._lock:
+                self._own.before = _numbers()
+                if self._inside == 0:
+                    self._before = self._own.before
+                self._inside += 1
+                _set_numbers([1] * len(self._own.before))
+        self._own.depth = depth + 1
+
+    def leave(self) -> None:
+        self._own.depth -= 1
+        if self._own.depth == 0:
+            with self._lock:
+                self._inside -= 1
+                _set_numbers(self._own.before if self._inside else self._before)
+
+
+_LIMIT = _Limit()
+
+
+def _numbers() -> list[int]:
+    return [each.num_threads for each in _libraries()]
+
+
+def _set_numbers(numbers: list[int]) -> None:
+    for library, number in zip(_libraries(), numbers, strict=True):
+        library.set_num_threads(number)
+
+
 @lru_cache(maxsize=1)
-def _libraries() -> ThreadpoolController:
+def _libraries() -> list[Any]:
     """Return the BLAS libraries of this process: looking for them takes longer than a task."""
-    return ThreadpoolController()
+    import scipy.linalg  # noqa: F401 - has a BLAS of its own, found only once it is loaded
+
+    return ThreadpoolController().select(user_api="blas").lib_controllers  # type: ignore[no-any-return]

@@ -18,6 +18,7 @@ from l2m_gtsam.qa.metrics.coverage import drive_metrics
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.sync import stuck_sensors
+from l2m_gtsam.threads import one_blas_thread
 from l2m_gtsam.validation_figures import Course, offset_s, sensor_figures
 from l2m_gtsam.validation_remarks import is_sound, missing_sensors, nothing_shared, remarks
 from l2m_gtsam.validation_results import (
@@ -27,6 +28,7 @@ from l2m_gtsam.validation_results import (
 )
 
 
+@one_blas_thread()
 def validate(
     recording: Recording,
     field_map: QueryableMap,

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from l2m_gtsam.appraise import appraise, scene_of
+from l2m_gtsam.appraise import FIGURES, appraise, scene_of
 from l2m_gtsam.batch.opening import OpenMap, SavedMap, check_bags, read_drive
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.scan_poses import read_drives_on
@@ -107,13 +107,14 @@ def calibrate_drive(
     metrics = appraise(recording, found, config.calibration, config.qa, progress)
     result = replace(found.result, options=config.model_dump(mode="json"))
     drives = [each.trajectory for each in recording.parts]
-    figure = calibration_figure(opened.field_map, drives, result, truth)
+    figure = calibration_figure(metrics.map, drives, result, truth)
     ensure_folder(out)
     if view is not None:
         ensure_folder(view.parent)
     write_calibration(out / CALIBRATION_FILE, result)
     write_metrics(out / METRICS_FILE, metrics)
     save_figure(figure, out / OVERVIEW_FILE)
+    progress(FIGURES, 1.0)
     if view is not None:
         write_scene(view, scene_of(recording, found))
     return result

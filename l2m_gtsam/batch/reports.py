@@ -10,10 +10,11 @@ from l2m_gtsam.batch.slam_report import SLAM_FILE, report_localisation
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
 from l2m_gtsam.metric_results import Metrics
+from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.judge import Verdict, judge
 from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.report.page import report_page
+from l2m_gtsam.qa.report.page import STAGE, report_page
 from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration
@@ -24,7 +25,9 @@ REPORT_FILE = "report.html"
 PDF_FILE = "report.pdf"
 
 
-def report_folder(folder: Path, config: Path | None, *, pdf: bool = False) -> Verdict:
+def report_folder(
+    folder: Path, config: Path | None, progress: Progress | None = None, *, pdf: bool = False
+) -> Verdict:
     """Write `report.html` from what is in a folder.
 
     Parameters
@@ -34,6 +37,8 @@ def report_folder(folder: Path, config: Path | None, *, pdf: bool = False) -> Ve
         was written to.
     config
         Configuration with thresholds; those that it was computed with if there is none.
+    progress
+        Called with a stage and the fraction of it that is done.
     pdf
         Whether `report.pdf` is written, too.
 
@@ -42,13 +47,16 @@ def report_folder(folder: Path, config: Path | None, *, pdf: bool = False) -> Ve
     L2MError
         A file is missing or damaged, or there is no browser to print with; one line.
     """
+    tell = progress or (lambda stage, fraction: None)
+    tell(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE, folder / PDF_FILE)
     if holds_localisation(folder):
         verdict = report_localisation(folder, config, folder / REPORT_FILE)
     else:
-        verdict = _report_calibration(folder, config)
+        verdict = _report_calibration(folder, config, tell)
     if pdf:
         print_page(folder / REPORT_FILE, folder / PDF_FILE)
+    tell(STAGE, 1.0)
     return verdict
 
 
@@ -70,15 +78,19 @@ def holds_localisation(folder: Path) -> bool:
     return True
 
 
-def _report_calibration(folder: Path, config: Path | None) -> Verdict:
+def _report_calibration(folder: Path, config: Path | None, progress: Progress) -> Verdict:
     result = read_calibration(folder / CALIBRATION_FILE)
     metrics = read_metrics(folder / METRICS_FILE)
     options = _saved(result) if config is None else load_config(config).qa
-    return write_report(folder, result, metrics, options)
+    return write_report(folder, result, metrics, options, progress)
 
 
 def write_report(
-    folder: Path, result: CalibrationResult, metrics: Metrics, options: QaOptions
+    folder: Path,
+    result: CalibrationResult,
+    metrics: Metrics,
+    options: QaOptions,
+    progress: Progress | None = None,
 ) -> Verdict:
     """Write the report on a calibration and return its verdict.
 
@@ -90,7 +102,7 @@ def write_report(
         It cannot be written.
     """
     check_names([each.sensor for each in result.sensors], options)
-    page = report_page(result, metrics, options)
+    page = report_page(result, metrics, options, progress)
     with atomic_path(folder / REPORT_FILE) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="replace")
     return judge(result, metrics, options)

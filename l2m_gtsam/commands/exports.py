@@ -67,10 +67,10 @@ def apply(
     ] = False,
 ) -> None:
     """Copy a bag and add the corrected readings, in the axes of the LiDAR, as TOPIC/calibrated."""
-    from l2m_gtsam.batch.corrected_bag import Application, apply_calibration
-
-    wanted = Application(bag, calibration, out, config, lidar_frame, replace)
     with shown_progress() as progress:
+        from l2m_gtsam.batch.corrected_bag import Application, apply_calibration
+
+        wanted = Application(bag, calibration, out, config, lidar_frame, replace)
         applied = apply_calibration(wanted, progress)
     warn(applied.notes)
     for sensor, topic in applied.topics.items():

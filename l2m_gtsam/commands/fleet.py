@@ -41,15 +41,15 @@ def batch(
     A bag that fails is a row with its reason, and the exit code stays 0. Started again with the
     same --out it computes only what is missing or has changed.
     """
-    from l2m_gtsam.batch.fleet import run_fleet
-    from l2m_gtsam.batch.fleet_drives import CSV_FILE, PAGE_FILE, PARQUET_FILE, FleetOrder
-    from l2m_gtsam.cluster import ClusterOptions
-
-    order = FleetOrder(source, map_path, config, out)
-    cluster = ClusterOptions(
-        scheduler=scheduler, **({} if workers is None else {"workers": workers})
-    )
     with shown_progress() as progress:
+        from l2m_gtsam.batch.fleet import run_fleet
+        from l2m_gtsam.batch.fleet_drives import CSV_FILE, PAGE_FILE, PARQUET_FILE, FleetOrder
+        from l2m_gtsam.cluster import ClusterOptions
+
+        order = FleetOrder(source, map_path, config, out)
+        cluster = ClusterOptions(
+            scheduler=scheduler, **({} if workers is None else {"workers": workers})
+        )
         fleet = run_fleet(order, cluster, progress)
     typer.echo(_summary(fleet))
     for row in fleet.rows:

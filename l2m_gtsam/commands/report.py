@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from l2m_gtsam.commands.terminal import shown_progress
+
 
 def report(
     folder: Annotated[
@@ -22,10 +24,11 @@ def report(
     ] = False,
 ) -> None:
     """Write report.html: verdict, reasons, pictures; needs no bag and no map."""
-    from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
-    from l2m_gtsam.qa.verdict_text import verdict_lines
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
+        from l2m_gtsam.qa.verdict_text import verdict_lines
 
-    verdict = report_folder(folder, config, pdf=pdf)
+        verdict = report_folder(folder, config, progress, pdf=pdf)
     for line in verdict_lines(verdict):
         typer.echo(line)
     written = [folder / REPORT_FILE, *([folder / PDF_FILE] if pdf else [])]

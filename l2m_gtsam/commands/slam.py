@@ -30,19 +30,19 @@ def slam(
     ] = None,
 ) -> None:
     """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
-    from l2m_gtsam.batch.slam import SlamInput, slam_bag
-    from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.slam_tables import (
-        drift_lines,
-        scan_lines,
-        slam_table,
-        start_lines,
-        truth_lines,
-    )
-    from l2m_gtsam.qa.verdict_text import verdict_lines
-
-    given = SlamInput(bag, map_path, calibration, truth)
     with shown_progress() as progress:
+        from l2m_gtsam.batch.slam import SlamInput, slam_bag
+        from l2m_gtsam.config import load_config
+        from l2m_gtsam.qa.slam_tables import (
+            drift_lines,
+            scan_lines,
+            slam_table,
+            start_lines,
+            truth_lines,
+        )
+        from l2m_gtsam.qa.verdict_text import verdict_lines
+
+        given = SlamInput(bag, map_path, calibration, truth)
         done = slam_bag(given, load_config(config), out, progress)
     print_table(slam_table(done.result))
     lines = (*start_lines(done.result.start), *drift_lines(done.result))

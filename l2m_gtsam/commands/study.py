@@ -30,23 +30,25 @@ def study(
 
     Started again with the same --out it goes on where it was stopped.
     """
-    from l2m_gtsam.cluster import ClusterOptions
-    from l2m_gtsam.config import load_options
-    from l2m_gtsam.errors import ConfigError
-    from l2m_gtsam.studies.registry import STUDIES
-    from l2m_gtsam.studies.run import run_study
-
-    if name not in STUDIES:
-        raise ConfigError(f"study {name!r} is not known; accepted: {', '.join(STUDIES)}")
-    chosen = STUDIES[name]
-    wanted = chosen.options() if options is None else load_options(options, chosen.options)
-    if seed is not None:
-        wanted = wanted.model_copy(update={"seed": seed})
-    cluster = ClusterOptions(
-        scheduler=scheduler, **({} if workers is None else {"workers": workers})
-    )
-    command = shlex.join(["l2m", "study", name, *(["--options", str(options)] if options else [])])
     with shown_progress() as progress:
+        from l2m_gtsam.cluster import ClusterOptions
+        from l2m_gtsam.config import load_options
+        from l2m_gtsam.errors import ConfigError
+        from l2m_gtsam.studies.registry import STUDIES
+        from l2m_gtsam.studies.run import run_study
+
+        if name not in STUDIES:
+            raise ConfigError(f"study {name!r} is not known; accepted: {', '.join(STUDIES)}")
+        chosen = STUDIES[name]
+        wanted = chosen.options() if options is None else load_options(options, chosen.options)
+        if seed is not None:
+            wanted = wanted.model_copy(update={"seed": seed})
+        cluster = ClusterOptions(
+            scheduler=scheduler, **({} if workers is None else {"workers": workers})
+        )
+        command = shlex.join(
+            ["l2m", "study", name, *(["--options", str(options)] if options else [])]
+        )
         made = run_study(chosen, wanted, out, cluster, progress, f"{command} --seed {wanted.seed}")
     typer.echo(chosen.page(made.summary))
     typer.echo(f"written: {out / f'{name}.md'}")

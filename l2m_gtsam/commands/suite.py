@@ -31,11 +31,11 @@ def suite(
     Poses have to be known well, the field does not: no field that can be looks the same to sensors
     that sit or read otherwise.
     """
-    from l2m_gtsam.batch.suite import calibrate_suite_file
-    from l2m_gtsam.config import load_config
-    from l2m_gtsam.qa.tables import calibration_table
-
     with shown_progress() as progress:
+        from l2m_gtsam.batch.suite import calibrate_suite_file
+        from l2m_gtsam.config import load_config
+        from l2m_gtsam.qa.tables import calibration_table
+
         found = calibrate_suite_file(bags, out, load_config(config), known, progress)
     print_table(calibration_table(found))
     warn(found.doubts)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
     from l2m_gtsam.progress import Progress
 
+STARTING = "starting"
 ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
 
 
@@ -32,7 +33,11 @@ def print_table(table: "Table") -> None:
 
 @contextmanager
 def shown_progress() -> "Iterator[Progress]":
-    """Show one bar per stage on the error stream while it runs."""
+    """Show one bar per stage on the error stream while it runs.
+
+    One that says "starting" stands there from the first until there is a stage: what a command
+    needs is best imported inside.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
     from rich.progress import TimeRemainingColumn as TimeLeftColumn
@@ -47,13 +52,21 @@ def shown_progress() -> "Iterator[Progress]":
     console = Console(stderr=True)
     with Progress(*columns, console=console, speed_estimate_period=ESTIMATE_S) as bars:
         stages: dict[str, TaskID] = {}
+        starting = [bars.add_task(STARTING, total=None)]
+        bars.refresh()
 
         def tell(stage: str, fraction: float) -> None:
             if stage not in stages:
                 stages[stage] = bars.add_task(stage, total=1.0)
             bars.update(stages[stage], completed=fraction)
+            while starting:
+                bars.remove_task(starting.pop())
 
-        yield tell
+        try:
+            yield tell
+        finally:
+            while starting:
+                bars.remove_task(starting.pop())
 
 
 def _needed(console: "Console", table: "Table") -> int:

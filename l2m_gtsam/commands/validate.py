@@ -36,16 +36,16 @@ def validate(
 
     Readings are predicted from poses, map and calibration with all that is uncertain of these.
     """
-    from l2m_gtsam.batch.validation import (
-        PAGE_FILE,
-        VALIDATION_FILE,
-        ValidationRequest,
-        validate_calibration,
-    )
-    from l2m_gtsam.qa.validation.tables import change_table, validation_lines, validation_table
-
-    asked = ValidationRequest(calibration, bag, map_path, compare, config, out)
     with shown_progress() as progress:
+        from l2m_gtsam.batch.validation import (
+            PAGE_FILE,
+            VALIDATION_FILE,
+            ValidationRequest,
+            validate_calibration,
+        )
+        from l2m_gtsam.qa.validation.tables import change_table, validation_lines, validation_table
+
+        asked = ValidationRequest(calibration, bag, map_path, compare, config, out)
         found = validate_calibration(asked, progress)
     if found.drive is not None:
         print_table(validation_table(found.drive, found.verdict))

@@ -13,12 +13,12 @@ from matplotlib.patches import Ellipse
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.metric_results import MapPicture, Row
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
 from l2m_gtsam.storage.atomic import atomic_path
 
 # Cells along the longer side of a map picture.
 CELLS = 240
-AROUND = 3.0  # metres of the map around a drive that are drawn with it
 ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision
 
 
@@ -41,15 +41,9 @@ class MapSlice:
     sigma: FloatArray
 
 
-def slice_map(field_map: FieldMap, height: float, places: FloatArray | None = None) -> MapSlice:
-    """Ask a map on a horizontal grid at a height in metres: all of it, or that around places.
-
-    A drive crosses little of a large map, and to ask the rest takes longer than to calibrate.
-    """
+def slice_map(field_map: FieldMap, height: float) -> MapSlice:
+    """Ask a map on a horizontal grid at a height in metres."""
     low, high = field_map.summary.lower[:2], field_map.summary.upper[:2]
-    if places is not None:
-        near, far = places[:, :2].min(axis=0) - AROUND, places[:, :2].max(axis=0) + AROUND
-        low, high = np.clip(near, low, high), np.clip(far, low, high)
     cell = max(high[0] - low[0], high[1] - low[1]) / CELLS
     x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
@@ -93,7 +87,7 @@ def map_figure(field_map: FieldMap, height: float | None) -> Figure:
 
 
 def calibration_figure(
-    field_map: FieldMap,
+    picture: MapPicture,
     drives: Sequence[Trajectory],
     result: CalibrationResult,
     truth: tuple[KnownSensor, ...],
@@ -102,8 +96,8 @@ def calibration_figure(
 
     Parameters
     ----------
-    field_map
-        The map.
+    picture
+        The map around the drive.
     drives
         Poses of the lidar in the map, drive by drive.
     result
@@ -115,14 +109,13 @@ def calibration_figure(
     grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1), height_ratios=(1.5, 1))
     place, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     side = figure.add_subplot(grid[1, 1])
-    height = _middle(field_map)
-    cut = slice_map(field_map, height, np.concatenate([each.p for each in drives]))
-    _draw_slice(figure, place, cut.strength, cut.extent, "field strength (uT)", "viridis")
+    strength, extent = np.array(picture.strength), _corners(picture.extent)
+    _draw_slice(figure, place, strength, extent, "field strength (uT)", "viridis")
     for k, drive in enumerate(drives):
         label = "_" if k else "drive of the lidar"  # one entry in the legend
         place.plot(*drive.p[:, :2].T, color="white", linewidth=2.2)
         place.plot(*drive.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label=label)
-    place.set_title(f"map at z = {height:.2f} m and drive")
+    place.set_title(f"map at z = {picture.height:.2f} m and drive")
     place.legend(loc="upper right")
     solved = [s for s in result.sensors if s.residuals is not None]
     _draw_vehicle(above, solved, truth, (0, 1))
@@ -141,6 +134,11 @@ def save_figure(figure: Figure, path: Path) -> None:
 
 def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained", dpi=130)
+
+
+def _corners(extent: Row) -> tuple[float, float, float, float]:
+    left, right, bottom, top = extent
+    return left, right, bottom, top
 
 
 def _middle(field_map: FieldMap) -> float:

@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.solve.chi_square import chance_beyond
 from l2m_gtsam.validation_results import Part
 
 PARAMETERS = 16  # t, C row by row, H, time offset
@@ -170,7 +170,7 @@ def parts_changed(told: Told, freedom: int, chance: float) -> tuple[Part, ...]:
         sizes = [width(part) for part in left]
         scores = [gain - size * price for gain, size in zip(gains, sizes, strict=True)]
         best = int(np.argmax(scores))
-        if chi2.sf(gains[best], sizes[best]) >= chance / len(COLUMNS):
+        if chance_beyond(gains[best], sizes[best]) >= chance / len(COLUMNS):
             break
         named.append(left.pop(best))
     return tuple(named)

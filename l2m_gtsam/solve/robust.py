@@ -18,20 +18,20 @@ import numpy as np
 from pydantic import Field
 from scipy.ndimage import label, uniform_filter1d
 from scipy.optimize import brentq
-from scipy.stats import chi2
 
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import NOISE_RANGE
 
 AXES = 3
-MEDIAN = float(chi2.median(AXES))  # of r^2 where only noise is left
+MEDIAN = float(quantile(0.5, AXES))  # of r^2 where only noise is left
 TINY = 1e-12  # a squared length of a whitened residual that is as good as none
 FIRST_ROUNDS = 10  # of least absolute deviations: an outlier pulls no more than a good reading
 TRIMMINGS = 30
 WINDOWS = (9, 25)  # readings of a mean
 # Beside readings that are wrong for certain a mean is believed to be wrong sooner.
-LEAST_TOGETHER = float(chi2.ppf(0.99, AXES))
+LEAST_TOGETHER = float(quantile(0.99, AXES))
 SEEDS = 3  # readings wrong by themselves that make a stretch of what lies about them
 SMALL = 1e-3  # of the median length: residuals shorter than that weigh alike
 
@@ -61,7 +61,7 @@ class RobustOptions(Options):
 
     def largest_of(self, components: int) -> float:
         """Return the same for residuals of so many components."""
-        return float(chi2.ppf(self.confidence, components))
+        return float(quantile(self.confidence, components))
 
 
 def truncated_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:

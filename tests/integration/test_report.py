@@ -122,6 +122,17 @@ def test_the_page_asks_for_nothing(reported: tuple[Level, str]) -> None:
     assert set(re.findall(r"url\(#([^)]+)\)", page)) <= set(names)
 
 
+def test_a_report_tells_how_far_it_is(made: Made) -> None:
+    """A step for each sensor, and the end only once the page is written."""
+    told: list[tuple[str, float]] = []
+    report_folder(made.folder, None, lambda stage, fraction: told.append((stage, fraction)))
+    assert {stage for stage, _ in told} == {"report"}
+    fractions = [fraction for _, fraction in told]
+    assert fractions == sorted(fractions)
+    assert (fractions[0], fractions[-1], fractions.count(1.0)) == (0.0, 1.0, 1)
+    assert len(set(fractions)) >= len(made.calibrated.result.sensors) + 2
+
+
 def test_thresholds_come_from_the_configuration(
     made: Made, reported: tuple[Level, str], tmp_path: Path
 ) -> None:

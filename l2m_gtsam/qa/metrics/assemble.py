@@ -25,7 +25,7 @@ from l2m_gtsam.results import CalibrationResult, SensorCalibration
 
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
 FEWEST, MOST = 100, 500  # of each
-CELLS = 90  # along the longer side of the map's picture
+CELLS = 120  # along the longer side of the map's picture
 AROUND = 0.15  # of the drive, on each side
 
 

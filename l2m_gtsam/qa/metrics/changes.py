@@ -6,12 +6,12 @@ from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from l2m_gtsam.data import BoolArray, FloatArray, same_content
 from l2m_gtsam.qa.metrics.mounting import PAIRS, gains, sensor_axes, skews_deg
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.solve.chi_square import chance_beyond
 from l2m_gtsam.validation_results import (
     CalibrationComparison,
     Change,
@@ -74,7 +74,7 @@ class Difference:
         sound = values > TINY * values[-1]
         squared = float(np.sum((axes.T @ d)[sound] ** 2 / values[sound]))
         freedom = int(sound.sum())
-        return ChangeTest(name, squared, freedom, float(chi2.sf(squared, freedom)))
+        return ChangeTest(name, squared, freedom, float(chance_beyond(squared, freedom)))
 
 
 def compare_calibrations(

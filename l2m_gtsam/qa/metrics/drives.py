@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.repeat_results import DriveRepeat, Repeatability
+from l2m_gtsam.solve.chi_square import quantile
 
 TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas
 BAND = 0.95
@@ -50,7 +50,7 @@ def compare_drives(drives: Sequence[tuple[str, Part | str]]) -> Repeatability:
         return Repeatability(0.0, 0, 0.0, 0.0, repeats)
     whole = common(parts)
     low, high = (
-        float(chi2.ppf(share, max(whole.freedom, 1))) for share in ((1 - BAND) / 2, (1 + BAND) / 2)
+        float(quantile(share, max(whole.freedom, 1))) for share in ((1 - BAND) / 2, (1 + BAND) / 2)
     )
     return Repeatability(whole.squared, whole.freedom, low, high, repeats)
 

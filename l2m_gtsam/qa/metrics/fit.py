@@ -1,12 +1,12 @@
 """How well readings fit, beside what a field without structure would explain."""
 
 import numpy as np
-from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.metric_results import Fit, Normalised
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.solve.chi_square import quantile
 
 BINS = 24
 
@@ -46,11 +46,11 @@ def normalised_figures(evidence: SensorEvidence) -> Normalised:
     """Return how the residuals compare with the noise that the solve assumed."""
     white = evidence.white[evidence.used]
     squared = np.sum(white**2, axis=1)
-    edges = np.linspace(0, chi2.ppf(0.999, 3), BINS + 1)
+    edges = np.linspace(0, quantile(0.999, 3), BINS + 1)
     counts, _ = np.histogram(np.minimum(squared, edges[-1]), edges)
     return Normalised(
         std=row(white.std(axis=0), 4),
         edges=row(edges, 4),
         counts=tuple(counts.tolist()),
-        beyond_95=float(np.mean(squared > chi2.ppf(0.95, 3))),
+        beyond_95=float(np.mean(squared > quantile(0.95, 3))),
     )

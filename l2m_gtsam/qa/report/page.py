@@ -10,6 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from l2m_gtsam.metric_results import Metrics
+from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.judge import judge
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.report import words
@@ -19,8 +20,15 @@ from l2m_gtsam.results import CalibrationResult
 from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.storage.calibration_legend import MODEL, UNCERTAINTY
 
+STAGE = "report"
 
-def report_page(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> str:
+
+def report_page(
+    result: CalibrationResult,
+    metrics: Metrics,
+    options: QaOptions,
+    progress: Progress | None = None,
+) -> str:
     """Return the report on a calibration as HTML.
 
     Text from bags is escaped; nothing is loaded from anywhere.
@@ -33,14 +41,19 @@ def report_page(result: CalibrationResult, metrics: Metrics, options: QaOptions)
         Its figures.
     options
         Thresholds of the verdict.
+    progress
+        Called with a stage and the fraction of it that is done.
     """
-    verdict = judge(result, metrics, options)
+    tell = counter(STAGE, progress or (lambda stage, fraction: None))
+    steps = len(result.sensors) + 2
+    tell(0, steps)
+    verdict, sections = judge(result, metrics, options), []
     with mpl.rc_context(SETTINGS):
         vehicle, place = overall_pictures(result, metrics, verdict)
-        sections = [
-            sensor_section(k, each, result, metrics, verdict[each.sensor])
-            for k, each in enumerate(result.sensors)
-        ]
+        for k, each in enumerate(result.sensors):
+            tell(k + 1, steps)
+            sections.append(sensor_section(k, each, result, metrics, verdict[each.sensor]))
+    tell(steps - 1, steps)
     return (
         environment()
         .get_template("report.html.j2")

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from l2m_gtsam.metric_results import Metrics, SensorMetrics
 from l2m_gtsam.qa.judge import SensorVerdict, Verdict
 from l2m_gtsam.qa.report import words
+from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.figures import course, place, statistics
 from l2m_gtsam.qa.report.figures.correlations import correlation_figure
 from l2m_gtsam.qa.report.figures.directions import directions_figure
@@ -252,6 +253,6 @@ def _correlations(anchor: str, sensor: SensorCalibration) -> Picture:
     )
 
 
-def picture(title: str, figure: Figure, name: str, alt: str, caption: str) -> Picture:
+def picture(title: str, figure: Figure | Drawing, name: str, alt: str, caption: str) -> Picture:
     """Return a figure of the page; see ``Picture`` and ``as_svg``."""
     return Picture(title, as_svg(figure, name, alt), caption)

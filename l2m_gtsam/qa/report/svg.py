@@ -1,6 +1,7 @@
 """Matplotlib figures as SVG that belongs to a page: its colours, its fonts, no names in common."""
 
 import re
+from functools import singledispatch
 from io import StringIO
 from typing import Any
 
@@ -82,18 +83,24 @@ def plain_figure(height: float) -> Figure:
     return figure
 
 
-def as_svg(figure: Figure, name: str, alt: str) -> Markup:
+@singledispatch
+def as_svg(figure: Any, name: str, alt: str) -> Markup:
     """Return a figure as an element of a page.
 
     Parameters
     ----------
     figure
-        Drawn under ``SETTINGS``.
+        A ``Drawing``, or one of matplotlib that was drawn under ``SETTINGS``.
     name
         Unique in the page; put before all names inside, so that figures do not share any.
     alt
         What it shows, for those who do not see it.
     """
+    raise TypeError(f"{name}: {type(figure).__name__} is no figure")
+
+
+@as_svg.register
+def _(figure: Figure, name: str, alt: str) -> Markup:
     stream = StringIO()
     figure.savefig(
         stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from l2m_gtsam.data import BoolArray, FloatArray, Trajectory
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.qa.metrics.plain import row, rows
 from l2m_gtsam.slam_records import POSE_FREEDOM, PoseErrors, TruthRecord
+from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.sync import has_pose, interpolated
 
 
@@ -115,7 +115,7 @@ def truth_record(truth: Trajectory, ways: Ways, max_pose_gap_s: float) -> TruthR
         localised=after.figures(),
         by_scans=None if by_scans is None else compared(at, by_scans[there]).figures(),
         nees=float(squared.mean()),
-        beyond_95=float(np.mean(squared > chi2.ppf(0.95, POSE_FREEDOM))),
+        beyond_95=float(np.mean(squared > quantile(0.95, POSE_FREEDOM))),
         path=rows(path),
         odometry_m=row(_spread(before.distance, there)),
         localised_m=row(_spread(after.distance, there)),

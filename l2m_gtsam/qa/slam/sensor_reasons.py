@@ -1,10 +1,9 @@
 """What is said of one sensor of a localisation, a plain sentence each."""
 
-from scipy.stats import chi2
-
 from l2m_gtsam.qa.options import QaOptions, SlamQaOptions
 from l2m_gtsam.qa.reasons.reason import Level, Reason, against
 from l2m_gtsam.slam_records import RefinedSensor, SensorRecord
+from l2m_gtsam.solve.chi_square import chance_beyond
 
 
 def on_sensor(
@@ -48,7 +47,7 @@ def _refined(refined: RefinedSensor | None, options: SlamQaOptions) -> list[Reas
     if refined is None:
         return []
     change = refined.change
-    if chi2.sf(change.value, change.freedom) >= options.chance:
+    if chance_beyond(change.value, change.freedom) >= options.chance:
         return []
     text = (
         f"Refining it changed it by more than its standard deviations allow ({change.value:.0f} "

@@ -1,7 +1,6 @@
 """What is said of a localisation as a whole, a plain sentence each."""
 
 import numpy as np
-from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.options import Limit, SlamQaOptions
@@ -10,6 +9,7 @@ from l2m_gtsam.qa.slam.course import HEADING, Course, course_of
 from l2m_gtsam.qa.slam.stretches import stretches
 from l2m_gtsam.slam_records import POSE_FREEDOM, LocalisationRecord, TruthRecord
 from l2m_gtsam.slam_results import LocalisationStatus, OdometryScale, ScanUse
+from l2m_gtsam.solve.chi_square import chance_beyond
 
 MANY = 3  # stretches that are told one by one
 EXACT = 1e-6  # m and degrees: nobody minds less
@@ -87,7 +87,7 @@ def _start(course: Course, options: SlamQaOptions) -> list[Reason]:
     """Return that a drive does not begin where it is said to."""
     position, heading = np.maximum(course.odometry_sigma[0, [0, HEADING]], EXACT)
     squared = (course.apart[0] / position) ** 2 + (course.turned[0] / heading) ** 2
-    if chi2.sf(squared, POSE_FREEDOM) >= options.chance:
+    if chance_beyond(squared, POSE_FREEDOM) >= options.chance:
         return []
     text = (
         f"The drive begins {course.apart[0]:.2f} m and {course.turned[0]:.1f}° from where it is "

@@ -1,66 +1,63 @@
 """What a sensor read along the drive."""
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.metric_results import Series
-from l2m_gtsam.qa.report.svg import (
-    AXES,
-    BAD,
-    GRID,
-    INK,
-    MUTED,
-    PAPER,
-    SMALL,
-    X,
-    Y,
-    dots,
-    plain_figure,
-)
+from l2m_gtsam.qa.report.drawing import Drawing, Entry, stacked
+from l2m_gtsam.qa.report.panel import Panel, Stroke, fill, letters, nice, numbers, spread
+from l2m_gtsam.qa.report.svg import AXES, BAD, GRID, INK, MUTED, SMALL, X, Y
 
 BETWEEN = 0.04  # of all drives' time, between two drives in a figure
+ZERO = Stroke(MUTED, 0.7)
+BEFORE = Stroke(X, 0.9)
+MOST = 8  # numbers along the time
+MAP = Stroke(INK, 2.2, alpha=0.35)
+AFTER = Stroke(Y, 1.0, dashes=(3.7, 1.6))
 
 
-def residuals_figure(series: Series) -> Figure:
+def residuals_figure(series: Series) -> Drawing:
     """Draw residuals over time, an axis each, with rejected readings marked."""
-    figure = plain_figure(3.8)
-    parts = figure.subplots(3, 1, sharex=True, sharey=True)
-    seconds, wrong = along(series), np.array(series.rejected)
+    height = 3.8
+    seconds, wrong = along(series), np.array(series.rejected, dtype=bool)
     residual = np.array(series.residual)
     limit = 1.3 * float(np.quantile(np.abs(residual[~wrong]), 0.995)) if (~wrong).any() else 1.0
-    for k, axes in enumerate(parts):
-        axes.axhline(0, color=MUTED, linewidth=0.7)
-        dots(axes, seconds[~wrong], residual[~wrong, k], 2.2, color=AXES[k], alpha=0.75)
+    ends = (-1.05 * limit, 1.05 * limit)
+    panels = [Panel(box, spread(seconds), ends) for box in stacked(height, 3)]
+    _time_axis(panels, series)
+    for k, panel in enumerate(panels):
+        panel.y_axis(f"{'xyz'[k]} (µT)", 4)
+        panel.level(0, ZERO)
+        panel.dots(seconds[~wrong], residual[~wrong, k], 2.2, AXES[k], 0.75)
         # Those beyond the picture stand at its edge.
         shown = np.clip(residual[wrong, k], -limit, limit)
-        axes.plot(seconds[wrong], shown, "x", color=BAD, markersize=4)
-        axes.set_ylabel(f"{'xyz'[k]} (µT)")
-    parts[0].set_ylim(-1.05 * limit, 1.05 * limit)
-    parts[-1].set_xlabel("time (s)")
-    show_drives(parts, series)
-    return figure
+        panel.crosses(seconds[wrong], shown, 4, BAD)
+        panel.frame()
+    return Drawing(height, tuple(panels))
 
 
-def curves_figure(course: Series) -> Figure:
+def curves_figure(course: Series) -> Drawing:
     """Draw readings before and after the calibration beside those of the map, an axis each."""
-    figure = plain_figure(4.6)
-    parts = figure.subplots(3, 1, sharex=True)
-    ends = _ends(course)
-    seconds = np.insert(along(course), ends, np.nan)
-    for k, axes in enumerate(parts):
-        before, after, there = (
-            np.insert(np.array(each)[:, k], ends, np.nan)
-            for each in (course.before, course.after, course.map)
-        )
-        axes.plot(seconds, before, "-", color=X, linewidth=0.9, label="before (BC)")
-        axes.plot(seconds, there, "-", color=INK, linewidth=2.2, alpha=0.35, label="map (MR)")
-        axes.plot(seconds, after, "--", color=Y, linewidth=1.0, label="after (AC)")
-        axes.set_ylabel(f"{'xyz'[k]} (µT)")
-    figure.legend(*parts[0].get_legend_handles_labels(), loc="upper center", ncols=3)
-    parts[-1].set_xlabel("time (s)")
-    show_drives(parts, course)
+    height = 4.6
+    ends, times = _ends(course), along(course)
+    seconds = np.insert(times, ends, np.nan)
+    lines = [
+        np.insert(np.array(each), ends, np.nan, axis=0)
+        for each in (course.before, course.map, course.after)
+    ]
+    panels = [
+        Panel(box, spread(times), spread(np.concatenate([line[:, k] for line in lines])))
+        for k, box in enumerate(stacked(height, 3))
+    ]
+    _time_axis(panels, course)
+    for k, panel in enumerate(panels):
+        panel.y_axis(f"{'xyz'[k]} (µT)")
+        for line, stroke in zip(lines, (BEFORE, MAP, AFTER), strict=True):
+            panel.line(seconds, line[:, k], stroke)
+        panel.frame()
+    figure = Drawing(height, tuple(panels))
+    names = ("before (BC)", "map (MR)", "after (AC)")
+    figure.legend_above([Entry(*each) for each in zip(names, (BEFORE, MAP, AFTER), strict=True)])
     return figure
 
 
@@ -72,29 +69,28 @@ def along(series: Series) -> FloatArray:
     return np.asarray(seconds + _starts(series)[np.array(series.drive)])
 
 
-def show_drives(parts: "np.ndarray", series: Series) -> None:
-    """Separate several drives, number them, and give each its own time."""
+def _time_axis(panels: list[Panel], series: Series) -> None:
+    """Draw the common axis of time; several drives are numbered, and each has its own time."""
+    last = panels[-1]
     if series.drive is None:
+        for panel in panels:
+            panel.x_lines(nice(panel.x, MOST))
+        last.x_names(nice(last.x, MOST), numbers(nice(last.x, MOST)))
+        last.x_label("time (s)")
         return
     starts, lengths = _starts(series), _lengths(series)
     between = BETWEEN * float(lengths.sum())
-    top: Axes = parts[0]
-    for k, (start, length) in enumerate(zip(starts, lengths, strict=True)):
-        if k > 0:
-            for axes in parts:
-                axes.axvspan(start - between, start, color=GRID, linewidth=0)
-        top.annotate(
-            f"drive {k + 1}" if len(starts) <= 4 else str(k + 1),
-            (start + length / 2, 1.0),
-            xycoords=("data", "axes fraction"),
-            xytext=(0, -11),
-            textcoords="offset points",
-            ha="center",
-            fontsize=SMALL,
-            bbox={"facecolor": PAPER, "edgecolor": "none", "alpha": 0.8, "pad": 1},
-        )
-    parts[-1].set_xticks(starts + lengths, [f"{each:.0f}" for each in lengths])
-    parts[-1].set_xlabel("time (s): the end of each drive, from its own start")
+    for panel in panels:
+        panel.x_lines(starts + lengths)
+        gaps = np.column_stack([starts - between, starts])[1:]
+        low, high = (np.full(len(gaps), each) for each in panel.y)
+        panel.bars(gaps, low, high, fill(GRID))
+    for k, middle in enumerate(starts + lengths / 2):
+        name = f"drive {k + 1}" if len(starts) <= 4 else str(k + 1)
+        top = panels[0]
+        top.text(float(top.across(middle)), top.box.top - 3, name, letters("middle", SMALL))
+    last.x_names(starts + lengths, [f"{each:.0f}" for each in lengths])
+    last.x_label("time (s): the end of each drive, from its own start")
 
 
 def _ends(series: Series) -> IntArray:

@@ -1,11 +1,17 @@
 """From which directions the field came, as the lidar sees it."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.metric_results import SensorMetrics
-from l2m_gtsam.qa.report.svg import GRID, MUTED, X, Y, dots, plain_figure
+from l2m_gtsam.qa.report.drawing import PAGE, Drawing
+from l2m_gtsam.qa.report.panel import Box, Panel, Stroke, letters
+from l2m_gtsam.qa.report.svg import GRID, MUTED, X, Y
+
+HEIGHT = 2.7  # inches
+SIZE = 164.0  # points of a disk with its room
+ENDS = (-1.15, 1.15)
+AXIS = letters("start", colour=MUTED)
 
 
 def equal_area(unit: FloatArray) -> FloatArray:
@@ -20,26 +26,23 @@ def equal_area(unit: FloatArray) -> FloatArray:
     return np.asarray(unit[:, :2] * scale[:, None])
 
 
-def directions_figure(sensor: SensorMetrics) -> Figure:
+def directions_figure(sensor: SensorMetrics) -> Drawing:
     """Draw the directions on two disks: the upper and the lower half of space."""
-    figure = plain_figure(2.7)
-    figure.subplots_adjust(left=0.02, right=0.98, bottom=0.03, top=0.86, wspace=0.08)
     b = np.array(sensor.series.map)
     unit = b / np.linalg.norm(b, axis=1, keepdims=True)
-    for axes, side, name, colour, size in zip(
-        figure.subplots(1, 2), (1, -1), ("upward", "downward"), (X, Y), (2.4, 2.4), strict=True
-    ):
-        turn = np.linspace(0, 2 * np.pi, 90)
-        for elevation in (0, 30, 60):
-            r = np.sqrt(1 - np.sin(np.deg2rad(elevation)))
-            axes.plot(r * np.cos(turn), r * np.sin(turn), color=GRID, linewidth=0.8)
-        axes.plot(np.cos(turn), np.sin(turn), color=MUTED, linewidth=0.9)
+    panels = []
+    for k, (side, name, colour) in enumerate(((1, "upward", X), (-1, "downward", Y))):
         own = unit[np.sign(unit[:, 2]) == side]
         x, y = equal_area(own).T
-        dots(axes, x, y, size, color=colour, alpha=0.6)
-        axes.set_title(f"{name}: {len(own) / len(unit):.0%}")
-        axes.set(aspect="equal", xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
-        axes.axis("off")
-        axes.annotate("x", (1.02, 0), va="center", color=MUTED)
-        axes.annotate("y", (0, 1.02), ha="center", color=MUTED)
-    return figure
+        panel = Panel(Box(k * PAGE / 2 + (PAGE / 2 - SIZE) / 2, 24, SIZE, SIZE), ENDS, ENDS)
+        for elevation in (30, 60):
+            panel.ring(np.sqrt(1 - np.sin(np.deg2rad(elevation))), Stroke(GRID, 0.8))
+        panel.ring(1.0, Stroke(MUTED, 0.9))
+        panel.dots(x, y, 2.4, colour, 0.6)
+        middle, top = float(panel.across(0)), float(panel.down(1.02))
+        title = f"{name}: {len(own) / len(unit):.0%}"
+        panel.text(middle, 16, title, letters("middle", 10.5))
+        panel.text(float(panel.across(1.02)), float(panel.down(0)) + 3, "x", AXIS)
+        panel.text(middle, top - 2, "y", letters("middle", colour=MUTED))
+        panels.append(panel)
+    return Drawing(HEIGHT, tuple(panels))

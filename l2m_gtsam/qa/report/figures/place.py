@@ -9,6 +9,9 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.metric_results import MapPicture, Metrics, Rows, Series
+from l2m_gtsam.qa.report.drawing import LEFT, PAGE, POINTS, Drawing, Entry, legend
+from l2m_gtsam.qa.report.panel import Box, Panel, Stroke, fill, nice, numbers, spread
+from l2m_gtsam.qa.report.scale import COLOURS, colours, shades
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.results import Disagreement
 
@@ -40,30 +43,65 @@ def sigma_figure(metrics: Metrics) -> Figure:
     return figure
 
 
-def residual_figure(series: Series) -> Figure:
+def residual_figure(series: Series) -> Drawing:
     """Draw the length of a sensor's residuals where they were read."""
     place, residual = np.array(series.place), np.array(series.residual)
-    wrong = np.array(series.rejected)
+    wrong = np.array(series.rejected, dtype=bool)
     size = np.linalg.norm(residual, axis=1)
-    x, y = place[~wrong, :2].T
-    figure, axes = wide(np.ptp(place[:, :2], axis=0))
     high = float(np.quantile(size[~wrong], 0.98)) if (~wrong).any() else 1.0
-    drawn = axes.scatter(
-        x, y, c=size[~wrong], cmap="viridis", vmin=0, vmax=high, s=10, linewidths=0, rasterized=True
-    )
-    axes.plot(*place[wrong, :2].T, "x", color=BAD, markersize=5, label="rejected")
-    figure.colorbar(drawn, ax=axes, label="length of the residual (µT)", **BELOW)
-    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+    extent = np.ptp(place[:, :2], axis=0)
+    height = height_of(extent)
+    room = Box(LEFT, 8, PAGE - LEFT - 8, POINTS * height - 8 - 80)
+    panel = _equal(room, place[:, :2])
+    panel.x_axis("x (m)")
+    panel.y_axis("y (m)", max(2, int(panel.box.height / 22)))
+    shade = shades(size, (0.0, high))
+    # Bright ones above: they are what is looked for.
+    for number, colour in enumerate(colours("viridis")):
+        own = ~wrong & (shade == number)
+        panel.dots(place[own, 0], place[own, 1], 3.2, colour, 1.0)
+    panel.crosses(place[wrong, 0], place[wrong, 1], 5, BAD)
+    panel.frame()
     if wrong.any():
-        axes.legend(loc="best")
-    return figure
+        legend(panel, [Entry("× rejected", Stroke(BAD, 0))])
+    bar = _bar(Box(90, POINTS * height - 40, PAGE - 180, 6), high)
+    return Drawing(height, (panel, bar))
+
+
+def _equal(room: Box, places: FloatArray) -> Panel:
+    """Return axes with one scale that hold places, shape (N, 2), in the middle of a room."""
+    (left, right), (low, high) = (
+        spread(np.append(v, [v.mean() - 0.05, v.mean() + 0.05])) for v in places.T
+    )
+    scale = min(room.width / (right - left), room.height / (high - low))
+    width, height = scale * (right - left), scale * (high - low)
+    corner = room.left + (room.width - width) / 2, room.top + (room.height - height) / 2
+    return Panel(Box(*corner, width, height), (left, right), (low, high))
+
+
+def _bar(box: Box, high: float) -> Panel:
+    """Draw which length of a residual has which colour."""
+    bar = Panel(box, (0.0, high or 1.0), (0.0, 1.0))
+    steps = np.linspace(*bar.x, COLOURS + 1)
+    # Each to the end, below the next: there is no seam between two.
+    for low, colour in zip(steps[:-1], colours("viridis"), strict=True):
+        bar.bars(np.array([[low, bar.x[1]]]), np.zeros(1), np.ones(1), fill(colour))
+    ticks = nice(bar.x, 6)
+    bar.x_names(ticks, numbers(ticks))
+    bar.x_label("length of the residual (µT)")
+    return bar
 
 
 def wide(extent: FloatArray) -> tuple[Figure, Axes]:
     """Return a figure as high as a place of this extent, shape (2,), asks for."""
-    height = 0.85 * WIDTH * float(extent[1]) / max(float(extent[0]), 0.1)
-    figure = new_figure(float(np.clip(height + 1.3, 2.0, 4.8)))
+    figure = new_figure(height_of(extent))
     return figure, figure.add_subplot()
+
+
+def height_of(extent: FloatArray) -> float:
+    """Return how many inches a figure of a place of this extent, shape (2,), is high."""
+    height = 0.85 * WIDTH * float(extent[1]) / max(float(extent[0]), 0.1)
+    return float(np.clip(height + 1.3, 2.0, 4.8))
 
 
 def strength_background(picture: MapPicture) -> tuple[Figure, Axes]:

@@ -1,0 +1,34 @@
+"""The chi-square distribution, without the time that ``scipy.stats`` takes to load."""
+
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtrc, gammaincinv, gammaln, xlogy
+
+from l2m_gtsam.data import FloatArray
+
+
+def quantile(share: Any, freedom: Any) -> FloatArray:
+    """Return what this share of all values is below, with so many degrees of freedom.
+
+    NaN where there is no freedom.
+    """
+    return np.asarray(2 * gammaincinv(_known(freedom) / 2, share))
+
+
+def chance_beyond(value: Any, freedom: Any) -> FloatArray:
+    """Return the share of all values that are above a value; one where that is below zero.
+
+    NaN where there is no freedom.
+    """
+    return np.asarray(chdtrc(_known(freedom), np.maximum(value, 0.0)))
+
+
+def density(value: FloatArray, freedom: float) -> FloatArray:
+    """Return the density at values of zero or more."""
+    half = freedom / 2
+    return np.asarray(np.exp(xlogy(half - 1, value) - value / 2 - gammaln(half) - half * np.log(2)))
+
+
+def _known(freedom: Any) -> FloatArray:
+    return np.where(np.asarray(freedom) > 0, freedom, np.nan)

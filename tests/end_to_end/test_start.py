@@ -1,0 +1,82 @@
+"""A command shows its first bar before it loads what it computes with."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = (
+    "dask",
+    "gtsam",
+    "jinja2",
+    "l2m_gtsam.batch",
+    "l2m_gtsam.config",
+    "matplotlib",
+    "numba",
+    "numpy",
+    "rosbags",
+    "ruamel",
+    "scipy",
+    "sklearn",
+)
+LOADED = f"import json, sys; print(json.dumps([each for each in {HEAVY} if each in sys.modules]))"
+# At the first bar it says what is loaded, and ends.
+AT_THE_FIRST_BAR = f"""
+import os
+import sys
+from rich.progress import Progress
+from l2m_gtsam.cli import main
+
+def start(self):
+    exec({LOADED!r})
+    sys.stdout.flush()
+    os._exit(0)
+
+Progress.start = start
+main()
+"""
+COMMANDS = {
+    "apply": "a.mcap --calibration c.yaml --out b.mcap",
+    "batch": "bags --map m.npz --out out",
+    "calibrate": "a.mcap --map m.npz --out out",
+    "demo": "--out out",
+    "inspect": "a.mcap",
+    "map build": "a.mcap --out m.npz",
+    "map compare": "a.mcap",
+    "map info": "m.npz",
+    "map plot": "m.npz --out m.png",
+    "map suite": "a.mcap --out s.yaml",
+    "map update": "m.npz a.mcap --out n.npz",
+    "plan": "a.mcap --map m.npz",
+    "report": "out",
+    "simulate": "--out out",
+    "slam": "a.mcap --calibration c.yaml --out out",
+    "study": "table1 --out out",
+    "validate": "a.mcap --calibration c.yaml --map m.npz",
+}
+
+
+def said(code: str, *arguments: str) -> list[str]:
+    """What a program prints as its last line."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=True
+    )
+    names: list[str] = json.loads(done.stdout.splitlines()[-1])
+    return names
+
+
+def test_the_command_line_loads_nothing_heavy() -> None:
+    assert said(f"import l2m_gtsam.cli; {LOADED}") == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_first_bar_comes_before_all_that_is_heavy(command: str) -> None:
+    assert said(AT_THE_FIRST_BAR, *command.split(), *COMMANDS[command].split()) == []
+
+
+def test_a_calibration_loads_no_statistics_and_no_other_peers() -> None:
+    """They take half a second for a quantile, or are for studies only."""
+    loaded = "[each for each in ('scipy.stats', 'sklearn', 'dask') if each in sys.modules]"
+    needed = "import json, sys, l2m_gtsam.batch.drives, l2m_gtsam.batch.reports"
+    assert said(f"{needed}; print(json.dumps({loaded}))") == []
