@@ -12,7 +12,7 @@ from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.graph.alternation import spread
-from l2m_gtsam.graph.one_key import solve_one_key
+from l2m_gtsam.graph.one_key import solve_part
 from l2m_gtsam.metric_results import Halves
 from l2m_gtsam.qa.metrics.drives import compare_drives
 from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
@@ -135,7 +135,7 @@ def _parts(
     """Return what some of the readings say of each sensor that they are enough for."""
     few = spread(readings, max(most, options.solve.min_readings))
     near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
-    solution = solve_one_key(few, calibrated.solver_map, t, near)
+    solution = solve_part(few, calibrated.solver_map, t, near)
     return {
         found.sensor: Part(
             solution.estimate.vector(found.sensor), found.covariance, found.shared_root

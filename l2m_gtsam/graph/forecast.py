@@ -11,13 +11,12 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions, fit_distortions, start_estimate
 from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.coverage import UncertainMap, cover
+from l2m_gtsam.graph.coverage import UncertainMap
 from l2m_gtsam.graph.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.graph.priors import NO_PRIORS, Priors
 from l2m_gtsam.graph.uncertain import (
     UncertainDrive,
     UncertainProblem,
-    WeightsPrior,
     starting_values,
 )
 from l2m_gtsam.graph.view import QueryableMap, View, observe
@@ -156,8 +155,7 @@ def _uncertain(
     options: OneKeyOptions,
 ) -> tuple[SensorSolution, ...]:
     """Return the solutions with the map's error, of which nothing is known yet, in the graph."""
-    coverage = cover(view, errors, estimate, options.pose_noise.correlation_s)
-    values, prior = starting_values(estimate, view.sensors, coverage), WeightsPrior.of(coverage)
-    drive = UncertainDrive(view, field_map, prior)
+    drive = UncertainDrive.of(view, field_map, errors, estimate, options)
+    values = starting_values(estimate, view.sensors, drive.prior.coverage)
     problem = UncertainProblem(drive, estimate, tests, options.factors)
     return problem.solutions(problem.linearised(values), values)

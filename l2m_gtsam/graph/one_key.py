@@ -10,8 +10,10 @@ Where the lidar's motion tells a sensor's time offset from its place, ``S(i)`` i
 the readings' poses are taken anew as it moves.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 
@@ -34,9 +36,10 @@ from l2m_gtsam.graph.joint import (
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.priors import NO_PRIORS, Priors
 from l2m_gtsam.graph.trust import NOTHING, Trusted, plausible, trusted
-from l2m_gtsam.graph.uncertain import solve_uncertain
+from l2m_gtsam.graph.uncertain import UncertainSolution, solve_uncertain, step_uncertain
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.solve.rank import Determinacy
 from l2m_gtsam.sync import with_offsets
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
@@ -121,6 +124,59 @@ def solve_one_key(
         What is known of the sensors beforehand.
     """
     tell = progress or (lambda stage, fraction: None)
+    stage = partial(tell, "map uncertainty")
+    finish = partial(solve_uncertain, progress=stage)
+    return _solved(readings, field_map, t_start, options, tell, trajectory, priors, finish)
+
+
+def solve_part(
+    readings: Readings, field_map: QueryableMap, t_start: FloatArray, options: OneKeyOptions
+) -> OneKeySolution:
+    """Calibrate all sensors on a part of what the whole was calibrated on.
+
+    As ``solve_one_key``, but the graph over an uncertain map is solved once, with the weights of
+    the joint graph, and not until its own have settled.
+
+    Parameters
+    ----------
+    readings, field_map, options
+        As of ``solve_one_key``.
+    t_start
+        Where the whole was found, metres, shape (S, 3).
+    """
+
+    def tell(stage: str, fraction: float) -> None:
+        """Say nothing: a part takes a second."""
+
+    return _solved(readings, field_map, t_start, options, tell, None, NO_PRIORS, step_uncertain)
+
+
+class Finish(Protocol):
+    """What is done over a map that knows its errors."""
+
+    def __call__(
+        self,
+        view: View,
+        field_map: QueryableMap,
+        errors: UncertainMap,
+        near: Estimate,
+        tests: Mapping[int, Determinacy],
+        options: OneKeyOptions,
+    ) -> UncertainSolution:
+        """Return the solutions from the optimum with independent errors."""
+        ...
+
+
+def _solved(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    options: OneKeyOptions,
+    tell: Progress,
+    trajectory: Trajectory | None,
+    priors: Priors,
+    finish: Finish,
+) -> OneKeySolution:
     good = readings.select(plausible(readings, field_map, t_start, options.robust))
     start = start_estimate(t_start, options, priors)
     near = alternate(good, field_map, start, options, tell)
@@ -141,10 +197,7 @@ def solve_one_key(
     errors = shared_errors(field_map, view.readings, options.uncertainty)
     if errors is None:
         return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
-    stage = partial(tell, "map uncertainty")
-    stage(0.0)
-    full = solve_uncertain(view, field_map, errors, joint.estimate, tests, options, stage)
-    stage(1.0)
+    full = finish(view, field_map, errors, joint.estimate, tests, options)
     unshared = isinstance(errors, NothingShared)
     return replace(
         outcome,

@@ -101,21 +101,42 @@ def solve_uncertain(
     progress
         Called with the fraction that is done.
     """
-    coverage = cover(view, errors, near, options.pose_noise.correlation_s)
-    moving = moving_fields(view.readings, options.moving_field_ut)
-    drive = UncertainDrive(view, field_map, WeightsPrior.of(replace(coverage, moving=moving)))
+    progress(0.0)
+    drive = UncertainDrive.of(view, field_map, errors, near, options)
     progress(1 / (MAX_ROUNDS + 1))
     values = starting_values(near, view.sensors, drive.prior.coverage)
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
         found = settle(drive, near, values, tests, options, solver, progress)
         if found.ending is not Ending.SINGULAR:
             break
-    return UncertainSolution(
-        found.estimate,
-        found.problem.solutions(found.joint, found.values),
-        found.ending,
-        found.settled,
-    )
+    solved = found.problem.solutions(found.joint, found.values)
+    progress(1.0)
+    return UncertainSolution(found.estimate, solved, found.ending, found.settled)
+
+
+def step_uncertain(
+    view: View,
+    field_map: QueryableMap,
+    errors: UncertainMap,
+    near: Estimate,
+    tests: Mapping[int, Determinacy],
+    options: OneKeyOptions,
+) -> UncertainSolution:
+    """Return the same after a single Gauss-Newton step, with the weights at its start.
+
+    From the optimum with independent errors that is exact but for products of C and shared errors.
+    Parameters are those of ``solve_uncertain``.
+    """
+    drive = UncertainDrive.of(view, field_map, errors, near, options)
+    problem = UncertainProblem(drive, near, tests, options.factors)
+    values = starting_values(near, view.sensors, drive.prior.coverage)
+    for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
+        step = problem.polish(values, solver)
+        if step.ending is not Ending.SINGULAR:
+            break
+    joint, estimate = problem.linearised(step.values), near.updated(step.values, view.sensors)
+    solved = problem.solutions(joint, step.values)
+    return UncertainSolution(estimate, solved, step.ending, settled=True)
 
 
 def starting_values(estimate: Estimate, sensors: list[int], coverage: Coverage) -> gtsam.Values:
@@ -235,6 +256,20 @@ class UncertainDrive:
     view: View
     field_map: QueryableMap
     prior: WeightsPrior
+
+    @classmethod
+    def of(
+        cls,
+        view: View,
+        field_map: QueryableMap,
+        errors: UncertainMap,
+        near: Estimate,
+        options: OneKeyOptions,
+    ) -> "UncertainDrive":
+        """Return what readings share where an estimate puts them."""
+        coverage = cover(view, errors, near, options.pose_noise.correlation_s)
+        moving = moving_fields(view.readings, options.moving_field_ut)
+        return cls(view, field_map, WeightsPrior.of(replace(coverage, moving=moving)))
 
 
 class UncertainProblem:
