@@ -176,4 +176,9 @@ def turned(
 
 def poses_among(sizes: Mapping[int, int]) -> list[slice]:
     """Return the components of each pose among variables."""
-    return [own for key, own in slices_of(sizes).items() if gtsam.symbolChr(key) == ord("X")]
+    return [own for key, own in slices_of(sizes).items() if is_pose(key)]
+
+
+def is_pose(key: int) -> bool:
+    """Return whether a variable is a pose; the others are vectors."""
+    return bool(gtsam.symbolChr(key) == ord("X"))
