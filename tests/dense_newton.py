@@ -24,12 +24,13 @@ def newton(
     known: JointGaussian,
     values: gtsam.Values,
     sizes: Mapping[int, int],
+    steps: int = STEPS,
 ) -> tuple[gtsam.Values, FloatArray]:
     """Return where a graph and a prior have their least cost, and the covariance there."""
     count, at = sum(sizes.values()), slices_of(sizes)
     among = [key for key in sizes if graph.keys().count(key)]
     own, prior = columns_of(at, among), columns_of(at, known.sizes)
-    for _ in range(STEPS):
+    for _ in range(steps):
         H, descent = np.zeros((count, count)), np.zeros(count)
         H[np.ix_(own, own)], descent[own] = graph.linearize(values).hessian(ordered(among))
         information, gradient = _quadratic(known, values)
