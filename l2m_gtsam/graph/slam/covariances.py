@@ -49,8 +49,7 @@ def is_refused(error: RuntimeError) -> bool:
 class Marginals:
     """Covariances of a linear graph's variables, by Cholesky, and by QR where that is refused.
 
-    Cholesky gives up where the last component of a variable is known 4,000 times worse than the
-    one before it; QR does not mind.
+    GTSAM's Cholesky gives up on directions 4,000 times weaker than others; QR does not mind.
 
     Parameters
     ----------
@@ -130,7 +129,7 @@ def unless_refused(work: Callable[[], Found]) -> Found | None:
 def covariance_of(root: FloatArray) -> FloatArray:
     """Return ``(R^T R)^-1`` of an upper triangle R.
 
-    GTSAM inverts the information itself, with Cholesky: what QR has gained would be lost.
+    GTSAM would invert ``R^T R`` by Cholesky: what QR has gained would be lost.
     """
     half = solve_triangular(root, np.eye(len(root)))
     return np.asarray(half @ half.T)

@@ -43,6 +43,8 @@ class Section:
     ----------
     calibrations
         Keys of the calibrations that are variables.
+    solver
+        Of linear systems, to begin with.
     """
 
     def __init__(self, calibrations: list[int], solver: str = CHOLESKY) -> None:
@@ -60,8 +62,9 @@ class Section:
                 self._told |= keys.intersection(self._calibrations)
         self._added.graph.push_back(graph)
         self._added.values.insert(values)
-        taken = unless_refused(lambda: self._take(graph, values, last, again))
-        if taken is None and self._solver == CHOLESKY:
+        if self._solver == QR:
+            self._take(graph, values, last, again)
+        elif unless_refused(lambda: self._take(graph, values, last, again)) is None:
             self._solver, self._engine = QR, _engine(QR)
             self._take(self._added.graph, self._added.values, last, ANEW)
 

@@ -1,6 +1,6 @@
 """How GTSAM solves the graphs of SLAM: solver and ordering, chosen by measurement.
 
-Processor seconds of one elimination, one thread; in brackets all variables and the tiles' weights:
+Processor seconds of one elimination, one thread; in brackets how many components:
 
 =================================  ==================  ==================  ====================
 graph                              COLAMD              weights first       METIS
