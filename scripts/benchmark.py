@@ -14,6 +14,7 @@ MODULES = (
     "one_key",
     "map_uncertainty",
     "online_localisation",
+    "slam_engine",
 )
 
 for name in MODULES:

@@ -8,8 +8,11 @@ from hypothesis import strategies as st
 
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.slam.dense_descent import Prior, descended
+from l2m_gtsam.graph.slam.covariances import joint_covariance, ordered
+from l2m_gtsam.graph.slam.gaussian_prior import prior_factors
 from l2m_gtsam.graph.slam.joint_gaussian import JointGaussian, conditioned, local, retracted
+from l2m_gtsam.graph.slam.solving import descended, least_fill
+from tests.dense_newton import newton
 
 ROUNDING = 1e-8  # of matrices of condition 1e4, with 1e-12 added to correlations
 
@@ -70,10 +73,29 @@ def solved(
     """Return where a descent with this prior comes to, and what it says of all variables."""
     values, sizes = gtsam.Values(of.values), {**of.sizes, M(9): 2}
     values.insert(M(9), np.zeros(2))
-    found = descended(graph, Prior(of), values, sizes, 50)
+    whole = gtsam.NonlinearFactorGraph(graph)
+    for factor in prior_factors(of):
+        whole.add(factor)
     for _ in range(3):  # to the last digit
-        found = descended(graph, Prior(of), found.values, sizes, 50)
-    return found.values, found.last(len(sizes))
+        values = descended(whole, values, least_fill(whole), 50, 0.0).values
+    covariance = joint_covariance(whole.linearize(values), list(sizes))
+    return values, JointGaussian(values, sizes, covariance)
+
+
+@pytest.mark.parametrize("step", [1e-3, 0.1, 0.5])
+def test_gtsam_comes_to_where_dense_newton_steps_lead(step: float) -> None:
+    """And has the covariance of its normal equations, of all variables and of few."""
+    rng = np.random.default_rng(4)
+    before = known(rng, 0.01)
+    graph = seen(rng, before.values, step)
+    values, whole = solved(graph, before)
+    start = gtsam.Values(before.values)
+    start.insert(M(9), np.zeros(2))
+    reference, covariance = newton(graph, before, start, whole.sizes)
+    sigma = np.sqrt(np.diag(covariance))
+    assert np.abs(local(reference, values, whole.sizes)).max() < 1e-6
+    wrong = (whole.covariance - covariance) / np.outer(sigma, sigma)
+    assert np.abs(wrong).max() < 1e-5
 
 
 @pytest.mark.parametrize(("step", "close"), [(1e-4, 1e-7), (0.1, 0.05)])
@@ -106,19 +128,23 @@ def test_nothing_learnt_changes_nothing() -> None:
 
 
 def test_the_prior_is_what_was_known() -> None:
-    """Its cost about any values has the gradient and, at the mean, the information that it says."""
+    """Its error about any values has the gradient and, at the mean, the information it says."""
     rng = np.random.default_rng(8)
     of = known(rng, 0.01)
-    prior, count = Prior(of), len(of.covariance)
-    at = retracted(of.values, of.sizes, 0.1 * rng.normal(size=count))
-    _, gradient = prior.quadratic(at)
-    side = 1e-5
+    prior, count = gtsam.NonlinearFactorGraph(), len(of.covariance)
+    for factor in prior_factors(of):
+        prior.add(factor)
+    away = 0.1 * rng.normal(size=count)
+    at, side, order = retracted(of.values, of.sizes, away), 1e-5, ordered(list(of.sizes))
+    assert prior.error(at) == pytest.approx(0.5 * away @ np.linalg.solve(of.covariance, away))
     slopes = [
-        prior.cost(retracted(at, of.sizes, side * axis))
-        - prior.cost(retracted(at, of.sizes, -side * axis))
+        prior.error(retracted(at, of.sizes, side * axis))
+        - prior.error(retracted(at, of.sizes, -side * axis))
         for axis in np.eye(count)
     ]
-    scale = np.abs(gradient).max()
-    np.testing.assert_allclose(np.array(slopes) / (2 * side), gradient, atol=1e-6 * scale)
-    H, _ = prior.quadratic(of.values)
+    _, descent = prior.linearize(at).hessian(order)
+    np.testing.assert_allclose(
+        np.array(slopes) / (2 * side), -descent, atol=1e-6 * np.abs(descent).max()
+    )
+    H, _ = prior.linearize(of.values).hessian(order)
     np.testing.assert_allclose(H @ of.covariance, np.eye(count), atol=1e-6)

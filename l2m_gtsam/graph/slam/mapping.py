@@ -17,13 +17,12 @@ import numpy as np
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.optimise import Ending, LinearSolver, Optimizer, optimise
+from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.covariances import (
+    Marginals,
     odometry_scale,
-    pose_covariances,
     pose_covariances_together,
     sensor_covariances,
-    solved_marginals,
 )
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.factors import (
@@ -38,6 +37,7 @@ from l2m_gtsam.graph.slam.field_prior import FieldPrior
 from l2m_gtsam.graph.slam.localised import NOTHING, Localised
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.graph.slam.sight import Sight, place, poses_in, sensors_in
+from l2m_gtsam.graph.slam.solving import descended, weights_first
 from l2m_gtsam.graph.slam.tiled import TiledDrive
 from l2m_gtsam.graph.slam.ways import Ways
 from l2m_gtsam.progress import Progress
@@ -195,9 +195,8 @@ class TiledProblem:
         if self._free:
             graph.push_back(calibration_graph(self._drive.sensors))
             values.insert(calibration_values(sensors))
-        end = optimise(
-            graph, values, Optimizer.LM, self._options.max_iterations, LinearSolver.CHOLESKY
-        )
+        order = weights_first(graph, values)
+        end = descended(graph, values, order, self._options.max_iterations)
         found = list(poses_in(end.values, len(poses)).values())
         after = sensors_in(end.values, sensors)
         return Solved(tiled, graph, weights, end.values, found, after, end.ending)
@@ -205,15 +204,15 @@ class TiledProblem:
     def finished(self, solved: Solved) -> Mapped:
         """Return a solved stage with its covariances and residuals."""
         drive, sensors = self._drive, solved.sensors
-        marginals = solved_marginals(solved.graph, solved.values)
-        of_poses = pose_covariances_together if self._free else pose_covariances
+        order = weights_first(solved.graph, solved.values)
+        marginals = Marginals(solved.graph.linearize(solved.values), order)
         ways = Ways.along(drive, solved.poses)
         tiled = solved.tiled.moved(ways, solved.poses, sensors)
         sights = tiled.sights(solved.values, sensors)
         solution = Localised(
             drive=replace(drive, sensors=sensors),
             poses=solved.poses,
-            pose_covariance=of_poses(marginals, len(drive)),
+            pose_covariance=pose_covariances_together(marginals, len(drive)),
             calibration_covariance=(
                 sensor_covariances(marginals, len(sensors.names))
                 if self._free

@@ -8,14 +8,16 @@ import numpy as np
 from l2m_factors import M, X
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.graph.slam.belief import POSE, Belief
-from l2m_gtsam.graph.slam.dense_descent import Descent, Prior, descended
+from l2m_gtsam.graph.slam.covariances import joint_covariance
 from l2m_gtsam.graph.slam.drive import Drive
 from l2m_gtsam.graph.slam.factors import step_factor
 from l2m_gtsam.graph.slam.field_memory import ExploredTile, FieldMemory, tile_of
 from l2m_gtsam.graph.slam.field_prior import FieldPrior
-from l2m_gtsam.graph.slam.joint_gaussian import part_of
+from l2m_gtsam.graph.slam.gaussian_prior import prior_factors
+from l2m_gtsam.graph.slam.joint_gaussian import JointGaussian, part_of
 from l2m_gtsam.graph.slam.options import SlamOptions
 from l2m_gtsam.graph.slam.sight import Place, place
+from l2m_gtsam.graph.slam.solving import descended, least_fill
 from l2m_gtsam.graph.slam.tile_readings import TileReadings
 from l2m_gtsam.graph.slam.tiled import LaidTile
 from l2m_gtsam.graph.slam.tiles import WaveTile, level_axes
@@ -24,6 +26,7 @@ from l2m_gtsam.graph.slam.tiles import WaveTile, level_axes
 # before, and where it comes to a tile of an earlier section, as far off as odometry has drifted.
 ONWARDS = (4.0, 1.0)
 AGAIN = (16.0, 4.0, 1.0)
+CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
 SOFT = 1.0  # how sharply good ones among them are told from wrong ones, mu of ``solve.robust``
 
 
@@ -52,8 +55,8 @@ class OpenSection:
         self._values = part_of(memory.known.values, [X(first)])
         self._tile_of: dict[int, int] = {}
         self._counted: list[TileReadings] = []
-        self._prior: Prior | None = None
-        self._descent: Descent | None = None
+        self._prior: gtsam.NonlinearFactorGraph | None = None
+        self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
 
     def extend(self, last: int) -> Belief:
         """Take the key poses up to one, and return what is known of it then."""
@@ -62,8 +65,8 @@ class OpenSection:
         entered = [self._enter(k) for k in new.tolist()]
         stages = AGAIN if any(entered) else ONWARDS
         for scale in stages[:-1]:
-            self._solve(self._graph(int(new[0]), scale), 1)
-        graph = self._graph(int(new[0]), stages[-1])
+            self._solve(self._factors(int(new[0]), scale), 1)
+        graph = self._factors(int(new[0]), stages[-1])
         for each in self._counted:
             tile = self._tiles[each.laid.number]
             for factor in each.doubts(self._drive, tile):
@@ -73,7 +76,7 @@ class OpenSection:
 
     def closed(self) -> FieldMemory:
         """Return what is known at its end."""
-        known = self._memory.known.told(self._solved().last(len(self._kept())))
+        known = self._memory.known.told(self._known(self._kept()))
         tiles = list(self._tiles)
         for each in self._counted:
             tile = tiles[each.laid.number]
@@ -142,7 +145,7 @@ class OpenSection:
         own = {int(k): origin.between(self.pose(int(k))) for k in np.unique(readings.key_pose)}
         return place(readings, own, self._drive.sensors)
 
-    def _graph(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
+    def _factors(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
         """Return odometry, the prior of new tiles, and readings, those from ``new`` on scaled."""
         graph, old = gtsam.NonlinearFactorGraph(), len(self._memory.tiles)
         for k in range(self._first, self._last):
@@ -177,13 +180,13 @@ class OpenSection:
     def _solve(self, graph: gtsam.NonlinearFactorGraph, most: int) -> None:
         """Solve for all variables of the section, in so many steps at most."""
         if self._prior is None:
-            self._prior = Prior(self._memory.known.marginal(self._shared))
-        kept = self._kept()
-        poses = [X(k) for k in range(self._first, self._last + 1)]
-        order = [*(key for key in poses if key not in kept), *kept]
-        sizes = {key: self._size(key) for key in order}
-        self._descent = descended(graph, self._prior, self._values, sizes, most)
-        self._values = self._descent.values
+            self._prior = gtsam.NonlinearFactorGraph()
+            for factor in prior_factors(self._memory.known.marginal(self._shared)):
+                self._prior.add(factor)
+        graph.push_back(self._prior)
+        self._graph = graph
+        found = descended(graph, self._values, least_fill(graph), most, CLOSE)
+        self._values = found.values
 
     def _kept(self) -> list[int]:
         """Return the variables that outlive the section or began it, the last pose at the end."""
@@ -198,11 +201,12 @@ class OpenSection:
             return len(self._tiles[gtsam.symbolIndex(key)].field)
         return POSE
 
-    def _solved(self) -> Descent:
-        if self._descent is None:
-            raise ValueError("a section is solved once it has key poses")
-        return self._descent
+    def _known(self, keys: list[int]) -> JointGaussian:
+        """Return what is known of some variables now."""
+        sizes = {key: self._size(key) for key in keys}
+        covariance = joint_covariance(self._graph.linearize(self._values), keys)
+        return JointGaussian(part_of(self._values, keys), sizes, covariance)
 
     def _belief(self) -> Belief:
-        known = self._solved().last(1)
+        known = self._known([X(self._last)])
         return Belief(self.pose(self._last), self._drive.sensors, known.covariance)

@@ -7,13 +7,13 @@ import numpy as np
 
 from l2m_factors import CarriedBatch, key_pose_factor
 from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.graph.optimise import Ending, Optimizer, optimise
+from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.slam.changes import Fit
 from l2m_gtsam.graph.slam.covariances import (
+    Marginals,
     odometry_scale,
     pose_covariances,
     sensor_covariances,
-    solved_marginals,
 )
 from l2m_gtsam.graph.slam.drive import Drive, KnownSensors
 from l2m_gtsam.graph.slam.factors import (
@@ -26,6 +26,7 @@ from l2m_gtsam.graph.slam.localised import NOTHING, Localised
 from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.graph.slam.shared import SharedMapErrors, errors_of
 from l2m_gtsam.graph.slam.sight import Sight, look, place, poses_in, sensors_in
+from l2m_gtsam.graph.slam.solving import descended, least_fill
 from l2m_gtsam.graph.slam.ways import Ways
 from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.solve.robust import WEIGHTS
@@ -132,7 +133,7 @@ class Problem:
         seen = self.look(values)
         weights = self.weights(seen, mu) * counts
         graph = self.graph(seen, weights, seen.sight.map_variance, None)
-        end = optimise(graph, values, Optimizer.LM, self._options.max_iterations)
+        end = descended(graph, values, least_fill(graph), self._options.max_iterations)
         return Solved(end.values, weights, end.ending)
 
     def fit(self, solved: Solved, counts: BoolArray) -> Fit:
@@ -203,9 +204,10 @@ class Problem:
             values.insert(shared.values())
         rest = seen.sight.map_variance if shared is None else shared.rest
         graph = self.graph(seen, weights, rest, shared)
-        optimised = optimise(graph, values, Optimizer.LM, self._options.max_iterations)
+        order = least_fill(graph)
+        optimised = descended(graph, values, order, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
-        marginals = solved_marginals(graph, values)
+        marginals = Marginals(graph.linearize(values), order)
         seen = self.look(values)
         return Localised(
             drive=replace(self._drive, sensors=sensors),

@@ -10,6 +10,9 @@ odometry's steps; P: the sensors' calibrations; M: the map's errors. A reading t
 not predict within its covariance has the variance of the map's whole field on top: it says next to
 nothing, like one that the map knows nothing of, and the likelihoods of all places stay those of the
 same readings.
+
+All residuals are correlated: a graph would be one dense factor, linearised anew at each place. What
+is asked for is likelihoods; the drive from the best place is solved by GTSAM.
 """
 
 from dataclasses import dataclass
