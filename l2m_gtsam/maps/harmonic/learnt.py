@@ -153,16 +153,16 @@ class Learnt:
     def basis(self, tile: int, rows: IntArray, visible: float = FINE) -> Basis:
         """Return the basis of a tile for its readings; ``visible`` is that of ``dipoles_of``."""
         centre, edge = self.tiling.grid.centres[tile], self.tiling.edge
-        near = self.sources.within(centre, edge)
+        structures, strengths = self.structures(tile)
         return basis_of(
-            self.readings[rows],
-            centre,
-            edge,
-            self.resolution,
-            [self.sources.pieces[s] for s in near],
-            self.strengths[near],
-            visible,
+            self.readings[rows], centre, edge, self.resolution, structures, strengths, visible
         )
+
+    def structures(self, tile: int) -> tuple[list[Sources], FloatArray]:
+        """Return the structures in or near a tile that have a field, and their strengths, (S,)."""
+        near = self.sources.within(self.tiling.grid.centres[tile], self.tiling.edge)
+        strong = [s for s in near if self.strengths[s] > 0]
+        return [self.sources.pieces[s] for s in strong], self.strengths[strong]
 
     def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""
