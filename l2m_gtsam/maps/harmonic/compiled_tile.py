@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
+from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
 from l2m_gtsam.maps.harmonic.places import Places
@@ -74,10 +75,17 @@ class CompiledTile:
         missing = np.flatnonzero(np.isnan(field[:, 0]))
         if len(missing):
             field[missing], gradient[missing] = self.terms.field_and_gradient(local[missing])
-        R = frame.R_map_tile
-        if not np.array_equal(R, np.eye(3)):
-            field, gradient = field @ R.T, turned(gradient, R)
+        return in_map(frame, field, gradient)
+
+
+def in_map(
+    frame: TileFrame, field: FloatArray, gradient: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return field (N, 3) and gradient (N, 3, 3) of a tile's frame in the map frame."""
+    R = frame.R_map_tile
+    if np.array_equal(R, np.eye(3)):
         return field, gradient
+    return field @ R.T, turned(gradient, R)
 
 
 def turned(gradient: FloatArray, R: FloatArray) -> FloatArray:
@@ -117,10 +125,12 @@ def compile_tile(tile: Tile, places: Places) -> CompiledTile | Tile:
     if not len(checks):
         return tile
     fineness = fineness_for(tile, sources)
-    truth = tile.field_and_gradient(checks)
+    terms = TermSum.of(tile, sources)
+    frame = tile.basis.frame
+    truth = in_map(frame, *terms.field_and_gradient(tile.clipped(frame.localise(checks))))
     for _ in range(ATTEMPTS):
         try:
-            compiled = with_grid(tile, sources, places, fineness)
+            compiled = with_grid(tile, terms, places, fineness)
         except MapError:  # the grid would be too large
             return tile
         excess = worst(compiled.field_and_gradient(checks), truth)
@@ -169,11 +179,10 @@ def check_places(tile: Tile, sources: PointSources, places: Places) -> FloatArra
     return np.concatenate([random[:CHECKS], random[nearest]])
 
 
-def with_grid(
-    tile: Tile, sources: PointSources, places: Places, fineness: Fineness
-) -> CompiledTile:
+def with_grid(tile: Tile, terms: TermSum, places: Places, fineness: Fineness) -> CompiledTile:
     """Return the tile with a grid of this fineness."""
     frame, spacing, radius = tile.basis.frame, fineness.spacing, fineness.radius
+    sources = terms.sources
 
     def potential(lattice: Lattice) -> FloatArray:
         phi = sources.smooth_potential(lattice, radius)
@@ -186,4 +195,4 @@ def with_grid(
     grid = potential_grid(potential, readings, places.reach, spacing, places.box(frame))
     upper = grid.lower + spacing * np.array(grid.coefficients.shape)
     near = near_sources(sources, grid.lower, upper, radius)
-    return CompiledTile(tile, grid, near, TermSum.of(tile, sources))
+    return CompiledTile(tile, grid, near, terms)

@@ -15,6 +15,7 @@ has the covariance ``s^2 (2h)^3 / sqrt(rho^2 + (z + z' + 2h)^2)`` at horizontal 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -59,17 +60,17 @@ class Modes:
     def __len__(self) -> int:
         return len(self.numbers)
 
-    @property
+    @cached_property
     def kx(self) -> FloatArray:
         """Wave numbers along x in 1/m, shape (m,)."""
         return np.asarray(np.pi * self.numbers[:, 0] / self.size[0])
 
-    @property
+    @cached_property
     def ky(self) -> FloatArray:
         """Wave numbers along y in 1/m, shape (m,)."""
         return np.asarray(np.pi * self.numbers[:, 1] / self.size[1])
 
-    @property
+    @cached_property
     def kz(self) -> FloatArray:
         """Growth with height in 1/m, shape (m,): negative for the floor."""
         sign = -1.0 if self.side == FLOOR else 1.0

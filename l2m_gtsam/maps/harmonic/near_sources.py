@@ -157,21 +157,23 @@ def add_smooth(
     phi: FloatArray,
 ) -> None:
     """Add the smooth part of all sources to the potential of the columns that are asked for."""
+    far = np.empty((4, len(positions)))
+    flats, levels, heights, uprights = far
     for i in range(len(x)):
         for j in range(len(y)):
             if not columns[i, j]:
                 continue
             out = phi[i, j]
+            count = 0
             for k in range(len(positions)):
                 dx, dy = x[i] - positions[k, 0], y[j] - positions[k, 1]
                 flat = dx * dx + dy * dy
                 edge = radii[k] * radii[k]
                 level = moments[k, 0] * dx + moments[k, 1] * dy
                 if flat >= edge:
-                    for c in range(len(z)):
-                        dz = z[c] - positions[k, 2]
-                        s = flat + dz * dz
-                        out[c] -= (level + moments[k, 2] * dz) / (s * np.sqrt(s))
+                    flats[count], levels[count] = flat, level
+                    heights[count], uprights[count] = positions[k, 2], moments[k, 2]
+                    count += 1
                     continue
                 for c in range(len(z)):
                     dz = z[c] - positions[k, 2]
@@ -182,6 +184,42 @@ def add_smooth(
                         inner = inner * t + TAYLOR[p]
                     # Beyond the radius t is 0 and the polynomial 1; within, s is the edge.
                     out[c] -= (level + moments[k, 2] * dz) * inner / (s * np.sqrt(s))
+            add_far(z, flats[:count], levels, heights, uprights, out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def add_far(
+    z: FloatArray,
+    flats: FloatArray,
+    levels: FloatArray,
+    heights: FloatArray,
+    uprights: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add the potential of sources to a column that none of them is near.
+
+    Parameters
+    ----------
+    z
+        Heights of the nodes in metres, shape (n,).
+    flats
+        Squared horizontal distances of the sources in m^2, shape (k,).
+    levels, heights, uprights
+        Horizontal part of ``m . r``, height and vertical moment of each, shape (k,) or longer.
+    out
+        Potential in uT m, shape (n,).
+    """
+    for c in range(len(z)):
+        total = 0.0
+        for k in range(len(flats)):
+            dz = z[c] - heights[k]
+            s = flats[k] + dz * dz
+            # A root of 32 bits and two of Newton's steps: as exact as one of 64, in half the time.
+            inverse = np.float64(np.float32(1) / np.sqrt(np.float32(s)))
+            inverse *= 1.5 - 0.5 * s * inverse * inverse
+            inverse *= 1.5 - 0.5 * s * inverse * inverse
+            total += (levels[k] + uprights[k] * dz) * (inverse * inverse * inverse)
+        out[c] -= total
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
