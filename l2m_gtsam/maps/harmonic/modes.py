@@ -81,15 +81,20 @@ class Modes:
         scale = getattr(hyperparameters, f"{self.side}_scale")
         h = getattr(hyperparameters, f"{self.side}_depth")
         k = np.abs(self.kz)
-        share = np.where((self.numbers == 0).any(axis=1), 2.0, 4.0) / np.prod(self.size)
         log_variance = 2 * np.log(scale) + 3 * np.log(2 * h) - 2 * k * h - np.log(k)
         return WeightPrior(
-            log_variance + np.log(2 * np.pi * share),
+            log_variance + self._log_share,
             {
                 f"{self.side}_scale": np.full(len(k), 2.0),
                 f"{self.side}_depth": 3.0 - 2.0 * k * h,
             },
         )
+
+    @cached_property
+    def _log_share(self) -> FloatArray:
+        """Logarithm of a mode's share in the box, shape (m,)."""
+        share = np.where((self.numbers == 0).any(axis=1), 2.0, 4.0) / np.prod(self.size)
+        return np.asarray(np.log(2 * np.pi * share))
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each mode; see ``Family``."""

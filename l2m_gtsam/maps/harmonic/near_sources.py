@@ -129,20 +129,78 @@ def near_sources(
         left = lower[axis] + CELL * np.arange(count)[:, None]
         place = sources.positions[:, axis]
         gaps.append(np.maximum(np.maximum(left - place, place - left - CELL), 0.0) ** 2)
-    near = gaps[0][:, None, None] + gaps[1][:, None] + gaps[2] < edge
-    cells, members = np.nonzero(near.reshape(nx * ny * nz, len(sources)))
-    counts = np.bincount(cells, minlength=nx * ny * nz)
-    lengths = -(-counts // LANES) * LANES
-    starts = np.append(0, np.cumsum(lengths))
+    counts = np.zeros((nx, ny, nz), dtype=np.int64)
+    count_near(*gaps, edge, counts)
+    starts = np.append(0, np.cumsum(-(-counts // LANES) * LANES))
     # What fills the lists up is far away, and has no moment.
     table = np.ones((8, starts[-1]))
     table[:3], table[3:6] = lower[:, None] - 10, 0.0
-    before = np.cumsum(counts) - counts
-    places = starts[cells] + np.arange(len(cells)) - before[cells]
-    table[:3, places] = sources.positions[members].T
-    table[3:6, places] = sources.moments[members].T
-    table[6:, places] = edge[members], 1 / edge[members]
+    free = starts[:-1].reshape(counts.shape).copy()
+    fill_near(*gaps, edge, sources.positions, sources.moments, free, table)
     return NearSources(lower, (nx, ny, nz), starts, table)
+
+
+@njit(cache=True, nogil=True)
+def count_near(
+    x: FloatArray, y: FloatArray, z: FloatArray, edge: FloatArray, counts: IntArray
+) -> None:
+    """Add up how many sources are felt in each cell.
+
+    Parameters
+    ----------
+    x, y, z
+        Squared gaps between cells and sources along each axis in m^2, shapes (nx, K) to (nz, K).
+    edge
+        Squared radii of the sources in m^2, shape (K,).
+    counts
+        Shape (nx, ny, nz).
+    """
+    nx, ny, nz = counts.shape
+    for k in range(len(edge)):
+        for i in range(nx):
+            for j in range(ny):
+                if x[i, k] + y[j, k] < edge[k]:
+                    for c in range(nz):
+                        counts[i, j, c] += x[i, k] + y[j, k] + z[c, k] < edge[k]
+
+
+@njit(cache=True, nogil=True)
+def fill_near(
+    x: FloatArray,
+    y: FloatArray,
+    z: FloatArray,
+    edge: FloatArray,
+    positions: FloatArray,
+    moments: FloatArray,
+    free: IntArray,
+    table: FloatArray,
+) -> None:
+    """Write each source into the lists of the cells that it is felt in; see ``count_near``.
+
+    Parameters
+    ----------
+    x, y, z, edge
+        As there.
+    positions, moments
+        Of the sources, shape (K, 3).
+    free
+        The next free column of each cell's list, shape (nx, ny, nz); moves on.
+    table
+        Lists; see ``NearSources``.
+    """
+    nx, ny, nz = free.shape
+    for k in range(len(edge)):
+        for i in range(nx):
+            for j in range(ny):
+                if x[i, k] + y[j, k] < edge[k]:
+                    for c in range(nz):
+                        if x[i, k] + y[j, k] + z[c, k] < edge[k]:
+                            at = free[i, j, c]
+                            free[i, j, c] += 1
+                            for axis in range(3):
+                                table[axis, at] = positions[k, axis]
+                                table[3 + axis, at] = moments[k, axis]
+                            table[6, at], table[7, at] = edge[k], 1 / edge[k]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
