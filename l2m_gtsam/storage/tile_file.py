@@ -111,7 +111,7 @@ def _read_start(file: IO[bytes], size: int) -> tuple[bytes, bytes]:
 def _facts(header: bytes) -> dict[str, Any]:
     try:
         facts = json.loads(header)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise MapError("its header is damaged") from None
     if not isinstance(facts, dict) or not {"fingerprint", "arrays"} <= set(facts):
         raise MapError("its header is damaged")
@@ -138,7 +138,7 @@ def _empty_arrays(facts: dict[str, Any], left: int) -> dict[str, npt.NDArray[Any
         raise MapError("it is cut short or too long")
     try:
         return {name: np.empty(shape, dtype) for name, (dtype, shape) in shapes.items()}
-    except ValueError:  # too many axes, or a length beside none that no array can have
+    except (ValueError, OverflowError):  # too many axes, or too long a one beside one of none
         raise MapError("its header is damaged") from None
 
 

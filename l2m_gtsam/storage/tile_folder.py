@@ -13,14 +13,14 @@ from threading import Lock
 
 from l2m_gtsam.errors import ConfigError, MapError, OutputError
 from l2m_gtsam.notices import Notice
-from l2m_gtsam.storage.tile_file import fingerprint_of, read_tile, write_tile
+from l2m_gtsam.storage.tile_file import MOST_HEADER_BYTES, fingerprint_of, read_tile, write_tile
 from l2m_gtsam.tile_store import NO_STORE, Arrays, Entry, Made, TileStore
 
 SUFFIX, FILE_SUFFIX = ".tiles", ".tile"
 LIMIT = "L2M_TILES_GIB"
 """Environment variable: how large the folder may become; 0 keeps no tiles."""
 ANEW = "this tile, and others like it, are made anew"
-MOST_GIB = 4.0  # two thousand tiles and more
+MOST_GIB = 4.0  # about two thousand tiles
 
 
 def tiles_beside(map_path: Path) -> TileStore:
@@ -87,8 +87,11 @@ class TileFolder:
 
     def keep(self, entry: Entry, arrays: Arrays, /) -> None:
         """Keep an entry, if there is space for it; see ``TileStore``."""
-        size = sum(array.nbytes for array in arrays.values())
-        if not self._makes_space(entry, size):
+        if not self._takes_more:
+            return
+        if not self._has_space(entry, sum(array.nbytes for array in arrays.values())):
+            full = f"{self._folder}: holds {self._most_bytes / 2**30:.3g} GiB, as {LIMIT} allows"
+            self._give_up(full)
             return
         try:
             self._folder.mkdir(exist_ok=True)
@@ -109,17 +112,16 @@ class TileFolder:
         with self._lock:
             self._held = None
 
-    def _makes_space(self, entry: Entry, size: int) -> bool:
+    def _has_space(self, entry: Entry, size: int) -> bool:
+        """Return whether there is space for an entry, which then counts as taken."""
         with self._lock:
-            if not self._takes_more:
-                return False
             if self._held is None:
                 self._held = sum(_size(path) for path in self._files())
-            held = self._held - _size(self._path(entry)) + size
-            self._takes_more = held <= self._most_bytes
-            if self._takes_more:
-                self._held = held
-            return self._takes_more
+            held = self._held - _size(self._path(entry)) + size + MOST_HEADER_BYTES
+            if held > self._most_bytes:
+                return False
+            self._held = held - MOST_HEADER_BYTES
+            return True
 
     def _path(self, entry: Entry) -> Path:
         return self._folder / f"{entry.name}{FILE_SUFFIX}"
@@ -134,7 +136,7 @@ class TileFolder:
     def _give_up(self, what: str) -> None:
         with self._lock:
             self._takes_more = False
-        self._notice(f"{what}; tiles are not kept")
+        self._notice(f"{what}; more tiles are not kept")
 
     def _notice(self, what: str) -> None:
         with self._lock:

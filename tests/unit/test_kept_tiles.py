@@ -197,12 +197,20 @@ def test_a_folder_that_can_only_be_read_is_read(
 
 def test_the_size_is_bounded(tmp_path: Path) -> None:
     sizes = [path.stat().st_size for path in filled(tmp_path / "all")]
-    most = sum(sizes) // 2
-    assert_right(beside(tmp_path / "some", most))
-    kept = [path.stat().st_size for path in (tmp_path / "some").iterdir()]
-    assert 0 < sum(kept) <= most
-    assert_right(beside(tmp_path / "some", most))
-    assert sum(path.stat().st_size for path in (tmp_path / "some").iterdir()) <= most
+    most, some = sum(sizes) // 2, tmp_path / "some"
+    for _ in range(2):
+        text = one_notice(lambda: assert_right(beside(some, most)))
+        assert "L2M_TILES_GIB" in text
+        assert 0 < sum(path.stat().st_size for path in some.iterdir()) <= most
+
+
+def test_making_all_ends_where_the_folder_is_full(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one_notice(lambda: make_all(beside(tmp_path, 1)))
+    assert not list(tmp_path.iterdir())
+    refuse_making(monkeypatch)
+    assert HarmonicMap.condition(plain().learnt, OPTIONS).make_tiles(print) == 0
 
 
 def test_making_all_leaves_nothing_else(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from l2m_gtsam.maps.harmonic.explanation import (
     UNJUDGED,
     Explanation,
 )
+from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
@@ -157,6 +158,11 @@ class Learnt:
         return basis_of(
             self.readings[rows], centre, edge, self.resolution, structures, strengths, visible
         )
+
+    def frame(self, tile: int) -> TileFrame:
+        """Return the box of a tile."""
+        points = self.readings.points[self.members[tile]]
+        return tile_frame(points, self.tiling.grid.centres[tile], self.tiling.edge)
 
     def structures(self, tile: int) -> tuple[list[Sources], FloatArray]:
         """Return the structures in or near a tile that have a field, and their strengths, (S,)."""

@@ -37,6 +37,8 @@ def make_all(compiled: CompiledTiles, told: Callable[[int, int], None]) -> int:
 
     def make(index: int) -> bool:
         nonlocal done
+        if not tiles.store.takes_more:
+            return False
         compiled.compiled(index, tiles.made(index))
         with lock:
             done += 1

@@ -129,14 +129,15 @@ def near_sources(
         left = lower[axis] + CELL * np.arange(count)[:, None]
         place = sources.positions[:, axis]
         gaps.append(np.maximum(np.maximum(left - place, place - left - CELL), 0.0) ** 2)
+    x, y, z = gaps
     counts = np.zeros((nx, ny, nz), dtype=np.int64)
-    count_near(*gaps, edge, counts)
+    count_near(x, y, z, edge, counts)
     starts = np.append(0, np.cumsum(-(-counts // LANES) * LANES))
     # What fills the lists up is far away, and has no moment.
     table = np.ones((8, starts[-1]))
     table[:3], table[3:6] = lower[:, None] - 10, 0.0
     free = starts[:-1].reshape(counts.shape).copy()
-    fill_near(*gaps, edge, sources.positions, sources.moments, free, table)
+    fill_near(x, y, z, edge, sources.positions, sources.moments, free, table)
     return NearSources(lower, (nx, ny, nz), starts, table)
 
 

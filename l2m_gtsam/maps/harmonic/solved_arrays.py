@@ -1,7 +1,7 @@
 """A solved tile as plain arrays, and back with checks.
 
 Kept is what took long: the posterior, the tile's own scales, and the combinations of moments that
-its readings see. Waves and places of sources follow from the map.
+its readings see. Box, waves and places of sources follow from the map.
 """
 
 import numpy as np
@@ -26,11 +26,9 @@ NAMES = tuple(sorted(Hyperparameters.model_fields))
 
 def solved_to_arrays(tile: Tile) -> Arrays:
     """Return a tile as arrays."""
-    frame, own = tile.basis.frame, tile.hyperparameters
+    own = tile.hyperparameters
     dipoles = [family for family in tile.basis.families if isinstance(family, Dipoles)]
     return {
-        "axes": frame.R_map_tile,
-        "box": np.array([*frame.corner, *frame.size, frame.height]),
         "hyperparameters": np.array([getattr(own, name) for name in NAMES]),
         "mean": tile.weights.mean,
         "prior_sigma": tile.weights.prior_sigma,
@@ -48,10 +46,7 @@ def solved_from_arrays(learnt: Learnt, index: int, arrays: Arrays) -> Tile:
     MapError
         If an array is missing, of the wrong shape, or makes no sense.
     """
-    box = finite(arrays, "box", (6,))
-    if (box[3:] < 0).any():
-        raise MapError("box has edges below zero")
-    frame = TileFrame(finite(arrays, "axes", (3, 3)), box[:3], box[3:5], float(box[5]))
+    frame = learnt.frame(index)
     basis = basis_with(frame, learnt.resolution, dipoles_from(learnt, index, frame, arrays))
     m = len(basis)
     factor = unpacked(finite(arrays, "factor", (m * (m + 1) // 2,)), m)
