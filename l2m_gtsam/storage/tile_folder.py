@@ -13,12 +13,13 @@ from threading import Lock
 
 from l2m_gtsam.errors import ConfigError, MapError, OutputError
 from l2m_gtsam.notices import Notice
-from l2m_gtsam.storage.tile_file import MOST_HEADER_BYTES, fingerprint_of, read_tile, write_tile
+from l2m_gtsam.storage.tile_file import fingerprint_of, read_tile, write_tile
 from l2m_gtsam.tile_store import NO_STORE, Arrays, Entry, Made, TileStore
 
 SUFFIX, FILE_SUFFIX = ".tiles", ".tile"
 LIMIT = "L2M_TILES_GIB"
 """Environment variable: how large the folder may become; 0 keeps no tiles."""
+ABOUT_A_HEADER = 2048  # bytes
 ANEW = "this tile, and others like it, are made anew"
 MOST_GIB = 4.0  # about two thousand tiles
 
@@ -117,10 +118,10 @@ class TileFolder:
         with self._lock:
             if self._held is None:
                 self._held = sum(_size(path) for path in self._files())
-            held = self._held - _size(self._path(entry)) + size + MOST_HEADER_BYTES
+            held = self._held - _size(self._path(entry)) + size + ABOUT_A_HEADER
             if held > self._most_bytes:
                 return False
-            self._held = held - MOST_HEADER_BYTES
+            self._held = held
             return True
 
     def _path(self, entry: Entry) -> Path:

@@ -22,7 +22,7 @@ def solved_entry(learnt: Learnt, index: int) -> Entry:
     structures, strengths = learnt.structures(index)
     facts = {
         "algorithm": ALGORITHM,
-        "version": _version(),
+        "versions": _versions(),
         "hyperparameters": learnt.hyperparameters.model_dump(mode="json"),
         "local": learnt.local.model_dump(mode="json"),
         "resolution": [learnt.resolution.floor, learnt.resolution.ceiling],
@@ -67,5 +67,6 @@ def _digest(facts: dict[str, object], *arrays: FloatArray) -> str:
 
 
 @cache
-def _version() -> str:
-    return version("l2m-gtsam")
+def _versions() -> list[str]:
+    """Return the versions of what computes: others may round otherwise."""
+    return [version(name) for name in ("l2m-gtsam", "numpy", "scipy", "numba")]
