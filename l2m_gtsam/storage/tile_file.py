@@ -68,7 +68,7 @@ def read_tile(path: Path, entry: Entry) -> Arrays:
         checksum, header = _read_start(file, left)
         facts = _facts(header)
         if facts["fingerprint"] != entry.fingerprint:
-            raise MapError("it belongs to another map, or to other readings")
+            raise MapError("it is of another map or of another version of the program")
         digest = hashlib.sha256(header)
         arrays = _empty_arrays(facts, left - file.tell())
         for array in arrays.values():
