@@ -1,4 +1,4 @@
-"""From readings to a harmonic map of which every tile is solved, with its whole covariance.
+"""From readings to a harmonic map of which every tile is solved, compiled, written and read again.
 
 Two places: the open floor of ``map_queries``, and the simulated warehouse of ``l2m simulate``,
 where racks and posts that a LiDAR saw add some 17,000 candidate sources. Ten of either side by
@@ -7,6 +7,8 @@ side show how the cost grows. The sliding Gaussian process of the same readings 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from rich.console import Console
@@ -17,13 +19,17 @@ from benchmarks.map_queries import READINGS, SIZE, survey, warehouse
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.mapping import suite_readings
+from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
+from l2m_gtsam.storage.tile_folder import TileFolder
+from l2m_gtsam.threads import in_threads
 
 COPIES = 10
 GAP = 15.0  # metres between copies
 ASKED = 2_000  # places, with variance
+PLENTY = 1 << 36  # bytes
 
 
 @dataclass(frozen=True)
@@ -63,6 +69,14 @@ def row(place: Place) -> list[str]:
     made: list[HarmonicMap] = []
     learn = once(lambda: made.append(HarmonicMap.fit(place.points, place.field, cloud=place.cloud)))
     solve = once(made[0].tiles.solve_all)
+    tiles, fast = made[0].tiles, CompiledTiles.of(made[0])
+    indices = range(len(tiles))
+    compiling = once(lambda: in_threads(lambda i: fast.compiled(i, tiles[i]), indices))
+    with TemporaryDirectory() as folder:
+        kept = made[0].with_store(TileFolder(Path(folder), PLENTY))
+        together = once(lambda: kept.make_tiles(lambda _done, _total: None))
+        size = sum(path.stat().st_size for path in Path(folder).iterdir())
+        read = once(lambda: kept.make_tiles(lambda _done, _total: None))
     sliding = once(lambda: SlidingGP.fit(place.points, place.field))
     rng = np.random.default_rng(0)
     middle = place.points[np.abs(place.points[:, 0] - SIZE[0] / 2) < SIZE[0] / 2]
@@ -73,7 +87,11 @@ def row(place: Place) -> list[str]:
         f"{len(made[0].tiles)}",
         f"{learn:.1f}",
         f"{solve:.1f}",
-        f"{learn + solve:.1f}",
+        f"{compiling:.1f}",
+        f"{together:.1f}",
+        f"{learn + together:.1f}",
+        f"{read:.1f}",
+        f"{size / 1e6:,.0f}",
         f"{sliding:.1f}",
         f"{ASKED / query:,.0f}",
     ]
@@ -81,8 +99,9 @@ def row(place: Place) -> list[str]:
 
 def report(title: str, place: Callable[[], Place]) -> Table:
     """Return the costs of one place and of ten."""
-    columns = ("readings", "tiles", "learn (s)", "solve all tiles (s)", "together (s)")
-    table = Table(*columns, "sliding GP (s)", "exact with variance (1/s)", title=title)
+    columns = ("readings", "tiles", "learn (s)", "solve all tiles (s)", "compile all (s)")
+    kept = ("solve, compile and write all (s)", "with learning (s)", "read all (s)", "size (MB)")
+    table = Table(*columns, *kept, "sliding GP (s)", "exact with variance (1/s)", title=title)
     one = place()
     table.add_row(*row(one))
     table.add_row(*row(one.repeated(COPIES)))

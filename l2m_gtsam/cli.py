@@ -17,7 +17,7 @@ from l2m_gtsam.commands.report import report
 from l2m_gtsam.commands.slam import slam
 from l2m_gtsam.commands.study import study
 from l2m_gtsam.commands.suite import suite
-from l2m_gtsam.commands.terminal import print_table, shown_progress, warn
+from l2m_gtsam.commands.terminal import print_table, shown_notices, shown_progress, warn
 from l2m_gtsam.commands.validate import validate
 from l2m_gtsam.errors import L2MError
 
@@ -69,6 +69,13 @@ StructureOption = Annotated[
 ScenarioOption = Annotated[
     Path | None, typer.Option("--options", help="YAML with the options of the simulation.")
 ]
+TilesOption = Annotated[
+    bool,
+    typer.Option(
+        help="Make all tiles of the map now and keep them in the folder MAP.tiles beside it; else "
+        "each is made, and kept, when it is first needed."
+    ),
+]
 SeedOption = Annotated[
     int | None,
     typer.Option(min=0, help="Of world, drives and sensors, instead of that in --options (1)."),
@@ -84,7 +91,8 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     try:
-        app(arguments)
+        with shown_notices():
+            app(arguments)
     except L2MError as error:
         if "--debug" in sys.argv[1:]:
             raise
@@ -276,14 +284,18 @@ def map_build(
             "point clouds and no poses.",
         ),
     ] = False,
+    tiles: TilesOption = True,
 ) -> None:
     """Build a map from one or several bags of a calibrated mapping suite."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.maps import build_map_file
+        from l2m_gtsam.batch.tiles import make_tiles
         from l2m_gtsam.config import load_config
         from l2m_gtsam.qa.tables import map_table
 
         built = build_map_file(bags, out, load_config(config), suite, progress, structure, lidar)
+        if tiles:
+            make_tiles(built.field_map, out, progress)
     print_table(map_table(built.description))
     warn(built.description.summary.doubts)
     typer.echo(f"written: {out}")
@@ -296,6 +308,7 @@ def map_update(
     out: MapFileOption,
     config: ConfigOption = None,
     suite: SuiteOption = None,
+    tiles: TilesOption = True,
 ) -> None:
     """Add bags to a map, which keeps its kind, its options and the prior of the whole map.
 
@@ -303,10 +316,13 @@ def map_update(
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.maps import update_map_file
+        from l2m_gtsam.batch.tiles import make_tiles
         from l2m_gtsam.config import load_config
         from l2m_gtsam.qa.tables import map_table
 
         updated = update_map_file(map_path, bags, out, load_config(config), suite, progress)
+        if tiles:
+            make_tiles(updated.field_map, out, progress)
     print_table(map_table(updated.description))
     warn(updated.description.summary.doubts)
     typer.echo(f"written: {out}")

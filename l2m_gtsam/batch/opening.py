@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from l2m_gtsam.batch.tiles import with_tiles
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import MapState, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import BagError, MapError
@@ -101,7 +102,7 @@ class SavedMap:
         for drive in drives:
             self.check_frame(drive)
         progress("loading the map", 0.0)
-        field_map = map_from_state(self.state)
+        field_map = with_tiles(map_from_state(self.state), self.path)
         progress("loading the map", 1.0)
         return field_map
 

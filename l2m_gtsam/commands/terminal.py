@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 import typer
 
@@ -20,6 +20,34 @@ def warn(doubts: Sequence[str]) -> None:
     """Say on the error stream what speaks against a result that was written all the same."""
     for doubt in doubts:
         typer.echo(f"l2m: warning: {doubt}", err=True)
+
+
+@contextmanager
+def shown_notices() -> Iterator[None]:
+    """Show notices of this program as its warnings; others appear as Python has them."""
+    import warnings
+
+    from l2m_gtsam.notices import Notice
+
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, Notice):
+                warn([str(message)])
+            else:
+                usual(message, category, filename, lineno, file, line)
+
+        warnings.simplefilter("always", Notice)
+        warnings.showwarning = show
+        yield
 
 
 def print_table(table: "Table") -> None:

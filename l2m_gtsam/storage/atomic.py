@@ -31,6 +31,17 @@ def atomic_path(path: Path) -> Iterator[Path]:
     OutputError
         The folder is missing or the file cannot be written.
     """
+    with renamed_path(path) as temporary:
+        yield temporary
+        _flush(temporary)
+
+
+@contextmanager
+def renamed_path(path: Path) -> Iterator[Path]:
+    """Give a temporary file as ``atomic_path`` does, for what may be lost with the power.
+
+    Half of it may then be under the name; whoever reads it has to notice.
+    """
     if path.exists() and not path.is_file():
         msg = f"{path}: cannot be written: it exists and is not a regular file"
         raise OutputError(msg)
@@ -38,7 +49,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
     try:
         temporary.touch(exist_ok=False)
         yield temporary
-        _flush(temporary)
         temporary.replace(path)
     except OSError as error:
         msg = f"{path}: cannot be written: {error.strerror or error}"

@@ -8,6 +8,7 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.maps.harmonic import compiled, tiles
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.map_file import load_map
 from tests.end_to_end.conftest import complaint_here, l2m, l2m_process
@@ -105,6 +106,33 @@ def test_an_updated_map_is_that_of_all_readings(yard: Yard, sliding: Path, tmp_p
     assert [bag["path"] for bag in load_map(path).provenance["bags"]] == [str(b) for b in bags]
     assert all(str(bag) in out for bag in bags)
     assert load_map(path).provenance["config"] == load_map(sliding).provenance["config"]
+
+
+def test_a_calibration_with_kept_tiles_makes_none(
+    yard: Yard, bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = yard.west.parent / "kept"
+    monkeypatch.setattr(tiles, "solved_tile", None)
+    monkeypatch.setattr(compiled, "compile_tile", None)
+    run = l2m("calibrate", yard.west, "--map", bare, "--config", yard.config, "--out", out)
+    assert ".tiles" not in run.err
+
+
+def test_damaged_tiles_are_one_warning(bare: Path) -> None:
+    picture = bare.with_suffix(".png")
+    for path in bare.with_suffix(".tiles").glob("*.solved.tile"):
+        path.write_bytes(path.read_bytes()[:-1])
+    run = l2m("map", "plot", bare, "--out", picture)
+    said = [line for line in run.err.splitlines() if ".tiles" in line]
+    assert len(said) == 1
+    assert said[0].startswith("l2m: warning: ")
+    assert ".tiles" not in l2m("map", "plot", bare, "--out", picture).err
+
+
+def test_tiles_are_left_to_the_first_use_on_request(yard: Yard) -> None:
+    path = yard.west.parent / "later.npz"
+    l2m("map", "build", yard.west, "--config", yard.config, "--out", path, "--no-tiles")
+    assert not path.with_suffix(".tiles").exists()
 
 
 def test_an_updated_harmonic_map_knows_the_new_place(

@@ -11,12 +11,13 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic import compiled, compiled_tile, potential_grid
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
-from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile
 from l2m_gtsam.maps.harmonic.evidence import Weights
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
+from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.harmonic.uniform import UniformField

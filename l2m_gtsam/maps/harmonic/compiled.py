@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from threading import Lock
 from typing import Protocol
 
@@ -11,9 +12,12 @@ import numpy as np
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.maps.harmonic.blend import Blend
-from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, Places, compile_tile
+from l2m_gtsam.maps.harmonic.compiled_arrays import compiled_from_arrays, compiled_to_arrays
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile
+from l2m_gtsam.maps.harmonic.entries import compiled_entry
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
+from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.training import TrainingSet, checked_points
@@ -107,7 +111,7 @@ class CompiledTiles:
         with self.locks[index]:
             found = self.made.get(index)
             if found is None:
-                found = compile_tile(self.exact.tiles[index], self._places(index))
+                found = self.compiled(index, self.exact.tiles[index])
                 with self.locks[-1]:
                     self.made[index] = found
                     self._forget()
@@ -116,7 +120,18 @@ class CompiledTiles:
                     self.made.move_to_end(index)
         return found
 
-    def _places(self, index: int) -> Places:
+    def compiled(self, index: int, tile: Tile) -> CompiledTile | Tile:
+        """Return a tile as it was kept, else compiled and kept, without holding it in memory."""
+        store, places = self.exact.tiles.store, self.places(index)
+        entry = compiled_entry(self.exact.learnt, index, places)
+        found = store.recall(entry, partial(compiled_from_arrays, tile))
+        if found is None:
+            found = compile_tile(tile, places)
+            store.keep(entry, compiled_to_arrays(found))
+        return found
+
+    def places(self, index: int) -> Places:
+        """Return where a tile is asked."""
         tiling = self.exact.learnt.tiling
         return Places.around(
             self.exact.learnt.readings.points,

@@ -12,7 +12,8 @@ from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
-from l2m_gtsam.maps.harmonic.potential_grid import Box, Lattice, PotentialGrid, potential_grid
+from l2m_gtsam.maps.harmonic.places import Places
+from l2m_gtsam.maps.harmonic.potential_grid import Lattice, PotentialGrid, potential_grid
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import WAVE_NUMBERS
@@ -37,56 +38,6 @@ class Smooth(Protocol):
     ) -> FloatArray:
         """Return the potential in uT m at the nodes of these axes, shape (nx, ny, nz)."""
         ...
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where a tile is asked.
-
-    Attributes
-    ----------
-    readings
-        Positions of the readings near the square below in the map frame in metres, shape (K, 3).
-    reach
-        How far from them, in metres.
-    centre
-        Middle of the tile's core in x and y, metres, shape (2,).
-    half
-        Half the edge of the square around it in which the tile has a share, metres.
-    """
-
-    readings: FloatArray
-    reach: float
-    centre: FloatArray
-    half: float
-
-    @classmethod
-    def around(
-        cls, readings: FloatArray, reach: float, centre: FloatArray, half: float
-    ) -> "Places":
-        """Return the places of a square near readings, which may lie anywhere."""
-        near = np.abs(readings[:, :2] - centre).max(axis=1) <= half + reach
-        return cls(readings[near], reach, centre, half)
-
-    def box(self, frame: TileFrame) -> Box:
-        """Return the box in the tile's frame that holds all places."""
-        square = self.centre + self.half * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-        z = self.readings[:, 2]
-        corners = [
-            np.column_stack([square, np.full(4, height)])
-            for height in (z.min() - self.reach, z.max() + self.reach)
-        ]
-        local = frame.localise(np.concatenate(corners))
-        return Box(local.min(axis=0), local.max(axis=0))
-
-    def random(self, count: int) -> FloatArray:
-        """Return places in the map frame, shape (N, 3): about as many as asked for, or none."""
-        if not len(self.readings):
-            return np.empty((0, 3))
-        rng = np.random.default_rng(0)
-        offset = rng.uniform(-1, 1, (count, 3)) * self.reach
-        places = self.readings[rng.integers(0, len(self.readings), count)] + offset
-        return np.asarray(places[np.abs(places[:, :2] - self.centre).max(axis=1) <= self.half])
 
 
 @dataclass(frozen=True)
@@ -124,10 +75,17 @@ class CompiledTile:
         missing = np.flatnonzero(np.isnan(field[:, 0]))
         if len(missing):
             field[missing], gradient[missing] = self.terms.field_and_gradient(local[missing])
-        R = frame.R_map_tile
-        if not np.array_equal(R, np.eye(3)):
-            field, gradient = field @ R.T, turned(gradient, R)
+        return in_map(frame, field, gradient)
+
+
+def in_map(
+    frame: TileFrame, field: FloatArray, gradient: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return field (N, 3) and gradient (N, 3, 3) of a tile's frame in the map frame."""
+    R = frame.R_map_tile
+    if np.array_equal(R, np.eye(3)):
         return field, gradient
+    return field @ R.T, turned(gradient, R)
 
 
 def turned(gradient: FloatArray, R: FloatArray) -> FloatArray:
@@ -167,10 +125,12 @@ def compile_tile(tile: Tile, places: Places) -> CompiledTile | Tile:
     if not len(checks):
         return tile
     fineness = fineness_for(tile, sources)
-    truth = tile.field_and_gradient(checks)
+    terms = TermSum.of(tile, sources)
+    frame = tile.basis.frame
+    truth = in_map(frame, *terms.field_and_gradient(tile.clipped(frame.localise(checks))))
     for _ in range(ATTEMPTS):
         try:
-            compiled = with_grid(tile, sources, places, fineness)
+            compiled = with_grid(tile, terms, places, fineness)
         except MapError:  # the grid would be too large
             return tile
         excess = worst(compiled.field_and_gradient(checks), truth)
@@ -219,11 +179,10 @@ def check_places(tile: Tile, sources: PointSources, places: Places) -> FloatArra
     return np.concatenate([random[:CHECKS], random[nearest]])
 
 
-def with_grid(
-    tile: Tile, sources: PointSources, places: Places, fineness: Fineness
-) -> CompiledTile:
+def with_grid(tile: Tile, terms: TermSum, places: Places, fineness: Fineness) -> CompiledTile:
     """Return the tile with a grid of this fineness."""
     frame, spacing, radius = tile.basis.frame, fineness.spacing, fineness.radius
+    sources = terms.sources
 
     def potential(lattice: Lattice) -> FloatArray:
         phi = sources.smooth_potential(lattice, radius)
@@ -236,4 +195,4 @@ def with_grid(
     grid = potential_grid(potential, readings, places.reach, spacing, places.box(frame))
     upper = grid.lower + spacing * np.array(grid.coefficients.shape)
     near = near_sources(sources, grid.lower, upper, radius)
-    return CompiledTile(tile, grid, near, TermSum.of(tile, sources))
+    return CompiledTile(tile, grid, near, terms)

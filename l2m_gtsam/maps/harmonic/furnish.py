@@ -42,19 +42,24 @@ def basis_of(
     resolution
         Largest wave numbers.
     structures, strengths
-        Structures in or near the box, and the strength of each; those of strength 0 are left out.
+        Structures in or near the box, and the strength of each.
     visible
         Of ``dipoles_of``.
     """
     frame = tile_frame(readings.points, centre, edge)
+    dipoles = [
+        dipoles_of(sources, readings, frame, strength, visible)
+        for sources, strength in zip(structures, strengths, strict=True)
+    ]
+    return basis_with(frame, resolution, dipoles)
+
+
+def basis_with(frame: TileFrame, resolution: Resolution, dipoles: Sequence[Dipoles]) -> Basis:
+    """Return the basis of a box with these sources."""
     families: list[Family] = [UniformField(UNIFORM_SIGMA)]
     families.append(modes_up_to(FLOOR, frame.size, 0.0, resolution.floor))
     families.append(modes_up_to(CEILING, frame.size, frame.height, resolution.ceiling))
-    families += [
-        dipoles_of(sources, readings, frame, strength, visible)
-        for sources, strength in zip(structures, strengths, strict=True)
-        if strength > 0
-    ]
+    families += dipoles
     return Basis(frame, tuple(family for family in families if len(family)))
 
 

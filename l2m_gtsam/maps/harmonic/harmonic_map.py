@@ -1,6 +1,7 @@
 """A map of harmonic potentials: tiles of floor and ceiling modes, uniform field and sources."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -8,10 +9,11 @@ from scipy.spatial import cKDTree
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.harmonic.blend import Blend
-from l2m_gtsam.maps.harmonic.compiled import CompiledMap
+from l2m_gtsam.maps.harmonic.compiled import CompiledMap, CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
+from l2m_gtsam.maps.harmonic.making import make_all
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.summary import summary_of
@@ -20,6 +22,7 @@ from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.visits import Visit
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
 from l2m_gtsam.threads import in_threads
+from l2m_gtsam.tile_store import TileStore
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out
@@ -133,6 +136,14 @@ class HarmonicMap:
         """
         learnt, options = learnt_from_state(state)
         return cls.condition(learnt, options)
+
+    def with_store(self, store: TileStore) -> "HarmonicMap":
+        """Return the map that keeps its tiles in a store, and takes from it those that it has."""
+        return replace(self, tiles=Tiles(self.learnt, self.tiles.solved, store))
+
+    def make_tiles(self, told: Callable[[int, int], None]) -> int:
+        """Have all tiles in the store, as far as it takes them; see ``make_all``."""
+        return make_all(CompiledTiles.of(self), told)
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""

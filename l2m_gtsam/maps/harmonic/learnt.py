@@ -13,6 +13,7 @@ from l2m_gtsam.maps.harmonic.explanation import (
     UNJUDGED,
     Explanation,
 )
+from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
@@ -153,16 +154,21 @@ class Learnt:
     def basis(self, tile: int, rows: IntArray, visible: float = FINE) -> Basis:
         """Return the basis of a tile for its readings; ``visible`` is that of ``dipoles_of``."""
         centre, edge = self.tiling.grid.centres[tile], self.tiling.edge
-        near = self.sources.within(centre, edge)
+        structures, strengths = self.structures(tile)
         return basis_of(
-            self.readings[rows],
-            centre,
-            edge,
-            self.resolution,
-            [self.sources.pieces[s] for s in near],
-            self.strengths[near],
-            visible,
+            self.readings[rows], centre, edge, self.resolution, structures, strengths, visible
         )
+
+    def frame(self, tile: int) -> TileFrame:
+        """Return the box of a tile."""
+        points = self.readings.points[self.members[tile]]
+        return tile_frame(points, self.tiling.grid.centres[tile], self.tiling.edge)
+
+    def structures(self, tile: int) -> tuple[list[Sources], FloatArray]:
+        """Return the structures in or near a tile that have a field, and their strengths, (S,)."""
+        near = self.sources.within(self.tiling.grid.centres[tile], self.tiling.edge)
+        strong = [s for s in near if self.strengths[s] > 0]
+        return [self.sources.pieces[s] for s in strong], self.strengths[strong]
 
     def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need."""

@@ -15,6 +15,7 @@ has the covariance ``s^2 (2h)^3 / sqrt(rho^2 + (z + z' + 2h)^2)`` at horizontal 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -59,17 +60,17 @@ class Modes:
     def __len__(self) -> int:
         return len(self.numbers)
 
-    @property
+    @cached_property
     def kx(self) -> FloatArray:
         """Wave numbers along x in 1/m, shape (m,)."""
         return np.asarray(np.pi * self.numbers[:, 0] / self.size[0])
 
-    @property
+    @cached_property
     def ky(self) -> FloatArray:
         """Wave numbers along y in 1/m, shape (m,)."""
         return np.asarray(np.pi * self.numbers[:, 1] / self.size[1])
 
-    @property
+    @cached_property
     def kz(self) -> FloatArray:
         """Growth with height in 1/m, shape (m,): negative for the floor."""
         sign = -1.0 if self.side == FLOOR else 1.0
@@ -80,15 +81,20 @@ class Modes:
         scale = getattr(hyperparameters, f"{self.side}_scale")
         h = getattr(hyperparameters, f"{self.side}_depth")
         k = np.abs(self.kz)
-        share = np.where((self.numbers == 0).any(axis=1), 2.0, 4.0) / np.prod(self.size)
         log_variance = 2 * np.log(scale) + 3 * np.log(2 * h) - 2 * k * h - np.log(k)
         return WeightPrior(
-            log_variance + np.log(2 * np.pi * share),
+            log_variance + self._log_share,
             {
                 f"{self.side}_scale": np.full(len(k), 2.0),
                 f"{self.side}_depth": 3.0 - 2.0 * k * h,
             },
         )
+
+    @cached_property
+    def _log_share(self) -> FloatArray:
+        """Logarithm of a mode's share in the box, shape (m,)."""
+        share = np.where((self.numbers == 0).any(axis=1), 2.0, 4.0) / np.prod(self.size)
+        return np.asarray(np.log(2 * np.pi * share))
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each mode; see ``Family``."""

@@ -129,20 +129,79 @@ def near_sources(
         left = lower[axis] + CELL * np.arange(count)[:, None]
         place = sources.positions[:, axis]
         gaps.append(np.maximum(np.maximum(left - place, place - left - CELL), 0.0) ** 2)
-    near = gaps[0][:, None, None] + gaps[1][:, None] + gaps[2] < edge
-    cells, members = np.nonzero(near.reshape(nx * ny * nz, len(sources)))
-    counts = np.bincount(cells, minlength=nx * ny * nz)
-    lengths = -(-counts // LANES) * LANES
-    starts = np.append(0, np.cumsum(lengths))
+    x, y, z = gaps
+    counts = np.zeros((nx, ny, nz), dtype=np.int64)
+    count_near(x, y, z, edge, counts)
+    starts = np.append(0, np.cumsum(-(-counts // LANES) * LANES))
     # What fills the lists up is far away, and has no moment.
     table = np.ones((8, starts[-1]))
     table[:3], table[3:6] = lower[:, None] - 10, 0.0
-    before = np.cumsum(counts) - counts
-    places = starts[cells] + np.arange(len(cells)) - before[cells]
-    table[:3, places] = sources.positions[members].T
-    table[3:6, places] = sources.moments[members].T
-    table[6:, places] = edge[members], 1 / edge[members]
+    free = starts[:-1].reshape(counts.shape).copy()
+    fill_near(x, y, z, edge, sources.positions, sources.moments, free, table)
     return NearSources(lower, (nx, ny, nz), starts, table)
+
+
+@njit(cache=True, nogil=True)
+def count_near(
+    x: FloatArray, y: FloatArray, z: FloatArray, edge: FloatArray, counts: IntArray
+) -> None:
+    """Add up how many sources are felt in each cell.
+
+    Parameters
+    ----------
+    x, y, z
+        Squared gaps between cells and sources along each axis in m^2, shapes (nx, K) to (nz, K).
+    edge
+        Squared radii of the sources in m^2, shape (K,).
+    counts
+        Shape (nx, ny, nz).
+    """
+    nx, ny, nz = counts.shape
+    for k in range(len(edge)):
+        for i in range(nx):
+            for j in range(ny):
+                if x[i, k] + y[j, k] < edge[k]:
+                    for c in range(nz):
+                        counts[i, j, c] += x[i, k] + y[j, k] + z[c, k] < edge[k]
+
+
+@njit(cache=True, nogil=True)
+def fill_near(
+    x: FloatArray,
+    y: FloatArray,
+    z: FloatArray,
+    edge: FloatArray,
+    positions: FloatArray,
+    moments: FloatArray,
+    free: IntArray,
+    table: FloatArray,
+) -> None:
+    """Write each source into the lists of the cells that it is felt in; see ``count_near``.
+
+    Parameters
+    ----------
+    x, y, z, edge
+        As there.
+    positions, moments
+        Of the sources, shape (K, 3).
+    free
+        The next free column of each cell's list, shape (nx, ny, nz); moves on.
+    table
+        Lists; see ``NearSources``.
+    """
+    nx, ny, nz = free.shape
+    for k in range(len(edge)):
+        for i in range(nx):
+            for j in range(ny):
+                if x[i, k] + y[j, k] < edge[k]:
+                    for c in range(nz):
+                        if x[i, k] + y[j, k] + z[c, k] < edge[k]:
+                            at = free[i, j, c]
+                            free[i, j, c] += 1
+                            for axis in range(3):
+                                table[axis, at] = positions[k, axis]
+                                table[3 + axis, at] = moments[k, axis]
+                            table[6, at], table[7, at] = edge[k], 1 / edge[k]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -157,21 +216,23 @@ def add_smooth(
     phi: FloatArray,
 ) -> None:
     """Add the smooth part of all sources to the potential of the columns that are asked for."""
+    far = np.empty((4, len(positions)))
+    flats, levels, heights, uprights = far
     for i in range(len(x)):
         for j in range(len(y)):
             if not columns[i, j]:
                 continue
             out = phi[i, j]
+            count = 0
             for k in range(len(positions)):
                 dx, dy = x[i] - positions[k, 0], y[j] - positions[k, 1]
                 flat = dx * dx + dy * dy
                 edge = radii[k] * radii[k]
                 level = moments[k, 0] * dx + moments[k, 1] * dy
                 if flat >= edge:
-                    for c in range(len(z)):
-                        dz = z[c] - positions[k, 2]
-                        s = flat + dz * dz
-                        out[c] -= (level + moments[k, 2] * dz) / (s * np.sqrt(s))
+                    flats[count], levels[count] = flat, level
+                    heights[count], uprights[count] = positions[k, 2], moments[k, 2]
+                    count += 1
                     continue
                 for c in range(len(z)):
                     dz = z[c] - positions[k, 2]
@@ -182,6 +243,42 @@ def add_smooth(
                         inner = inner * t + TAYLOR[p]
                     # Beyond the radius t is 0 and the polynomial 1; within, s is the edge.
                     out[c] -= (level + moments[k, 2] * dz) * inner / (s * np.sqrt(s))
+            add_far(z, flats[:count], levels, heights, uprights, out)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy", inline="always")
+def add_far(
+    z: FloatArray,
+    flats: FloatArray,
+    levels: FloatArray,
+    heights: FloatArray,
+    uprights: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add the potential of sources to a column that none of them is near.
+
+    Parameters
+    ----------
+    z
+        Heights of the nodes in metres, shape (n,).
+    flats
+        Squared horizontal distances of the sources in m^2, shape (k,).
+    levels, heights, uprights
+        Horizontal part of ``m . r``, height and vertical moment of each, shape (k,) or longer.
+    out
+        Potential in uT m, shape (n,).
+    """
+    for c in range(len(z)):
+        total = 0.0
+        for k in range(len(flats)):
+            dz = z[c] - heights[k]
+            s = flats[k] + dz * dz
+            # A root of 32 bits and two of Newton's steps: as exact as one of 64, in half the time.
+            inverse = np.float64(np.float32(1) / np.sqrt(np.float32(s)))
+            inverse *= 1.5 - 0.5 * s * inverse * inverse
+            inverse *= 1.5 - 0.5 * s * inverse * inverse
+            total += (levels[k] + uprights[k] * dz) * (inverse * inverse * inverse)
+        out[c] -= total
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -65,11 +65,12 @@ def spline_coefficients(values: FloatArray) -> FloatArray:
     A coefficient is NaN where one of its values is.
     """
     for axis in range(3):
-        ndimage.correlate1d(values, filter_taps(), axis, values, mode="constant", cval=np.nan)
+        ndimage.correlate1d(values, TAPS, axis, values, mode="constant", cval=np.nan)
     inner = slice(HALF_TAPS, -HALF_TAPS)
     return np.ascontiguousarray(values[inner, inner, inner])
 
 
+TAPS = filter_taps()
 PIECES = np.tile(spline_pieces(), 3)  # once for each axis
 
 # An index that cannot be negative need not be asked whether it counts from the end: loops over it

@@ -2,13 +2,17 @@
 
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
+from functools import partial
 from threading import Lock
 
+from l2m_gtsam.maps.harmonic.entries import solved_entry
 from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.local import local_hyperparameters
+from l2m_gtsam.maps.harmonic.solved_arrays import solved_from_arrays, solved_to_arrays
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.threads import in_threads
+from l2m_gtsam.tile_store import NO_STORE, TileStore
 
 MEMORY = 2_000_000_000  # bytes of the tiles' covariances that are kept
 
@@ -25,17 +29,25 @@ class Tiles:
         What the tiles follow from.
     kept
         Tiles that are solved already.
+    store
+        Keeps tiles from run to run.
     """
 
-    def __init__(self, learnt: Learnt, kept: Mapping[int, Tile] | None = None) -> None:
+    def __init__(
+        self,
+        learnt: Learnt,
+        kept: Mapping[int, Tile] | None = None,
+        store: TileStore = NO_STORE,
+    ) -> None:
+        self.store = store
         self._learnt = learnt
         self._solved: OrderedDict[int, Tile] = OrderedDict(kept or {})
         self._held = sum(tile.nbytes for tile in self._solved.values())
         self._lock = Lock()
 
-    def __reduce__(self) -> tuple[type["Tiles"], tuple[Learnt]]:
+    def __reduce__(self) -> tuple[type["Tiles"], tuple[Learnt, None, TileStore]]:
         # Another process solves the tiles that it needs: they are ten times as large.
-        return Tiles, (self._learnt,)
+        return Tiles, (self._learnt, None, self.store)
 
     def __len__(self) -> int:
         return len(self._learnt.tiling)
@@ -49,13 +61,22 @@ class Tiles:
                 self._solved.move_to_end(index)
                 return found
         # Outside of the lock: two threads solve different tiles at the same time.
-        found = solved_tile(self._learnt, index)
+        found = self.made(index)
         with self._lock:
             self._remember(index, found)
         return found
 
     def __iter__(self) -> Iterator[Tile]:
         return (self[index] for index in range(len(self)))
+
+    def made(self, index: int) -> Tile:
+        """Return a tile as it was kept, else solved and kept, without holding it in memory."""
+        entry = solved_entry(self._learnt, index)
+        found = self.store.recall(entry, partial(solved_from_arrays, self._learnt, index))
+        if found is None:
+            found = solved_tile(self._learnt, index)
+            self.store.keep(entry, solved_to_arrays(found))
+        return found
 
     def solve_all(self) -> None:
         """Solve every tile now."""

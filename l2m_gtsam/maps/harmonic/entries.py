@@ -1,0 +1,72 @@
+"""What tiles are kept as: a name, and all that they follow from as one number."""
+
+import hashlib
+import json
+from functools import cache
+from importlib.metadata import version
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.places import Places
+from l2m_gtsam.tile_store import Entry
+
+ALGORITHM = 1
+"""To be raised with every change to what is solved, compiled or kept of the same readings."""
+
+
+def solved_entry(learnt: Learnt, index: int) -> Entry:
+    """Return what a solved tile is kept as: it follows from readings, sources, prior and box."""
+    readings = learnt.readings[learnt.members[index]]
+    structures, strengths = learnt.structures(index)
+    facts = {
+        "algorithm": ALGORITHM,
+        "versions": _versions(),
+        "hyperparameters": learnt.hyperparameters.model_dump(mode="json"),
+        "local": learnt.local.model_dump(mode="json"),
+        "resolution": [learnt.resolution.floor, learnt.resolution.ceiling],
+        "edge": learnt.tiling.edge,
+        "sources": [len(each) for each in structures],
+    }
+    fingerprint = _digest(
+        facts,
+        learnt.tiling.grid.centres[index],
+        readings.points,
+        readings.field,
+        readings.weight,
+        strengths,
+        *(each.positions for each in structures),
+    )
+    return Entry(f"{_cell(learnt, index)}.solved", fingerprint)
+
+
+def compiled_entry(learnt: Learnt, index: int, places: Places) -> Entry:
+    """Return what a compiled tile is kept as: it follows from the solved one and its places."""
+    facts: dict[str, object] = {
+        "solved": solved_entry(learnt, index).fingerprint,
+        "reach": places.reach,
+        "half": places.half,
+    }
+    fingerprint = _digest(facts, places.centre, places.readings)
+    return Entry(f"{_cell(learnt, index)}.compiled", fingerprint)
+
+
+def _cell(learnt: Learnt, index: int) -> str:
+    """Return the place of a tile among the others: a map that grows keeps it."""
+    i, j = learnt.tiling.grid.cells[index].tolist()
+    return f"{i}_{j}"
+
+
+def _digest(facts: dict[str, object], *arrays: FloatArray) -> str:
+    shapes = [array.shape for array in arrays]
+    digest = hashlib.sha256(json.dumps([facts, shapes], sort_keys=True).encode())
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array, dtype="<f8").data)
+    return digest.hexdigest()
+
+
+@cache
+def _versions() -> list[str]:
+    """Return the versions of what computes: others may round otherwise."""
+    return [version(name) for name in ("l2m-gtsam", "numpy", "scipy", "numba")]

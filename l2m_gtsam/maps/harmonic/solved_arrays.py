@@ -1,0 +1,114 @@
+"""A solved tile as plain arrays, and back with checks.
+
+Kept is what took long: the posterior, the tile's own scales, and the combinations of moments that
+its readings see. Box, waves and places of sources follow from the map.
+"""
+
+import numpy as np
+from numba import njit
+from pydantic import ValidationError
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.harmonic.dipoles import Dipoles
+from l2m_gtsam.maps.harmonic.evidence import Weights
+from l2m_gtsam.maps.harmonic.frame import TileFrame
+from l2m_gtsam.maps.harmonic.furnish import basis_with
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.kept_arrays import finite
+from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.trained import first_complaint
+from l2m_gtsam.tile_store import Arrays
+
+NAMES = tuple(sorted(Hyperparameters.model_fields))
+
+
+def solved_to_arrays(tile: Tile) -> Arrays:
+    """Return a tile as arrays."""
+    own = tile.hyperparameters
+    dipoles = [family for family in tile.basis.families if isinstance(family, Dipoles)]
+    return {
+        "hyperparameters": np.array([getattr(own, name) for name in NAMES]),
+        "mean": tile.weights.mean,
+        "prior_sigma": tile.weights.prior_sigma,
+        "factor": packed(tile.weights.factor),
+        # By columns, as they lie in memory: products with them are then the same to the last bit.
+        **{f"combinations{k}": each.combinations.T for k, each in enumerate(dipoles)},
+    }
+
+
+def solved_from_arrays(learnt: Learnt, index: int, arrays: Arrays) -> Tile:
+    """Return the tile of a map that ``solved_to_arrays`` took apart.
+
+    Raises
+    ------
+    MapError
+        If an array is missing, of the wrong shape, or makes no sense.
+    """
+    frame = learnt.frame(index)
+    basis = basis_with(frame, learnt.resolution, dipoles_from(learnt, index, frame, arrays))
+    m = len(basis)
+    factor = unpacked(finite(arrays, "factor", (m * (m + 1) // 2,)), m)
+    weights = Weights(finite(arrays, "mean", (m,)), finite(arrays, "prior_sigma", (m,)), factor)
+    if not (factor.diagonal() > 0).all():
+        raise MapError("factor is not that of a covariance")
+    return Tile(basis, weights, hyperparameters_from(arrays), learnt.resolution)
+
+
+def dipoles_from(
+    learnt: Learnt, index: int, frame: TileFrame, arrays: Arrays
+) -> tuple[Dipoles, ...]:
+    """Return the sources of a tile in the combinations that were kept."""
+    return tuple(
+        Dipoles(
+            frame.localise(each.positions),
+            finite(arrays, f"combinations{k}", (None, 3 * len(each))).T,
+            strength,
+        )
+        for k, (each, strength) in enumerate(zip(*learnt.structures(index), strict=True))
+    )
+
+
+def hyperparameters_from(arrays: Arrays) -> Hyperparameters:
+    """Return the scales and depths of a tile."""
+    values = finite(arrays, "hyperparameters", (len(NAMES),))
+    try:
+        return Hyperparameters(**dict(zip(NAMES, values.tolist(), strict=True)))
+    except ValidationError as error:
+        raise MapError(first_complaint(error)) from None
+
+
+def packed(factor: FloatArray) -> FloatArray:
+    """Return the lower triangle of a matrix (m, m), column by column, shape (m (m + 1) / 2,)."""
+    m = len(factor)
+    values = np.empty(m * (m + 1) // 2)
+    write_packed(factor, values)
+    return values
+
+
+def unpacked(values: FloatArray, m: int) -> FloatArray:
+    """Return the matrix (m, m) that ``packed`` took apart, as LAPACK lays it out."""
+    factor = np.zeros((m, m), order="F")
+    write_unpacked(values, factor)
+    return factor
+
+
+@njit(cache=True, nogil=True)
+def write_packed(factor: FloatArray, values: FloatArray) -> None:
+    """Write the lower triangle of a matrix (m, m), column by column."""
+    at = 0
+    for j in range(len(factor)):
+        for i in range(j, len(factor)):
+            values[at] = factor[i, j]
+            at += 1
+
+
+@njit(cache=True, nogil=True)
+def write_unpacked(values: FloatArray, factor: FloatArray) -> None:
+    """Write values, column by column, as the lower triangle of a matrix (m, m)."""
+    at = 0
+    for j in range(len(factor)):
+        for i in range(j, len(factor)):
+            factor[i, j] = values[at]
+            at += 1
