@@ -20,6 +20,7 @@ from l2m_gtsam.graph.moving_solve import MovingProblem, solve_moving
 from l2m_gtsam.graph.named_priors import priors_of
 from l2m_gtsam.graph.one_key import OneKeySolution
 from l2m_gtsam.graph.priors import Priors
+from l2m_gtsam.graph.remembered_map import RememberedMap
 from l2m_gtsam.graph.trust import judged
 from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.joining import drive_at, own_ns
@@ -106,7 +107,8 @@ def calibrated(
     """Calibrate as ``calibrate`` does, and keep what the result rests on, to judge it by."""
     synchronised = prepare(recording, options)
     alive = synchronised.readings.select(~stuck_readings(synchronised.readings))
-    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    compiled = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    solver_map = RememberedMap(compiled)
     priors = priors_of(options.priors, alive.sensors)
     found = _starts(alive, solver_map, options, priors, progress)
     t_start = _start_places(alive.sensors, found, options)

@@ -60,13 +60,9 @@ def optimise(
     optimizer: Optimizer,
     max_iterations: int,
     solver: LinearSolver = LinearSolver.QR,
-    ordering: gtsam.Ordering | None = None,
 ) -> Optimised:
-    """Minimise a graph's error from a start, with at most so many linearisations.
-
-    Variables are eliminated in an ordering; in GTSAM's own choice (COLAMD) without one.
-    """
-    engine = _engine(graph, start, optimizer, max_iterations, solver, ordering)
+    """Minimise a graph's error from a start, with at most so many linearisations."""
+    engine = _engine(graph, start, optimizer, max_iterations, solver)
     try:
         values = engine.optimize()
     except RuntimeError as error:
@@ -82,7 +78,6 @@ def polish(
     values: gtsam.Values,
     steps: int,
     solver: LinearSolver = LinearSolver.QR,
-    ordering: gtsam.Ordering | None = None,
 ) -> Optimised:
     """Take Gauss-Newton steps to where the gradient vanishes, without asking the error.
 
@@ -91,7 +86,7 @@ def polish(
     gradient does not see them. A rise of the error beyond what such steps make is refused.
     """
     params = gtsam.GaussNewtonParams()
-    _limit(params, steps, solver, ordering)
+    _limit(params, steps, solver)
     engine = gtsam.GaussNewtonOptimizer(graph, values, params)
     try:
         for _ in range(steps):
@@ -119,14 +114,13 @@ def _engine(
     optimizer: Optimizer,
     max_iterations: int,
     solver: LinearSolver,
-    ordering: gtsam.Ordering | None,
 ) -> gtsam.NonlinearOptimizer:
     if optimizer is Optimizer.GN:
         gauss_newton = gtsam.GaussNewtonParams()
-        _limit(gauss_newton, max_iterations, solver, ordering)
+        _limit(gauss_newton, max_iterations, solver)
         return gtsam.GaussNewtonOptimizer(graph, start, gauss_newton)
     levenberg = gtsam.LevenbergMarquardtParams()
-    _limit(levenberg, max_iterations, solver, ordering)
+    _limit(levenberg, max_iterations, solver)
     return gtsam.LevenbergMarquardtOptimizer(graph, start, levenberg)
 
 
@@ -134,11 +128,8 @@ def _limit(
     params: gtsam.NonlinearOptimizerParams,
     max_iterations: int,
     solver: LinearSolver,
-    ordering: gtsam.Ordering | None,
 ) -> None:
     params.setMaxIterations(max_iterations)
     params.setRelativeErrorTol(TOLERANCE)
     params.setAbsoluteErrorTol(TOLERANCE)
     params.setLinearSolverType(solver.value)
-    if ordering is not None:
-        params.setOrdering(ordering)

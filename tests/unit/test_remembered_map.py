@@ -1,0 +1,60 @@
+"""A map that is asked for no place twice."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from l2m_gtsam.data import FieldSample, FloatArray
+from l2m_gtsam.graph import remembered_map
+from l2m_gtsam.graph.coverage import UncertainMap
+from l2m_gtsam.graph.remembered_map import RememberedMap
+from tests.worlds import dipole_world
+
+
+class Counting:
+    """A world with a made-up variance that counts the places it is asked for."""
+
+    def __init__(self) -> None:
+        self.world, self.asked = dipole_world(1), 0
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        return self.world.field_and_gradient(points)
+
+    def query(self, points: FloatArray, /) -> FieldSample:
+        self.asked += len(points)
+        field, gradient = self.world.field_and_gradient(points)
+        return FieldSample(field, gradient, points**2, points[:, 0] > 0)
+
+
+@settings(max_examples=30)
+@given(rows=st.lists(st.lists(st.integers(0, 30), max_size=20), min_size=1, max_size=6))
+def test_answers_are_the_maps_own_and_places_are_asked_once(rows: list[list[int]]) -> None:
+    """Any order, any repetition, also within one question, to the last bit."""
+    places = np.random.default_rng(0).normal(size=(31, 3))
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    for chosen in rows:
+        at = places[np.array(chosen, dtype=np.int64)]
+        found, own = remembered.query(at), Counting().query(at)
+        for name in ("field", "gradient", "variance", "inside"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(own, name))
+        asked = counting.asked
+        remembered.query(at)
+        assert counting.asked == asked
+
+
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond it all is forgotten, and answers stay right."""
+    monkeypatch.setattr(remembered_map, "MOST", 10)
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    places = np.random.default_rng(0).normal(size=(12, 3))
+    for at in (places[:8], places[4:], places[:8]):
+        np.testing.assert_array_equal(remembered.query(at).variance, at**2)
+    assert counting.asked == 24
+
+
+def test_it_knows_of_errors_what_the_map_does() -> None:
+    """A map that does not know how its errors are correlated does not learn it so."""
+    assert not isinstance(RememberedMap(Counting()), UncertainMap)
