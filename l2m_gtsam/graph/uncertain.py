@@ -238,6 +238,11 @@ class WeightsPrior:
     graph: gtsam.NonlinearFactorGraph
     information: FloatArray
 
+    @property
+    def sizes(self) -> dict[int, int]:
+        """Number of weights of each key."""
+        return self.coverage.sizes
+
     @classmethod
     def of(cls, coverage: Coverage) -> "WeightsPrior":
         """Return the prior of the weights of a coverage."""
@@ -306,22 +311,22 @@ class UncertainProblem:
             )
         ]
         self._sensor_priors = prior_graph(estimate, {s: tests[s] for s in view.sensors})
-        self._graph = gtsam.NonlinearFactorGraph()
+        self.graph = gtsam.NonlinearFactorGraph()
         for readings in self._groups:
-            self._graph.push_back(_factors(readings, factors))
-        self._graph.push_back(prior.graph)
-        self._graph.push_back(self._sensor_priors)
+            self.graph.push_back(_factors(readings, factors))
+        self.graph.push_back(prior.graph)
+        self.graph.push_back(self._sensor_priors)
 
     def descend(
         self, values: gtsam.Values, options: OneKeyOptions, solver: LinearSolver
     ) -> Optimised:
         """Minimise the cost."""
         optimizer, most = options.optimizer, options.joint_iterations
-        return optimise(self._graph, values, optimizer, most, solver)
+        return optimise(self.graph, values, optimizer, most, solver)
 
     def polish(self, values: gtsam.Values, solver: LinearSolver) -> Optimised:
         """Take another step, which a descent leaves out as too short."""
-        return polish(self._graph, values, POLISHING_STEPS, solver)
+        return polish(self.graph, values, POLISHING_STEPS, solver)
 
     def linearised(self, values: gtsam.Values) -> JointInformation:
         """Return all variables together, linearised at some values."""
@@ -357,7 +362,7 @@ class UncertainProblem:
     ) -> tuple[SensorSolution, ...]:
         """Return covariance and figures of every sensor."""
         residual, sensors = self._residuals(values), tuple(self._view.sensors)
-        linear = self._graph.linearize(values)
+        linear = self.graph.linearize(values)
         among = joint_covariance(linear, values, joint.among)
         missed = contradictions(self._known, values, among)
         every = among(sensors)

@@ -13,7 +13,7 @@ from l2m_gtsam.graph.pose_errors import pose_seconds
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.solve.alterations import against_calibration, changes_of
 from tests.calibrations import SIGMA
-from tests.integration.test_uncertain_calibration import GIVEN, NOISE, OPTIONS, WORLD, small_sensors
+from tests.uncertain_drives import GIVEN, NOISE, OPTIONS, WORLD, small_sensors
 
 SENSOR = small_sensors(1)[0]
 COUNT = 60

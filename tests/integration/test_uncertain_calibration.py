@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import block_diag, eigh
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.coverage import UncertainMap
@@ -16,63 +16,34 @@ from l2m_gtsam.graph.priors import Difference, Priors
 from l2m_gtsam.graph.view import observe
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.results import Uncertainty
-from tests.worlds import DipoleWorld, dipole_world, random_sensors
+from tests.uncertain_drives import (
+    CALM,
+    GIVEN,
+    NOISE,
+    OPTIONS,
+    SENSORS,
+    STARTS,
+    WORLD,
+    surveyed_map,
+    turning_drive,
+)
+from tests.worlds import DipoleWorld
 
-NOISE = 0.1
-GIVEN = Hyperparameters(
-    floor_scale=6.0, floor_depth=0.7, ceiling_scale=2.0, ceiling_depth=1.4, noise=0.2
-)
-CALM = dipole_world(1)
-WORLD = DipoleWorld(CALM.uniform, CALM.positions, 4 * CALM.moments)
-OPTIONS = HarmonicOptions(
-    hyperparameters=GIVEN, search=SearchOptions(rounds=0), modes=200, mode_share=0.5
-)
 FULL, INDEPENDENT = (
     OneKeyOptions(uncertainty=kind, sensor_noise_ut=NOISE)
     for kind in (Uncertainty.FULL, Uncertainty.INDEPENDENT)
 )
 
 
-def small_sensors(count: int) -> tuple[KnownSensor, ...]:
-    """Sensors within 0.2 m of the lidar."""
-    return tuple(
-        KnownSensor(s.sensor, 0.3 * s.t_lidar_mag, s.distortion) for s in random_sensors(3, count)
-    )
-
-
-SENSORS = small_sensors(2)
-STARTS = np.stack([s.t_lidar_mag for s in SENSORS]) + 0.05
-
-
 @pytest.fixture(scope="module")
 def field_map() -> HarmonicMap:
-    """A survey of 700 readings in nine tiles and more."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform([-1.5, -1.5, 0.2], [1.5, 1.5, 0.8], (700, 3))
-    field = WORLD.field_and_gradient(points)[0] + rng.normal(0, GIVEN.noise, points.shape)
-    return HarmonicMap.fit(points, field, OPTIONS)
+    return surveyed_map()
 
 
 @pytest.fixture(scope="module")
 def readings() -> Readings:
-    """A drive over all of the survey, turning, tilting and heaving; 150 readings each."""
-    rng, count = np.random.default_rng(1), 150
-    N = count * len(SENSORS)
-    angles = np.column_stack([rng.uniform(-np.pi, np.pi, N), rng.normal(0, 0.15, (N, 2))])
-    R = Rotation.from_euler("ZYX", angles).as_matrix()
-    p = np.column_stack([rng.uniform(-1.1, 1.1, (N, 2)), rng.uniform(0.4, 0.6, N)])
-    sensor = np.repeat(np.arange(len(SENSORS)), count)
-    t = np.stack([s.t_lidar_mag for s in SENSORS])[sensor]
-    B, _ = WORLD.field_and_gradient(np.einsum("nij,nj->ni", R, t) + p)
-    b = np.einsum("nji,nj->ni", R, B)
-    measured = [s.distortion.apply(b[sensor == i]) for i, s in enumerate(SENSORS)]
-    field = np.concatenate(measured) + rng.normal(0, NOISE, (N, 3))
-    stamps = np.tile(np.arange(count) * 50_000_000, len(SENSORS))
-    return Readings(tuple(s.sensor for s in SENSORS), sensor, stamps, R, p, field)
+    return turning_drive()
 
 
 @pytest.fixture(scope="module")

@@ -15,14 +15,12 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.pose_noise import PoseNoiseOptions
 from l2m_gtsam.solve.robust import Loss, RobustOptions
 from tests.integration.test_uncertain_calibration import (
-    NOISE,
-    SENSORS,
-    STARTS,
     all_features,
     dense_rows,
     field_map,
     readings,
 )
+from tests.uncertain_drives import NOISE, SENSORS, STARTS
 
 __all__ = ["field_map", "readings"]  # fixtures
 
