@@ -13,6 +13,7 @@ MODULES = (
     "global_start",
     "one_key",
     "map_uncertainty",
+    "last_stage",
     "online_localisation",
     "slam_engine",
 )

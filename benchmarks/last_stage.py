@@ -1,0 +1,142 @@
+"""The last graph of a calibration: GTSAM beside the block elimination that it replaced.
+
+One round each: descent, degrees of freedom of all sensors, covariances. The old engine took two
+Gauss-Newton steps; both start where sensors are to within millimetres, without any error of the
+map. Processor seconds, one BLAS thread, growth with the readings and with the sensors.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import gtsam
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.one_key import NOISE, hall, survey
+from l2m_factors import map_weights_prior
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.graph.alternation import OneKeyOptions, start_estimate
+from l2m_gtsam.graph.calibration import Estimate, FactorForm
+from l2m_gtsam.graph.joint import joint_problem
+from l2m_gtsam.graph.optimise import LinearSolver
+from l2m_gtsam.graph.uncertain import UncertainDrive, UncertainProblem, starting_values
+from l2m_gtsam.graph.view import observe
+from l2m_gtsam.maps.harmonic.compiled import CompiledMap
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.threads import one_blas_thread
+from tests.reference.elimination import Eliminated, eliminate
+from tests.worlds import drive, random_sensors
+
+OPTIONS = OneKeyOptions()
+GROWTH = ((12, 2_000), (12, 8_000), (1, 2_000), (4, 2_000), (48, 2_000))  # sensors, readings
+POSE_SIGMA = (0.002, 0.002)  # rad and m: knots take part
+OLD_STEPS = 2
+
+
+@dataclass(frozen=True)
+class Case:
+    """The last graph of one drive, and where it starts; ``rows`` has the prior as rows."""
+
+    problem: UncertainProblem
+    rows: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    sizes: dict[int, int]
+    sensors: list[int]
+
+    def old_round(self) -> list[FloatArray]:
+        """Return covariances after the steps and the noise of the old engine."""
+        values = self.values
+        for _ in range(OLD_STEPS):
+            values = self.eliminated(values).stepped(values, self.sizes)
+        system = self.eliminated(values)
+        for sensor in self.sensors:
+            system.taken(sensor)
+        return [system.covariance(sensor) for sensor in self.sensors]
+
+    def round(self) -> list[FloatArray]:
+        """Return covariances after a descent, degrees of freedom and marginals by GTSAM."""
+        values = self.problem.descend(self.values, OPTIONS, LinearSolver.CHOLESKY).values
+        joint = self.problem.linearised(values)
+        return [each.joint_covariance for each in self.problem.solutions(joint, values)]
+
+    def eliminated(self, values: gtsam.Values) -> Eliminated:
+        """Return the old engine's solution of the linear graph."""
+        return eliminate(self.rows.linearize(values), self.sensors, self.sizes)
+
+    def old_covariances(self) -> list[FloatArray]:
+        """Return covariances by the old engine, linearised where the graph starts."""
+        system = self.eliminated(self.values)
+        return [system.covariance(sensor) for sensor in self.sensors]
+
+    def marginals(self) -> gtsam.Marginals:
+        """Return GTSAM's."""
+        return gtsam.Marginals(self.problem.graph.linearize(self.values), self.values)
+
+
+def case(field_map: CompiledMap, count: int, each: int) -> Case:
+    """Return the graph of so many sensors with so many readings each."""
+    world, sensors = hall(1), random_sensors(1, count)
+    readings = drive(2, sensors, world, count=each, noise=NOISE)
+    root = np.diag(np.repeat(POSE_SIGMA, 3))
+    readings = replace(readings, pose_root=np.broadcast_to(root, (len(readings), 6, 6)))
+    start = start_estimate(np.stack([s.t_lidar_mag for s in sensors]), OPTIONS)
+    truth = np.stack([s.distortion.vector() for s in sensors])
+    estimate: Estimate = replace(start, distortion=truth, noise=np.full(count, NOISE))
+    view = observe(readings, field_map, estimate, OPTIONS.min_readings)
+    tests = joint_problem(view, field_map, estimate, OPTIONS).determinacies
+    drive_ = UncertainDrive.of(view, field_map, field_map, estimate, OPTIONS)
+    problem = UncertainProblem(drive_, estimate, tests, FactorForm.BLOCK)
+    coverage = drive_.prior.coverage
+    rows = gtsam.NonlinearFactorGraph()
+    information = drive_.prior.graph.at(0)
+    for index in range(problem.graph.size()):
+        factor = problem.graph.at(index)
+        if set(factor.keys()) != set(information.keys()):
+            rows.add(factor)
+    rows.add(map_weights_prior(coverage.tiles, coverage.root_information))
+    values = starting_values(estimate, view.sensors, coverage)
+    return Case(problem, rows, values, coverage.sizes, view.sensors)
+
+
+def seconds(work: Callable[[], object], repeats: int = 3) -> float:
+    """Return the shortest processor time of several runs."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        work()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
+@one_blas_thread()
+def report() -> Table:
+    """Return what a round and the covariances cost, old and new."""
+    data = survey(hall(1), 8000)
+    field_map = HarmonicMap.fit(data.points, data.field).compile()
+    columns = ("old round (s)", "GTSAM's (s)", "ratio", "old covariances (s)", "Marginals (s)")
+    table = Table("sensors x readings", "weights", *columns, "ratio")
+    for count, each in GROWTH:
+        now = case(field_map, count, each)
+        now.round()  # tiles are compiled when first asked
+        old, new, old_part, new_part = (
+            seconds(partial(work))
+            for work in (now.old_round, now.round, now.old_covariances, now.marginals)
+        )
+        table.add_row(
+            f"{count} x {each:,}",
+            f"{sum(now.sizes.values()):,}",
+            f"{old:.2f}",
+            f"{new:.2f}",
+            f"{old / new:.2f}",
+            f"{old_part:.2f}",
+            f"{new_part:.2f}",
+            f"{old_part / new_part:.2f}",
+        )
+    return table
+
+
+if __name__ == "__main__":
+    Console().print(report())
