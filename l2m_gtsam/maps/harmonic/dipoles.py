@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.family import WeightPrior
+from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 
 SOFT = 1e-3  # metres
@@ -48,8 +48,15 @@ class Dipoles:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each combination; see ``Family``."""
-        moments = moment_features(points, self.positions).reshape(3 * len(points), -1)
-        return np.asarray(moments @ self.combinations).reshape(len(points), 3, -1)
+        return features_of(self, points)
+
+    def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
+        """Write the field of so many units of each combination; see ``Family``."""
+        moments = np.empty((3 * len(self.positions), 3, len(points)))
+        write_moment_rows(points, self.positions, moments)
+        mixed = (self.combinations * units).T
+        flat = len(moments), 3 * len(points)
+        np.matmul(mixed, moments.reshape(flat), out=rows.reshape(len(rows), flat[1]))
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
@@ -110,3 +117,29 @@ def fill_moment_features(points: FloatArray, sources: FloatArray, out: FloatArra
                 along = 3.0 * cube * inverse * r[i]
                 for j in range(3):
                     out[n, i, 3 * k + j] = along * r[j] - (cube if i == j else 0.0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def write_moment_rows(points: FloatArray, sources: FloatArray, rows: FloatArray) -> None:
+    """Write the field of unit moments, one moment after the other, shape (3 K, 3, N)."""
+    # Point after point in the inner loops: they run in vector registers.
+    count = len(points)
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    r, fifth, cube = np.empty((3, count)), np.empty(count), np.empty(count)
+    for k in range(len(sources)):
+        a, b, c = sources[k, 0], sources[k, 1], sources[k, 2]
+        for n in range(count):
+            r[0, n], r[1, n], r[2, n] = x[n] - a, y[n] - b, z[n] - c
+            square = r[0, n] * r[0, n] + r[1, n] * r[1, n] + r[2, n] * r[2, n]
+            inverse = 1.0 / max(square, SOFT * SOFT)
+            cube[n] = inverse * np.sqrt(inverse)
+            fifth[n] = 3.0 * cube[n] * inverse
+        for j in range(3):
+            for i in range(3):
+                row = rows[3 * k + j, i]
+                if i == j:
+                    for n in range(count):
+                        row[n] = fifth[n] * r[i, n] * r[j, n] - cube[n]
+                else:
+                    for n in range(count):
+                        row[n] = fifth[n] * r[i, n] * r[j, n]

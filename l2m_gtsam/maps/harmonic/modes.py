@@ -18,9 +18,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.family import WeightPrior
+from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 
 FLOOR, CEILING = "floor", "ceiling"
@@ -91,6 +92,21 @@ class Modes:
         )
 
     @cached_property
+    def _growths(self) -> tuple[FloatArray, IntArray]:
+        """Different growths with height in 1/m, shape (d,), and which a mode has, shape (m,)."""
+        kz, which = np.unique(self.kz, return_inverse=True)
+        return kz, which
+
+    def _tables(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return cosines and sines along x, then along y, by half waves, shapes (p, N), (q, N)."""
+        most = self.numbers.max(axis=0) + 1
+        x, y = (
+            np.arange(most[axis])[:, None] * (np.pi * points[:, axis] / self.size[axis])
+            for axis in (0, 1)
+        )
+        return np.cos(x), np.sin(x), np.cos(y), np.sin(y)
+
+    @cached_property
     def _log_share(self) -> FloatArray:
         """Logarithm of a mode's share in the box, shape (m,)."""
         share = np.where((self.numbers == 0).any(axis=1), 2.0, 4.0) / np.prod(self.size)
@@ -98,12 +114,14 @@ class Modes:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each mode; see ``Family``."""
-        waves = self._waves(points)
-        F = np.empty((len(points), 3, len(self)))
-        np.multiply(waves.sc, -self.kx, out=F[:, 0])
-        np.multiply(waves.cs, -self.ky, out=F[:, 1])
-        np.multiply(waves.cc, self.kz, out=F[:, 2])
-        return F
+        return features_of(self, points)
+
+    def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
+        """Write the field of so many units of each mode; see ``Family``."""
+        kz, which = self._growths
+        growth = np.exp(kz[:, None] * (points[:, 2] - self.z))
+        factors = np.stack([-self.kx, -self.ky, self.kz]) * units
+        write_wave_rows(*self._tables(points), self.numbers, growth, which, factors, rows)
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
@@ -150,6 +168,43 @@ class Modes:
         cx *= e
         sx *= e
         return Waves(cx * cy, sx * cy, cx * sy, sx * sy)
+
+
+@njit(cache=True, nogil=True)
+def write_wave_rows(
+    cos_x: FloatArray,
+    sin_x: FloatArray,
+    cos_y: FloatArray,
+    sin_y: FloatArray,
+    numbers: IntArray,
+    growth: FloatArray,
+    which: IntArray,
+    factors: FloatArray,
+    rows: FloatArray,
+) -> None:
+    """Write the field of modes, one mode after the other.
+
+    Parameters
+    ----------
+    cos_x, sin_x, cos_y, sin_y
+        By half waves and points, shapes (p, N) and (q, N).
+    numbers
+        Half waves of each mode, shape (m, 2).
+    growth, which
+        Exponentials by growth and points, shape (d, N), and which of them a mode has, shape (m,).
+    factors
+        Of each mode's field along x, y and z, shape (3, m).
+    rows
+        Shape (m, 3, N).
+    """
+    for m in range(len(numbers)):
+        p, q = numbers[m, 0], numbers[m, 1]
+        cx, sx, cy, sy, e = cos_x[p], sin_x[p], cos_y[q], sin_y[q], growth[which[m]]
+        by_x, by_y, by_z = rows[m, 0], rows[m, 1], rows[m, 2]
+        ax, ay, az = factors[0, m], factors[1, m], factors[2, m]
+        for n in range(len(e)):
+            c, s = cx[n] * e[n], sx[n] * e[n]
+            by_x[n], by_y[n], by_z[n] = s * cy[n] * ax, c * sy[n] * ay, c * cy[n] * az
 
 
 def modes_up_to(side: str, size: FloatArray, z: float, k_max: float) -> Modes:
