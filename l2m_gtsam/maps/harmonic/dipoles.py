@@ -12,10 +12,9 @@ import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.dipole_sum import SOFT, add_dipoles
 from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-
-SOFT = 1e-3  # metres
 
 
 @dataclass(frozen=True)
@@ -62,36 +61,20 @@ class Dipoles:
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient; see ``Family``."""
-        m = self.moments(weights)
-        r, inverse, cube = separations(points, self.positions)
-        fifth = 3 * cube * inverse
-        mr = np.einsum("nki,ki->nk", r, m)
-        pull = mr * fifth
-        field = np.einsum("nki,nk->ni", r, pull) - cube @ m
-        mixed = np.einsum("nki,nk->nik", r, fifth) @ m
-        outer = r.transpose(0, 2, 1) @ (r * (-5 * pull * inverse)[..., None])
-        gradient = mixed + mixed.transpose(0, 2, 1) + outer
-        gradient[:, range(3), range(3)] += pull.sum(axis=1)[:, None]
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        add_dipoles(points, self.positions, self.moments(weights), field, gradient)
         return field, gradient
 
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential; see ``Family``."""
-        r, _, cube = separations(points, self.positions)
-        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), cube))
+        r = points[:, None, :] - self.positions
+        # At a source itself the potential is not finite; a map must be.
+        square = np.maximum(np.einsum("nki,nki->nk", r, r), SOFT**2)
+        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), square**-1.5))
 
     def moments(self, weights: FloatArray) -> FloatArray:
         """Return the moments of the sources in uT m^3, shape (K, 3)."""
         return np.asarray((self.combinations @ weights).reshape(-1, 3))
-
-
-def separations(
-    points: FloatArray, sources: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return vectors r (N, K, 3) from sources to points in metres, and r^-2 and r^-3, (N, K)."""
-    r = points[:, None, :] - sources
-    # At a source itself the field is not finite; a map must be.
-    inverse = 1.0 / np.maximum(np.einsum("nki,nki->nk", r, r), SOFT**2)
-    return r, inverse, inverse * np.sqrt(inverse)
 
 
 def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:

@@ -15,26 +15,17 @@ has the covariance ``s^2 (2h)^3 / sqrt(rho^2 + (z + z' + 2h)^2)`` at horizontal 
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
-from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.wave_rows import write_wave_rows
+from l2m_gtsam.maps.harmonic.wave_sum import add_waves
 
 FLOOR, CEILING = "floor", "ceiling"
-
-
-@dataclass(frozen=True)
-class Waves:
-    """Products of the modes' factors at N points, each of shape (N, m)."""
-
-    cc: FloatArray
-    sc: FloatArray
-    cs: FloatArray
-    ss: FloatArray
 
 
 @dataclass(frozen=True)
@@ -127,18 +118,17 @@ class Modes:
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient; see ``Family``."""
-        waves, kx, ky, kz = self._waves(points), self.kx, self.ky, self.kz
-        w = weights
-        by_z, xx, yy = (waves.cc @ np.column_stack([kz * w, -kx * kx * w, -ky * ky * w])).T
-        by_x, xz = (waves.sc @ np.column_stack([-kx * w, -kx * kz * w])).T
-        by_y, yz = (waves.cs @ np.column_stack([-ky * w, -ky * kz * w])).T
-        xy = waves.ss @ (kx * ky * w)
-        gradient = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, -xx - yy], axis=-1)
-        return np.stack([by_x, by_y, by_z], axis=-1), gradient.reshape(-1, 3, 3)
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        steps = np.pi / self.size
+        add_waves(points, steps, self.z, self.numbers, self.kz, weights, field, gradient)
+        return field, gradient
 
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential; see ``Family``."""
-        return np.asarray(self._waves(points).cc @ weights)
+        cos_x, _, cos_y, _ = self._tables(points)
+        p, q = self.numbers.T
+        growth = np.exp(self.kz[:, None] * (points[:, 2] - self.z))
+        return np.asarray(weights @ (cos_x[p] * cos_y[q] * growth))
 
     def potential_on(
         self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
@@ -155,65 +145,23 @@ class Modes:
         along_y = (cos_y @ table).reshape(most[0], -1)
         return np.asarray((cos_x @ along_y).reshape(len(x), len(y), len(z)))
 
-    def _waves(self, points: FloatArray) -> Waves:
-        most = self.numbers.max(axis=0) + 1
-        phase_x, phase_y = (
-            np.pi * points[:, axis, None] / self.size[axis] * np.arange(most[axis])
-            for axis in (0, 1)
-        )
-        e = np.exp((points[:, 2] - self.z)[:, None] * self.kz)
-        p, q = self.numbers.T
-        cx, sx = np.cos(phase_x).take(p, axis=1), np.sin(phase_x).take(p, axis=1)
-        cy, sy = np.cos(phase_y).take(q, axis=1), np.sin(phase_y).take(q, axis=1)
-        cx *= e
-        sx *= e
-        return Waves(cx * cy, sx * cy, cx * sy, sx * sy)
-
-
-@njit(cache=True, nogil=True)
-def write_wave_rows(
-    cos_x: FloatArray,
-    sin_x: FloatArray,
-    cos_y: FloatArray,
-    sin_y: FloatArray,
-    numbers: IntArray,
-    growth: FloatArray,
-    which: IntArray,
-    factors: FloatArray,
-    rows: FloatArray,
-) -> None:
-    """Write the field of modes, one mode after the other.
-
-    Parameters
-    ----------
-    cos_x, sin_x, cos_y, sin_y
-        By half waves and points, shapes (p, N) and (q, N).
-    numbers
-        Half waves of each mode, shape (m, 2).
-    growth, which
-        Exponentials by growth and points, shape (d, N), and which of them a mode has, shape (m,).
-    factors
-        Of each mode's field along x, y and z, shape (3, m).
-    rows
-        Shape (m, 3, N).
-    """
-    for m in range(len(numbers)):
-        p, q = numbers[m, 0], numbers[m, 1]
-        cx, sx, cy, sy, e = cos_x[p], sin_x[p], cos_y[q], sin_y[q], growth[which[m]]
-        by_x, by_y, by_z = rows[m, 0], rows[m, 1], rows[m, 2]
-        ax, ay, az = factors[0, m], factors[1, m], factors[2, m]
-        for n in range(len(e)):
-            c, s = cx[n] * e[n], sx[n] * e[n]
-            by_x[n], by_y[n], by_z[n] = s * cy[n] * ax, c * sy[n] * ay, c * cy[n] * az
-
 
 def modes_up_to(side: str, size: FloatArray, z: float, k_max: float) -> Modes:
     """Return all modes of a box whose wave number does not exceed ``k_max`` in 1/m."""
+    return Modes(side, size, z, half_waves(float(size[0]), float(size[1]), k_max))
+
+
+@lru_cache(maxsize=8)  # the tiles of a map have boxes of one size
+def half_waves(along_x: float, along_y: float, k_max: float) -> IntArray:
+    """Return the half waves of all modes of a box of these edges in metres, shape (m, 2)."""
+    size = np.array([along_x, along_y])
     highest = np.floor(k_max * size / np.pi).astype(np.int64)
     p, q = np.meshgrid(np.arange(highest[0] + 1), np.arange(highest[1] + 1), indexing="ij")
     k = np.pi * np.hypot(p / size[0], q / size[1])
     chosen = (k <= k_max) & (k > 0)
-    return Modes(side, size, z, np.column_stack([p[chosen], q[chosen]]))
+    numbers = np.column_stack([p[chosen], q[chosen]])
+    numbers.setflags(write=False)
+    return numbers
 
 
 def left_out(scale: float, depth: float, k_max: float, away: FloatArray) -> FloatArray:
