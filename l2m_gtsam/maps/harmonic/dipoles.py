@@ -79,27 +79,9 @@ class Dipoles:
 
 def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:
     """Return the field of unit moments at sources, source by source, shape (N, 3, 3 K)."""
-    T = np.empty((len(points), 3, 3 * len(sources)))
-    fill_moment_features(np.ascontiguousarray(points), np.ascontiguousarray(sources), T)
-    return T
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def fill_moment_features(points: FloatArray, sources: FloatArray, out: FloatArray) -> None:
-    """Write the field of unit moments, shape (N, 3, 3 K)."""
-    r = np.empty(3)
-    for n in range(len(points)):
-        for k in range(len(sources)):
-            square = 0.0
-            for i in range(3):
-                r[i] = points[n, i] - sources[k, i]
-                square += r[i] * r[i]
-            inverse = 1.0 / max(square, SOFT * SOFT)
-            cube = inverse * np.sqrt(inverse)
-            for i in range(3):
-                along = 3.0 * cube * inverse * r[i]
-                for j in range(3):
-                    out[n, i, 3 * k + j] = along * r[j] - (cube if i == j else 0.0)
+    rows = np.empty((3 * len(sources), 3, len(points)))
+    write_moment_rows(points, sources, rows)
+    return np.ascontiguousarray(rows.transpose(2, 1, 0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
