@@ -123,6 +123,16 @@ class FieldMap(Protocol):
         ...
 
 
+def unknown(count: int) -> FieldSample:
+    """Return the sample of so many points without data nearby."""
+    return FieldSample(
+        np.full((count, 3), np.nan),
+        np.full((count, 3, 3), np.nan),
+        np.full((count, 3), np.inf),
+        np.zeros(count, dtype=np.bool_),
+    )
+
+
 def masked(sample: FieldSample) -> FieldSample:
     """Return a sample that says nothing where the map has no data: NaN and infinite variance."""
     inside = sample.inside

@@ -9,7 +9,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.family import Family, WeightPrior
-from l2m_gtsam.maps.harmonic.frame import TileFrame
+from l2m_gtsam.maps.harmonic.frame import TileFrame, turn_rows
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 
 BATCH = 512  # points whose features are in memory, and about in cache, at once
@@ -53,13 +53,31 @@ class Basis:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each weight in the map frame, uT per unit, shape (N, 3, m)."""
+        return np.ascontiguousarray(self.rows(points, np.ones(len(self))).transpose(2, 1, 0))
+
+    def rows(self, points: FloatArray, units: FloatArray) -> FloatArray:
+        """Return the field in uT that so many units of each weight make, weight by weight.
+
+        Parameters
+        ----------
+        points
+            In the map frame in metres, shape (N, 3).
+        units
+            Shape (m,).
+
+        Returns
+        -------
+        FloatArray
+            Along the axes of the map frame, shape (m, 3, N): a weight's numbers lie together, as
+            solves with the factor of their covariance want them.
+        """
         local = self.frame.localise(points)
-        F = np.empty((len(points), 3, len(self)))
+        rows = np.empty((len(self), 3, len(points)))
         for columns, family in zip(self.columns, self.families, strict=True):
-            F[:, :, columns] = family.features(local)
-        if np.array_equal(self.frame.R_map_tile, np.eye(3)):
-            return F
-        return np.asarray(np.einsum("ij,njm->nim", self.frame.R_map_tile, F, optimize=True))
+            family.write_rows(local, units[columns], rows[columns])
+        if not np.array_equal(self.frame.R_map_tile, np.eye(3)):
+            turn_rows(self.frame.R_map_tile, rows)
+        return rows
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray

@@ -59,8 +59,12 @@ class ExactMap(Protocol):
         """Figures of the map."""
         ...
 
-    def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
-        """Return what is known at points with this field and gradient."""
+    def sample(
+        self,
+        points: FloatArray,
+        answers: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
+    ) -> FieldSample:
+        """Return what is known at points, given who answers for those near a reading."""
         ...
 
     def variance(self, points: FloatArray) -> FloatArray:
@@ -187,8 +191,9 @@ class CompiledMap:
 
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
-        points = checked_points(points)
-        return self.exact.sample(points, *self.field_and_gradient(points))
+        return self.exact.sample(
+            points, lambda near: (*self.field_and_gradient(near), self.variance(near))
+        )
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""

@@ -1,6 +1,7 @@
 """A tile made fast: its smooth part on a grid, its near sources one by one."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -61,7 +62,7 @@ class CompiledTile:
     near: NearSources
     terms: TermSum
 
-    @property
+    @cached_property  # added up over all tiles whenever one is made
     def nbytes(self) -> int:
         """Memory in bytes."""
         return self.grid.coefficients.nbytes + self.near.nbytes + self.terms.nbytes

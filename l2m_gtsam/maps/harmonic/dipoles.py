@@ -12,10 +12,9 @@ import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.family import WeightPrior
+from l2m_gtsam.maps.harmonic.dipole_sum import SOFT, add_dipoles
+from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-
-SOFT = 1e-3  # metres
 
 
 @dataclass(frozen=True)
@@ -48,65 +47,64 @@ class Dipoles:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each combination; see ``Family``."""
-        moments = moment_features(points, self.positions).reshape(3 * len(points), -1)
-        return np.asarray(moments @ self.combinations).reshape(len(points), 3, -1)
+        return features_of(self, points)
+
+    def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
+        """Write the field of so many units of each combination; see ``Family``."""
+        moments = np.empty((3 * len(self.positions), 3, len(points)))
+        write_moment_rows(points, self.positions, moments)
+        mixed = (self.combinations * units).T
+        flat = len(moments), 3 * len(points)
+        np.matmul(mixed, moments.reshape(flat), out=rows.reshape(len(rows), flat[1]))
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient; see ``Family``."""
-        m = self.moments(weights)
-        r, inverse, cube = separations(points, self.positions)
-        fifth = 3 * cube * inverse
-        mr = np.einsum("nki,ki->nk", r, m)
-        pull = mr * fifth
-        field = np.einsum("nki,nk->ni", r, pull) - cube @ m
-        mixed = np.einsum("nki,nk->nik", r, fifth) @ m
-        outer = r.transpose(0, 2, 1) @ (r * (-5 * pull * inverse)[..., None])
-        gradient = mixed + mixed.transpose(0, 2, 1) + outer
-        gradient[:, range(3), range(3)] += pull.sum(axis=1)[:, None]
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        add_dipoles(points, self.positions, self.moments(weights), field, gradient)
         return field, gradient
 
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential; see ``Family``."""
-        r, _, cube = separations(points, self.positions)
-        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), cube))
+        r = points[:, None, :] - self.positions
+        # At a source itself the potential is not finite; a map must be.
+        square = np.maximum(np.einsum("nki,nki->nk", r, r), SOFT**2)
+        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), square**-1.5))
 
     def moments(self, weights: FloatArray) -> FloatArray:
         """Return the moments of the sources in uT m^3, shape (K, 3)."""
         return np.asarray((self.combinations @ weights).reshape(-1, 3))
 
 
-def separations(
-    points: FloatArray, sources: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return vectors r (N, K, 3) from sources to points in metres, and r^-2 and r^-3, (N, K)."""
-    r = points[:, None, :] - sources
-    # At a source itself the field is not finite; a map must be.
-    inverse = 1.0 / np.maximum(np.einsum("nki,nki->nk", r, r), SOFT**2)
-    return r, inverse, inverse * np.sqrt(inverse)
-
-
 def moment_features(points: FloatArray, sources: FloatArray) -> FloatArray:
     """Return the field of unit moments at sources, source by source, shape (N, 3, 3 K)."""
-    T = np.empty((len(points), 3, 3 * len(sources)))
-    fill_moment_features(np.ascontiguousarray(points), np.ascontiguousarray(sources), T)
-    return T
+    rows = np.empty((3 * len(sources), 3, len(points)))
+    write_moment_rows(points, sources, rows)
+    return np.ascontiguousarray(rows.transpose(2, 1, 0))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fill_moment_features(points: FloatArray, sources: FloatArray, out: FloatArray) -> None:
-    """Write the field of unit moments, shape (N, 3, 3 K)."""
-    r = np.empty(3)
-    for n in range(len(points)):
-        for k in range(len(sources)):
-            square = 0.0
-            for i in range(3):
-                r[i] = points[n, i] - sources[k, i]
-                square += r[i] * r[i]
+def write_moment_rows(points: FloatArray, sources: FloatArray, rows: FloatArray) -> None:
+    """Write the field of unit moments, one moment after the other, shape (3 K, 3, N)."""
+    # Point after point in the inner loops: they run in vector registers.
+    count = len(points)
+    x, y, z = points[:, 0].copy(), points[:, 1].copy(), points[:, 2].copy()
+    r, fifth, cube = np.empty((3, count)), np.empty(count), np.empty(count)
+    for k in range(len(sources)):
+        a, b, c = sources[k, 0], sources[k, 1], sources[k, 2]
+        for n in range(count):
+            r[0, n], r[1, n], r[2, n] = x[n] - a, y[n] - b, z[n] - c
+            square = r[0, n] * r[0, n] + r[1, n] * r[1, n] + r[2, n] * r[2, n]
             inverse = 1.0 / max(square, SOFT * SOFT)
-            cube = inverse * np.sqrt(inverse)
+            cube[n] = inverse * np.sqrt(inverse)
+            fifth[n] = 3.0 * cube[n] * inverse
+        for j in range(3):
             for i in range(3):
-                along = 3.0 * cube * inverse * r[i]
-                for j in range(3):
-                    out[n, i, 3 * k + j] = along * r[j] - (cube if i == j else 0.0)
+                row = rows[3 * k + j, i]
+                if i == j:
+                    for n in range(count):
+                        row[n] = fifth[n] * r[i, n] * r[j, n] - cube[n]
+                else:
+                    for n in range(count):
+                        row[n] = fifth[n] * r[i, n] * r[j, n]

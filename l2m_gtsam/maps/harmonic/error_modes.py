@@ -18,6 +18,8 @@ share it gives their covariance. The other part, the prior's, counts as independ
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg.lapack import dpstrf
+from scipy.sparse import csr_array, tril
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid
@@ -27,6 +29,8 @@ from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.threads import in_threads
+
+NEGLIGIBLE = 1e-15  # share of the variance at places
 
 
 @dataclass(frozen=True)
@@ -51,8 +55,15 @@ class TileModes:
         """Return A at points, uT per unit of beta, shape (N, 3, r)."""
         A = np.empty((len(points), 3, len(self)))
         for at in batches(len(points)):
-            A[at] = self.tile.basis.features(self.tile.within(points[at])) @ self.weights
+            A[at] = self.rows(points[at]).transpose(2, 1, 0)
         return A
+
+    def rows(self, points: FloatArray) -> FloatArray:
+        """Return A at points beta by beta, uT per unit of beta, shape (r, 3, N)."""
+        tile = self.tile
+        F = tile.basis.rows(tile.within(points), np.ones(len(tile.basis)))
+        A = self.weights.T @ F.reshape(len(F), 3 * len(points))
+        return np.asarray(A.reshape(len(self), 3, len(points)))
 
 
 @dataclass(frozen=True)
@@ -108,7 +119,7 @@ def error_modes(
     def modes(index: int) -> TileModes:
         rows = np.flatnonzero(owner == index)
         some = rows[np.linspace(0, len(rows) - 1, min(options.places, len(rows))).astype(int)]
-        directions = leading(tiles[index].root(points[some]), options.rest)
+        directions = leading(tiles[index].root_rows(points[some]), options.rest)
         return TileModes(tiles[index], tiles[index].unwhitened(directions))
 
     found = dict(zip(crossed, in_threads(modes, crossed), strict=True))
@@ -121,40 +132,63 @@ def leading(root: FloatArray, rest: float) -> FloatArray:
     Parameters
     ----------
     root
-        ``F L`` at places, shape (N, 3, m).
+        ``F L`` at places, weight by weight, shape (m, 3, N).
     rest
         Share that may be left out.
     """
-    rows = root.reshape(-1, root.shape[2])
-    # By the smaller of the two Gram matrices: few places, many weights.
-    squares, left = np.linalg.eigh(rows @ rows.T)
-    squares, left = np.maximum(squares[::-1], 0.0), left[:, ::-1]
+    rows = root.reshape(len(root), root.shape[1] * root.shape[2])
+    # By the smaller of the two Gram matrices: few places, many weights. Neighbours know much the
+    # same: its Cholesky factor, the largest pivots first, has few columns.
+    gram = rows.T @ rows
+    factor, pivots, rank, _ = dpstrf(gram, tol=NEGLIGIBLE * np.trace(gram), lower=1)
+    factor = np.tril(factor)[:, :rank]
+    squares, turned = np.linalg.eigh(factor.T @ factor)
+    squares, turned = np.maximum(squares[::-1], 0.0), turned[:, ::-1]
     held = np.cumsum(squares) / np.sum(squares)
     count = int(np.searchsorted(held, 1 - rest)) + 1
-    return np.asarray(rows.T @ left[:, :count] / np.sqrt(squares[:count]))
+    left = np.empty((len(gram), count))
+    left[pivots - 1] = factor @ turned[:, :count]
+    return np.asarray(rows @ left / squares[:count])
 
 
 def joint_covariance(learnt: Learnt, tiles: dict[int, TileModes]) -> FloatArray:
     """Return the covariance of all beta: one in each tile, and what shared readings correlate."""
-    members, readings = learnt.members, learnt.readings
+    readings = learnt.readings
     scale = np.sqrt(readings.weight) / learnt.hyperparameters.noise
     indices = list(tiles)
+    rows, pairs = shared_readings([learnt.members[index] for index in indices], len(readings))
 
-    def seen(index: int) -> FloatArray:
-        rows = members[index]
-        A = tiles[index].features(readings.points[rows])
-        return np.asarray(A * scale[rows, None, None])
+    def seen(k: int) -> FloatArray:
+        return tiles[indices[k]].rows(readings.points[rows[k]]) * scale[rows[k]]
 
-    whitened = dict(zip(indices, in_threads(seen, indices), strict=True))
+    whitened = in_threads(seen, range(len(indices)))
     starts = np.cumsum([0, *(len(modes) for modes in tiles.values())])
     covariance = np.eye(int(starts[-1]))
-    for i, a in enumerate(indices):
-        for j, b in enumerate(indices[:i]):
-            _, in_a, in_b = np.intersect1d(members[a], members[b], return_indices=True)
-            if len(in_a):
-                shared = np.einsum(
-                    "nir,nis->rs", whitened[a][in_a], whitened[b][in_b], optimize=True
-                )
-                covariance[starts[i] : starts[i + 1], starts[j] : starts[j + 1]] = shared
-                covariance[starts[j] : starts[j + 1], starts[i] : starts[i + 1]] = shared.T
+    for i, j in pairs:
+        _, in_a, in_b = np.intersect1d(rows[i], rows[j], assume_unique=True, return_indices=True)
+        a, b = whitened[i][:, :, in_a], whitened[j][:, :, in_b]
+        shared = a.reshape(len(a), 3 * len(in_a)) @ b.reshape(len(b), 3 * len(in_b)).T
+        covariance[starts[i] : starts[i + 1], starts[j] : starts[j + 1]] = shared
+        covariance[starts[j] : starts[j + 1], starts[i] : starts[i + 1]] = shared.T
     return covariance
+
+
+def shared_readings(
+    members: list[IntArray], count: int
+) -> tuple[list[IntArray], list[tuple[int, int]]]:
+    """Return which readings of each tile another one has, too, and the pairs of such tiles.
+
+    Parameters
+    ----------
+    members
+        Readings of each tile.
+    count
+        Number of all readings.
+    """
+    tile = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
+    reading = np.concatenate([np.empty(0, dtype=np.int64), *members])
+    has = csr_array((np.ones(len(tile)), (tile, reading)), shape=(len(members), count))
+    often = np.bincount(reading, minlength=count) > 1
+    together = tril(has @ has.T, -1)
+    pairs = list(zip(together.row.tolist(), together.col.tolist(), strict=True))
+    return [rows[often[rows]] for rows in members], pairs

@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
+from l2m_gtsam.maps.harmonic.triangular import solve_rows
 from l2m_gtsam.maps.training import TrainingSet
 
 ROUNDING, LOST = 1e-14, 1e-11
@@ -137,6 +138,12 @@ class Weights:
         return np.asarray(
             solve_triangular(self.factor, white, lower=True, overwrite_b=True, check_finite=False).T
         )
+
+    def root_rows(self, basis: Basis, points: FloatArray) -> FloatArray:
+        """Return ``F L`` at points (N, 3), uT, but weight by weight, shape (m, 3, N)."""
+        rows = basis.rows(points, self.prior_sigma)
+        solve_rows(self.factor, rows.reshape(len(rows), 3 * len(points)))
+        return rows
 
     def unwhitened(self, directions: FloatArray) -> FloatArray:
         """Return ``L U`` for directions U, both of shape (m, r)."""

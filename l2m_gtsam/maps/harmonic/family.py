@@ -40,6 +40,20 @@ class Family(Protocol):
         """Return the field of each weight at points, in uT per unit weight, shape (N, 3, m)."""
         ...
 
+    def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
+        """Write the field that so many units of each weight make at points.
+
+        Parameters
+        ----------
+        points
+            Shape (N, 3).
+        units
+            Shape (m,).
+        rows
+            For the field in uT, one weight after the other, shape (m, 3, N), in C order.
+        """
+        ...
+
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -49,6 +63,13 @@ class Family(Protocol):
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential phi with ``B = grad phi`` in uT m, shape (N,)."""
         ...
+
+
+def features_of(family: Family, points: FloatArray) -> FloatArray:
+    """Return the features of a family point by point, shape (N, 3, m); see ``Family``."""
+    rows = np.empty((len(family), 3, len(points)))
+    family.write_rows(points, np.ones(len(family)), rows)
+    return np.ascontiguousarray(rows.transpose(2, 1, 0))
 
 
 def no_slopes(variance: float, count: int) -> WeightPrior:

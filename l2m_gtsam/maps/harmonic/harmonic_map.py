@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
-from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.blend import Blend
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap, CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
@@ -166,7 +166,10 @@ class HarmonicMap:
 
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
-        points = checked_points(points)
+        return self.sample(points, self._answers)
+
+    def _answers(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return field, gradient and variance at points, also outside."""
         blend, variance = Blend.of(len(points)), np.empty_like(points)
         visits, owner = self.learnt.tiling.visits(points), self.learnt.tiling.grid.block_of(points)
 
@@ -179,15 +182,34 @@ class HarmonicMap:
         for visit, found in zip(visits, in_threads(answer, visits), strict=True):
             blend.add(visit.rows, visit.share, found.said)
             variance[visit.rows[found.own]] = found.variance
-        return self._sample(points, blend, variance)
+        return blend.field, blend.gradient, variance
 
     def compile(self) -> CompiledMap:
         """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster."""
         return CompiledMap.of(self)
 
-    def sample(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> FieldSample:
-        """Return what is known at points with this field and gradient; see ``query``."""
-        return self._sample(points, Blend(field, gradient), self.variance(points))
+    def sample(
+        self,
+        points: FloatArray,
+        answers: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
+    ) -> FieldSample:
+        """Return what is known at points; see ``query``.
+
+        Parameters
+        ----------
+        points
+            In the map frame in metres, shape (N, 3).
+        answers
+            Gives field, gradient and variance of points. It is asked about those near a reading
+            alone: what it says of others would not be used.
+        """
+        points = checked_points(points)
+        away, _ = self.learnt.readings.tree.query(points, distance_upper_bound=self.options.reach)
+        near = np.flatnonzero(np.isfinite(away))
+        known = unknown(len(points))
+        known.field[near], known.gradient[near], known.variance[near] = answers(points[near])
+        known.inside[near] = known.variance[near].sum(axis=1) <= self.learnt.most_variance
+        return masked(known)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
@@ -243,8 +265,3 @@ class HarmonicMap:
         rest = self.variance(points).ravel() - covariance.diagonal()
         covariance[np.diag_indices_from(covariance)] += np.maximum(rest, 0.0)
         return np.asarray(covariance.reshape(count, 3, count, 3))
-
-    def _sample(self, points: FloatArray, blend: Blend, variance: FloatArray) -> FieldSample:
-        away, _ = self.learnt.readings.tree.query(points, distance_upper_bound=self.options.reach)
-        inside = np.isfinite(away) & (variance.sum(axis=1) <= self.learnt.most_variance)
-        return masked(FieldSample(blend.field, blend.gradient, variance, inside))

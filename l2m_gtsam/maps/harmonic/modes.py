@@ -15,25 +15,17 @@ has the covariance ``s^2 (2h)^3 / sqrt(rho^2 + (z + z' + 2h)^2)`` at horizontal 
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.family import WeightPrior
+from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.wave_rows import write_wave_rows
+from l2m_gtsam.maps.harmonic.wave_sum import add_waves
 
 FLOOR, CEILING = "floor", "ceiling"
-
-
-@dataclass(frozen=True)
-class Waves:
-    """Products of the modes' factors at N points, each of shape (N, m)."""
-
-    cc: FloatArray
-    sc: FloatArray
-    cs: FloatArray
-    ss: FloatArray
 
 
 @dataclass(frozen=True)
@@ -91,6 +83,21 @@ class Modes:
         )
 
     @cached_property
+    def _growths(self) -> tuple[FloatArray, IntArray]:
+        """Different growths with height in 1/m, shape (d,), and which a mode has, shape (m,)."""
+        kz, which = np.unique(self.kz, return_inverse=True)
+        return kz, which
+
+    def _tables(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return cosines and sines along x, then along y, by half waves, shapes (p, N), (q, N)."""
+        most = self.numbers.max(axis=0) + 1
+        x, y = (
+            np.arange(most[axis])[:, None] * (np.pi * points[:, axis] / self.size[axis])
+            for axis in (0, 1)
+        )
+        return np.cos(x), np.sin(x), np.cos(y), np.sin(y)
+
+    @cached_property
     def _log_share(self) -> FloatArray:
         """Logarithm of a mode's share in the box, shape (m,)."""
         share = np.where((self.numbers == 0).any(axis=1), 2.0, 4.0) / np.prod(self.size)
@@ -98,29 +105,30 @@ class Modes:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each mode; see ``Family``."""
-        waves = self._waves(points)
-        F = np.empty((len(points), 3, len(self)))
-        np.multiply(waves.sc, -self.kx, out=F[:, 0])
-        np.multiply(waves.cs, -self.ky, out=F[:, 1])
-        np.multiply(waves.cc, self.kz, out=F[:, 2])
-        return F
+        return features_of(self, points)
+
+    def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
+        """Write the field of so many units of each mode; see ``Family``."""
+        kz, which = self._growths
+        growth = np.exp(kz[:, None] * (points[:, 2] - self.z))
+        factors = np.stack([-self.kx, -self.ky, self.kz]) * units
+        write_wave_rows(*self._tables(points), self.numbers, growth, which, factors, rows)
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient; see ``Family``."""
-        waves, kx, ky, kz = self._waves(points), self.kx, self.ky, self.kz
-        w = weights
-        by_z, xx, yy = (waves.cc @ np.column_stack([kz * w, -kx * kx * w, -ky * ky * w])).T
-        by_x, xz = (waves.sc @ np.column_stack([-kx * w, -kx * kz * w])).T
-        by_y, yz = (waves.cs @ np.column_stack([-ky * w, -ky * kz * w])).T
-        xy = waves.ss @ (kx * ky * w)
-        gradient = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, -xx - yy], axis=-1)
-        return np.stack([by_x, by_y, by_z], axis=-1), gradient.reshape(-1, 3, 3)
+        field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
+        steps = np.pi / self.size
+        add_waves(points, steps, self.z, self.numbers, self.kz, weights, field, gradient)
+        return field, gradient
 
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential; see ``Family``."""
-        return np.asarray(self._waves(points).cc @ weights)
+        cos_x, _, cos_y, _ = self._tables(points)
+        p, q = self.numbers.T
+        growth = np.exp(self.kz[:, None] * (points[:, 2] - self.z))
+        return np.asarray(weights @ (cos_x[p] * cos_y[q] * growth))
 
     def potential_on(
         self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
@@ -137,28 +145,23 @@ class Modes:
         along_y = (cos_y @ table).reshape(most[0], -1)
         return np.asarray((cos_x @ along_y).reshape(len(x), len(y), len(z)))
 
-    def _waves(self, points: FloatArray) -> Waves:
-        most = self.numbers.max(axis=0) + 1
-        phase_x, phase_y = (
-            np.pi * points[:, axis, None] / self.size[axis] * np.arange(most[axis])
-            for axis in (0, 1)
-        )
-        e = np.exp((points[:, 2] - self.z)[:, None] * self.kz)
-        p, q = self.numbers.T
-        cx, sx = np.cos(phase_x).take(p, axis=1), np.sin(phase_x).take(p, axis=1)
-        cy, sy = np.cos(phase_y).take(q, axis=1), np.sin(phase_y).take(q, axis=1)
-        cx *= e
-        sx *= e
-        return Waves(cx * cy, sx * cy, cx * sy, sx * sy)
-
 
 def modes_up_to(side: str, size: FloatArray, z: float, k_max: float) -> Modes:
     """Return all modes of a box whose wave number does not exceed ``k_max`` in 1/m."""
+    return Modes(side, size, z, half_waves(float(size[0]), float(size[1]), k_max))
+
+
+@lru_cache(maxsize=8)  # the tiles of a map have boxes of one size
+def half_waves(along_x: float, along_y: float, k_max: float) -> IntArray:
+    """Return the half waves of all modes of a box of these edges in metres, shape (m, 2)."""
+    size = np.array([along_x, along_y])
     highest = np.floor(k_max * size / np.pi).astype(np.int64)
     p, q = np.meshgrid(np.arange(highest[0] + 1), np.arange(highest[1] + 1), indexing="ij")
     k = np.pi * np.hypot(p / size[0], q / size[1])
     chosen = (k <= k_max) & (k > 0)
-    return Modes(side, size, z, np.column_stack([p[chosen], q[chosen]]))
+    numbers = np.column_stack([p[chosen], q[chosen]])
+    numbers.setflags(write=False)
+    return numbers
 
 
 def left_out(scale: float, depth: float, k_max: float, away: FloatArray) -> FloatArray:

@@ -68,9 +68,11 @@ class Tile:
 
     def root(self, points: FloatArray) -> FloatArray:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""
-        m = len(self.basis)
-        F = self.basis.features(self.within(points)).reshape(-1, m)
-        return np.asarray(self.weights.root(F).reshape(-1, 3, m))
+        return self.root_rows(points).transpose(2, 1, 0)
+
+    def root_rows(self, points: FloatArray) -> FloatArray:
+        """Return ``F L`` weight by weight, shape (m, 3, N); see ``root``."""
+        return self.weights.root_rows(self.basis, self.within(points))
 
     def unwhitened(self, directions: FloatArray) -> FloatArray:
         """Return the weights that directions of the posterior's root stand for, both (m, r)."""
@@ -80,8 +82,8 @@ class Tile:
         """Return the posterior variance per axis in uT^2, shape (N, 3)."""
         variance = np.empty((len(points), 3))
         for at in batches(len(points)):
-            root = self.root(points[at])
-            variance[at] = np.einsum("nim,nim->ni", root, root)
+            root = self.root_rows(points[at])
+            variance[at] = np.einsum("min,min->ni", root, root)
         return variance + self.unresolved(points)
 
     def unresolved(self, points: FloatArray) -> FloatArray:

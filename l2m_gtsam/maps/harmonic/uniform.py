@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.family import WeightPrior, no_slopes
+from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of, no_slopes
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 
 
@@ -30,7 +30,11 @@ class UniformField:
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return one unit per axis; see ``Family``."""
-        return np.tile(np.eye(3), (len(points), 1, 1))
+        return features_of(self, points)
+
+    def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
+        """Write the same for all points; see ``Family``."""
+        rows[:] = np.diag(units)[:, :, None]
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
