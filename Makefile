@@ -15,7 +15,8 @@ test: .venv/dev.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
-	$(BIN)/pytest -n auto --dist loadfile
+	# In the order of folders: files of whole commands are long and come first, those of units last.
+	$(BIN)/pytest -n auto --dist loadfile --no-loadscope-reorder
 
 study: .venv/dev.stamp
 	$(BIN)/pytest -m study

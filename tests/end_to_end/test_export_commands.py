@@ -1,6 +1,5 @@
 """`l2m export` and `l2m apply` on what `l2m calibrate` wrote."""
 
-import json
 import re
 import shlex
 import shutil
@@ -8,78 +7,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray
 from l2m_gtsam.results import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
-from tests.bags import Entry, ros, write
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.yard import NOISE, START, STEP, Yard, make_yard, route, world
-
-T_LIDAR_MAG = np.array([0.12, -0.08, 0.05])
-TURN = Rotation.from_euler("xyz", [0.2, -0.1, 1.3])
-P = np.array([[1.03, 0.01, 0], [0.01, 0.97, -0.012], [0, -0.012, 1.01]])
-C = TURN.as_matrix() @ P
-H = np.array([4.0, -7.0, 2.0])
-
-
-@pytest.fixture(scope="module")
-def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return make_yard(tmp_path_factory.mktemp("yard"))
+from tests.end_to_end.yard_drives import (
+    T_LIDAR_MAG,
+    C,
+    CalibratedYard,
+    calibrated,
+    calibrated_yard,
+    written,
+)
 
 
 @pytest.fixture(scope="module")
-def field_map(yard: Yard) -> Path:
-    path = yard.west.parent / "map.npz"
-    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
-    return path
+def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:
+    return calibrated_yard(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
-def drive(yard: Yard) -> Path:
-    return written(yard.west.parent, "mcap")
-
-
-def written(
-    folder: Path, kind: str, name: str = "drive", seed: int = 5, offset: FloatArray = H
-) -> Path:
-    """Write a drive through the west with turns and tilts, and one distorted sensor."""
-    make, entries = ros(kind), []
-    p, rng = route(-2.8, 0.2), np.random.default_rng(seed)
-    k = np.arange(len(p))
-    angles = np.column_stack([0.05 * k, 0.3 * np.sin(0.31 * k), 0.3 * np.cos(0.43 * k)])
-    R = Rotation.from_euler("ZYX", angles)
-    field, _ = world().field_and_gradient(p + R.apply(T_LIDAR_MAG))
-    readings = R.inv().apply(field) @ C.T + offset + rng.normal(0, NOISE, field.shape)
-    for n, q in enumerate(R.as_quat()):
-        stamp = START + n * STEP
-        pose = make.pose_stamped(stamp, p[n], q)
-        entries.append(Entry("/pose", "geometry_msgs/PoseStamped", stamp, pose))
-        magnetic = make.magnetic(stamp, readings[n] * 1e-6)
-        entries.append(Entry("/mag", "sensor_msgs/MagneticField", stamp, magnetic))
-    return write(folder, kind, entries, name)
-
-
-@pytest.fixture(scope="module")
-def calibration(yard: Yard, field_map: Path, drive: Path) -> Path:
-    return calibrated(yard.west.parent / "first", yard, field_map, drive, "mag")
-
-
-def calibrated(folder: Path, yard: Yard, field_map: Path, bag: Path, sensor: str) -> Path:
-    """Calibrate one sensor from a start near its place, and return the file; JSON is YAML."""
-    folder.mkdir()
-    content = json.loads(yard.config.read_text())
-    content["bag"]["fields"] = [f"/{sensor}"]
-    content["calibration"] = {"start": {sensor: [0.1, -0.1, 0.0]}}
-    config = folder / "c.yaml"
-    config.write_text(json.dumps(content))
-    l2m("calibrate", bag, "--map", field_map, "--config", config, "--out", folder)
-    return folder / "calibration.yaml"
+def calibration(place: CalibratedYard) -> Path:
+    return place.calibration
 
 
 def test_a_calibrated_bag_calibrates_to_nothing(
-    yard: Yard, field_map: Path, drive: Path, calibration: Path, tmp_path: Path
+    place: CalibratedYard, calibration: Path, tmp_path: Path
 ) -> None:
     """C = I and H = 0 within the sigmas, and t as before.
 
@@ -89,9 +42,9 @@ def test_a_calibrated_bag_calibrates_to_nothing(
     sigma, t by 0.3.
     """
     bag = tmp_path / "calibrated"
-    out = l2m("apply", drive, "--calibration", calibration, "--out", bag, "--replace").out
+    out = l2m("apply", place.drive, "--calibration", calibration, "--out", bag, "--replace").out
     assert "mag: /mag/calibrated" in out
-    again = calibrated(tmp_path / "second", yard, field_map, bag, "mag/calibrated")
+    again = calibrated(tmp_path / "second", place.yard, place.map, bag, "mag/calibrated")
     first = read_calibration(calibration)["mag"]
     second = read_calibration(again)["mag/calibrated"]
     assert first.status is second.status is SensorStatus.SOLVED
@@ -143,8 +96,8 @@ def test_a_robot_gets_the_sensor(calibration: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
-def test_bad_input(calibration: Path, drive: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_bad_input(place: CalibratedYard, calibration: Path, tmp_path: Path) -> None:
+    out, drive = tmp_path / "out", place.drive
 
     def export(*arguments: str | Path) -> str:
         return complaint_here("export", *arguments, "--out", out)

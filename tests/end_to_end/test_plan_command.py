@@ -9,19 +9,18 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from tests.bags import Entry, ros, write
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.yard import START, STEP, Yard, make_yard, route
+from tests.end_to_end.yard import START, STEP, Yard, route
+from tests.end_to_end.yard_drives import calibrated_yard
 
 
 @pytest.fixture(scope="module")
 def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return make_yard(tmp_path_factory.mktemp("yard"))
+    return calibrated_yard(tmp_path_factory).yard
 
 
 @pytest.fixture(scope="module")
-def field_map(yard: Yard) -> Path:
-    path = yard.west.parent / "map.npz"
-    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
-    return path
+def field_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return calibrated_yard(tmp_path_factory).map
 
 
 def poses_only(folder: Path, places: FloatArray) -> Path:

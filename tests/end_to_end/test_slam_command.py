@@ -19,27 +19,26 @@ from l2m_gtsam.storage.calibration_file import read_calibration, write_calibrati
 from l2m_gtsam.storage.tum import write_tum
 from tests.calibrations import calibration, sensor
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.yard import NOISE, Yard, make_yard, route
+from tests.end_to_end.yard import NOISE, Yard, route
+from tests.end_to_end.yard_drives import calibrated_yard
 
 SIGMA = np.concatenate([np.full(3, 0.01), np.full(9, 0.01), np.full(3, 1.0)])
 
 
 @pytest.fixture(scope="module")
 def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return make_yard(tmp_path_factory.mktemp("yard"))
+    return calibrated_yard(tmp_path_factory).yard
 
 
 @pytest.fixture(scope="module")
-def field_map(yard: Yard) -> Path:
-    path = yard.west.parent / "map.npz"
-    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
-    return path
+def field_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return calibrated_yard(tmp_path_factory).map
 
 
 @pytest.fixture(scope="module")
-def known(yard: Yard) -> Path:
+def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The sensor of the yard, which sits at the lidar and is ideal."""
-    path = yard.west.parent / "known.yaml"
+    path = tmp_path_factory.mktemp("known") / "known.yaml"
     ideal = sensor(
         "mag",
         t_lidar_mag=np.zeros(3),

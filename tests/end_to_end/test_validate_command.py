@@ -15,27 +15,23 @@ from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.validation_file import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.test_export_commands import H, calibrated, written
-from tests.end_to_end.yard import NOISE, Yard, make_yard
+from tests.end_to_end.yard import NOISE
+from tests.end_to_end.yard_drives import CalibratedYard, H, calibrated_yard, written
 
 
 @pytest.fixture(scope="module")
-def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return make_yard(tmp_path_factory.mktemp("yard"))
+def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:
+    return calibrated_yard(tmp_path_factory)
 
 
 @pytest.fixture(scope="module")
-def field_map(yard: Yard) -> Path:
-    path = yard.west.parent / "map.npz"
-    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
-    return path
+def calibration(place: CalibratedYard) -> Path:
+    return place.calibration
 
 
 @pytest.fixture(scope="module")
-def calibration(yard: Yard, field_map: Path) -> Path:
-    folder = yard.west.parent
-    bag = written(folder, "mcap", "first")
-    return calibrated(folder / "first_out", yard, field_map, bag, "mag")
+def field_map(place: CalibratedYard) -> Path:
+    return place.map
 
 
 def changed_file(calibration: Path, path: Path, **changes: object) -> Path:
@@ -110,7 +106,10 @@ def silent(stage: str, fraction: float) -> None:
     """Show no progress."""
 
 
-def test_bad_input(calibration: Path, field_map: Path, yard: Yard, tmp_path: Path) -> None:
+def test_bad_input(
+    place: CalibratedYard, calibration: Path, field_map: Path, tmp_path: Path
+) -> None:
+    west = place.yard.west
     out = tmp_path / "out"
 
     def line(*arguments: str | Path) -> str:
@@ -118,11 +117,11 @@ def test_bad_input(calibration: Path, field_map: Path, yard: Yard, tmp_path: Pat
 
     own = ("--calibration", calibration)
     assert "give a BAG with --map, or --compare" in line(*own)
-    assert "needs --map" in line(yard.west, *own)
+    assert "needs --map" in line(west, *own)
     assert "--map: goes with a BAG" in line(*own, "--map", field_map)
     assert "no such file" in line("--calibration", tmp_path / "no.yaml", "--compare", calibration)
     assert "no such file" in line(*own, "--compare", tmp_path / "no.yaml")
-    assert "none of its sensors (points)" not in line(yard.west, *own, "--map", tmp_path / "no.npz")
+    assert "none of its sensors (points)" not in line(west, *own, "--map", tmp_path / "no.npz")
     without = changed_file(calibration, tmp_path / "without.yaml", covariance=None)
     assert "sensors.mag.covariance" in line("--calibration", without, "--compare", calibration)
     matrix = read_calibration(calibration)["mag"].covariance
@@ -137,6 +136,6 @@ def test_bad_input(calibration: Path, field_map: Path, yard: Yard, tmp_path: Pat
     write_yaml(tmp_path / "front.yaml", content, "")
     shared = line(*own, "--compare", tmp_path / "front.yaml")
     assert "no sensor that both calibrations know: there are front" in shared
-    stranger = line(yard.west, "--calibration", tmp_path / "front.yaml", "--map", field_map)
+    stranger = line(west, "--calibration", tmp_path / "front.yaml", "--map", field_map)
     assert "none of its sensors (mag) is in the calibration (front)" in stranger
     assert not out.exists()

@@ -44,6 +44,17 @@ class Yard:
     config: Path
     sliding: Path
 
+    @classmethod
+    def of(cls, folder: Path) -> "Yard":
+        """Return the yard that lies in a folder."""
+        return cls(
+            west=folder / "west",
+            east=folder / "east",
+            cloud=folder / "post.ply",
+            config=folder / "harmonic.yaml",
+            sliding=folder / "sliding.yaml",
+        )
+
 
 def world() -> DipoleWorld:
     """The post as a column of dipoles in the Earth's field."""
@@ -101,15 +112,10 @@ def make_yard(folder: Path) -> Yard:
         "harmonic": QUICK_HARMONIC | {"hyperparameters": HARMONIC_PRIOR},
     }
     sliding = {"kind": "sliding_gp", "sliding_gp": {"hyperparameters": PRIOR}}
-    config, plain = folder / "harmonic.yaml", folder / "sliding.yaml"
-    config.write_text(json.dumps({"bag": bag, "mapping": {"model": harmonic}}))
-    plain.write_text(json.dumps({"bag": bag, "mapping": {"model": sliding}}))
-    cloud = folder / "post.ply"
-    write_cloud(cloud, post())
-    return Yard(
-        west=survey(folder, "west", route(-3, 0.5), 1),
-        east=survey(folder, "east", route(0, 3), 2),
-        cloud=cloud,
-        config=config,
-        sliding=plain,
-    )
+    yard = Yard.of(folder)
+    yard.config.write_text(json.dumps({"bag": bag, "mapping": {"model": harmonic}}))
+    yard.sliding.write_text(json.dumps({"bag": bag, "mapping": {"model": sliding}}))
+    write_cloud(yard.cloud, post())
+    survey(folder, "west", route(-3, 0.5), 1)
+    survey(folder, "east", route(0, 3), 2)
+    return yard

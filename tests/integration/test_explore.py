@@ -13,7 +13,7 @@ from tests.integration.test_slam import pose_nees, position_error, quiet
 from tests.slam_drives import SlamDrive, calibrated, laps, slam_drive
 from tests.worlds import dipole_world, random_sensors
 
-SENSORS = 6
+SENSORS = 4
 COARSE = {"distance_m": 0.3, "readings": 2}  # enough, and quick
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from l2m_gtsam.cluster import ClusterOptions
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.studies.bound import cramer_rao
@@ -19,7 +18,7 @@ from l2m_gtsam.studies.honesty.pictures import honesty_figures
 from l2m_gtsam.studies.honesty.place import drive_through, surveyed_hall
 from l2m_gtsam.studies.honesty.study import HONESTY, keys, prepare, site
 from l2m_gtsam.studies.honesty.summary import NAMES, HonestySummary, Verdict, honesty_summary
-from l2m_gtsam.studies.run import run_study
+from tests.inline_study import run_inline
 from tests.quick_maps import quick
 
 TINY = HonestyOptions(
@@ -176,9 +175,7 @@ def test_both_conditions_of_a_survey_share_its_map() -> None:
 
 
 def test_the_study_runs_and_repeats_itself(tmp_path: Path) -> None:
-    cluster = ClusterOptions(workers=1)
-    made = run_study(HONESTY, TINY, tmp_path, cluster, lambda *_: None, "l2m study honesty")
-    clean, troubled = made.summary.of(Uncertainty.FULL)
+    clean, troubled = run_inline(HONESTY, TINY, tmp_path).of(Uncertainty.FULL)
     assert (clean.condition, troubled.condition) == (Condition.CLEAN, Condition.TROUBLED)
     assert [row.name for row in clean.blocks] == ["t", "C, H", "all"]
     assert [row.name for row in troubled.blocks] == ["t", "C, H", "all", "offset"]

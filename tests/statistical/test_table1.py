@@ -12,7 +12,14 @@ from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.sensors import NoiseOptions
 from l2m_gtsam.studies.site import random_drive
 from l2m_gtsam.studies.table1 import report
-from l2m_gtsam.studies.table1.cells import Ends, Table1Cell, Table1Options, compute, prepare
+from l2m_gtsam.studies.table1.cells import (
+    Ends,
+    Place,
+    Table1Cell,
+    Table1Options,
+    compute,
+    prepare,
+)
 from l2m_gtsam.studies.table1.methods import (
     HARMONIC,
     NAIVE,
@@ -41,8 +48,12 @@ TINY = Table1Options(
 
 
 @pytest.fixture(scope="module")
-def cells() -> dict[str, Table1Cell]:
-    place = prepare(TINY)
+def place() -> Place:
+    return prepare(TINY)
+
+
+@pytest.fixture(scope="module")
+def cells(place: Place) -> dict[str, Table1Cell]:
     return {key: compute(TINY, place, *map(int, key.split("-"))) for key in keys(TINY)}
 
 
@@ -68,8 +79,7 @@ def test_every_method_has_an_entry_on_its_maps(summary: Table1Summary) -> None:
     assert {each.calibrations for each in others} == {TINY.others * TINY.other_starts}
 
 
-def test_the_published_algorithm_off_the_map_has_no_result() -> None:
-    place = prepare(TINY)
+def test_the_published_algorithm_off_the_map_has_no_result(place: Place) -> None:
     drive = random_drive(place.site, TINY.site, np.random.default_rng(1))
     away = np.array([500.0, 0.0, 0.0])
     assert np.isnan(as_published(drive.readings, place.maps[HARMONIC], away)).all()
