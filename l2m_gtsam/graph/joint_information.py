@@ -91,6 +91,10 @@ class JointInformation:
         step = self.step[columns_at(self.columns, keys_of(sensor))] / sigma
         return float(np.sqrt(step @ cho_solve((lower, True), step)))
 
+    def furthest(self, sensors: Sequence[int]) -> float:
+        """Return the longest step of some sensors in standard deviations."""
+        return max(self.sigmas(sensor) for sensor in sensors)
+
     def taken(self, sensor: int) -> float:
         """Return the degrees of freedom that a sensor's rows take beside its own sixteen.
 

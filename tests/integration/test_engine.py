@@ -112,7 +112,7 @@ def last(
 def test_the_old_elimination_says_the_same(last: LastGraph, form: FactorForm) -> None:
     """Covariance, degrees of freedom and what is shared, of the same linear graph; rounding."""
     problem = last.problem(form)
-    values = problem.polish(last.values(np.zeros(3)), LinearSolver.CHOLESKY).values
+    values = problem.polish(last.values(np.zeros(3)), 1, LinearSolver.CHOLESKY).values
     old = eliminate(problem.graph.linearize(values), last.view.sensors, last.drive.prior.sizes)
     joint = problem.linearised(values)
     found = problem.solutions(joint, values)
@@ -151,7 +151,7 @@ def test_from_a_poor_start_lm_arrives_where_gauss_newton_does_not(
     """Sensors begin 3 m off, under the floor, where the field is steeper than anywhere else."""
     problem, start = last.problem(form), last.values(np.array([-2.73, 0.49, -1.15]))
     least = problem.graph.error(
-        problem.polish(last.values(np.zeros(3)), LinearSolver.CHOLESKY).values
+        problem.polish(last.values(np.zeros(3)), 1, LinearSolver.CHOLESKY).values
     )
     ends = {
         method: problem.descend(
