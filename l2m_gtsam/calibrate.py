@@ -110,7 +110,7 @@ def calibrated(
     compiled = field_map.compile() if isinstance(field_map, Compilable) else field_map
     solver_map = RememberedMap(compiled)
     priors = priors_of(options.priors, alive.sensors)
-    found = _starts(alive, solver_map, options, priors, progress)
+    found = _starts(alive, compiled, options, priors, progress)
     t_start = _start_places(alive.sensors, found, options)
     problem = MovingProblem(
         readings=alive,

@@ -5,6 +5,7 @@ forty times its field. A calibration comes back to the places of a drive, where 
 where they were found, to test ranks, to compare models and to judge residuals.
 """
 
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -27,12 +28,18 @@ class RememberedMap:
 
     def __init__(self, field_map: QueryableMap) -> None:
         self._map = field_map
+        self._lock = Lock()
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.__dict__["_map"], name)
+        if name == "_map":  # before there is one, as when another process unpacks it
+            raise AttributeError(name)
+        return getattr(self._map, name)
+
+    def __reduce__(self) -> tuple[type["RememberedMap"], tuple[QueryableMap]]:
+        return RememberedMap, (self._map,)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, which are not remembered: they cost little."""
@@ -40,7 +47,10 @@ class RememberedMap:
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
+        with self._lock:
+            return self._recalled(np.ascontiguousarray(points, dtype=np.float64))
+
+    def _recalled(self, points: FloatArray) -> FieldSample:
         names = points.view(f"V{points.itemsize * points.shape[1]}").ravel().tolist()
         if len(self._rows) + len(points) > MOST:
             self._rows, self._values, self._inside = {}, self._values[:0], self._inside[:0]

@@ -1,5 +1,8 @@
 """A map that is asked for no place twice."""
 
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -58,3 +61,23 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_it_knows_of_errors_what_the_map_does() -> None:
     """A map that does not know how its errors are correlated does not learn it so."""
     assert not isinstance(RememberedMap(Counting()), UncertainMap)
+
+
+def test_threads_may_ask_at_once() -> None:
+    """Many questions from four threads, places in common: each gets its own answer."""
+    places = np.random.default_rng(0).normal(size=(400, 3))
+    chosen = [np.random.default_rng(seed).permutation(400)[:150] for seed in range(60)]
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda at: remembered.query(places[at]), chosen))
+    for at, each in zip(chosen, found, strict=True):
+        np.testing.assert_array_equal(each.variance, places[at] ** 2)
+    assert counting.asked <= 400
+
+
+def test_it_goes_to_another_process_without_its_memory() -> None:
+    remembered = RememberedMap(Counting())
+    remembered.query(np.ones((2, 3)))
+    there = pickle.loads(pickle.dumps(remembered))  # noqa: S301  our own, a moment ago
+    np.testing.assert_array_equal(there.query(np.ones((1, 3))).variance, np.ones((1, 3)))
