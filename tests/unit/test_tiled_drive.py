@@ -1,5 +1,7 @@
 """A drive laid out on tiles: how much noise the tiles are thought to take up."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
@@ -73,3 +75,19 @@ def test_readings_that_do_not_count_say_nothing_of_the_noise(drawn: DrawnDrive) 
     wrong = np.arange(count) % 7 == 0
     found = counted(drawn, 0.4, 1e6 * wrong, 1.0 - wrong)
     assert found == pytest.approx(0.25, rel=4 * np.sqrt(2 / (3 * (~wrong).sum())))
+
+
+def test_a_tile_without_readings_is_not_laid(drawn: DrawnDrive) -> None:
+    """Its readings gone, the others keep their numbers and all of theirs."""
+    drive = drawn.drive
+    poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    ways = Ways.along(drive, poses)
+    whole = TiledDrive.lay(ways, poses, drive.sensors, PRIOR)
+    assert len(whole.tiles) > 1
+    gone = whole.tiles[0]
+    kept = np.setdiff1d(np.arange(len(drive.readings)), gone.rows)
+    left = replace(ways, readings=ways.readings[kept])
+    fewer = TiledDrive.lay(left, poses, drive.sensors, PRIOR)
+    assert [each.number for each in fewer.tiles] == [each.number for each in whole.tiles[1:]]
+    for after, before in zip(fewer.tiles, whole.tiles[1:], strict=True):
+        np.testing.assert_array_equal(kept[after.rows], before.rows)
