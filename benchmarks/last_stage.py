@@ -101,7 +101,7 @@ def case(field_map: CompiledMap, count: int, each: int) -> Case:
     return Case(problem, rows, values, coverage.sizes, view.sensors)
 
 
-def seconds(work: Callable[[], object], repeats: int = 3) -> float:
+def seconds(work: Callable[[], object], repeats: int = 2) -> float:
     """Return the shortest processor time of several runs."""
     times = []
     for _ in range(repeats):

@@ -15,6 +15,7 @@ and Cholesky factors what GTSAM's test of neighbouring pivots refuses; QR does t
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -101,11 +102,15 @@ class JointInformation:
         As many as there are weights that no prior and no other sensor determines, and less of its
         own where other sensors determine them.
         """
-        taken = -float(SENSOR)
+        return self._traces.get(sensor, 0.0) - SENSOR
+
+    @cached_property
+    def _traces(self) -> dict[int, float]:
+        """Trace of ``J Sigma J^T`` over the rows of each sensor."""
+        traces: dict[int, float] = {}
         for rows in self.rows:
-            if rows.sensor == sensor:
-                taken += self._share(rows)
-        return taken
+            traces[rows.sensor] = traces.get(rows.sensor, 0.0) + self._share(rows)
+        return traces
 
     def _share(self, rows: Rows) -> float:
         """Return the trace of ``J Sigma J^T`` of some rows."""
