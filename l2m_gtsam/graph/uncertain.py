@@ -211,7 +211,9 @@ def settle(
         after = estimate.updated(values, sensors)
         if options.sensor_noise_ut is None:
             after = replace(after, noise=problem.noise(joint, values, estimate))
-        settled = joint.furthest(sensors) < SETTLED_SIGMAS and after.same_noise(estimate)
+        # The weights of the first round are those of the optimum with independent errors.
+        at_rest = joint.furthest(sensors) < SETTLED_SIGMAS and after.same_noise(estimate)
+        settled = at_rest and round_ > 0
         estimate = after
         if settled:
             break
