@@ -8,14 +8,14 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.one_key import NOISE, hall, seconds, survey
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.one_key import solve_one_key
+from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.global_start import StartOptions, find_starts
-from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.results import FoundStart
-from tests.worlds import DipoleWorld, drive, random_sensors
+from l2m_gtsam.records.calibration import FoundStart
+from tests.worlds.exact import DipoleWorld, drive, random_sensors
 
 SENSORS, READINGS = 12, 2_000
 WRONG = 0.1  # share of the readings, off by 50 uT and more

@@ -18,13 +18,13 @@ from benchmarks.compiled_map import once
 from benchmarks.map_queries import READINGS, SIZE, survey, warehouse
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.mapping import suite_readings
+from l2m_gtsam.mapping.mapping import suite_readings
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.sliding_gp import SlidingGP
+from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.storage.tile_folder import TileFolder
-from l2m_gtsam.threads import in_threads
 
 COPIES = 10
 GAP = 15.0  # metres between copies

@@ -15,18 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.one_key import NOISE, hall, survey
 from l2m_factors import map_weights_prior
+from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
+from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm
+from l2m_gtsam.calibration.joint import joint_problem
+from l2m_gtsam.calibration.optimise import LinearSolver
+from l2m_gtsam.calibration.uncertain import UncertainDrive, UncertainProblem, starting_values
+from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions, start_estimate
-from l2m_gtsam.graph.calibration import Estimate, FactorForm
-from l2m_gtsam.graph.joint import joint_problem
-from l2m_gtsam.graph.optimise import LinearSolver
-from l2m_gtsam.graph.uncertain import UncertainDrive, UncertainProblem, starting_values
-from l2m_gtsam.graph.view import observe
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.threads import one_blas_thread
+from l2m_gtsam.parallel.threads import one_blas_thread
 from tests.reference.elimination import Eliminated, eliminate
-from tests.worlds import DipoleWorld, random_sensors
+from tests.worlds.exact import DipoleWorld, random_sensors
 
 OPTIONS = OneKeyOptions()
 GROWTH = ((12, 2_000), (12, 8_000), (1, 2_000), (4, 2_000), (48, 2_000))  # sensors, readings

@@ -26,7 +26,7 @@ from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from l2m_gtsam.maps.training import ThinningOptions
-from tests.worlds import DipoleWorld
+from tests.worlds.exact import DipoleWorld
 
 SIZE = np.array([45.0, 35.0])  # metres
 READINGS = 40_000

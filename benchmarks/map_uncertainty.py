@@ -7,11 +7,11 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.one_key import NOISE, hall, seconds, survey
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.results import Uncertainty
-from tests.worlds import drive, random_sensors
+from l2m_gtsam.records.calibration import Uncertainty
+from tests.worlds.exact import drive, random_sensors
 
 SENSORS = 12
 SIZES = (500, 2_000, 4_000)  # readings of each sensor

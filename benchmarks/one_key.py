@@ -19,11 +19,11 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from l2m_factors import BatchedReadings, D, MagneticReadings, T, block_factor, reading_factor
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.maps.sliding_gp import SlidingGP
-from tests.worlds import DipoleWorld, drive, random_sensors
+from tests.worlds.exact import DipoleWorld, drive, random_sensors
 
 NOISE = 0.1  # uT, of the survey and of the sensors
 

@@ -15,13 +15,13 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from benchmarks.one_key import NOISE, hall, survey
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.graph.slam.following import SECTION, Follower
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.slam.online.following import SECTION, Follower
 from l2m_gtsam.solve.robust import RobustOptions
-from tests.drawn_drives import DrawnDrive, drawn_drive
-from tests.worlds import random_sensors
+from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.worlds.exact import random_sensors
 
 SENSORS, RATE_HZ, SPEED = 12, 10, 0.8
 HOUR, SHORT = 36_000, 1_000  # key poses

@@ -6,30 +6,30 @@ from typing import Any, TypeVar, get_origin
 
 from pydantic import BaseModel, Field, ValidationError
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.prior_options import PriorOptions
+from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.global_start import StartOptions
-from l2m_gtsam.graph.prior_options import PriorOptions
-from l2m_gtsam.graph.slam.options import SlamOptions
-from l2m_gtsam.graph.suite.options import SuiteOptions
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, ScanStartOptions
 from l2m_gtsam.lidar.loops import LoopOptions
 from l2m_gtsam.lidar.odometry import OdometryOptions
 from l2m_gtsam.lidar.search import SearchOptions
+from l2m_gtsam.mapping.suite.options import SuiteOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.compare import CompareOptions
-from l2m_gtsam.motion import MotionOptions
 from l2m_gtsam.options import Options
+from l2m_gtsam.planning.motion import MotionOptions
 from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.regressors import ResampleOptions
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.recording.regressors import ResampleOptions
+from l2m_gtsam.recording.sync import SyncOptions
+from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.solve.model_comparison import ModelOptions
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
 from l2m_gtsam.storage.scan_topic import ScanOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
-from l2m_gtsam.sync import SyncOptions
 
 Model = TypeVar("Model", bound=BaseModel)
 

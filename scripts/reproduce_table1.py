@@ -5,7 +5,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from l2m_gtsam.cli import main
+from l2m_gtsam.cli.app import main
 
 if __name__ == "__main__":
     sys.argv[1:1] = ["study", "table1"]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from tests.browsing import find_tools
+from tests.support.browsing import find_tools
 
 # Machines are as fast as they are, and the first call of a compiled function compiles it.
 settings.register_profile("l2m", deadline=None)

@@ -7,7 +7,7 @@ from pathlib import Path
 from l2m_gtsam.batch.corrections import Reading, corrections_of, not_applicable
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.storage.bag_copy import bag_copy, check_copy
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibrated_topics import (

@@ -13,8 +13,8 @@ from l2m_gtsam.data import CorrectedField, FloatArray, IntArray, ScalarSeries
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.regressors import ResampleOptions, resampled
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.recording.regressors import ResampleOptions, resampled
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.solve.correction import corrected, moving_variance, without_moving
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibrated_topics import Correct

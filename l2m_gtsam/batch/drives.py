@@ -4,19 +4,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from l2m_gtsam.appraise import FIGURES, appraise, scene_of
 from l2m_gtsam.batch.opening import OpenMap, SavedMap, check_bags, read_drive
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.scan_poses import read_drives_on
-from l2m_gtsam.calibrate import calibrated
+from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.plan import assumed_recording, plan
-from l2m_gtsam.plan_results import DrivePlan
+from l2m_gtsam.planning.plan import assumed_recording, plan
 from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.qa.evaluate import FIGURES, appraise, scene_of
 from l2m_gtsam.qa.figures import calibration_figure, save_figure
 from l2m_gtsam.qa.nominal import check_names
-from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.plan import DrivePlan
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.digest import source_file

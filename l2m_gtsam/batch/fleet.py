@@ -25,14 +25,14 @@ from l2m_gtsam.batch.fleet_task import (
 )
 from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
-from l2m_gtsam.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.fleet_results import DriveOutcome, FleetRow
+from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.fleet.outliers import with_outliers
 from l2m_gtsam.qa.fleet.page import fleet_page
+from l2m_gtsam.records.fleet import DriveOutcome, FleetRow
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.fleet_table import write_csv, write_parquet

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from l2m_gtsam.errors import BagError, ConfigError
-from l2m_gtsam.fleet_results import DATE
+from l2m_gtsam.records.fleet import DATE
 from l2m_gtsam.storage.find_bags import FILES, find_bags, is_bag, is_folder
 from l2m_gtsam.storage.folder_names import folder_names
 from l2m_gtsam.storage.manifest import ManifestEntry, read_manifest

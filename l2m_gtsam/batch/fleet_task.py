@@ -20,8 +20,8 @@ from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import L2MError, OutputError
-from l2m_gtsam.fleet_results import DATE, DriveOutcome, Made, RowKey
 from l2m_gtsam.qa.fleet.rows import sensor_rows
+from l2m_gtsam.records.fleet import DATE, DriveOutcome, Made, RowKey
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.folder_names import printable
 from l2m_gtsam.storage.outcome_file import write_outcome

@@ -9,13 +9,13 @@ from l2m_gtsam.batch.outputs import check_outputs
 from l2m_gtsam.batch.slam_report import SLAM_FILE, report_localisation
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
-from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.judge import Verdict, judge
 from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.page import STAGE, report_page
-from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.metrics_file import read_metrics

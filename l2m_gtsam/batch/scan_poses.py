@@ -14,13 +14,13 @@ from l2m_gtsam.batch.opening import (
 from l2m_gtsam.config import Config, LidarOptions, PoseSource
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import BagError, LidarError
-from l2m_gtsam.joining import joined
 from l2m_gtsam.lidar.localisation import ScanLocalisation, localise_scans
 from l2m_gtsam.lidar.odometry import ScanStep, follow, odometry
 from l2m_gtsam.lidar.registration import PoseEstimate, unseen_covariance
 from l2m_gtsam.lidar.search import find_start
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.storage.bag import has_poses, read_fields
 from l2m_gtsam.storage.clocks import check_clocks
 from l2m_gtsam.storage.digest import source_file

@@ -15,28 +15,28 @@ from l2m_gtsam.batch.slam_report import SLAM_FILE, write_slam_report
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording, SourceFile
 from l2m_gtsam.errors import MapError, OutputError
-from l2m_gtsam.explore import explore
-from l2m_gtsam.graph.slam.g2o import write_g2o
-from l2m_gtsam.graph.slam.jumps import without_jumps
-from l2m_gtsam.graph.slam.localised import Localised
-from l2m_gtsam.localise import Sources, localise
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.slam.errors import check_truth
-from l2m_gtsam.results import CalibrationResult
-from l2m_gtsam.scans import ScanEvidence
-from l2m_gtsam.slam_figures import Told, localisation_record
-from l2m_gtsam.slam_records import LocalisationRecord
-from l2m_gtsam.slam_results import LocalisationResult, LocalisationStatus
+from l2m_gtsam.recording.odometry_jumps import without_jumps
+from l2m_gtsam.recording.sync import twists
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
+from l2m_gtsam.records.localisation_file import LocalisationRecord
+from l2m_gtsam.records.scans import ScanEvidence
+from l2m_gtsam.slam.explore import explore
+from l2m_gtsam.slam.figures import Told, localisation_record
+from l2m_gtsam.slam.g2o import write_g2o
+from l2m_gtsam.slam.localise import Sources, localise
+from l2m_gtsam.slam.localised import Localised
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.slam_file import write_slam
 from l2m_gtsam.storage.trajectory_bag import LocalisedMotion, write_trajectory_bag
 from l2m_gtsam.storage.tum import read_tum, write_tum
-from l2m_gtsam.sync import twists
 
 TRAJECTORY_FILE = "trajectory.tum"
 BAG_FILE = "trajectory.mcap"

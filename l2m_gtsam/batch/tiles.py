@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.storage.tile_folder import tiles_beside
-from l2m_gtsam.tile_store import TileStore
 
 
 @runtime_checkable

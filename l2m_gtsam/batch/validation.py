@@ -10,7 +10,7 @@ from l2m_gtsam.batch.corrections import saved_options
 from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.scan_poses import read_drive_on
-from l2m_gtsam.calibrate import VERSIONED
+from l2m_gtsam.calibration.calibrate import VERSIONED
 from l2m_gtsam.config import CalibrationOptions, Config, load_config
 from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
@@ -19,19 +19,19 @@ from l2m_gtsam.qa.metrics.changes import compare_calibrations, is_calibrated
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.validation_page import validation_page
 from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
-from l2m_gtsam.storage.atomic import atomic_path
-from l2m_gtsam.storage.bag_options import BagOptions
-from l2m_gtsam.storage.calibration_file import read_calibration
-from l2m_gtsam.storage.digest import source_file
-from l2m_gtsam.storage.validation_file import write_validation
-from l2m_gtsam.validate import validate
-from l2m_gtsam.validation_results import (
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.validation import (
     CalibrationComparison,
     DriveValidation,
     NamedSource,
     Validation,
 )
+from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.validation_file import write_validation
+from l2m_gtsam.validation.validate import validate
 
 VALIDATION_FILE = "validation.json"
 PAGE_FILE = "validation.html"

@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.lidar.extra import library
-from l2m_gtsam.rigid import as_matrix, from_matrix
+from l2m_gtsam.records.rigid import as_matrix, from_matrix
 
 
 class KissFollower:

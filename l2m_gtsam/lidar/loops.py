@@ -12,8 +12,8 @@ from l2m_gtsam.lidar.odometry import ScanStep
 from l2m_gtsam.lidar.registration import Refusal, RegistrationOptions, by_scan, register
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.rigid import between
-from l2m_gtsam.scans import Loop
+from l2m_gtsam.records.rigid import between
+from l2m_gtsam.records.scans import Loop
 
 
 class LoopOptions(Options):

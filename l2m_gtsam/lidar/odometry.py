@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.geometry import moved
 from l2m_gtsam.lidar.kiss import KissFollower
 from l2m_gtsam.lidar.registration import (
     PoseEstimate,
@@ -23,9 +24,8 @@ from l2m_gtsam.lidar.registration import (
 )
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.pose_covariance import moved
-from l2m_gtsam.rigid import IDENTITY, between, compose, difference, perturbed
-from l2m_gtsam.scans import Scan, taken_at_once
+from l2m_gtsam.records.rigid import IDENTITY, between, compose, difference, perturbed
+from l2m_gtsam.records.scans import Scan, taken_at_once
 
 FRAME, CHILD_FRAME = "odom", "lidar"
 # A scan of fewer is of nothing, or broken.

@@ -13,8 +13,8 @@ from matplotlib.patches import Ellipse
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.metric_results import MapPicture, Row
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.metrics import MapPicture, Row
 from l2m_gtsam.storage.atomic import atomic_path
 
 # Cells along the longer side of a map picture.

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.reasons.ending import ending
 from l2m_gtsam.qa.reasons.fit import clock, fit, misfit
@@ -11,7 +10,8 @@ from l2m_gtsam.qa.reasons.precision import precision
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason, worst
 from l2m_gtsam.qa.reasons.repeat import repeat
 from l2m_gtsam.qa.reasons.whole import own_stretches, whole
-from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.metrics import Metrics
 
 # In the order in which a person would ask; the gravest stand first in the end.
 RULES = (repeat, ending, mounting, fit, own_stretches, clock, precision)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.records.calibration import CalibrationResult
 
 
 def check_names(sensors: Sequence[str], options: QaOptions) -> None:

@@ -9,8 +9,8 @@ from l2m_gtsam.qa.metrics.assemble import MapForms
 from l2m_gtsam.qa.metrics.curves import curves
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, sensor_evidence
 from l2m_gtsam.qa.metrics.plain import evenly
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
-from l2m_gtsam.scene import DriveView, MapView, Scene, SensorView
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.scene import DriveView, MapView, Scene, SensorView
 
 AROUND = 1.5  # metres of the map on each side of a drive
 LATTICE = 4000  # places of the map, about

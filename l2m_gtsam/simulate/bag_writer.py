@@ -15,7 +15,9 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from l2m_gtsam.data import IntArray, Recording, Trajectory
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.options import Options
-from l2m_gtsam.ros_messages import (
+from l2m_gtsam.simulate.messages import Scans, magnetic_field, point_clouds, poses
+from l2m_gtsam.simulate.sensors import NoiseOptions
+from l2m_gtsam.storage.ros_messages import (
     NANOSECONDS,
     Channel,
     odometry_channel,
@@ -23,8 +25,6 @@ from l2m_gtsam.ros_messages import (
     ros2,
     write_channels,
 )
-from l2m_gtsam.simulate.messages import Scans, magnetic_field, point_clouds, poses
-from l2m_gtsam.simulate.sensors import NoiseOptions
 
 
 class BagKind(StrEnum):

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.options import Options
-from l2m_gtsam.scans import Scan
+from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.simulate.solids import Solids
 
 NANOSECONDS = 1e9

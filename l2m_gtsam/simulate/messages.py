@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FieldSeries, IntArray, Trajectory
-from l2m_gtsam.ros_messages import Channel, Dialect
-from l2m_gtsam.scans import Scan
+from l2m_gtsam.records.scans import Scan
+from l2m_gtsam.storage.ros_messages import Channel, Dialect
 
 TESLA_PER_MICROTESLA = 1e-6
 MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"

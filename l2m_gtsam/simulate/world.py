@@ -6,7 +6,7 @@ import numpy as np
 from magpylib.core import magnet_cuboid_Bfield
 
 from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.threads import in_threads
+from l2m_gtsam.parallel.threads import in_threads
 
 MICROTESLA_PER_TESLA = 1e6
 PAIRS_PER_BATCH = 20_000  # of a body and a point: about 10 MB of intermediate arrays

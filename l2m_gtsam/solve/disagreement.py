@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
-from l2m_gtsam.results import Disagreement, Return
+from l2m_gtsam.records.calibration import Disagreement, Return
 
 FEWEST = 3  # rejected readings of one sensor in a row: fewer are stray ones
 SKIP = 2  # good readings within a run that do not end it

@@ -3,7 +3,7 @@
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.results import ResidualFigures
+from l2m_gtsam.records.calibration import ResidualFigures
 
 
 def residual_figures(residual: FloatArray, whitening: FloatArray, taken: float) -> ResidualFigures:

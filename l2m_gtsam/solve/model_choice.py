@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.models import Model
+from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.solve.model_fits import Fit, Spread
 
 

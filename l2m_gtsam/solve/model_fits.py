@@ -12,7 +12,7 @@ from scipy.linalg import matmul_toeplitz
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.models import ONE_DRIVE, Coefficients, Model, Samples
+from l2m_gtsam.records.sensor_models import ONE_DRIVE, Coefficients, Model, Samples
 
 ROUNDING = 1e-10  # of the largest: directions in which columns vary less follow from rounding
 EXACT = 1e-9  # of the readings' spread: what is left of them is never taken to be less

@@ -9,7 +9,7 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import FieldSeries, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
-from l2m_gtsam.pose_covariance import moved
+from l2m_gtsam.geometry import moved
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
 from l2m_gtsam.storage.clocks import check_clocks, check_stamps, clock_notes
 from l2m_gtsam.storage.digest import source_file

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.data import Distortion, RigidTransform, SourceFile, SyncCounts
-from l2m_gtsam.results import (
+from l2m_gtsam.records.calibration import (
     CalibrationResult,
     Disagreement,
     FoundStart,

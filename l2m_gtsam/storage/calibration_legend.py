@@ -1,6 +1,6 @@
 """What ``calibration.yaml`` says of itself: formulas, frames, units and what its sigmas hold."""
 
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 
 UNCERTAINTY = {
     Uncertainty.FULL: (

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.options import Options
-from l2m_gtsam.scans import Scan, taken_at_once
+from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import located
 from l2m_gtsam.storage.messages import header_ns

@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.fleet_results import DATE, FleetRow, SensorRow
-from l2m_gtsam.metric_results import Row
+from l2m_gtsam.records.fleet import DATE, FleetRow, SensorRow
+from l2m_gtsam.records.metrics import Row
 from l2m_gtsam.storage.atomic import atomic_path
 
 MISSING = "fleet.parquet needs pyarrow, fleet.csv has the same: pip install 'l2m-gtsam[fleet]'"

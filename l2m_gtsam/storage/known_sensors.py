@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import ConfigDict, Field, field_validator
 
 from l2m_gtsam.data import Distortion, KnownSensor
-from l2m_gtsam.results import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.file_model import Lenient, Matrix, Vector, read_model
 from l2m_gtsam.storage.yaml_file import write_yaml
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
-from l2m_gtsam.pose_covariance import from_ros
+from l2m_gtsam.geometry import from_ros
 from l2m_gtsam.storage.covariances import CovarianceBuffer
 from l2m_gtsam.storage.tf import Link
 

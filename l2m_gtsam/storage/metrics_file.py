@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import TypeAdapter
 
-from l2m_gtsam.metric_results import Metrics, Record
+from l2m_gtsam.records.metrics import Metrics, Record
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.record_file import read_record
 

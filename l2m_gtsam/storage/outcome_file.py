@@ -8,8 +8,8 @@ from typing import Literal
 
 from pydantic import TypeAdapter, ValidationError
 
-from l2m_gtsam.fleet_results import DATE, VERDICTS, DriveOutcome, SensorRow
-from l2m_gtsam.metric_results import Record
+from l2m_gtsam.records.fleet import DATE, VERDICTS, DriveOutcome, SensorRow
+from l2m_gtsam.records.metrics import Record
 from l2m_gtsam.storage.atomic import atomic_path
 
 MAX_BYTES = 10_000_000  # a hundred sensors are some 100 kB

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.options import Options
-from l2m_gtsam.scans import Scan
+from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.messages import header_ns
 from l2m_gtsam.storage.open_bag import Progress, open_bag

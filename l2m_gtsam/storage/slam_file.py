@@ -6,8 +6,8 @@ from typing import Literal
 
 from pydantic import TypeAdapter
 
-from l2m_gtsam.metric_results import Record
-from l2m_gtsam.slam_records import LocalisationRecord
+from l2m_gtsam.records.localisation_file import LocalisationRecord
+from l2m_gtsam.records.metrics import Record
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.record_file import read_record
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.tile_store import Arrays, Entry
 from l2m_gtsam.storage.atomic import renamed_path
-from l2m_gtsam.tile_store import Arrays, Entry
 
 MAGIC = b"l2m-tile"
 VERSION = 1

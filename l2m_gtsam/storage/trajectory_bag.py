@@ -9,8 +9,8 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.ros_messages import odometry_channel, ros2, transform_channel, write_channels
 from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.ros_messages import odometry_channel, ros2, transform_channel, write_channels
 
 TOPIC = "/odometry/localised"
 ODOM = "odom"  # REP-105

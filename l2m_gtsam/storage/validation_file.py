@@ -6,10 +6,10 @@ from typing import Literal
 
 from pydantic import TypeAdapter
 
-from l2m_gtsam.metric_results import Record
+from l2m_gtsam.records.metrics import Record
+from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.record_file import read_record
-from l2m_gtsam.validation_results import Validation
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,14 @@
 
 import numpy as np
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.forecast import stated_at
+from l2m_gtsam.calibration.view import QueryableMap, observe
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.coverage import UncertainMap
-from l2m_gtsam.graph.forecast import stated_at
-from l2m_gtsam.graph.view import QueryableMap, observe
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 
 
 def cramer_rao(

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_estimate
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions, alternate, start_estimate
-from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.solve.closed_form import (
     MIN_READINGS,
     ClosedFormOptions,

@@ -10,8 +10,8 @@ from typing import Any, Generic, TypeVar
 
 from pydantic import TypeAdapter
 
-from l2m_gtsam.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.options import Options
+from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.figures import save_figure
 from l2m_gtsam.storage.atomic import atomic_path

@@ -6,13 +6,14 @@ from functools import lru_cache
 import numpy as np
 from pydantic import Field
 
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.graph.view import Compilable, QueryableMap
-from l2m_gtsam.mapping import suite_readings
+from l2m_gtsam.mapping.mapping import suite_readings
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
+from l2m_gtsam.recording.sync import SyncOptions, synchronise
 from l2m_gtsam.simulate.drive import drive
 from l2m_gtsam.simulate.floor_plan import FloorPlan
 from l2m_gtsam.simulate.recorder import Vehicle, record
@@ -25,7 +26,6 @@ from l2m_gtsam.simulate.sensors import (
     random_distortion,
 )
 from l2m_gtsam.simulate.world import SteelWorld
-from l2m_gtsam.sync import SyncOptions, synchronise
 
 
 class SiteOptions(Options):

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.appraise import appraise
 from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE
 from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
-from l2m_gtsam.calibrate import calibrated
+from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import SourceFile
+from l2m_gtsam.qa.evaluate import appraise
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.metrics_file import write_metrics
-from tests.browsing import Looked, look
-from tests.verdict_drives import NOMINAL, loose
+from tests.drives.verdict import NOMINAL, loose
+from tests.support.browsing import Looked, look
 
 HOSTILE = {
     "mag_0": "<script>alert(1)</script>",

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2m_gtsam.fleet_results import FleetRow
 from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.fleet.outliers import with_outliers
 from l2m_gtsam.qa.fleet.page import fleet_page
-from tests.browsing import (
+from l2m_gtsam.records.fleet import FleetRow
+from tests.drives.fleet_rows import row, sensor_row
+from tests.support.browsing import (
     Looked,
     check_accessibility,
     check_figures,
@@ -20,7 +21,6 @@ from tests.browsing import (
     look,
     told_by,
 )
-from tests.fleet_rows import row, sensor_row
 
 MOST_BYTES = 700_000  # 192 rows: a fleet of 800 then stays below three megabytes
 VEHICLES, DRIVES, SENSORS = 4, 12, 4

@@ -7,7 +7,13 @@ from PIL import Image
 
 from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
 from tests.browser.conftest import BAG, HOSTILE
-from tests.browsing import Looked, check_accessibility, check_figures, check_phone, check_silence
+from tests.support.browsing import (
+    Looked,
+    check_accessibility,
+    check_figures,
+    check_phone,
+    check_silence,
+)
 
 FIGURES = 4 + 3 * 8  # of vehicle and map, and of each sensor
 # A figure that failed to draw is a blank card: of one that is drawn at least this share differs

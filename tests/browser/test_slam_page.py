@@ -7,10 +7,11 @@ import pytest
 
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.slam_page import slam_page
-from l2m_gtsam.slam_records import LocalisationRecord
-from l2m_gtsam.validation_results import NamedSource
+from l2m_gtsam.records.localisation_file import LocalisationRecord
+from l2m_gtsam.records.validation import NamedSource
 from tests.browser.conftest import BAG, HOSTILE
-from tests.browsing import (
+from tests.drives.localised import record
+from tests.support.browsing import (
     Looked,
     check_accessibility,
     check_figures,
@@ -18,7 +19,6 @@ from tests.browsing import (
     check_silence,
     look,
 )
-from tests.localised import record
 
 FIGURES = 6 + 2 * 5  # of the whole with a truth, and of each refined sensor
 NOTE = "<i onclick=alert(5)>mag_9</i> is left out"

@@ -10,11 +10,13 @@ from l2m_gtsam.qa.metrics.changes import compare_calibrations
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.validation_page import validation_page
 from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
-from l2m_gtsam.results import CalibrationResult
-from l2m_gtsam.validate import validate
-from l2m_gtsam.validation_results import NamedSource, Validation
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.validation import NamedSource, Validation
+from l2m_gtsam.validation.validate import validate
 from tests.browser.conftest import BAG, HOSTILE
-from tests.browsing import (
+from tests.drives.degenerate import STRONG
+from tests.drives.validation import OPTIONS, calibrated, changed, other_drive
+from tests.support.browsing import (
     Looked,
     check_accessibility,
     check_figures,
@@ -22,8 +24,6 @@ from tests.browsing import (
     check_silence,
     look,
 )
-from tests.degenerate_drives import STRONG
-from tests.validation_drives import OPTIONS, calibrated, changed, other_drive
 
 FIGURES = 4 + 3 * 4  # of all sensors and map, and of each sensor
 

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.cli import main
-from tests.end_to_end.halls import SMALL_HALL
+from l2m_gtsam.cli.app import main
+from tests.worlds.halls import SMALL_HALL
 
 TERMINAL = {"COLUMNS": "200", "NO_COLOR": "1"}
 
@@ -55,7 +55,7 @@ def ended(*arguments: str | Path) -> Finished:
 
 def l2m_process(*arguments: str | Path, fails: bool = False, timeout: float = 600) -> Finished:
     """Run ``l2m`` as a user would, in a process of its own."""
-    command = [sys.executable, "-c", "from l2m_gtsam.cli import main; main()"]
+    command = [sys.executable, "-c", "from l2m_gtsam.cli.app import main; main()"]
     run = subprocess.run(
         [*command, *map(str, arguments)],
         capture_output=True,

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from l2m_gtsam.results import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
-from tests.bags import Entry, ros, write
-from tests.browsing import (
+from tests.drives.bags import Entry, ros, write
+from tests.end_to_end.conftest import Demo, complaint_here, l2m, l2m_process, one_line
+from tests.support.browsing import (
     check_accessibility,
     check_figures,
     check_phone,
     check_silence,
     look,
 )
-from tests.end_to_end.conftest import Demo, complaint_here, l2m, l2m_process, one_line
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -29,7 +29,7 @@ def test_help_loads_nothing_heavy() -> None:
     }
     code = (
         "import sys; sys.argv = ['l2m', '--help']\n"
-        "from l2m_gtsam.cli import main\n"
+        "from l2m_gtsam.cli.app import main\n"
         "try:\n    main()\n"
         f"except SystemExit:\n    print('loaded:', sorted({heavy!r} & set(sys.modules)))"
     )

@@ -62,8 +62,8 @@ def test_every_option_is_on_its_page(site: Path) -> None:
 def test_the_reference_has_what_people_call(site: Path) -> None:
     inside = "".join(p.read_text(encoding="utf-8") for p in (site / "reference").glob("*.html"))
     for name in (
-        "l2m_gtsam.plan.plan",
-        "l2m_gtsam.results.SensorCalibration",
+        "l2m_gtsam.planning.plan.plan",
+        "l2m_gtsam.records.calibration.SensorCalibration",
         "l2m_gtsam.maps.harmonic.harmonic_map.HarmonicMap",
         "l2m_gtsam.batch.drives.calibrate_bag",
         "l2m_factors.reading.reading_factor",

@@ -8,17 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2m_gtsam.results import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
+from tests.drives.yard import T_LIDAR_MAG, C, CalibratedYard, calibrated, calibrated_yard, written
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.yard_drives import (
-    T_LIDAR_MAG,
-    C,
-    CalibratedYard,
-    calibrated,
-    calibrated_yard,
-    written,
-)
 
 
 @pytest.fixture(scope="module")

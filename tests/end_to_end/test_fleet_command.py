@@ -27,11 +27,11 @@ from l2m_gtsam.batch.fleet_task import (
     open_map,
 )
 from l2m_gtsam.batch.opening import SavedMap
-from l2m_gtsam.cluster import ClusterOptions
-from l2m_gtsam.fleet_results import DriveOutcome
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.parallel.cluster import ClusterOptions
+from l2m_gtsam.records.fleet import DriveOutcome
+from tests.drives.fleets import Place, make_place, not_a_bag, truncated, vehicle
 from tests.end_to_end.conftest import Finished, complaint_here, l2m
-from tests.fleets import Place, make_place, not_a_bag, truncated, vehicle
 
 HOSTILE = "<img src=x onerror=alert(1)>.bag"
 

@@ -17,10 +17,10 @@ from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.map_file import load_map, save_map
 from l2m_gtsam.storage.slam_file import read_slam
-from tests.calibrations import calibration, sensor
+from tests.drives.calibrations import calibration, sensor
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.halls import SMALL_HALL
-from tests.quick_maps import QUICK_HARMONIC
+from tests.worlds.halls import SMALL_HALL
+from tests.worlds.quick_maps import QUICK_HARMONIC
 
 # With a lidar of few columns, which a driver has freed of motion.
 HALL = SMALL_HALL | {"array": {"count": 1}, "lidar": {"rate": 2.5, "columns": 120}}

@@ -12,8 +12,8 @@ from l2m_gtsam.maps.harmonic import compiled, tiles
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.map_file import load_map
 from tests.end_to_end.conftest import complaint_here, l2m, l2m_process
-from tests.end_to_end.yard import POST, Yard, make_yard, world
-from tests.quick_maps import QUICK_HARMONIC
+from tests.worlds.quick_maps import QUICK_HARMONIC
+from tests.worlds.yard import POST, Yard, make_yard, world
 
 # About what is learnt from the whole run.
 OPTITRACK_PRIOR = {"floor_scale": 7.8, "floor_depth": 0.5, "noise": 0.35}

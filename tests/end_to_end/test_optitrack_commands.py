@@ -4,16 +4,16 @@ from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.results import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
-from tests.browsing import (
+from tests.end_to_end.conftest import l2m
+from tests.support.browsing import (
     check_accessibility,
     check_figures,
     check_phone,
     check_silence,
     look,
 )
-from tests.end_to_end.conftest import l2m
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from tests.bags import Entry, ros, write
+from tests.drives.bags import Entry, ros, write
+from tests.drives.yard import calibrated_yard
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.yard import START, STEP, Yard, route
-from tests.end_to_end.yard_drives import calibrated_yard
+from tests.worlds.yard import START, STEP, Yard, route
 
 
 @pytest.fixture(scope="module")

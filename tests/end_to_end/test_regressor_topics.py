@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.models import Model
+from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.storage.calibration_file import read_calibration
-from tests.bags import Entry, ros, write
+from tests.drives.bags import Entry, ros, write
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.yard import NOISE, START, STEP, Yard, make_yard, route, world
+from tests.worlds.yard import NOISE, START, STEP, Yard, make_yard, route, world
 
 H = np.array([0.8, -0.5, 0.6])  # uT/A
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from l2m_gtsam.results import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.end_to_end.conftest import l2m, l2m_process
-from tests.end_to_end.halls import SMALL_HALL
-from tests.quick_maps import QUICK_HARMONIC
+from tests.worlds.halls import SMALL_HALL
+from tests.worlds.quick_maps import QUICK_HARMONIC
 
 PRIOR = {"floor_scale": 4.0, "floor_depth": 0.6, "noise": 0.1}
 QUICK = {"mapping": {"model": {"harmonic": QUICK_HARMONIC | {"hyperparameters": PRIOR}}}}

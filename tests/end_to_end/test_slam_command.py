@@ -17,10 +17,10 @@ from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.tum import write_tum
-from tests.calibrations import calibration, sensor
+from tests.drives.calibrations import calibration, sensor
+from tests.drives.yard import calibrated_yard
 from tests.end_to_end.conftest import complaint_here, l2m
-from tests.end_to_end.yard import NOISE, Yard, route
-from tests.end_to_end.yard_drives import calibrated_yard
+from tests.worlds.yard import NOISE, Yard, route
 
 SIGMA = np.concatenate([np.full(3, 0.01), np.full(9, 0.01), np.full(3, 1.0)])
 

@@ -26,7 +26,7 @@ AT_THE_FIRST_BAR = f"""
 import os
 import sys
 from rich.progress import Progress
-from l2m_gtsam.cli import main
+from l2m_gtsam.cli.app import main
 
 def start(self):
     exec({LOADED!r})
@@ -67,7 +67,7 @@ def said(code: str, *arguments: str) -> list[str]:
 
 
 def test_the_command_line_loads_nothing_heavy() -> None:
-    assert said(f"import l2m_gtsam.cli; {LOADED}") == []
+    assert said(f"import l2m_gtsam.cli.app; {LOADED}") == []
 
 
 @pytest.mark.parametrize("command", COMMANDS)

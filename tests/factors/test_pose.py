@@ -28,7 +28,7 @@ from l2m_factors import (
     key_pose_factor,
 )
 from tests.factors.test_reading import CountingWorld, random_values
-from tests.worlds import dipole_world
+from tests.worlds.exact import dipole_world
 
 SENSORS = 2
 MODES = 4  # of a map's error

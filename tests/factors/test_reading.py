@@ -24,7 +24,7 @@ from l2m_factors import (
     reading_factor,
 )
 from l2m_gtsam.data import FloatArray, Readings
-from tests.worlds import DipoleWorld, dipole_world, drive, random_sensors
+from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
 
 
 def as_magnetic(readings: Readings) -> MagneticReadings:

@@ -14,9 +14,9 @@ from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.sliding_gp import SlidingGP
-from tests.harmonic_models import OPTIONS, POST, PRIOR, WORLD, fitted_map, rms
-from tests.harmonic_models import readings as readings_at_a_post
-from tests.worlds import DIPOLE_CONSTANT, DipoleWorld
+from tests.worlds.exact import DIPOLE_CONSTANT, DipoleWorld
+from tests.worlds.harmonic import OPTIONS, POST, PRIOR, WORLD, fitted_map, rms
+from tests.worlds.harmonic import readings as readings_at_a_post
 
 KEEP_ALL = OPTIONS.model_copy(update={"merge": 1e-6})
 

@@ -16,7 +16,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.hyperparameters import Hyperparameters, LearningOptions, learn
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.maps.training import ThinningOptions, training_set
-from tests.worlds import DipoleWorld, dipole_world
+from tests.worlds.exact import DipoleWorld, dipole_world
 
 GIVEN = Hyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
 KINDS = pytest.mark.parametrize("kind", ["sliding_gp", "dense_gp"])

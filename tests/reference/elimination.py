@@ -22,9 +22,9 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
+from l2m_gtsam.calibration.marginals import clusters_of
+from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_among, columns_of, rows_in
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.graph.marginals import clusters_of
-from l2m_gtsam.graph.sensor_columns import SENSOR, columns_among, columns_of, rows_in
 
 NONE = np.empty(0, dtype=np.int64)
 SHARED = -1  # of rows that are no one sensor's

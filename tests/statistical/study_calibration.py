@@ -6,9 +6,9 @@ from itertools import product
 
 import numpy as np
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, hall_cloud, steel_hall
 from l2m_gtsam.studies.honesty.outcomes import Honesty, Outcomes, honesty

@@ -7,8 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.simulate.hall_drives import Survey, held_out, survey
 from l2m_gtsam.simulate.steel_hall import (

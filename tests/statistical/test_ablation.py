@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
+from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -31,8 +31,8 @@ from l2m_gtsam.studies.ablation.study import ABLATION
 from l2m_gtsam.studies.ablation.table import AblationTable, ablation_table, gain
 from l2m_gtsam.studies.fingerprints import LAYER, thinned_rows
 from l2m_gtsam.studies.site import SiteOptions
-from tests.inline_study import run_inline
-from tests.quick_maps import quick
+from tests.support.inline_study import run_inline
+from tests.worlds.quick_maps import quick
 
 HALL = ScenarioOptions(
     floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),

@@ -9,10 +9,10 @@ import pytest
 from pydantic import TypeAdapter
 from scipy.stats import binomtest
 
-from l2m_gtsam.cluster import ClusterOptions
+from l2m_gtsam.calibration.one_key import solve_one_key
+from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.config import MappingOptions
-from l2m_gtsam.graph.global_start import find_starts
-from l2m_gtsam.graph.one_key import solve_one_key
+from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -30,7 +30,7 @@ from l2m_gtsam.studies.basin.study import BASIN
 from l2m_gtsam.studies.run import run_study
 from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive
-from tests.quick_maps import quick
+from tests.worlds.quick_maps import quick
 
 HALL = ScenarioOptions(
     floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),

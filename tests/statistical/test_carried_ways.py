@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.slam.following import Follower
-from l2m_gtsam.graph.slam.localisation import localise_drive
-from l2m_gtsam.graph.slam.options import DriftOptions, SlamOptions
+from l2m_gtsam.slam.localisation import localise_drive
+from l2m_gtsam.slam.online.following import Follower
+from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.solve.robust import RobustOptions
-from tests.drawn_drives import DrawnDrive, drawn_drive
-from tests.slam_drives import rounds
-from tests.worlds import dipole_world, random_sensors
+from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.drives.slam import rounds
+from tests.worlds.exact import dipole_world, random_sensors
 
 DRIVES, SECONDS, NOISE = 10, 30, 0.2
 EVERY = 3  # of poses 6 cm apart is a key pose

@@ -7,14 +7,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from l2m_gtsam.graph.slam.drive_prior import drive_prior
-from l2m_gtsam.graph.slam.exploring import Explorer, ExploringOptions
-from l2m_gtsam.graph.slam.mapping import map_drive
-from l2m_gtsam.graph.slam.options import SlamOptions
-from tests.integration.test_exploring import OnLine, prepared_drive, rms
-from tests.integration.test_slam import quiet
-from tests.slam_drives import calibrated, laps
-from tests.worlds import random_sensors
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.unknown_field.drive_prior import drive_prior
+from l2m_gtsam.slam.unknown_field.exploring import Explorer, ExploringOptions
+from l2m_gtsam.slam.unknown_field.mapping import map_drive
+from tests.drives.slam import calibrated, laps
+from tests.integration.slam.test_exploring import OnLine, prepared_drive, rms
+from tests.integration.slam.test_slam import quiet
+from tests.worlds.exact import random_sensors
 
 SEEDS, SENSORS = range(1, 7), 6
 TWO_AND_A_HALF, EIGHT = 90, 290  # seconds of laps of 21 m

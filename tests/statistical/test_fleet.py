@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from l2m_gtsam.batch.fleet_task import OUTCOME_FILE
+from tests.drives.fleets import BROKEN, Place, make_place, vehicle
 from tests.end_to_end.conftest import l2m_process
-from tests.fleets import BROKEN, Place, make_place, vehicle
 
 pytestmark = pytest.mark.study
 
@@ -43,7 +43,7 @@ def arguments(place: Place, bags: Path, out: Path) -> list[str]:
 
 def kill_at_half(command: list[str], out: Path) -> set[Path]:
     """Start a run, kill it with its workers when half is done, and return what was done."""
-    program = [sys.executable, "-c", "from l2m_gtsam.cli import main; main()", *command]
+    program = [sys.executable, "-c", "from l2m_gtsam.cli.app import main; main()", *command]
     started = subprocess.Popen(program, stderr=subprocess.DEVNULL, start_new_session=True)
     deadline = time.monotonic() + TIMEOUT_S
     while len(done(out)) < VEHICLES * DRIVES // 2:

@@ -9,7 +9,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.bound import cramer_rao
 from l2m_gtsam.studies.honesty.cells import Cell, Stated, bound_of, cell_of
 from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
@@ -18,8 +18,8 @@ from l2m_gtsam.studies.honesty.pictures import honesty_figures
 from l2m_gtsam.studies.honesty.place import drive_through, surveyed_hall
 from l2m_gtsam.studies.honesty.study import HONESTY, keys, prepare, site
 from l2m_gtsam.studies.honesty.summary import NAMES, HonestySummary, Verdict, honesty_summary
-from tests.inline_study import run_inline
-from tests.quick_maps import quick
+from tests.support.inline_study import run_inline
+from tests.worlds.quick_maps import quick
 
 TINY = HonestyOptions(
     surveys=2,

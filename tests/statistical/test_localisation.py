@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.slam.options import SlamOptions
-from l2m_gtsam.localise import localise
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.slam_results import LocalisationStatus
-from tests.integration.test_slam import pose_nees, position_error, quiet
-from tests.quick_maps import quick
-from tests.slam_drives import calibrated, rounds, slam_drive
-from tests.worlds import DipoleWorld, dipole_world, random_sensors
+from l2m_gtsam.records.localisation import LocalisationStatus
+from l2m_gtsam.slam.localise import localise
+from l2m_gtsam.slam.options import SlamOptions
+from tests.drives.slam import calibrated, rounds, slam_drive
+from tests.integration.slam.test_slam import pose_nees, position_error, quiet
+from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
+from tests.worlds.quick_maps import quick
 
 DRIVES = 12
 NOISE = 0.2  # uT

@@ -2,9 +2,9 @@
 
 import pytest
 
-from l2m_gtsam.models import Model
+from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.solve.model_comparison import ModelOptions, compare_models
-from tests.model_drives import NOISE, Setting, drawn
+from tests.drives.model import NOISE, Setting, drawn
 
 SETTINGS = {
     "white": Setting(),

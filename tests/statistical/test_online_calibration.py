@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.graph.slam.drive import KnownSensors
-from l2m_gtsam.graph.slam.following import Follower
-from l2m_gtsam.graph.slam.localisation import localise_drive
-from l2m_gtsam.graph.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.localisation import localise_drive
+from l2m_gtsam.slam.online.following import Follower
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.solve.robust import RobustOptions
-from tests.drawn_drives import DrawnDrive, drawn_drive
-from tests.slam_drives import rounds
-from tests.worlds import dipole_world, random_sensors
+from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.drives.slam import rounds
+from tests.worlds.exact import dipole_world, random_sensors
 
 DRIVES, SENSORS, SECONDS = 50, 3, 60
 RATE, EVERY = 2, 3  # every other pose of the drive, every third of these a key pose

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from l2m_gtsam.results import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus
 from tests.statistical.study_plan import Agreement, agreements
 
 WITHIN = 1.3  # the promise: 30 % either way

@@ -5,15 +5,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from l2m_gtsam.cluster import ClusterOptions
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.parallel.cluster import ClusterOptions
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
 from l2m_gtsam.simulate.steel_hall import CloudVariant
 from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions

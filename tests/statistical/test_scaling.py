@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.config import MappingOptions
-from l2m_gtsam.graph.global_start import StartOptions
 from l2m_gtsam.maps.training import training_set
 from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
 from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
@@ -21,11 +21,11 @@ from l2m_gtsam.studies.scaling.table import ScalingTable, exponent, scaling_tabl
 from l2m_gtsam.studies.scaling.tasks import middle
 from l2m_gtsam.studies.scaling.workers import Stint, rate
 from l2m_gtsam.studies.site import SiteOptions
-from tests.inline_study import run_inline
-from tests.quick_maps import quick
 from tests.statistical.test_ablation import HALL
-from tests.worlds import dipole_world, random_sensors
-from tests.worlds import drive as simulated
+from tests.support.inline_study import run_inline
+from tests.worlds.exact import dipole_world, random_sensors
+from tests.worlds.exact import drive as simulated
+from tests.worlds.quick_maps import quick
 
 MIB = 2**20
 FRESH = 64 * MIB

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.slam_results import LocalisationStatus
-from tests.drive_faults import jumped, shift
-from tests.integration.test_explore import explored
-from tests.integration.test_slam import position_error
-from tests.slam_drives import laps, slam_drive
-from tests.worlds import dipole_world, random_sensors
+from l2m_gtsam.records.localisation import LocalisationStatus
+from tests.drives.faults import jumped, shift
+from tests.drives.slam import laps, slam_drive
+from tests.integration.slam.test_explore import explored
+from tests.integration.slam.test_slam import position_error
+from tests.worlds.exact import dipole_world, random_sensors
 
 
 @pytest.mark.study

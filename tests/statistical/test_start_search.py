@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from l2m_gtsam.graph.slam.options import SlamOptions
-from l2m_gtsam.graph.slam.start_search import find_start
-from l2m_gtsam.graph.view import Compilable
-from l2m_gtsam.localise import prepared
-from l2m_gtsam.slam_results import StartVerdict
-from tests.integration.test_slam import quiet
-from tests.slam_drives import calibrated, slam_drive
+from l2m_gtsam.calibration.view import Compilable
+from l2m_gtsam.records.localisation import StartVerdict
+from l2m_gtsam.slam.localise import prepared
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.start.search import find_start
+from tests.drives.slam import calibrated, slam_drive
+from tests.integration.slam.test_slam import quiet
 from tests.statistical.test_localisation import survey
-from tests.surveyed_worlds import in_odometry, wandering
-from tests.worlds import dipole_world, random_sensors
+from tests.worlds.exact import dipole_world, random_sensors
+from tests.worlds.surveyed import in_odometry, wandering
 
 HALLS, DRIVES = 5, 20
 NEAR = 0.5  # metres

@@ -27,7 +27,7 @@ from tests.statistical.study_maps import (
     StudiedMap,
     map_study,
 )
-from tests.worlds import DipoleWorld, dipole_world
+from tests.worlds.exact import DipoleWorld, dipole_world
 
 Exact = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 

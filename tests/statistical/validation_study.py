@@ -4,18 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.calibrate import calibrate
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile
-from l2m_gtsam.graph.alternation import OneKeyOptions
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.recording.sync import SyncOptions
+from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.records.validation import ValidatedSensor
 from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
-from l2m_gtsam.sync import SyncOptions
-from l2m_gtsam.validate import validate
-from l2m_gtsam.validation_results import ValidatedSensor
+from l2m_gtsam.validation.validate import validate
 
 HEIGHTS = (0.4, 0.7, 1.0)
 SPAN = (0.4, 1.0)

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from l2m_gtsam.calibration.optimise import Optimizer
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.graph.optimise import Optimizer
 
 
 def test_defaults_without_a_file() -> None:

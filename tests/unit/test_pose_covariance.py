@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform
-from l2m_gtsam.pose_covariance import from_ros, moved, to_ros
+from l2m_gtsam.geometry import from_ros, moved, to_ros
 
 SEEDS = st.integers(0, 2**32 - 1)
 STEP = 1e-6

@@ -21,7 +21,7 @@ from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.training import TrainingSet, checked_points
-from l2m_gtsam.threads import in_threads
+from l2m_gtsam.parallel.threads import in_threads
 
 MEMORY = 1_000_000_000  # bytes of grids that are kept
 SHARES = 4  # that points are divided into, for as many threads at most

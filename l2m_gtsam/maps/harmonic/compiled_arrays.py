@@ -9,7 +9,7 @@ from l2m_gtsam.maps.harmonic.near_sources import NearSources
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
-from l2m_gtsam.tile_store import Arrays
+from l2m_gtsam.maps.tile_store import Arrays
 
 
 def compiled_to_arrays(compiled: CompiledTile | Tile) -> Arrays:

@@ -10,7 +10,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.places import Places
-from l2m_gtsam.tile_store import Entry
+from l2m_gtsam.maps.tile_store import Entry
 
 ALGORITHM = 1
 """To be raised with every change to what is solved, compiled or kept of the same readings."""

@@ -28,7 +28,7 @@ from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.threads import in_threads
+from l2m_gtsam.parallel.threads import in_threads
 
 NEGLIGIBLE = 1e-15  # share of the variance at places
 

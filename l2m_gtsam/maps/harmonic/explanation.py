@@ -11,7 +11,7 @@ from l2m_gtsam.maps.harmonic.evidence import Weights, condition, normal_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.training import TrainingSet
-from l2m_gtsam.threads import in_threads
+from l2m_gtsam.parallel.threads import in_threads
 
 FOLDS = 4
 PATCH = 0.6  # metres; about as far as the space between two lanes of a survey

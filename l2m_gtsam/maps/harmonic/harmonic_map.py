@@ -20,9 +20,9 @@ from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.visits import Visit
+from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
-from l2m_gtsam.threads import in_threads
-from l2m_gtsam.tile_store import TileStore
+from l2m_gtsam.parallel.threads import in_threads
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.tile_store import Arrays
+from l2m_gtsam.maps.tile_store import Arrays
 
 Shape = tuple[int | None, ...]
 """None stands for any length."""

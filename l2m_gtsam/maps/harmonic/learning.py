@@ -27,7 +27,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
 )
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
-from l2m_gtsam.threads import in_threads
+from l2m_gtsam.parallel.threads import in_threads
 
 ROUNDS = 2  # learning is repeated while it asks for finer modes than it looked at
 BOUND_TOLERANCE = 1e-6

@@ -5,7 +5,7 @@ from threading import Lock
 
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.entries import compiled_entry, solved_entry
-from l2m_gtsam.threads import in_threads
+from l2m_gtsam.parallel.threads import in_threads
 
 
 def make_all(compiled: CompiledTiles, told: Callable[[int, int], None]) -> int:

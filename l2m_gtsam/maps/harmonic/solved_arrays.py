@@ -18,8 +18,8 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.kept_arrays import finite
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.tile_store import Arrays
 from l2m_gtsam.maps.trained import first_complaint
-from l2m_gtsam.tile_store import Arrays
 
 NAMES = tuple(sorted(Hyperparameters.model_fields))
 

@@ -27,7 +27,7 @@ from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
-from l2m_gtsam.threads import in_threads
+from l2m_gtsam.parallel.threads import in_threads
 
 # Tiles whose held-out places say whether the field is explained, and those of them where the
 # readings are roughest.

@@ -11,8 +11,8 @@ from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.local import local_hyperparameters
 from l2m_gtsam.maps.harmonic.solved_arrays import solved_from_arrays, solved_to_arrays
 from l2m_gtsam.maps.harmonic.tile import Tile
-from l2m_gtsam.threads import in_threads
-from l2m_gtsam.tile_store import NO_STORE, TileStore
+from l2m_gtsam.maps.tile_store import NO_STORE, TileStore
+from l2m_gtsam.parallel.threads import in_threads
 
 MEMORY = 2_000_000_000  # bytes of the tiles' covariances that are kept
 

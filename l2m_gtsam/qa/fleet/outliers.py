@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import median_abs_deviation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.fleet_results import FleetRow, Outlier, SensorRow
 from l2m_gtsam.qa.fleet.options import FleetOptions
+from l2m_gtsam.records.fleet import FleetRow, Outlier, SensorRow
 
 MOST = 500  # rotations that are compared each with each: 2 MB
 MEDIAN = np.pi / 2  # variance of a median beside that of a mean, of normal numbers

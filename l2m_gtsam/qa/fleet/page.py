@@ -14,13 +14,13 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.fleet_results import ERROR, FleetRow, SensorRow
 from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.fleet.trends import SIGMAS, Trend, trend_figure, trends
 from l2m_gtsam.qa.report.page import number, style
 from l2m_gtsam.qa.report.sections import Picture
 from l2m_gtsam.qa.report.svg import SETTINGS, as_svg
 from l2m_gtsam.qa.report.words import with_sigma
+from l2m_gtsam.records.fleet import ERROR, FleetRow, SensorRow
 
 REPORT = "report.html"  # in the folder of each drive
 

@@ -4,12 +4,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.fleet_results import SensorRow
 from l2m_gtsam.qa.judge import SensorVerdict, Verdict
 from l2m_gtsam.qa.metrics.mounting import gains
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.qa.reasons.reason import Level, Reason, worst
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.fleet import SensorRow
 
 NAN = float("nan")
 DIGITS = 9  # well below any sigma, in metres as in microtesla

@@ -11,9 +11,9 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.fleet_results import DATE, FleetRow
 from l2m_gtsam.qa.fleet.outliers import by_sensor
 from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MUTED, dots, plain_figure
+from l2m_gtsam.records.fleet import DATE, FleetRow
 
 SIGMAS = 2  # of the bars
 ROOM = 1.15  # around what is drawn

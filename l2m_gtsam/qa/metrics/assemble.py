@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Recording
-from l2m_gtsam.metric_results import Halves, MapPicture, Metrics, SensorMetrics
 from l2m_gtsam.qa.metrics.autocorrelation import autocorrelation
 from l2m_gtsam.qa.metrics.coverage import directions, drive_metrics
 from l2m_gtsam.qa.metrics.curves import curve_errors, curves, series
@@ -20,8 +19,9 @@ from l2m_gtsam.qa.metrics.fit import fit_figures, normalised_figures
 from l2m_gtsam.qa.metrics.halves import NOT_DONE, SEVERAL, no_halves
 from l2m_gtsam.qa.metrics.mounting import mounting
 from l2m_gtsam.qa.metrics.plain import row, rows
-from l2m_gtsam.repeat_results import Repeatability
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.metrics import Halves, MapPicture, Metrics, SensorMetrics
+from l2m_gtsam.records.repeat import Repeatability
 
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
 FEWEST, MOST = 100, 500  # of each

@@ -3,9 +3,9 @@
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.metric_results import Autocorrelation
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.records.metrics import Autocorrelation
 
 LAGS = 40
 

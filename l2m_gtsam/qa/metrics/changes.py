@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import BoolArray, FloatArray, same_content
 from l2m_gtsam.qa.metrics.mounting import PAIRS, gains, sensor_axes, skews_deg
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
-from l2m_gtsam.solve.chi_square import chance_beyond
-from l2m_gtsam.validation_results import (
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.validation import (
     CalibrationComparison,
     Change,
     ChangeTest,
@@ -20,6 +19,7 @@ from l2m_gtsam.validation_results import (
     NotValidated,
     Part,
 )
+from l2m_gtsam.solve.chi_square import chance_beyond
 
 TINY = 1e-12  # of the largest variance, in units of sigmas: a direction that both share exactly
 INDEPENDENT = (

@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray, Recording, Trajectory
-from l2m_gtsam.metric_results import Directions, DriveMetrics
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import evenly, row, rows
+from l2m_gtsam.records.metrics import Directions, DriveMetrics
 
 SPHERE = 400  # directions, about 10 degrees apart
 NEAR_DEG = 15.0

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.metric_results import CurveErrors, Series
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import evenly, row, rows
-from l2m_gtsam.results import SensorCalibration
+from l2m_gtsam.records.calibration import SensorCalibration
+from l2m_gtsam.records.metrics import CurveErrors, Series
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings
-from l2m_gtsam.results import SensorCalibration
+from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.validation_results import FieldError
+from l2m_gtsam.records.validation import FieldError
 
 
 def field_error(field: FloatArray, of_map: FloatArray) -> FieldError:

@@ -3,9 +3,9 @@
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import Fit, Normalised
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.records.metrics import Fit, Normalised
 from l2m_gtsam.solve.chi_square import quantile
 
 BINS = 24

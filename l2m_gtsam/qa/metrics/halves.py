@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, Distortion, FloatArray
-from l2m_gtsam.metric_results import Halves
 from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.records.metrics import Halves
 
 TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas
 SEVERAL = "several drives are compared with each other instead of halves of one"

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from l2m_gtsam.metric_results import Halves, SensorMetrics
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.records.metrics import Halves, SensorMetrics
 
 
 def fits_elsewhere(others: Sequence[SensorMetrics], options: QaOptions) -> bool:

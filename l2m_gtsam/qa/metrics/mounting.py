@@ -5,9 +5,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import AxisOrder, Mounting
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.results import SensorCalibration
+from l2m_gtsam.records.calibration import SensorCalibration
+from l2m_gtsam.records.metrics import AxisOrder, Mounting
 
 AXES = "xyz"
 PAIRS = ((0, 1), (1, 2), (2, 0))

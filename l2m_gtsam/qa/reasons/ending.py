@@ -4,7 +4,7 @@ import numpy as np
 
 from l2m_gtsam.qa.metrics.misfit import fits_elsewhere
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason
-from l2m_gtsam.results import SensorCalibration, SensorStatus
+from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
 
 
 def ending(case: Case) -> list[Reason]:

@@ -4,10 +4,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import AxisOrder
 from l2m_gtsam.qa.nominal import nominal_place, nominal_rotation
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason, against
-from l2m_gtsam.results import SensorCalibration, SensorStatus
+from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
+from l2m_gtsam.records.metrics import AxisOrder
 
 NOT_SOLVED = (SensorStatus.NO_READINGS, SensorStatus.OUTSIDE_MAP)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason, against
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 
 
 def precision(case: Case) -> list[Reason]:

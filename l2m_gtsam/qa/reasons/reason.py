@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from l2m_gtsam.metric_results import Metrics, SensorMetrics
 from l2m_gtsam.qa.options import Limit, QaOptions
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.metrics import Metrics, SensorMetrics
 
 
 class Level(StrEnum):

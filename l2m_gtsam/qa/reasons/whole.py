@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_gtsam.qa.reasons.fit import misfit
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason
-from l2m_gtsam.results import CalibrationResult, Disagreement, Return, SensorStatus
+from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
 
 HEADS = {
     Return.NEVER: "The environment has changed, or something passed by",

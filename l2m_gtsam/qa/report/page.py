@@ -9,14 +9,14 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.judge import judge
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.report import words
 from l2m_gtsam.qa.report.sections import overall_pictures, sensor_section
 from l2m_gtsam.qa.report.svg import SETTINGS
-from l2m_gtsam.results import CalibrationResult
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.storage.calibration_legend import MODEL, UNCERTAINTY
 

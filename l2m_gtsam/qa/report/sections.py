@@ -6,7 +6,6 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from l2m_gtsam.metric_results import Metrics, SensorMetrics
 from l2m_gtsam.qa.judge import SensorVerdict, Verdict
 from l2m_gtsam.qa.report import words
 from l2m_gtsam.qa.report.drawing import Drawing
@@ -16,8 +15,9 @@ from l2m_gtsam.qa.report.figures.directions import directions_figure
 from l2m_gtsam.qa.report.figures.drives import drive_names, drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.svg import as_svg
-from l2m_gtsam.repeat_results import Repeatability
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.metrics import Metrics, SensorMetrics
+from l2m_gtsam.records.repeat import Repeatability
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from l2m_gtsam.qa.report.sections import Picture, picture
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.slam.course import Course, course_of
 from l2m_gtsam.qa.slam.judge import judge_localisation, slam_thresholds
-from l2m_gtsam.slam_records import (
+from l2m_gtsam.records.localisation_file import (
     LocalisationRecord,
     RefinedSensor,
     SensorRecord,

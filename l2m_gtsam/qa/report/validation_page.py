@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import matplotlib as mpl
 import numpy as np
 
-from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.qa.report.figures import course, place
 from l2m_gtsam.qa.report.figures.statistics import sigmas_figure
 from l2m_gtsam.qa.report.figures.validation import field_errors_figure, nis_figure
@@ -14,14 +13,15 @@ from l2m_gtsam.qa.report.page import environment, style
 from l2m_gtsam.qa.report.sections import Picture, picture
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.validation.sentences import NAMES, amount
-from l2m_gtsam.solve.rank import PARAMETERS
-from l2m_gtsam.validation_results import (
+from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.validation import (
     ComparedSensor,
     DriveValidation,
     SensorRemarks,
     ValidatedSensor,
     Validation,
 )
+from l2m_gtsam.solve.rank import PARAMETERS
 
 
 @dataclass(frozen=True)

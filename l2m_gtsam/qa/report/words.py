@@ -4,10 +4,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import SensorMetrics
 from l2m_gtsam.qa.report.figures.correlations import NAMES, correlations
-from l2m_gtsam.repeat_results import Repeatability
-from l2m_gtsam.results import CalibrationResult, SensorCalibration, Uncertainty
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
+from l2m_gtsam.records.metrics import SensorMetrics
+from l2m_gtsam.records.repeat import Repeatability
 from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.pose_covariance import to_ros
-from l2m_gtsam.slam_records import LocalisationRecord
+from l2m_gtsam.geometry import to_ros
+from l2m_gtsam.records.localisation_file import LocalisationRecord
 
 HEADING = 5  # of x, y, z, and rotations about them
 

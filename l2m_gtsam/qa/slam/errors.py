@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import BoolArray, FloatArray, Trajectory
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.qa.metrics.plain import row, rows
-from l2m_gtsam.slam_records import POSE_FREEDOM, PoseErrors, TruthRecord
+from l2m_gtsam.recording.sync import has_pose, interpolated
+from l2m_gtsam.records.localisation_file import POSE_FREEDOM, PoseErrors, TruthRecord
 from l2m_gtsam.solve.chi_square import quantile
-from l2m_gtsam.sync import has_pose, interpolated
 
 
 @dataclass(frozen=True)

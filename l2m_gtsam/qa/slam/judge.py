@@ -5,8 +5,8 @@ from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.reasons.reason import Level, Reason, worst
 from l2m_gtsam.qa.slam.sensor_reasons import on_sensor
 from l2m_gtsam.qa.slam.whole_reasons import on_whole
-from l2m_gtsam.slam_records import LocalisationRecord, RefinedSensor, SensorRecord
-from l2m_gtsam.validation_results import Threshold
+from l2m_gtsam.records.localisation_file import LocalisationRecord, RefinedSensor, SensorRecord
+from l2m_gtsam.records.validation import Threshold
 
 SHARED_LIMITS = ("rejected", "outside_map", "chi_square")
 

@@ -2,7 +2,7 @@
 
 from l2m_gtsam.qa.options import QaOptions, SlamQaOptions
 from l2m_gtsam.qa.reasons.reason import Level, Reason, against
-from l2m_gtsam.slam_records import RefinedSensor, SensorRecord
+from l2m_gtsam.records.localisation_file import RefinedSensor, SensorRecord
 from l2m_gtsam.solve.chi_square import chance_beyond
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from l2m_gtsam.slam_records import SensorRecord
+from l2m_gtsam.records.localisation_file import SensorRecord
 
 MOST = 0.5  # share of a sensor's readings in a span of the timeline
 

@@ -7,8 +7,8 @@ from l2m_gtsam.qa.options import Limit, SlamQaOptions
 from l2m_gtsam.qa.reasons.reason import Level, Reason, against
 from l2m_gtsam.qa.slam.course import HEADING, Course, course_of
 from l2m_gtsam.qa.slam.stretches import stretches
-from l2m_gtsam.slam_records import POSE_FREEDOM, LocalisationRecord, TruthRecord
-from l2m_gtsam.slam_results import LocalisationStatus, OdometryScale, ScanUse
+from l2m_gtsam.records.localisation import LocalisationStatus, OdometryScale, ScanUse
+from l2m_gtsam.records.localisation_file import POSE_FREEDOM, LocalisationRecord, TruthRecord
 from l2m_gtsam.solve.chi_square import chance_beyond
 
 MANY = 3  # stretches that are told one by one

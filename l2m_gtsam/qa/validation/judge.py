@@ -7,7 +7,7 @@ import numpy as np
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.reasons.reason import Level, Reason, against, level_of, worst
 from l2m_gtsam.qa.validation.sentences import MEANINGS, NAMES, amount, by_how_much, limits_of
-from l2m_gtsam.validation_results import (
+from l2m_gtsam.records.validation import (
     CalibrationComparison,
     Change,
     ComparedSensor,

@@ -3,7 +3,7 @@
 import numpy as np
 
 from l2m_gtsam.qa.options import Limit, ValidationOptions
-from l2m_gtsam.validation_results import Change, Part
+from l2m_gtsam.records.validation import Change, Part
 
 NAMES = {
     Part.PLACE: "its place t",

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.results import SensorCalibration
+from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.storage.exports.export import Export, ExportedSensor, not_correctable, not_oriented
 from l2m_gtsam.storage.yaml_file import yaml_text
 

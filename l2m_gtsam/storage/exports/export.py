@@ -8,7 +8,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.errors import CalibrationError, ConfigError
-from l2m_gtsam.results import CalibrationResult, SensorCalibration, SensorStatus
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, SensorStatus
 
 Fault = Callable[[SensorCalibration], str | None]
 """Why a sensor cannot be part of a file, as half a sentence; None where it can."""

@@ -12,15 +12,15 @@ from functools import lru_cache
 import numpy as np
 from pydantic import Field
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.one_key import solve_one_key
+from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import Distortion, FloatArray, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.global_start import StartOptions, find_starts
-from l2m_gtsam.graph.one_key import solve_one_key
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method, Weighting

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.world import SteelWorld
 from l2m_gtsam.studies.ablation.packed import Packed

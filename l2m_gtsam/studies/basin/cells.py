@@ -22,12 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.one_key import solve_one_key
+from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_around
 from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.global_start import StartOptions, find_starts_around
-from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.options import Options
-from l2m_gtsam.results import FoundStart, Uncertainty
+from l2m_gtsam.records.calibration import FoundStart, Uncertainty
 from l2m_gtsam.studies.basin.levenberg_marquardt import levenberg_marquardt
 from l2m_gtsam.studies.json_array import JsonBools, JsonFloats
 from l2m_gtsam.studies.methods import published

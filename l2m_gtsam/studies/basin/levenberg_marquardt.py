@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings, reading_graph
+from l2m_gtsam.calibration.optimise import Optimizer, optimise
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import Distortion, FloatArray, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.calibration import Estimate, batch_readings, reading_graph
-from l2m_gtsam.graph.optimise import Optimizer, optimise
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.solve.closed_form import fit_distortion
 from l2m_gtsam.solve.noise import reading_covariance
 

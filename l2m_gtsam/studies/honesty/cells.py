@@ -5,18 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.calibration import Estimate
-from l2m_gtsam.graph.one_key import solve_one_key
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.recording.sync import with_offsets
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.bound import bound_at
 from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
 from l2m_gtsam.studies.honesty.outcomes import Outcomes
 from l2m_gtsam.studies.honesty.place import Place, drive_through, start_near
 from l2m_gtsam.studies.honesty.trouble import Disturbed
 from l2m_gtsam.studies.json_array import JsonFloats
-from l2m_gtsam.sync import with_offsets
 
 PARAMETERS = 16
 

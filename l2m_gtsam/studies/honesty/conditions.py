@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field, field_validator
 
-from l2m_gtsam.graph.alternation import OneKeyOptions
+from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.studies.honesty.trouble import POSE_NOISE

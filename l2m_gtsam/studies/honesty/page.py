@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.honesty.conditions import HonestyOptions
 from l2m_gtsam.studies.honesty.outcomes import Honesty
 from l2m_gtsam.studies.honesty.summary import (

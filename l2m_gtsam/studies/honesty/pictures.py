@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from scipy.stats import norm
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.honesty.page import setting
 from l2m_gtsam.studies.honesty.summary import (
     EDGES,

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.view import Compilable, QueryableMap
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.honesty.cells import Cell
 from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
 from l2m_gtsam.studies.honesty.outcomes import OFFSET, Honesty, Outcomes, honesty

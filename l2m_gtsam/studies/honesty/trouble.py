@@ -6,9 +6,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Readings, Trajectory
-from l2m_gtsam.pose_noise import PoseNoiseOptions, pose_roots
+from l2m_gtsam.recording.pose_noise import PoseNoiseOptions, pose_roots
+from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.simulate.hall_drives import STEP_NS, CalibrationDrive
-from l2m_gtsam.sync import with_offsets
 
 SHARE = 0.1  # of the readings
 LATE_S = 0.04  # clocks are off by up to this

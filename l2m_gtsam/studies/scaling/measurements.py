@@ -9,15 +9,15 @@ from enum import StrEnum
 
 from pydantic import Field
 
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.global_start import StartOptions
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.options import Options
+from l2m_gtsam.recording.sync import SyncOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
 from l2m_gtsam.studies.site import SiteOptions
-from l2m_gtsam.sync import SyncOptions
 
 
 class Part(StrEnum):

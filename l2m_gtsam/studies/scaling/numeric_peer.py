@@ -8,8 +8,8 @@ the dense algebra with its cube.
 import numpy as np
 from scipy.optimize import least_squares
 
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.view import QueryableMap
 
 UNKNOWNS = 15  # of a sensor: t, C and H
 MOST_STEPS = 30

@@ -5,14 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l2m_gtsam.calibration.alternation import spread
+from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.calibration.start.global_start import find_starts
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.alternation import spread
-from l2m_gtsam.graph.global_start import find_starts
-from l2m_gtsam.graph.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.training import ThinningOptions, TrainingSet
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.recording.sync import synchronise
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.drive import drive
 from l2m_gtsam.simulate.recorder import Vehicle, record
 from l2m_gtsam.simulate.route import calibration_route
@@ -22,7 +23,6 @@ from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOpt
 from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
 from l2m_gtsam.studies.scaling.stopwatch import taken
 from l2m_gtsam.studies.site import Surveyed
-from l2m_gtsam.sync import synchronise
 
 KINDS = {Way.HARMONIC: "harmonic", Way.SLIDING: "sliding_gp", Way.DENSE: "dense_gp"}
 WARM = 200  # readings that pass everywhere on the drive

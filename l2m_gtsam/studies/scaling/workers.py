@@ -14,12 +14,12 @@ from functools import partial
 import numpy as np
 from pydantic import TypeAdapter
 
-from l2m_gtsam.cluster import ClusterOptions, Work, computed
+from l2m_gtsam.calibration.one_key import solve_one_key
+from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.errors import ClusterError
-from l2m_gtsam.graph.global_start import find_starts
-from l2m_gtsam.graph.one_key import solve_one_key
 from l2m_gtsam.options import Options
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
 from l2m_gtsam.studies.site import Site, mapped_site, random_drive
 

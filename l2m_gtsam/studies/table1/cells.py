@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.start.global_start import StartOptions
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.global_start import StartOptions
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
-from l2m_gtsam.results import Uncertainty
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions

@@ -7,11 +7,11 @@ from time import process_time
 import numpy as np
 from scipy.linalg import polar
 
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.one_key import solve_one_key
+from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_around
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.graph.alternation import OneKeyOptions
-from l2m_gtsam.graph.global_start import StartOptions, find_starts_around
-from l2m_gtsam.graph.one_key import solve_one_key
-from l2m_gtsam.graph.view import QueryableMap
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from l2m_gtsam.studies.methods import published, two_step
 from l2m_gtsam.studies.peers.magyc import ChipDrive, magyc_peer, magyc_python

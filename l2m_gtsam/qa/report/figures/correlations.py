@@ -7,7 +7,7 @@ from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.panel import Box, Panel, Stroke, fill, letters
 from l2m_gtsam.qa.report.scale import COLOURS, colours, shades
 from l2m_gtsam.qa.report.svg import PAPER, SMALL
-from l2m_gtsam.results import SensorCalibration
+from l2m_gtsam.records.calibration import SensorCalibration
 
 HEIGHT = 4.0  # inches
 MATRIX = Box(34, 10, 240, 240)

@@ -3,10 +3,10 @@
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.metric_results import Series
 from l2m_gtsam.qa.report.drawing import Drawing, Entry, stacked
 from l2m_gtsam.qa.report.panel import Panel, Stroke, fill, letters, nice, numbers, spread
 from l2m_gtsam.qa.report.svg import AXES, BAD, GRID, INK, MUTED, SMALL, X, Y
+from l2m_gtsam.records.metrics import Series
 
 BETWEEN = 0.04  # of all drives' time, between two drives in a figure
 ZERO = Stroke(MUTED, 0.7)

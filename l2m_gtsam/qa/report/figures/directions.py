@@ -3,10 +3,10 @@
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import SensorMetrics
 from l2m_gtsam.qa.report.drawing import PAGE, Drawing
 from l2m_gtsam.qa.report.panel import Box, Panel, Stroke, letters
 from l2m_gtsam.qa.report.svg import GRID, MUTED, X, Y
+from l2m_gtsam.records.metrics import SensorMetrics
 
 HEIGHT = 2.7  # inches
 SIZE = 164.0  # points of a disk with its room

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.qa.report.svg import GRID, INK, MUTED, SMALL, X, new_figure
-from l2m_gtsam.repeat_results import Repeatability
-from l2m_gtsam.results import SensorCalibration
+from l2m_gtsam.records.calibration import SensorCalibration
+from l2m_gtsam.records.repeat import Repeatability
 
 MANY = 12  # drives beyond which only some are numbered
 

@@ -11,7 +11,6 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import MapPicture, Rows
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.report.figures.place import mark, strength_background, wide
 from l2m_gtsam.qa.report.svg import (
@@ -31,7 +30,8 @@ from l2m_gtsam.qa.report.svg import (
     short_name,
 )
 from l2m_gtsam.qa.slam.course import HEADING, Course
-from l2m_gtsam.slam_records import SensorRecord, TruthRecord
+from l2m_gtsam.records.localisation_file import SensorRecord, TruthRecord
+from l2m_gtsam.records.metrics import MapPicture, Rows
 
 DRAWN = 1500  # poses of a line, at most
 ELLIPSES = 12

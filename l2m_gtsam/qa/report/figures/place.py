@@ -8,12 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.metric_results import MapPicture, Metrics, Rows, Series
 from l2m_gtsam.qa.report.drawing import LEFT, PAGE, POINTS, Drawing, Entry, legend
 from l2m_gtsam.qa.report.panel import Box, Panel, Stroke, fill, nice, numbers, spread
 from l2m_gtsam.qa.report.scale import COLOURS, colours, shades
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
-from l2m_gtsam.results import Disagreement
+from l2m_gtsam.records.calibration import Disagreement
+from l2m_gtsam.records.metrics import MapPicture, Metrics, Rows, Series
 
 # Of colour bars: a drive is wider than high more often than not.
 BELOW: Any = {"location": "bottom", "shrink": 0.7, "aspect": 40, "pad": 0.02}

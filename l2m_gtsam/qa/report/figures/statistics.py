@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from l2m_gtsam.metric_results import Normalised, Row, SensorMetrics
 from l2m_gtsam.qa.report.drawing import Drawing, Entry, legend, usual
 from l2m_gtsam.qa.report.panel import Panel, Stroke, fill, letters, paint
 from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, SMALL, X, Y
+from l2m_gtsam.records.metrics import Normalised, Row, SensorMetrics
 from l2m_gtsam.solve.chi_square import density
 
 CUT = 7.81  # 95 % of chi-square of three

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.qa.report.svg import BAD, GOOD, GRID, INK, MUTED, X, Y, new_figure, short_name
-from l2m_gtsam.validation_results import ValidatedSensor
+from l2m_gtsam.records.validation import ValidatedSensor
 
 ROW = 0.26  # inches of a sensor
 ROUND = 0.15  # of the axis of ratios: room around the outermost

@@ -11,7 +11,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.reasons.reason import Level
 from l2m_gtsam.qa.report.svg import BAD, FAIR, GOOD, INK, MUTED, SMALL, new_figure, short_name
-from l2m_gtsam.results import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 
 CHI2_95 = 5.991  # of two degrees of freedom
 COLOURS = {Level.PASS: GOOD, Level.WARN: FAIR, Level.FAIL: BAD}

@@ -1,0 +1,233 @@
+"""Recording + map + options -> calibration. Pure: no files, no terminal."""
+
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+
+import numpy as np
+
+from l2m_gtsam.calibration.alternation import Progress
+from l2m_gtsam.calibration.explanation import explained
+from l2m_gtsam.calibration.moving_solve import MovingProblem, solve_moving
+from l2m_gtsam.calibration.named_priors import priors_of
+from l2m_gtsam.calibration.one_key import OneKeySolution
+from l2m_gtsam.calibration.prepare import prepare
+from l2m_gtsam.calibration.priors import Priors
+from l2m_gtsam.calibration.remembered_map import RememberedMap
+from l2m_gtsam.calibration.start.global_start import find_starts
+from l2m_gtsam.calibration.trust import judged
+from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.data import (
+    FloatArray,
+    Readings,
+    Recording,
+    SourceFile,
+)
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.recording.joining import drive_at, own_ns
+from l2m_gtsam.recording.sync import stuck_readings
+from l2m_gtsam.records.calibration import (
+    CalibrationResult,
+    Disagreement,
+    FoundStart,
+    SensorCalibration,
+    SensorStatus,
+)
+from l2m_gtsam.solve.disagreement import disagreements
+from l2m_gtsam.solve.explain import movement
+
+VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """A calibration with what it rests on.
+
+    Attributes
+    ----------
+    result
+        The calibration.
+    solution
+        Of the solve, with its readings.
+    field_map, solver_map
+        The map, and the form of it that is asked faster along the drive.
+    """
+
+    result: CalibrationResult
+    solution: OneKeySolution
+    field_map: QueryableMap
+    solver_map: QueryableMap
+
+
+def calibrate(
+    recording: Recording,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    map_source: SourceFile | None = None,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """Find where every magnetometer sits on the lidar and how it distorts the field.
+
+    Parameters
+    ----------
+    recording
+        A drive through the mapped place, or several of one vehicle (``joining.joined``): sensors
+        then have one t, C, H and time offset over all of them.
+    field_map
+        The magnetic map, in the frame of the recording's poses.
+    options
+        Synchronisation, starts and solve.
+    map_source
+        Where the map came from, for the record.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    SyncError
+        Readings and poses do not overlap.
+    CalibrationError
+        No sensor can be solved: the map does not cover the drive, or nothing was read. Or a start
+        or prior names no sensor of the recording.
+    """
+    return calibrated(recording, field_map, options, map_source, progress).result
+
+
+@one_blas_thread()
+def calibrated(
+    recording: Recording,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    map_source: SourceFile | None = None,
+    progress: Progress | None = None,
+) -> Calibrated:
+    """Calibrate as ``calibrate`` does, and keep what the result rests on, to judge it by."""
+    synchronised = prepare(recording, options)
+    alive = synchronised.readings.select(~stuck_readings(synchronised.readings))
+    compiled = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    solver_map = RememberedMap(compiled)
+    priors = priors_of(options.priors, alive.sensors)
+    found = _starts(alive, compiled, options, priors, progress)
+    t_start = _start_places(alive.sensors, found, options)
+    problem = MovingProblem(
+        readings=alive,
+        names=tuple(each.name for each in recording.scalars),
+        field_map=solver_map,
+        options=options.solve,
+        models=options.models,
+        progress=progress,
+        trajectory=recording.trajectory,
+        priors=priors,
+    )
+    outcome = solve_moving(problem, t_start)
+    solution = outcome.solution
+    told = explained(outcome.readings, solver_map, t_start, solution, options.solve)
+    drive = SolvedDrive(
+        synchronised=synchronised,
+        readings=alive,
+        outcome=outcome,
+        told=told,
+        starts=tuple(found),
+        moved=movement(recording.trajectory.R, recording.trajectory.p),
+    )
+    sensors = sensor_verdicts(drive, options)
+    if not solution.solved:
+        raise CalibrationError(_nothing_solved(recording, map_source, sensors))
+    verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
+    result = CalibrationResult(
+        sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
+        iterations=solution.steps,
+        uncertainty=solution.uncertainty,
+        doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
+        disagreements=tuple(_in_own_time(each, recording) for each in disagreements(verdicts)),
+        bag=None if recording.drives else recording.source,
+        map=map_source,
+        options=options.model_dump(mode="json"),
+        versions={name: version(name) for name in VERSIONED},
+        bags=tuple(drive.source for drive in recording.drives),
+        notes=tuple(note for drive in recording.parts for note in drive.notes),
+    )
+    return Calibrated(result, solution, field_map, solver_map)
+
+
+def _starts(
+    readings: Readings,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    priors: Priors,
+    progress: Progress | None,
+) -> list[FoundStart | None]:
+    """Look for the start of each sensor; none where it is given or none is found.
+
+    Raises
+    ------
+    CalibrationError
+        A start is given for a sensor that the recording does not have.
+    """
+    if unknown := sorted(set(options.start) - set(readings.sensors)):
+        sensors = ", ".join(readings.sensors)
+        msg = f"start: no sensor named {unknown[0]!r}; the recording has {sensors}"
+        raise CalibrationError(msg)
+    if not len(readings) or set(options.start) == set(readings.sensors):
+        return [None] * len(readings.sensors)
+    tell = progress or (lambda stage, fraction: None)
+    tell("global start", 0.0)
+    found = find_starts(readings, field_map, np.zeros(3), options.search, priors)
+    tell("global start", 1.0)
+    names = zip(readings.sensors, found, strict=True)
+    return [None if name in options.start else each for name, each in names]
+
+
+def _start_places(
+    sensors: tuple[str, ...], found: list[FoundStart | None], options: CalibrationOptions
+) -> FloatArray:
+    """Return where each sensor starts, shape (S, 3), metres: given, found, or the lidar."""
+    at_lidar = (0.0, 0.0, 0.0)
+    return np.array(
+        [
+            options.start.get(name, at_lidar) if each is None else each.t_lidar_mag
+            for name, each in zip(sensors, found, strict=True)
+        ]
+    )
+
+
+def _with_missing(
+    sensor: SensorCalibration, readings: Readings, recording: Recording
+) -> SensorCalibration:
+    """Return the same with the drives in which nothing usable was read of it."""
+    own = (
+        readings.drive
+        if readings.drive is None
+        else readings.drive[readings.rows_of(readings.sensors.index(sensor.sensor))]
+    )
+    missing = [
+        drive.source.path for k, drive in enumerate(recording.drives) if not np.any(own == k)
+    ]
+    return replace(sensor, missing_in=tuple(missing)) if missing else sensor
+
+
+def _in_own_time(stretch: Disagreement, recording: Recording) -> Disagreement:
+    """Return a stretch with the name of its drive, in that one's time."""
+    if not recording.drives:
+        return stretch
+    drive = recording.drives[drive_at(recording, stretch.start_ns)]
+    start, end = (own_ns(recording, each) for each in (stretch.start_ns, stretch.end_ns))
+    return replace(stretch, start_ns=start, end_ns=end, bag=drive.source.path)
+
+
+def _nothing_solved(
+    recording: Recording, map_source: SourceFile | None, sensors: tuple[SensorCalibration, ...]
+) -> str:
+    place = map_source.path if map_source else "the map"
+    if any(sensor.status is SensorStatus.OUTSIDE_MAP for sensor in sensors):
+        low, high = recording.trajectory.p.min(axis=0), recording.trajectory.p.max(axis=0)
+        return (
+            f"{place} does not cover the drive {recording.source.path}, which runs from "
+            f"({low[0]:.1f}, {low[1]:.1f}, {low[2]:.1f}) to ({high[0]:.1f}, {high[1]:.1f}, "
+            f"{high[2]:.1f}) m in frame {recording.trajectory.frame!r}: is it another place or "
+            "another map frame?"
+        )
+    return f"{recording.source.path}: no sensor can be solved: {sensors[0].message}"

@@ -1,0 +1,199 @@
+"""What the readings of a view share: the map's error in each tile, the poses' at each knot."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import gtsam
+import numpy as np
+from scipy.linalg.lapack import dtrtri
+
+from l2m_factors import M, P, map_weights_information, pose_errors_prior
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.moving_fields import MovingFields
+from l2m_gtsam.calibration.pose_errors import PoseKnots, pose_seconds
+from l2m_gtsam.calibration.view import View
+from l2m_gtsam.data import FloatArray, IntArray, Readings
+
+POSE = 6  # weights of a knot
+# Readings of a group: what is left of their poses' error is a matrix of three times as many rows.
+MOST = 100
+
+
+class MapErrors(Protocol):
+    """The error of a map over the places of a drive: ``A beta`` in each tile."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of all beta, tile by tile, shape (K, K)."""
+        ...
+
+    def sizes(self) -> dict[int, int]:
+        """Return the number of beta of each tile."""
+        ...
+
+    def owner(self, points: FloatArray, /) -> IntArray:
+        """Return the tile whose beta act at each point, shape (N,)."""
+        ...
+
+    def features(self, points: FloatArray, tile: int, /) -> FloatArray:
+        """Return A of a tile at points in uT, shape (N, 3, r)."""
+        ...
+
+
+@runtime_checkable
+class UncertainMap(Protocol):
+    """A map that knows how its errors are correlated."""
+
+    def errors_over(self, points: FloatArray, /) -> MapErrors:
+        """Return the map's error over places, shape (N, 3), in metres."""
+        ...
+
+
+class NothingShared:
+    """A map whose errors are independent: one tile with one weight that no reading feels."""
+
+    covariance = np.eye(1)
+
+    def errors_over(self, points: FloatArray, /) -> "NothingShared":
+        """Return the same for any places."""
+        return self
+
+    def sizes(self) -> dict[int, int]:
+        """Return the weight of the tile."""
+        return {0: 1}
+
+    def owner(self, points: FloatArray, /) -> IntArray:
+        """Return the tile for each point, shape (N,)."""
+        return np.zeros(len(points), dtype=np.int64)
+
+    def features(self, points: FloatArray, tile: int, /) -> FloatArray:
+        """Return that it does nothing, shape (N, 3, 1)."""
+        return np.zeros((len(points), 3, 1))
+
+
+@dataclass(frozen=True)
+class Group:
+    """Readings of one sensor in one tile and, where poses are uncertain, between two knots.
+
+    Attributes
+    ----------
+    sensor, tile, segment
+        Which; the segment is the number of the knot before, and zero without knots.
+    rows
+        Of the view, shape (n,).
+    features
+        The map's error per weight of the tile, map frame, in uT, shape (n, 3, r).
+    """
+
+    sensor: int
+    tile: int
+    segment: int
+    rows: IntArray
+    features: FloatArray
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """The errors that readings of a view share.
+
+    Attributes
+    ----------
+    groups
+        All readings.
+    rest
+        Variance of each reading that stays independent, per axis of the map in uT^2, (N, 3).
+    tiles
+        Number of weights of each tile.
+    root_information
+        Square root of the information of all tiles' weights, lower triangular, shape (K, K).
+    knots
+        Where pose errors are variables; absent where poses are taken for exact.
+    seconds
+        When each pose was taken, as the knots count, shape (N,).
+    moving
+        The sensors that feel recorded numbers.
+    """
+
+    groups: tuple[Group, ...]
+    rest: FloatArray
+    tiles: dict[int, int]
+    root_information: FloatArray
+    knots: PoseKnots | None
+    seconds: FloatArray
+    moving: MovingFields = field(default_factory=MovingFields)
+
+    @property
+    def sizes(self) -> dict[int, int]:
+        """Number of weights of each key of the graph."""
+        knots = 0 if self.knots is None else len(self.knots.seconds)
+        tiles = {M(tile): size for tile, size in self.tiles.items()}
+        return tiles | {P(knot): POSE for knot in range(knots)} | self.moving.sizes
+
+    @property
+    def columns(self) -> dict[int, slice]:
+        """Where the weights of each key stand among all of them."""
+        ends = np.cumsum(list(self.sizes.values())).tolist()
+        pairs = zip(self.sizes.items(), ends, strict=True)
+        return {key: slice(end - size, end) for (key, size), end in pairs}
+
+    def prior(self) -> gtsam.NonlinearFactorGraph:
+        """Return the prior of all weights, which is linear in them."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(map_weights_information(self.tiles, self.root_information))
+        if self.knots is not None:
+            graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
+        graph.push_back(self.moving.prior())
+        return graph
+
+
+def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: float) -> Coverage:
+    """Ask the map for its errors at the readings, where the estimate puts them.
+
+    Parameters
+    ----------
+    view
+        The readings used.
+    errors
+        What the map knows of its errors.
+    estimate
+        Of their sensors.
+    correlation_s
+        How long an error of a pose lasts, seconds.
+    """
+    readings = view.readings
+    t = estimate.t[readings.sensor]
+    x = np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar
+    seconds, knots = pose_seconds(readings), None
+    if readings.pose_root is not None:
+        knots = PoseKnots.over(seconds, correlation_s, readings.drive)
+    segment = np.zeros(len(x), dtype=np.int64) if knots is None else knots.segment(seconds)
+    told = errors.errors_over(x)
+    owner, rest, groups = told.owner(x), np.empty_like(x), []
+    for tile in told.sizes():
+        rows = np.flatnonzero(owner == tile)
+        features = told.features(x[rows], tile)
+        shared = np.einsum("nir,nir->ni", features, features)
+        rest[rows] = np.maximum(view.map_variance[rows] - shared, 0.0)
+        for own in together(readings, segment, rows, whole=knots is None):
+            first = rows[own[0]]
+            where = int(readings.sensor[first]), tile, int(segment[first])
+            groups.append(Group(*where, rows[own], features[own]))
+    root, _ = dtrtri(np.linalg.cholesky(told.covariance), lower=1)
+    return Coverage(tuple(groups), rest, told.sizes(), root, knots, seconds)
+
+
+def together(
+    readings: Readings, segment: IntArray, rows: IntArray, *, whole: bool
+) -> Iterator[IntArray]:
+    """Yield which of some readings are of one sensor and one segment.
+
+    Unless they may stay ``whole``, there are no more than can be whitened together; readings come
+    in order of time.
+    """
+    keys = np.column_stack([readings.sensor[rows], segment[rows], readings.stamp_ns[rows]])
+    order = np.lexsort(keys.T[::-1])
+    starts = np.flatnonzero(np.diff(keys[order, :2], axis=0).any(axis=1)) + 1
+    for part in np.split(order, starts):
+        if len(part):
+            yield from [part] if whole else np.array_split(part, -(-len(part) // MOST))

@@ -1,0 +1,146 @@
+"""Shared errors and noise of each group of readings, at an estimate."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg.lapack import dtrtri
+
+from l2m_factors import M, P, SharedError
+from l2m_gtsam.calibration.coverage import Coverage, Group
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.pose_errors import PoseKnots, error_of_poses
+from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
+
+
+@dataclass(frozen=True)
+class GroupNoise:
+    """What the groups of a coverage share and what stays noise.
+
+    Attributes
+    ----------
+    errors
+        Of each group, what its readings share.
+    whitenings
+        Of each group the matrix or matrices that make the rest white in 1/uT, (n, 3, 3) or
+        (3 n, 3 n).
+    alone
+        The same for each reading by itself, shape (N, 3, 3).
+    rest
+        Mean variance of each reading that map and poses leave beside the shared errors in uT^2,
+        shape (N,).
+    """
+
+    errors: tuple[tuple[SharedError, ...], ...]
+    whitenings: tuple[FloatArray, ...]
+    alone: FloatArray
+    rest: FloatArray
+
+
+@dataclass(frozen=True)
+class PoseShare:
+    """What errors of the poses do to N readings.
+
+    Attributes
+    ----------
+    knots
+        Where they are variables.
+    seconds
+        When poses were taken, shape (N,).
+    features
+        F in the lidar frame in uT, shape (N, 3, 6).
+    in_sensor
+        C F, shape (N, 3, 6).
+    """
+
+    knots: PoseKnots
+    seconds: FloatArray
+    features: FloatArray
+    in_sensor: FloatArray
+
+    def errors(self, group: Group) -> tuple[SharedError, SharedError]:
+        """Return what the readings of a group share: the knots before and after."""
+        weights = self.knots.weights(self.seconds[group.rows])[:, :, None, None]
+        F, segment = self.features[group.rows], group.segment
+        before = SharedError(P(segment), weights[:, 0] * F)
+        return before, SharedError(P(segment + 1), weights[:, 1] * F)
+
+    def bridge(self, group: Group) -> FloatArray:
+        """Return the covariance of a group's readings that knots leave in uT^2, (3 n, 3 n)."""
+        n = len(group.rows)
+        CF = self.in_sensor[group.rows].reshape(3 * n, -1)
+        left = self.knots.bridge(self.seconds[group.rows])[:, None, :, None]
+        return np.asarray(((CF @ CF.T).reshape(n, 3, n, 3) * left).reshape(3 * n, 3 * n))
+
+
+def group_noise(
+    view: View, field_map: QueryableMap, coverage: Coverage, estimate: Estimate
+) -> GroupNoise:
+    """Return errors and noise of all groups.
+
+    Parameters
+    ----------
+    view, coverage
+        Readings, and the errors that they share.
+    field_map
+        The map.
+    estimate
+        Whose distortions and places count.
+    """
+    readings, C = view.readings, estimate.C()[view.readings.sensor]
+    share = map_covariance(C, readings.R_map_lidar, coverage.rest)
+    own = reading_covariance(estimate.noise[readings.sensor], share, view.trust)
+    R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
+    q = readings.regressors
+    shared = [
+        (
+            SharedError(M(group.tile), R_lidar_map[group.rows] @ group.features),
+            *coverage.moving.errors(group.sensor, None if q is None else q[group.rows]),
+        )
+        for group in coverage.groups
+    ]
+    pose = pose_share(readings, field_map, coverage, estimate)
+    if pose is None:
+        W = whitening(own)
+        return GroupNoise(
+            errors=tuple(shared),
+            whitenings=tuple(W[group.rows] for group in coverage.groups),
+            alone=W,
+            rest=_mean_variance(share),
+        )
+    left, whitenings = np.zeros_like(share), []
+    for group in coverage.groups:
+        each, covariance = np.arange(len(group.rows)), pose.bridge(group)
+        blocks = covariance.reshape(len(each), 3, len(each), 3)  # a view
+        left[group.rows] = blocks[each, :, each]
+        blocks[each, :, each] += own[group.rows]
+        whitenings.append(_inverse_root(covariance))
+    pairs = zip(shared, coverage.groups, strict=True)
+    return GroupNoise(
+        errors=tuple((*each, *pose.errors(group)) for each, group in pairs),
+        whitenings=tuple(whitenings),
+        alone=whitening(own + left),
+        rest=_mean_variance(share + left),
+    )
+
+
+def pose_share(
+    readings: Readings, field_map: QueryableMap, coverage: Coverage, estimate: Estimate
+) -> PoseShare | None:
+    """Return what errors of the poses do to readings; nothing where poses are exact."""
+    if coverage.knots is None:
+        return None
+    F = error_of_poses(readings, field_map, estimate)
+    C = estimate.C()[readings.sensor]
+    return PoseShare(coverage.knots, coverage.seconds, F, C @ F)
+
+
+def _inverse_root(covariance: FloatArray) -> FloatArray:
+    """Return the lower triangular W with ``W S W^T = I``."""
+    inverse, _ = dtrtri(np.linalg.cholesky(covariance), lower=1)
+    return np.ascontiguousarray(inverse)
+
+
+def _mean_variance(covariance: FloatArray) -> FloatArray:
+    return np.asarray(np.trace(covariance, axis1=1, axis2=2) / 3)

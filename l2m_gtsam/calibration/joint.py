@@ -1,0 +1,208 @@
+"""The joint graph over ``T(i)``, ``D(i)`` and ``S(i)``: the finish of the solve, and how sure."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import gtsam
+import numpy as np
+
+from l2m_factors import BatchedReadings
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.contradictions import Contradiction, contradictions
+from l2m_gtsam.calibration.determined import determinacies
+from l2m_gtsam.calibration.factor_graph import (
+    Estimate,
+    batch_readings,
+    prior_graph,
+    reading_graph,
+    whitened_jacobian,
+)
+from l2m_gtsam.calibration.marginals import covariance_by_qr, joint_covariance
+from l2m_gtsam.calibration.moving_fields import Correction
+from l2m_gtsam.calibration.optimise import Ending, optimise, polish
+from l2m_gtsam.calibration.pose_errors import error_of_poses
+from l2m_gtsam.calibration.sensor_columns import keys_of
+from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.records.calibration import ResidualFigures
+from l2m_gtsam.solve.figures import residual_figures
+from l2m_gtsam.solve.noise import (
+    HALF,
+    estimate_noise,
+    map_covariance,
+    reading_covariance,
+    whitening,
+)
+from l2m_gtsam.solve.rank import Determinacy
+
+# Of each round; two rounds at least are made, and each step shortens what remains fourfold.
+POLISHING_STEPS = 2
+
+
+@dataclass(frozen=True)
+class SensorSolution:
+    """What the joint graph says of one sensor.
+
+    Attributes
+    ----------
+    sensor
+        Index of the sensor.
+    joint_covariance
+        Of (t, C row by row, H, time offset) in m, uT and s; undetermined parameters have infinite
+        variance and no correlation, shape (16, 16).
+    figures
+        Residuals of the readings used.
+    determinacy
+        What the data determine.
+    remaining_sigmas
+        Length of the Newton step that remains, in standard deviations.
+    contradictions
+        What was known of the sensor beforehand and the readings speak against.
+    moving
+        What recorded numbers add to the readings, beyond what was taken off them; absent where it
+        is no variable of the graph.
+    shared_root
+        This sensor's rows, t, C row by row and H, of a root of the covariance of all sensors,
+        shape (15, K): two of them have the covariance ``root_a @ root_b.T`` in common, by errors
+        of map and poses. Absent where errors are not shared.
+    """
+
+    sensor: int
+    joint_covariance: FloatArray
+    figures: ResidualFigures
+    determinacy: Determinacy
+    remaining_sigmas: float
+    contradictions: tuple[Contradiction, ...] = ()
+    moving: Correction | None = None
+    shared_root: FloatArray | None = None
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of (t, C row by row, H) alone, shape (15, 15)."""
+        return self.joint_covariance[:-1, :-1]
+
+    @property
+    def offset_covariance(self) -> FloatArray:
+        """Of (t, C row by row, H) with the time offset, shape (15,)."""
+        return self.joint_covariance[:-1, -1]
+
+    @property
+    def offset_sigma(self) -> float:
+        """Standard deviation of the time offset in seconds."""
+        return float(np.sqrt(self.joint_covariance[-1, -1]))
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """The joint graph with its weights frozen at one estimate.
+
+    Attributes
+    ----------
+    view
+        The readings used.
+    batch
+        The same, as the factors evaluate them.
+    share
+        Covariance that map and poses contribute to each residual in uT^2, shape (N, 3, 3).
+    covariance
+        Covariance of each residual in uT^2, shape (N, 3, 3).
+    determinacies
+        Rank test of each sensor.
+    graph
+        Readings, priors, ridge, and a hold on what these cannot determine.
+    """
+
+    view: View
+    batch: BatchedReadings
+    share: FloatArray
+    covariance: FloatArray
+    determinacies: dict[int, Determinacy]
+    graph: gtsam.NonlinearFactorGraph
+
+
+@dataclass(frozen=True)
+class JointStep:
+    """An optimum for frozen weights."""
+
+    estimate: Estimate
+    ending: Ending
+
+
+def joint_problem(
+    view: View, field_map: QueryableMap, estimate: Estimate, options: OneKeyOptions
+) -> JointProblem:
+    """Build the joint graph at an estimate: rank test first, undetermined directions held."""
+    sensor, C = view.readings.sensor, estimate.C()[view.readings.sensor]
+    share = map_covariance(C, view.readings.R_map_lidar, view.map_variance)
+    by_pose = C @ error_of_poses(view.readings, field_map, estimate)
+    share += by_pose @ by_pose.transpose(0, 2, 1)
+    covariance = reading_covariance(estimate.noise[sensor], share, view.trust)
+    batch = batch_readings(view.readings, field_map)
+    values, W = estimate.values(view.sensors), whitening(covariance)
+    jacobians = {s: whitened_jacobian(batch, W, values, s) for s in view.sensors}
+    tests = determinacies(jacobians, estimate.priors, values, options.rank)
+    graph = reading_graph(batch, covariance, options.factors)
+    graph.push_back(prior_graph(estimate, tests))
+    return JointProblem(view, batch, share, covariance, tests, graph)
+
+
+def joint_step(problem: JointProblem, estimate: Estimate, options: OneKeyOptions) -> JointStep:
+    """Optimise T(i), D(i), S(i) of all sensors, then the noise from the residuals that remain."""
+    sensors = problem.view.sensors
+    start = estimate.values(sensors)
+    optimised = optimise(problem.graph, start, options.optimizer, options.joint_iterations)
+    values = polish(problem.graph, optimised.values, POLISHING_STEPS).values
+    after = estimate.updated(values, sensors)
+    most = options.largest_offset_s
+    after = replace(after, offset=np.clip(after.offset, -most, most))
+    if options.sensor_noise_ut is None:
+        after = replace(after, noise=_noise(problem, after))
+    return JointStep(after, optimised.ending)
+
+
+def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
+    """Return the most likely noise of each sensor in uT, shape (S,)."""
+    noise, values = estimate.noise.copy(), estimate.values(problem.view.sensors)
+    variance = np.trace(problem.share, axis1=1, axis2=2) / 3
+    for s in problem.view.sensors:
+        rows, taken = problem.batch.rows_of(s), problem.determinacies[s].free
+        rows = rows[problem.view.trust[rows] > HALF]
+        residual = problem.batch.residuals(values, s).residual[rows]
+        noise[s] = estimate_noise(residual, variance[rows], taken)
+    return noise
+
+
+def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
+    """Return covariance and figures of every sensor at the optimum of its own weights."""
+    values = estimate.values(problem.view.sensors)
+    linear = problem.graph.linearize(values)
+    among = joint_covariance(linear, values, partial(covariance_by_qr, linear))
+    missed = contradictions(estimate.priors.among(problem.view.sensors), values, among)
+    gradients = linear.gradientAtZero()
+    W = whitening(problem.covariance)
+    solutions = []
+    for s in problem.view.sensors:
+        rows, test = problem.batch.rows_of(s), problem.determinacies[s]
+        residual = problem.batch.residuals(values, s).residual[rows]
+        covariance = among((s,))
+        gradient = np.concatenate([gradients.at(key) for key in keys_of(s)])
+        solutions.append(
+            SensorSolution(
+                sensor=s,
+                joint_covariance=with_infinities(covariance, test),
+                figures=residual_figures(residual, W[rows], test.free),
+                determinacy=test,
+                remaining_sigmas=float(np.sqrt(gradient @ covariance @ gradient)),
+                contradictions=tuple(each for each in missed if s in each.sensors),
+            )
+        )
+    return tuple(solutions)
+
+
+def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
+    """Return the covariance without the made-up figures of directions that were held."""
+    honest, touched = covariance.copy(), np.append(test.touched, not test.offset)
+    honest[touched, :] = 0.0
+    honest[:, touched] = 0.0
+    honest[touched, touched] = np.inf
+    return honest

@@ -1,0 +1,227 @@
+"""The one-key solve beside recorded numbers that may explain part of the readings.
+
+First without them. Then models are compared for each sensor; where one with the numbers is
+recommended, their field is taken off its readings and all is solved again from where it was, until
+that field does not change any more. What is left of it is a variable of the graph.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.alternation import OneKeyOptions, Progress
+from l2m_gtsam.calibration.model_samples import explicable, model_samples
+from l2m_gtsam.calibration.moving_fields import Correction
+from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import FloatArray, Readings, Trajectory
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.records.model_results import ModelComparison, MovingField
+from l2m_gtsam.solve.model_comparison import ModelOptions, compare_models
+
+ROUNDS = 5  # of taking fields off; two or three settle
+SETTLED_SIGMAS = 0.1
+
+
+@dataclass(frozen=True)
+class MovingSolution:
+    """A solve, and what its readings say of models and of recorded numbers.
+
+    Attributes
+    ----------
+    solution
+        Of the readings without the fields of numbers.
+    readings
+        All that it was given, without these fields.
+    compared
+        Models of each solved sensor that has enough readings.
+    not_compared
+        Why there is no comparison for the other solved ones.
+    moving
+        Fields of the numbers, for sensors that feel them.
+    """
+
+    solution: OneKeySolution
+    readings: Readings
+    compared: dict[int, ModelComparison]
+    not_compared: dict[int, str]
+    moving: dict[int, tuple[MovingField, ...]]
+
+
+@dataclass(frozen=True)
+class MovingProblem:
+    """What all rounds have in common.
+
+    Attributes
+    ----------
+    readings
+        As they were read, with recorded numbers.
+    names
+        Of the K numbers.
+    field_map
+        The map.
+    options, models
+        How to solve and how to compare.
+    progress
+        Called with a stage and the fraction of it that is done.
+    trajectory
+        The lidar's poses.
+    priors
+        What is known of the sensors beforehand.
+    """
+
+    readings: Readings
+    names: tuple[str, ...]
+    field_map: QueryableMap
+    options: OneKeyOptions
+    models: ModelOptions
+    progress: Progress | None
+    trajectory: Trajectory | None
+    priors: Priors = NO_PRIORS
+
+    def solved(self, t_start: FloatArray, fields: Mapping[int, Correction]) -> "Round":
+        """Solve without the fields of the sensors that feel some, and compare models."""
+        given = without(self.readings, fields)
+        solution = solve_one_key(
+            given,
+            self.field_map,
+            t_start,
+            self.options,
+            self.progress,
+            self.trajectory,
+            self.priors,
+        )
+        compared, not_compared = self._compared(solution)
+        return Round(fields, given, solution, compared, not_compared)
+
+    def _compared(
+        self, solution: OneKeySolution
+    ) -> tuple[dict[int, ModelComparison], dict[int, str]]:
+        compared, not_compared = {}, {}
+        for sensor in (found.sensor for found in solution.solved):
+            try:
+                compared[sensor] = self._comparison(solution, sensor)
+            except CalibrationError as error:
+                not_compared[sensor] = str(error)
+        return compared, not_compared
+
+    def _comparison(self, solution: OneKeySolution, sensor: int) -> ModelComparison:
+        """Compare models of a sensor on its readings as they were read, at the solve's poses."""
+        whole = replace(
+            solution.readings, field=self.readings.field, regressors=self.readings.regressors
+        )
+        counts = solution.inside if self.names else solution.used
+        own = whole.select(counts & (whole.sensor == sensor))
+        samples = model_samples(own, self.field_map, solution.estimate, self.names)
+        if self.names:
+            noise = float(solution.estimate.noise[sensor])
+            samples = samples[explicable(samples, noise, self.options.robust)]
+        return compare_models(samples, self.models)
+
+
+@dataclass(frozen=True)
+class Round:
+    """A solve with fields of numbers taken off, and the comparison of models after it.
+
+    Attributes
+    ----------
+    fields
+        What was taken off of the sensors that feel something.
+    given
+        The readings without that.
+    solution
+        Of them.
+    compared, not_compared
+        Models of each sensor, or why there are none.
+    """
+
+    fields: Mapping[int, Correction]
+    given: Readings
+    solution: OneKeySolution
+    compared: dict[int, ModelComparison]
+    not_compared: dict[int, str]
+
+    def found(self) -> dict[int, Correction]:
+        """Return the fields of numbers for all sensors to which they are recommended."""
+        left = {each.sensor: each.moving for each in self.solution.solved}
+        return {
+            sensor: _total(comparison, self.fields.get(sensor), left[sensor])
+            for sensor, comparison in self.compared.items()
+            if comparison.recommended.has_regressors
+        }
+
+    def settled(self, found: Mapping[int, Correction]) -> bool:
+        """Return whether what was found is what had been taken off."""
+        return found.keys() == self.fields.keys() and all(
+            (np.abs(each.h - self.fields[s].h) <= SETTLED_SIGMAS * each.sigma).all()
+            for s, each in found.items()
+        )
+
+
+def _total(
+    comparison: ModelComparison, taken_off: Correction | None, left: Correction | None
+) -> Correction:
+    """Return what was taken off and what the graph found besides; else what the models say."""
+    if taken_off is None or left is None:
+        return Correction(comparison.coefficients.h, comparison.sigma.h)
+    return Correction(taken_off.h + left.h, left.sigma)
+
+
+def solve_moving(problem: MovingProblem, t_start: FloatArray) -> MovingSolution:
+    """Calibrate all sensors of a batch of readings, and compare models of each.
+
+    Parameters
+    ----------
+    problem
+        What to solve.
+    t_start
+        Where to start each sensor in the lidar frame in metres, shape (S, 3).
+    """
+    last = problem.solved(t_start, {})
+    found, given_up = last.found(), set[int]()
+    for _ in range(ROUNDS):
+        if last.settled(found):
+            break
+        last = problem.solved(_places(last.solution, t_start), found)
+        # A sensor that the numbers turn out not to help is solved without them, for good.
+        given_up |= found.keys() - last.found().keys()
+        found = {s: each for s, each in last.found().items() if s not in given_up}
+    return MovingSolution(
+        solution=last.solution,
+        readings=last.given,
+        compared=last.compared,
+        not_compared=last.not_compared,
+        moving={
+            sensor: _named(problem.names, found.get(sensor, taken_off))
+            for sensor, taken_off in last.fields.items()
+        },
+    )
+
+
+def without(readings: Readings, fields: Mapping[int, Correction]) -> Readings:
+    """Return readings without the fields of numbers, and the numbers only where they are felt."""
+    if readings.regressors is None or not fields:
+        return replace(readings, regressors=None)
+    B, numbers = readings.field.copy(), np.zeros_like(readings.regressors)
+    for sensor, each in fields.items():
+        rows = readings.rows_of(sensor)
+        numbers[rows] = readings.regressors[rows]
+        B[rows] -= numbers[rows] @ each.h
+    return replace(readings, field=B, regressors=numbers)
+
+
+def _places(solution: OneKeySolution, t_start: FloatArray) -> FloatArray:
+    """Return where sensors were found, or where they started if they were not, shape (S, 3)."""
+    t = t_start.copy()
+    for found in solution.solved:
+        t[found.sensor] = solution.estimate.t[found.sensor]
+    return t
+
+
+def _named(names: tuple[str, ...], found: Correction) -> tuple[MovingField, ...]:
+    return tuple(
+        MovingField(name, h, sigma)
+        for name, h, sigma in zip(names, found.h, found.sigma, strict=True)
+    )

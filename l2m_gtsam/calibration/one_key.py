@@ -1,0 +1,295 @@
+"""The one-key solve: from readings and a map to t, C, H and their uncertainty.
+
+The paper's algorithm 1 in two stages. The *alternation* brings t near: the distortion follows in
+closed form from what the map predicts at the current t (w-RRTLS), then the graph over all ``T(i)``
+moves the sensors, with the same weights inside and outside. The *joint* graph over ``T(i)`` and
+``D(i)`` then finishes both, with the full covariance of each reading, and its marginals are the
+uncertainty. All sensors are in one graph and share one evaluation of the map.
+
+Where the lidar's motion tells a sensor's time offset from its place, ``S(i)`` is a variable, too;
+the readings' poses are taken anew as it moves.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+
+from l2m_gtsam.calibration.alternation import OneKeyOptions, Progress, alternate, start_estimate
+from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.joint import (
+    JointProblem,
+    SensorSolution,
+    joint_problem,
+    joint_step,
+    sensor_solutions,
+)
+from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
+from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
+from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
+from l2m_gtsam.calibration.view import QueryableMap, View, observe
+from l2m_gtsam.data import BoolArray, FloatArray, Readings, Trajectory
+from l2m_gtsam.recording.sync import with_offsets
+from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.solve.rank import Determinacy
+
+# The joint graph is solved again while its frozen weights still change; they settle in two or
+# three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
+MAX_ROUNDS = 10
+SETTLED_M = 1e-5
+# The map's variance changes over decimetres: after a shorter move it is not asked for again.
+REOBSERVE_M = 5e-3
+# A vehicle moves a tenth of a millimetre meanwhile.
+SETTLED_S = 1e-4
+
+
+@dataclass(frozen=True)
+class OneKeySolution:
+    """The estimate of all sensors and, for those that could be solved, how good it is.
+
+    Attributes
+    ----------
+    readings
+        All N readings, with their poses at the estimated time offsets.
+    estimate
+        Values of all S sensors; what stands for one that is not solved means nothing.
+    solved
+        Solutions of the sensors that have enough readings inside the map.
+    inside
+        Which readings lie inside the map at the estimate, shape (N,).
+    rejected
+        Which of them do not count, for no distortion explains them beside the others, shape (N,).
+    steps
+        Alternations taken.
+    ending
+        How the last joint optimisation ended.
+    settled
+        Whether estimate and weights agree: another round would repeat the last.
+    uncertainty
+        How the map's errors were counted: full needs a map that knows them.
+    """
+
+    readings: Readings
+    estimate: Estimate
+    solved: tuple[SensorSolution, ...]
+    inside: BoolArray
+    rejected: BoolArray
+    steps: int
+    ending: Ending
+    settled: bool
+    uncertainty: Uncertainty = Uncertainty.INDEPENDENT
+
+    @property
+    def used(self) -> BoolArray:
+        """Which readings count, shape (N,)."""
+        return self.inside & ~self.rejected
+
+
+def solve_one_key(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    options: OneKeyOptions,
+    progress: Progress | None = None,
+    trajectory: Trajectory | None = None,
+    priors: Priors = NO_PRIORS,
+) -> OneKeySolution:
+    """Calibrate all sensors of a batch of readings.
+
+    Parameters
+    ----------
+    readings
+        Readings of S sensors with poses.
+    field_map
+        The magnetic map.
+    t_start
+        Where to start each sensor in the lidar frame in metres, shape (S, 3).
+    options
+        How to solve.
+    progress
+        Called with a stage and the fraction of it that is done.
+    trajectory
+        The lidar's poses, to take those of the readings anew for other time offsets; without it
+        they go on as they move.
+    priors
+        What is known of the sensors beforehand.
+    """
+    tell = progress or (lambda stage, fraction: None)
+    stage = partial(tell, "map uncertainty")
+    finish = partial(solve_uncertain, progress=stage)
+    return _solved(readings, field_map, t_start, options, tell, trajectory, priors, finish)
+
+
+def solve_part(
+    readings: Readings, field_map: QueryableMap, t_start: FloatArray, options: OneKeyOptions
+) -> OneKeySolution:
+    """Calibrate all sensors on a part of what the whole was calibrated on.
+
+    As ``solve_one_key``, but the graph over an uncertain map is solved once, with the weights of
+    the joint graph, and not until its own have settled.
+
+    Parameters
+    ----------
+    readings, field_map, options
+        As of ``solve_one_key``.
+    t_start
+        Where the whole was found, metres, shape (S, 3).
+    """
+
+    def tell(stage: str, fraction: float) -> None:
+        """Say nothing: a part takes a second."""
+
+    return _solved(readings, field_map, t_start, options, tell, None, NO_PRIORS, step_uncertain)
+
+
+class Finish(Protocol):
+    """What is done over a map that knows its errors."""
+
+    def __call__(
+        self,
+        view: View,
+        field_map: QueryableMap,
+        errors: UncertainMap,
+        near: Estimate,
+        tests: Mapping[int, Determinacy],
+        options: OneKeyOptions,
+    ) -> UncertainSolution:
+        """Return the solutions from the optimum with independent errors."""
+        ...
+
+
+def _solved(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    options: OneKeyOptions,
+    tell: Progress,
+    trajectory: Trajectory | None,
+    priors: Priors,
+    finish: Finish,
+) -> OneKeySolution:
+    good = readings.select(plausible(readings, field_map, t_start, options.robust))
+    start = start_estimate(t_start, options, priors)
+    near = alternate(good, field_map, start, options, tell)
+    joint = settle(readings, field_map, near.estimate, options, tell, trajectory)
+    outcome = OneKeySolution(
+        readings=joint.readings,
+        estimate=joint.estimate,
+        solved=(),
+        inside=joint.whole.inside,
+        rejected=joint.rejected,
+        steps=near.steps,
+        ending=joint.ending,
+        settled=joint.settled,
+    )
+    if joint.problem is None:
+        return outcome
+    view, tests = joint.problem.view, joint.problem.determinacies
+    errors = shared_errors(field_map, view.readings, options.uncertainty)
+    if errors is None:
+        return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
+    full = finish(view, field_map, errors, joint.estimate, tests, options)
+    unshared = isinstance(errors, NothingShared)
+    return replace(
+        outcome,
+        estimate=full.estimate,
+        solved=full.solved,
+        ending=full.ending,
+        settled=joint.settled and full.settled,
+        uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
+    )
+
+
+def shared_errors(
+    field_map: QueryableMap, readings: Readings, uncertainty: Uncertainty
+) -> UncertainMap | None:
+    """Return the errors that are variables beside the sensors; none if nothing is shared.
+
+    Fields of recorded numbers are shared whatever is known of the map.
+    """
+    if uncertainty is Uncertainty.FULL and isinstance(field_map, UncertainMap):
+        return field_map
+    return None if readings.regressors is None else NothingShared()
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Where the joint graph settled.
+
+    Attributes
+    ----------
+    readings
+        All, with their poses at the estimated time offsets.
+    estimate
+        All sensors.
+    whole
+        Those inside the map.
+    weights
+        How far each of them counts, shape (M,).
+    problem
+        The graph of those that count; none if no sensor has enough.
+    ending
+        How the last optimisation ended.
+    settled
+        Whether another round would repeat the last.
+    """
+
+    readings: Readings
+    estimate: Estimate
+    whole: View
+    weights: FloatArray
+    problem: JointProblem | None
+    ending: Ending
+    settled: bool
+
+    @property
+    def rejected(self) -> BoolArray:
+        """Which of all readings lie inside the map and do not count, shape (N,)."""
+        rejected = np.zeros(len(self.whole.inside), dtype=np.bool_)
+        rejected[self.whole.rows] = self.weights <= NOTHING
+        return rejected
+
+
+def settle(
+    readings: Readings,
+    field_map: QueryableMap,
+    estimate: Estimate,
+    options: OneKeyOptions,
+    tell: Progress,
+    trajectory: Trajectory | None,
+) -> Joint:
+    """Solve the joint graph again and again, until the weights are those of its result.
+
+    That is the graduated loop too: each round trusts readings as the residuals of the last say.
+    """
+    whole = observe(readings, field_map, estimate, options.min_readings)
+    ending, settled = Ending.TOLERANCE, False
+    last: Trusted | None = None
+    problem: JointProblem | None = None
+    for round_ in range(MAX_ROUNDS):
+        tell("joint graph", round_ / MAX_ROUNDS)
+        now = trusted(whole, field_map, estimate, options, round_, last)
+        if not now.view.sensors:
+            return Joint(readings, estimate, whole, now.weights, None, ending, settled=False)
+        problem = joint_problem(now.view, field_map, estimate, options)
+        step = joint_step(problem, estimate, options)
+        moved = float(np.abs(step.estimate.t - estimate.t).max())
+        late = float(np.abs(step.estimate.offset - estimate.offset).max())
+        quiet = moved < SETTLED_M and late < SETTLED_S and step.estimate.same_noise(estimate)
+        settled = quiet and now.agrees(last)
+        estimate, ending, last = step.estimate, step.ending, now
+        if settled:
+            break
+        if late > SETTLED_S and trajectory is not None:
+            readings = with_offsets(readings, trajectory, estimate.offset)
+        if moved > REOBSERVE_M or late > SETTLED_S:
+            whole = observe(readings, field_map, estimate, options.min_readings)
+    tell("joint graph", 1.0)
+    if last is None or not settled:  # the last round's weights are not those of its result
+        last = trusted(whole, field_map, estimate, options, MAX_ROUNDS, None)
+        problem = joint_problem(last.view, field_map, estimate, options)
+    return Joint(readings, estimate, whole, last.weights, problem, ending, settled)

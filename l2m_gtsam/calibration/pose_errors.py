@@ -1,0 +1,146 @@
+r"""Errors of the lidar's poses that last: variables ``P(k)`` at knots of the drive.
+
+A pose is wrong by ``true = measured Exp(L u)``, with L a root of its covariance and u six
+independent Ornstein-Uhlenbeck processes of unit variance. At a sensor this changes the field by
+
+.. math::
+    F u, \quad F = \left( [b]_\times - S [t]_\times \;\; S \right) L, \quad S = R^T G R
+
+Between two knots u is what they say plus a bridge, which is independent of all other bridges and
+whose covariance is exact here: the knots may be far apart.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_factors import skew
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import FloatArray, IntArray, Readings
+
+SEGMENTS = 60  # of a drive, at most: six weights at each end of one
+SHORTEST_S = 1e-6  # stands for errors that do not last
+
+
+@dataclass(frozen=True)
+class PoseKnots:
+    """Where pose errors are variables.
+
+    Attributes
+    ----------
+    seconds
+        Times, drive by drive, shape (K,); each drive has two at least, evenly spread over it.
+    correlation_s
+        Time over which the correlation falls to 1/e. Errors of two drives have nothing in common.
+    spacing
+        Time between each knot and the next in seconds, infinite from one drive to the next, shape
+        (K - 1,).
+    """
+
+    seconds: FloatArray
+    correlation_s: float
+    spacing: FloatArray
+
+    @classmethod
+    def over(
+        cls, seconds: FloatArray, correlation_s: float, drive: IntArray | None = None
+    ) -> "PoseKnots":
+        """Return knots for times, shape (N,): two for as long as an error lasts, if not fewer.
+
+        ``drive`` says which drive each time is of, shape (N,); absent if all are of one.
+        """
+        of = np.zeros(len(seconds), dtype=np.int64) if drive is None else drive
+        drives = [seconds[of == each] for each in np.unique(of)]
+        ends = [(own.min(), max(own.max(), own.min() + SHORTEST_S)) for own in drives]
+        whole = float(sum(last - first for first, last in ends))
+        between = max(correlation_s / 2, whole / SEGMENTS)
+        knots, spacing = [], []
+        for first, last in ends:
+            count = max(int(np.ceil((last - first) / between)) + 1, 2)
+            knots.append(np.linspace(first, last, count))
+            spacing += [float(knots[-1][1] - knots[-1][0])] * (count - 1) + [np.inf]
+        return cls(np.concatenate(knots), max(correlation_s, SHORTEST_S), np.array(spacing[:-1]))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Of the errors at each knot and the next, shape (K - 1,)."""
+        return self._like(self.spacing)
+
+    def segment(self, seconds: FloatArray) -> IntArray:
+        """Return the knot before each time, shape (N,)."""
+        before = np.searchsorted(self.seconds, seconds, side="right") - 1
+        before = np.clip(before, 0, len(self.seconds) - 2)
+        # At the very end of a drive the knot before is not the drive's last.
+        return np.asarray(before - np.isinf(self.spacing[before]))
+
+    def weights(self, seconds: FloatArray) -> FloatArray:
+        """Return what the knots before and after say of the error at each time, shape (N, 2)."""
+        return self._weights(*self._between(seconds))
+
+    def bridge(self, seconds: FloatArray) -> FloatArray:
+        """Return the covariance of what the knots leave open at times of one segment, (n, n)."""
+        after, spacing = self._between(seconds)
+        at_knots = np.column_stack([self._like(after), self._like(spacing - after)])
+        apart = np.abs(seconds[:, None] - seconds)
+        return np.asarray(self._like(apart) - self._weights(after, spacing) @ at_knots.T)
+
+    def _between(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the time since the knot before and that from it to the next, shapes (N,)."""
+        segment = self.segment(seconds)
+        spacing = self.spacing[segment]
+        return np.clip(seconds - self.seconds[segment], 0.0, spacing), spacing
+
+    def _weights(self, after: FloatArray, spacing: FloatArray) -> FloatArray:
+        whole = -np.expm1(-2 * spacing / self.correlation_s)
+        return np.column_stack(
+            [
+                (self._like(gap) - self._like(2 * spacing - gap)) / whole
+                for gap in (after, spacing - after)
+            ]
+        )
+
+    def _like(self, apart: FloatArray) -> FloatArray:
+        return np.asarray(np.exp(-apart / self.correlation_s))
+
+
+def error_of_poses(readings: Readings, field_map: QueryableMap, estimate: Estimate) -> FloatArray:
+    """Return F of readings at an estimate, uT in the lidar frame, shape (N, 3, 6).
+
+    It is zero where poses are taken for exact.
+    """
+    if readings.pose_root is None:
+        return np.zeros((len(readings), 3, 6))
+    R, t = readings.R_map_lidar, estimate.t[readings.sensor]
+    x = np.einsum("nij,nj->ni", R, t) + readings.p_map_lidar
+    field, gradient = field_map.field_and_gradient(x)
+    R_lidar_map = R.transpose(0, 2, 1)
+    b_lidar = np.einsum("nij,nj->ni", R_lidar_map, field)
+    return pose_features(readings.pose_root, b_lidar, R_lidar_map @ gradient @ R, t)
+
+
+def pose_features(
+    pose_root: FloatArray, b_lidar: FloatArray, slope: FloatArray, t: FloatArray
+) -> FloatArray:
+    """Return F: what a pose error does to the field at a sensor, uT in the lidar frame, (N, 3, 6).
+
+    Parameters
+    ----------
+    pose_root
+        L in rad and m, shape (N, 6, 6).
+    b_lidar
+        Field in the lidar frame in uT, shape (N, 3).
+    slope
+        ``R^T G R`` in uT/m, shape (N, 3, 3).
+    t
+        Position of the sensor in the lidar frame in metres, shape (N, 3).
+    """
+    turn = skew(b_lidar) - slope @ skew(t)
+    return np.asarray(np.concatenate([turn, slope], axis=2) @ pose_root)
+
+
+def pose_seconds(readings: Readings) -> FloatArray:
+    """Return when the readings' poses were taken, seconds after the first stamp, shape (N,)."""
+    seconds = 1e-9 * (readings.stamp_ns - readings.stamp_ns.min(initial=np.iinfo(np.int64).max))
+    offset = 0.0 if readings.motion is None else readings.motion.offset
+    return np.asarray(seconds + offset)

@@ -1,0 +1,1 @@
+"""Initial guesses of the extrinsics, searched for over the whole map."""

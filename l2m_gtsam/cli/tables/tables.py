@@ -1,0 +1,241 @@
+"""Results as tables in the terminal."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.maps.field_map import MapSummary
+from l2m_gtsam.records.calibration import (
+    CalibrationResult,
+    Disagreement,
+    Return,
+    SensorCalibration,
+    SensorStatus,
+    TimeOffset,
+)
+from l2m_gtsam.storage.inspect import BagReport, TopicReport
+
+
+def calibration_table(result: CalibrationResult) -> Table:
+    """Return one row per sensor: position, sigma, offset, scale, rotation, residual, status."""
+    table = Table(title="Calibration: B_meas = C @ B_lidar + H", title_justify="left")
+    table.add_column("sensor", no_wrap=True)
+    for heading in (
+        "t_lidar_mag (m)",
+        "± (mm)",
+        "H (uT)",
+        "|C - R| max",
+        "rotation (deg)",
+        "clock (ms)",
+        "|residual| rms (uT)",
+        "readings used",
+        "outside map",
+        "rejected",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("status")
+    for sensor in result.sensors:
+        table.add_row(*_calibration_row(sensor))
+    return table
+
+
+def disagreement_note(stretch: Disagreement) -> str:
+    """Return where, when and by how much readings and map disagree, as a sentence."""
+    (x0, y0), (x1, y1) = stretch.p_from[:2], stretch.p_to[:2]
+    meaning = {
+        Return.NEVER: "not passed again, so that a passing source and a changed place look alike",
+        Return.AS_MAPPED: "passed again it was as mapped: something moved by",
+        Return.DIFFERS: "passed again it differed too: the field has changed there",
+    }[stretch.passed_again]
+    where = f"{stretch.bag}: " if stretch.bag else ""
+    return (
+        f"{where}{', '.join(stretch.sensors)}: {stretch.readings} readings fit neither map nor "
+        f"distortion and do not count, {1e-9 * stretch.start_ns:.2f} to "
+        f"{1e-9 * stretch.end_ns:.2f} s, "
+        f"{stretch.length:.1f} m from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m, "
+        f"{stretch.size:.2g} uT off; {meaning}"
+    )
+
+
+def missing_note(result: CalibrationResult) -> tuple[str, ...]:
+    """Return which sensors are calibrated from some of several drives only, a sentence each."""
+    return tuple(
+        f"{sensor.sensor}: nothing usable was read in {', '.join(sensor.missing_in)}; it is "
+        "calibrated from the rest"
+        for sensor in result.sensors
+        if sensor.missing_in and len(sensor.missing_in) < len(result.bags)
+    )
+
+
+def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Table:
+    """Return truth, estimate, error and sigma of every sensor's position, and errors of C and H."""
+    table = Table(title="Truth and estimate", title_justify="left")
+    table.add_column("sensor")
+    for heading in ("true t (m)", "estimated t (m)", "error (mm)", "sigma (mm)"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("|C error|", "sigma", "|H error| (uT)", "sigma"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for known in truth:
+        table.add_row(*_truth_row(known, result[known.sensor]))
+    return table
+
+
+def honesty_note(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> str:
+    """Return how the errors of all positions compare with their sigmas, as a sentence."""
+    ratios = [
+        (result[known.sensor].t_lidar_mag - known.t_lidar_mag) / result[known.sensor].t_sigma
+        for known in truth
+        if result[known.sensor].residuals is not None
+    ]
+    if not ratios:
+        return "no sensor was solved"
+    rms = float(np.sqrt(np.mean(np.square(ratios))))
+    return f"errors of t are {rms:.1f} times their sigmas (rms, 1 is honest)"
+
+
+def bag_table(report: BagReport) -> Table:
+    """Return one row per topic: type, frame, count, rate, gaps, NaN, strength, use."""
+    table = Table(title=escape(str(report.path)), title_justify="left")
+    for heading in ("topic", "type", "frame"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("count", "Hz", "gap (s)", "clock (s)", "NaN", "|B| (uT)"):
+        table.add_column(heading, justify="right")
+    table.add_column("use", overflow="fold")
+    for topic in report.topics:
+        table.add_row(*_topic_row(topic))
+    return table
+
+
+def _topic_row(topic: TopicReport) -> tuple[str, ...]:
+    found = topic.strength
+    field = "" if found is None else f"{found.low:.4g} - {found.median:.4g} - {found.high:.4g}"
+    return (
+        escape(topic.topic),
+        escape(topic.msgtype.replace("/msg/", "/")),
+        escape(", ".join(topic.frames)),
+        f"{topic.count:,}",
+        _number(topic.rate_hz, ".4g"),
+        _number(topic.longest_gap_s, ".3g"),
+        _number(topic.clock_offset_s, ".3g"),
+        _number(topic.nan_share, ".1%"),
+        field,
+        escape(topic.use),
+    )
+
+
+def _number(value: float, form: str) -> str:
+    return "" if np.isnan(value) else format(value, form)
+
+
+@dataclass(frozen=True)
+class MapDescription:
+    """A map's figures and where it came from: plain values of its file."""
+
+    summary: MapSummary
+    provenance: dict[str, Any]
+
+
+def map_table(description: MapDescription) -> Table:
+    """Return what a map is made of, what it covers and where it came from."""
+    summary = description.summary
+    table = Table("fact", "value", title="Magnetic map", title_justify="left")
+    table.add_row("kind", summary.kind)
+    table.add_row("readings given, rows kept", f"{summary.readings:,}, {summary.rows:,}")
+    for axis, low, high in zip("xyz", summary.lower, summary.upper, strict=True):
+        table.add_row(f"readings along {axis}", f"{low:.2f} to {high:.2f} m")
+    for name, value in summary.facts.items():
+        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+        table.add_row(escape(name), escape(shown))
+    for name in ("frame", "version"):
+        table.add_row(name, escape(str(description.provenance.get(name, "unknown"))))
+    for source in _bags(description.provenance):
+        table.add_row("made from", escape(", ".join(str(value) for value in source.values())))
+    for name, shown in (("structure", "structure"), ("lidar", "cloud of scans")):
+        if isinstance(parts := description.provenance.get(name), dict):
+            facts = (f"{part.replace('_', ' ')} {value}" for part, value in parts.items())
+            table.add_row(shown, escape(", ".join(facts)))
+    return table
+
+
+def _bags(provenance: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the bags in a map file, which may have been tampered with."""
+    bags = provenance.get("bags")
+    return [each for each in bags if isinstance(each, dict)] if isinstance(bags, list) else []
+
+
+def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
+    status = _status(sensor)
+    if sensor.residuals is None:
+        counts = (f"{sensor.outside_map:,}", f"{sensor.rejected:,}")
+        return (escape(sensor.sensor), *("-",) * 8, *counts, status)
+    distortion, R = sensor.distortion, sensor.R_lidar_mag.T
+    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    return (
+        escape(sensor.sensor),
+        _vector(sensor.t_lidar_mag, 3),
+        _vector(1e3 * sensor.t_sigma, 1),
+        _vector(distortion.H, 2),
+        f"{np.abs(distortion.C - R).max():.3f}",
+        f"{angle:.2f}",
+        _clock(sensor.time_offset),
+        f"{sensor.residuals.rms:.3f}",
+        f"{sensor.residuals.readings:,}",
+        f"{sensor.outside_map:,}",
+        f"{sensor.rejected:,}",
+        status,
+    )
+
+
+def _clock(offset: TimeOffset | None) -> str:
+    """Return a time offset in milliseconds with its sigma; a dash where it is held at zero."""
+    if offset is None or not offset.estimated:
+        return "-"
+    return f"{1e3 * offset.seconds:.2f} ± {1e3 * offset.sigma:.2f}"
+
+
+def held_clocks_note(result: CalibrationResult) -> str:
+    """Return which sensors' time offsets are taken as zero and why, as a sentence; else nothing."""
+    held = {
+        sensor.sensor: sensor.time_offset.held
+        for sensor in result.sensors
+        if sensor.time_offset is not None and not sensor.time_offset.estimated
+    }
+    if not held:
+        return ""
+    first, reason = next(iter(held.items()))
+    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
+    return f"time offset of {first}{more} {reason}"
+
+
+def _truth_row(known: KnownSensor, sensor: SensorCalibration) -> tuple[str, ...]:
+    if sensor.residuals is None:
+        return (escape(known.sensor), _vector(known.t_lidar_mag, 3), *("-",) * 6, _status(sensor))
+    C_error = np.linalg.norm(sensor.distortion.C - known.distortion.C)
+    H_error = np.linalg.norm(sensor.distortion.H - known.distortion.H)
+    return (
+        escape(known.sensor),
+        _vector(known.t_lidar_mag, 3),
+        _vector(sensor.t_lidar_mag, 3),
+        _vector(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), 1),
+        _vector(1e3 * sensor.t_sigma, 1),
+        f"{C_error:.4f}",
+        f"{np.linalg.norm(sensor.C_sigma):.4f}",
+        f"{H_error:.3f}",
+        f"{np.linalg.norm(sensor.H_sigma):.3f}",
+    )
+
+
+def _vector(values: FloatArray, digits: int) -> str:
+    return " ".join(f"{value:{digits + 5}.{digits}f}" for value in values)
+
+
+def _status(sensor: SensorCalibration) -> str:
+    colour = "green" if sensor.status is SensorStatus.SOLVED else "yellow"
+    if sensor.status is SensorStatus.SOLVED:
+        known = f"; from priors: {', '.join(sensor.from_priors)}" if sensor.from_priors else ""
+        return f"[{colour}]{sensor.status.value}[/]{escape(known)}"
+    return f"[{colour}]{sensor.status.value}[/]: {escape(sensor.message)}"

@@ -1,0 +1,117 @@
+"""A validation in the terminal."""
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from l2m_gtsam.records.validation import (
+    CalibrationComparison,
+    ComparedSensor,
+    DriveValidation,
+    FieldError,
+    ValidatedSensor,
+    ValidationVerdict,
+)
+
+COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
+
+
+def validation_table(drive: DriveValidation, verdict: ValidationVerdict) -> Table:
+    """Return one row per sensor: field errors before and after, NIS, and the verdict."""
+    table = Table(
+        title="Readings beside pose, map and calibration",
+        title_justify="left",
+        caption="e_B: mean squared distance to the map's field (uT^2); distance and axes (of the "
+        "lidar): mean ± std after the calibration (uT); NIS per degree of freedom, in brackets "
+        "where 95 % of all lie",
+        caption_justify="left",
+    )
+    table.add_column("sensor", no_wrap=True)
+    for heading in ("e_B before", "e_B after", "distance", "x", "y", "z", "NIS", "readings"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("outside", "rejected"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("verdict")
+    levels = {each.sensor: each.level for each in verdict.sensors}
+    for sensor in drive.sensors:
+        table.add_row(*_row(sensor), _level(levels[sensor.sensor]))
+    for each in drive.missing:
+        table.add_row(escape(each.sensor), *("-",) * 10, _level(levels[each.sensor]))
+    return table
+
+
+def _row(sensor: ValidatedSensor) -> tuple[str, ...]:
+    nis = sensor.nis
+    return (
+        escape(sensor.sensor),
+        f"{sensor.before.squared:.3g}",
+        f"{sensor.after.squared:.3g}",
+        f"{sensor.after.mean:.3f} ± {sensor.after.std:.3f}",
+        *_axes(sensor.after),
+        f"{nis.ratio:.2f} ({nis.low / nis.freedom:.2f} - {nis.high / nis.freedom:.2f})",
+        f"{sensor.readings:,}",
+        f"{sensor.outside:,}",
+        f"{sensor.rejected:,}",
+    )
+
+
+def _axes(error: FieldError) -> list[str]:
+    pairs = zip(error.mean_axes, error.std_axes, strict=True)
+    return [f"{mean:.3f} ± {std:.3f}" for mean, std in pairs]
+
+
+def _level(level: str) -> str:
+    return f"[{COLOURS[level]}]{level.upper()}[/]"
+
+
+def change_table(comparison: CalibrationComparison) -> Table:
+    """Return one row per sensor: differences with their sigmas, and the chi-square tests."""
+    table = Table(
+        title="New less old calibration",
+        title_justify="left",
+        caption="chi-square / degrees of freedom over each part and all; ! where chance makes as "
+        "much less than once in 1,000 times",
+        caption_justify="left",
+    )
+    table.add_column("sensor", no_wrap=True)
+    for heading in ("t (mm)", "H (uT)", "place", "rotation", "gains", "angles", "C", "H", "all"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for sensor in comparison.sensors:
+        table.add_row(*_comparison_row(sensor))
+    for each in comparison.missing:
+        table.add_row(escape(each.sensor), *("-",) * 9)
+    return table
+
+
+def _comparison_row(sensor: ComparedSensor) -> tuple[str, ...]:
+    d, sigma = np.array(sensor.difference), np.array(sensor.sigma)
+    names = ("place", "rotation", "gains", "angles", "C", "offset", "all")
+    return (
+        escape(sensor.sensor),
+        _with_sigmas(1e3 * d[:3], 1e3 * sigma[:3], 1),
+        _with_sigmas(d[12:], sigma[12:], 2),
+        *(_test(sensor, name) for name in names),
+    )
+
+
+def _with_sigmas(values: np.ndarray, sigmas: np.ndarray, digits: int) -> str:
+    pairs = zip(values, sigmas, strict=True)
+    return "  ".join(
+        f"{v:.{digits}f} ± {s:.{digits}f}" if np.isfinite(s) else "unknown" for v, s in pairs
+    )
+
+
+def _test(sensor: ComparedSensor, name: str) -> str:
+    test = sensor.test(name)
+    mark = " !" if test.chance < 1e-3 else ""
+    return f"{test.chi_square:.1f} / {test.freedom}{mark}" if test.freedom else "-"
+
+
+def validation_lines(verdict: ValidationVerdict) -> list[str]:
+    """Return the verdict on the whole with its reasons, then on every sensor with reasons."""
+    lines = [f"verdict: {verdict.level.upper()}"]
+    lines += [f"  {each.level.upper()}: {each.text}" for each in verdict.remarks]
+    for sensor in verdict.sensors:
+        told = " ".join(each.text for each in sensor.remarks)
+        lines.append(f"  {sensor.level.upper()} {sensor.sensor}{': ' if told else ''}{told}")
+    return lines

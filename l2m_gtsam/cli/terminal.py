@@ -1,0 +1,109 @@
+"""What commands have in common: tables, warnings and progress at a terminal."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TextIO
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from l2m_gtsam.progress import Progress
+
+STARTING = "starting"
+ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
+
+
+def warn(doubts: Sequence[str]) -> None:
+    """Say on the error stream what speaks against a result that was written all the same."""
+    for doubt in doubts:
+        typer.echo(f"l2m: warning: {doubt}", err=True)
+
+
+@contextmanager
+def shown_notices() -> Iterator[None]:
+    """Show notices of this program as its warnings; others appear as Python has them."""
+    import warnings
+
+    from l2m_gtsam.records.notices import Notice
+
+    with warnings.catch_warnings():
+        usual = warnings.showwarning
+
+        def show(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, Notice):
+                warn([str(message)])
+            else:
+                usual(message, category, filename, lineno, file, line)
+
+        warnings.simplefilter("always", Notice)
+        warnings.showwarning = show
+        yield
+
+
+def print_table(table: "Table") -> None:
+    """Print a table as wide as its numbers need: a narrow terminal wraps, it cuts no digits."""
+    from rich.console import Console
+
+    console = Console()
+    wide = console.width if console.is_terminal else 200
+    Console(width=max(_needed(console, table), wide)).print(table)
+
+
+@contextmanager
+def shown_progress() -> "Iterator[Progress]":
+    """Show one bar per stage on the error stream while it runs.
+
+    One that says "starting" stands there from the first until there is a stage: what a command
+    needs is best imported inside.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+    from rich.progress import TimeRemainingColumn as TimeLeftColumn
+
+    columns = (
+        TextColumn("{task.description:<28}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeLeftColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, speed_estimate_period=ESTIMATE_S) as bars:
+        stages: dict[str, TaskID] = {}
+        starting = [bars.add_task(STARTING, total=None)]
+        bars.refresh()
+
+        def tell(stage: str, fraction: float) -> None:
+            if stage not in stages:
+                stages[stage] = bars.add_task(stage, total=1.0)
+            bars.update(stages[stage], completed=fraction)
+            while starting:
+                bars.remove_task(starting.pop())
+
+        try:
+            yield tell
+        finally:
+            while starting:
+                bars.remove_task(starting.pop())
+
+
+def _needed(console: "Console", table: "Table") -> int:
+    """Return the width of a table whose words, and lines that do not wrap, are whole."""
+    from rich.measure import Measurement
+
+    options, widths = console.options.update(width=1000), []
+    for column in table.columns:
+        cells = (Measurement.get(console, options, cell) for cell in (column.header, *column.cells))
+        widths.append(max(cell.maximum if column.no_wrap else cell.minimum for cell in cells))
+    borders = 3 * len(widths) + 1
+    return sum(widths) + borders

@@ -1,0 +1,1 @@
+"""From recordings of a mapping suite to a map."""

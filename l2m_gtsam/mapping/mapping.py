@@ -1,0 +1,181 @@
+"""Recordings of a mapping suite -> map. Pure: no files, no terminal."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from l2m_gtsam.config import MappingOptions
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.build import KINDS, build_map
+from l2m_gtsam.maps.compare import MapComparison, compare_maps
+from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.training import TrainingSet, checked_readings
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.recording.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
+
+
+@one_blas_thread()
+def map_recordings(
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    options: MappingOptions,
+    cloud: FloatArray | None = None,
+) -> FieldMap:
+    """Build a map from one or several drives of a suite whose calibration is known.
+
+    Parameters
+    ----------
+    recordings
+        Drives with poses in one map frame.
+    suite
+        Position and distortion of every sensor by name; None means that all are ideal and sit at
+        the lidar's origin.
+    options
+        Which readings enter, and the kind of map.
+    cloud
+        Structure that a LiDAR saw: points of the map frame in metres, shape (M, 3).
+
+    Raises
+    ------
+    MapError
+        Recordings in different frames, a sensor that the suite does not list, no map from
+        these readings, or a kind that has no use for a structure cloud.
+    SyncError
+        Readings and poses of a recording do not overlap.
+    """
+    readings = suite_readings(recordings, suite, options.sync)
+    return build_map(readings.points, readings.field, options.model, cloud)
+
+
+@one_blas_thread()
+def update_map(
+    field_map: FieldMap,
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    options: MappingOptions,
+) -> FieldMap:
+    """Return a map with the readings of more drives; its kind and its prior stay as they are.
+
+    Parameters
+    ----------
+    field_map
+        In the frame of the recordings' poses.
+    recordings, suite
+        As in ``map_recordings``.
+    options
+        Which readings enter.
+
+    Raises
+    ------
+    MapError, SyncError
+        As in ``map_recordings``.
+    """
+    readings = suite_readings(recordings, suite, options.sync)
+    return field_map.updated(readings.points, readings.field)
+
+
+@one_blas_thread()
+def compare_recordings(
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    options: MappingOptions,
+    cloud: FloatArray | None,
+    progress: Progress,
+) -> MapComparison:
+    """Compare the kinds of maps that drives of a suite could become, each with its options.
+
+    Parameters
+    ----------
+    recordings, suite
+        As in ``map_recordings``.
+    options
+        Which readings enter, the options of each kind, and how readings are held out.
+    cloud
+        Structure in the map frame in metres, shape (M, 3), for the kind that can use it.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    MapError, SyncError
+        As in ``map_recordings``, or the readings fill too few patches.
+    """
+    readings = suite_readings(recordings, suite, options.sync)
+    built = dict.fromkeys(options.compare.kinds, 0)
+
+    def build(points: FloatArray, field: FloatArray, kind: str) -> FieldMap:
+        stage = f"building {kind} maps"
+        progress(stage, built[kind] / options.compare.folds)
+        model = options.model.model_copy(update={"kind": kind})
+        field_map = build_map(points, field, model, cloud if KINDS[kind].uses_structure else None)
+        built[kind] += 1
+        progress(stage, built[kind] / options.compare.folds)
+        return field_map
+
+    return compare_maps(readings.points, readings.field, options.compare, build)
+
+
+@one_blas_thread()
+def suite_readings(
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    sync: SyncOptions,
+) -> TrainingSet:
+    """Return what a suite read, in the map frame; see ``map_recordings``."""
+    frames = sorted({recording.trajectory.frame for recording in recordings})
+    if len(frames) > 1:
+        named = ", ".join(f"{r.source.path} in {r.trajectory.frame!r}" for r in recordings)
+        msg = f"the recordings' poses are in different frames: {named}; one map frame is needed"
+        raise MapError(msg)
+    points, fields = [], []
+    for recording in recordings:
+        known = [_known(series.sensor, suite, recording) for series in recording.series]
+        offset = np.array([each.time_offset for each in known])
+        readings = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0))).readings
+        _refuse_stuck(readings, recording)
+        if offset.any():
+            readings = with_offsets(readings, recording.trajectory, offset)
+        points.append(sensor_positions(readings, known))
+        fields.append(map_fields(readings, known))
+    return checked_readings(np.concatenate(points), np.concatenate(fields))
+
+
+def _refuse_stuck(readings: Readings, recording: Recording) -> None:
+    """Raise a MapError for a sensor that reports one constant value: it would poison the map."""
+    if stuck := [readings.sensors[index] for index in stuck_sensors(readings)]:
+        msg = (
+            f"{recording.source.path}: the sensor {stuck[0]!r} is stuck on one value; choose the "
+            "others with `bag.fields`"
+        )
+        raise MapError(msg)
+
+
+def sensor_positions(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:
+    """Return where each reading was taken in the map frame in metres, shape (N, 3)."""
+    t = np.stack([sensor.t_lidar_mag for sensor in known])[readings.sensor]
+    return np.asarray(
+        np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar, dtype=float
+    )
+
+
+def map_fields(readings: Readings, known: Sequence[KnownSensor]) -> FloatArray:
+    """Return the field that each reading stands for in the map frame in uT, shape (N, 3)."""
+    b_lidar = np.empty_like(readings.field)
+    for index, sensor in enumerate(known):
+        rows = readings.rows_of(index)
+        b_lidar[rows] = sensor.distortion.undo(readings.field[rows])
+    return np.asarray(np.einsum("nij,nj->ni", readings.R_map_lidar, b_lidar))
+
+
+def _known(name: str, suite: Mapping[str, KnownSensor] | None, recording: Recording) -> KnownSensor:
+    if suite is None:
+        return KnownSensor.ideal(name)
+    if name not in suite:
+        msg = (
+            f"{recording.source.path}: the suite does not list the sensor {name!r}; it lists "
+            f"{', '.join(sorted(suite))} (choose sensors with `bag.fields`)"
+        )
+        raise MapError(msg)
+    return suite[name]

@@ -1,0 +1,185 @@
+"""Mapping drives -> the sensors of their suite, with no map and no calibration. Pure."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+
+import numpy as np
+
+from l2m_gtsam.data import (
+    Distortion,
+    FloatArray,
+    KnownSensor,
+    Readings,
+    Recording,
+    SyncCounts,
+)
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.mapping.suite.evidence import SIZE, TAU
+from l2m_gtsam.mapping.suite.options import SuiteOptions
+from l2m_gtsam.mapping.suite.solve import SuiteSolution, solve_suite
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.recording.joining import joined
+from l2m_gtsam.recording.sync import stuck_sensors, synchronise, with_offsets
+from l2m_gtsam.records.calibration import (
+    CalibrationResult,
+    SensorCalibration,
+    SensorStatus,
+    TimeOffset,
+    Uncertainty,
+)
+from l2m_gtsam.solve.figures import residual_figures
+from l2m_gtsam.solve.rotation import polar_rotation
+
+REACH = 5.0  # standard deviations of a clock for which readings need poses around them
+UNTOLD = 0.5  # of the sigma that was assumed: a parameter known no better is told by nothing else
+PARAMETERS = (
+    *("t_lidar_mag x", "t_lidar_mag y", "t_lidar_mag z"),
+    *(f"C[{i},{j}]" for i in range(3) for j in range(3)),
+    *("H x", "H y", "H z"),
+    "time offset",
+)
+
+
+@dataclass(frozen=True)
+class SuiteDrive:
+    """The drive of a suite: one recording, or several joined, and its readings with poses."""
+
+    recording: Recording
+    readings: Readings
+    counts: tuple[SyncCounts, ...]
+
+    def at(self, offset: FloatArray) -> Readings:
+        """Return the readings with the poses at their stamps and these clock offsets, (S,)."""
+        return with_offsets(self.readings, self.recording.trajectory, offset)
+
+
+@one_blas_thread()
+def calibrate_suite(
+    recordings: Sequence[Recording],
+    assumed: Mapping[str, KnownSensor] | None,
+    options: SuiteOptions,
+    progress: Progress,
+) -> CalibrationResult:
+    """Calibrate the sensors of a mapping suite from its own drives.
+
+    Parameters
+    ----------
+    recordings
+        Drives of the suite with poses in one map frame.
+    assumed
+        Sensors by name, as far as they are known; the others are taken for ideal ones at the
+        lidar's origin.
+    options
+        How sure that is, and how to solve.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    CalibrationError
+        Drives do not go together, or an axis of a sensor looks flipped.
+    MapError
+        A sensor is stuck on one value, or there are too few readings.
+    SyncError
+        Readings and poses do not overlap.
+    """
+    drive = suite_drive(recordings, options)
+    known = [(assumed or {}).get(name, KnownSensor.ideal(name)) for name in drive.readings.sensors]
+    start = np.stack([_parameters(each) for each in known])
+    solution = solve_suite(drive.at, start, options, progress)
+    return _result(drive, solution, options)
+
+
+def suite_drive(recordings: Sequence[Recording], options: SuiteOptions) -> SuiteDrive:
+    """Return drives of a suite as one, with readings that have poses whatever their clocks."""
+    recording = joined(recordings)
+    reach = REACH * options.clock_s
+    synchronised = synchronise(recording, options.sync, reach)
+    readings = synchronised.readings
+    if stuck := [readings.sensors[index] for index in stuck_sensors(readings)]:
+        raise MapError(
+            f"{recording.source.path}: the sensor {stuck[0]!r} is stuck on one value; choose the "
+            "others with `bag.fields`"
+        )
+    return SuiteDrive(recording, readings, synchronised.counts)
+
+
+def _parameters(sensor: KnownSensor) -> FloatArray:
+    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector(), [0.0]])
+
+
+def _result(drive: SuiteDrive, solution: SuiteSolution, options: SuiteOptions) -> CalibrationResult:
+    """Return a solution as a calibration."""
+    sensors = tuple(_sensor(drive, solution, i) for i in range(len(drive.readings.sensors)))
+    recording = drive.recording
+    return CalibrationResult(
+        sensors=sensors,
+        iterations=solution.rounds,
+        uncertainty=Uncertainty.FULL,
+        doubts=_doubts(drive.readings.sensors, solution, options),
+        disagreements=(),
+        bag=None if recording.drives else recording.source,
+        map=None,
+        options=options.model_dump(mode="json"),
+        versions={"l2m-gtsam": version("l2m-gtsam")},
+        bags=tuple(each.source for each in recording.drives),
+        notes=tuple(note for part in recording.parts for note in part.notes),
+    )
+
+
+def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibration:
+    own = slice(SIZE * i, SIZE * (i + 1))
+    parameters, covariance = solution.parameters[i], solution.covariance[own, own]
+    distortion = Distortion.from_vector(parameters[3:TAU])
+    rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
+    sigma = float(np.sqrt(covariance[TAU, TAU]))
+    status, message = _ending(solution)
+    noise = float(solution.prior.noise * np.cbrt(np.linalg.det(distortion.C)))
+    residual = solution.residuals[i]
+    white = np.tile(np.eye(3) / noise, (len(residual), 1, 1))
+    return SensorCalibration(
+        sensor=drive.readings.sensors[i],
+        status=status,
+        message=message,
+        t_lidar_mag=parameters[:3],
+        distortion=distortion,
+        R_lidar_mag=rotation.R_mag_lidar.T,
+        covariance=covariance[:TAU, :TAU],
+        rotation_covariance=rotation.covariance,
+        noise=noise,
+        residuals=residual_figures(residual, white, taken=0.0) if len(residual) else None,
+        undetermined=(),
+        sync=drive.counts[i],
+        outside_map=0,
+        time_offset=TimeOffset(float(parameters[TAU]), sigma, covariance[:TAU, TAU], ""),
+    )
+
+
+def _ending(solution: SuiteSolution) -> tuple[SensorStatus, str]:
+    if solution.converged:
+        return SensorStatus.SOLVED, "with the field of its own drive"
+    message = (
+        f"still moving after {solution.rounds} rounds; allow more with mapping.suite.rounds, or "
+        "give what is known with --suite"
+    )
+    return SensorStatus.NOT_CONVERGED, message
+
+
+def _doubts(
+    names: Sequence[str], solution: SuiteSolution, options: SuiteOptions
+) -> tuple[str, ...]:
+    """Return which parameters the drive told little of, a sentence for each sensor."""
+    sigma = np.sqrt(np.diag(solution.covariance)).reshape(len(names), SIZE)
+    assumed = np.repeat(
+        [options.position_m, options.matrix, options.offset_ut, options.clock_s], [3, 9, 3, 1]
+    )
+    sentences = []
+    for name, own in zip(names, sigma, strict=True):
+        if untold := [PARAMETERS[k] for k in np.flatnonzero(own > UNTOLD * assumed)]:
+            sentences.append(
+                f"{name}: the drive says little of {', '.join(untold)}; drive with all headings "
+                "and some tilt, or give what is known with --suite"
+            )
+    return tuple(sentences)

@@ -1,0 +1,239 @@
+"""The sensors of a mapping suite by the marginal likelihood of their own drive.
+
+The drive's poses are known, the field is not. A sensor that is taken to sit or to read otherwise
+than it does sees at one place, under two headings, two fields, and over the drive one that no
+sources could make: both are unlikely. By Fisher scoring; strength and depth of the sources are
+learnt anew in rounds.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.mapping.suite.evidence import SIZE, C, Scored, scored
+from l2m_gtsam.mapping.suite.options import SuiteOptions
+from l2m_gtsam.mapping.suite.windows import SuiteWindows, windows_over
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.solve.model_comparison import correlation_of
+
+# Nobody can tell fields that are all stronger by a factor from sensors that read less by it: the
+# mean of C's diagonals stays what it is assumed to be.
+SAME_SCALE = 1e-5
+DIAGONAL = [3, 7, 11]
+SMALLEST = 1 / 16  # of a step
+SETTLED = 0.5  # standard deviations that a round may still move a parameter by
+GAIN = 0.01  # of the log likelihood: a step that gains less is the last
+
+ReadingsAt = Callable[[FloatArray], Readings]
+"""From clock offsets in seconds, shape (S,), to the readings with the poses that they have then."""
+
+
+@dataclass(frozen=True)
+class SuiteSolution:
+    """Sensors of a suite.
+
+    Attributes
+    ----------
+    parameters
+        (t, C row by row, H, time offset) in m, uT and s, shape (S, 16).
+    covariance
+        Of all, shape (16 S, 16 S).
+    prior
+        Of the field, with the noise of a reading.
+    residuals
+        Of each sensor ``C b + H - z`` in uT over the readings that took part, shape (n, 3).
+    independent
+        As how many readings they all count: residuals near each other in time are alike.
+    converged
+        Whether the last round moved nothing any more.
+    rounds
+        That were taken.
+    """
+
+    parameters: FloatArray
+    covariance: FloatArray
+    prior: Hyperparameters
+    residuals: tuple[FloatArray, ...]
+    independent: float
+    converged: bool
+    rounds: int
+
+
+def solve_suite(
+    readings_at: ReadingsAt, assumed: FloatArray, options: SuiteOptions, progress: Progress
+) -> SuiteSolution:
+    """Find the sensors of a suite.
+
+    Parameters
+    ----------
+    readings_at
+        The drive.
+    assumed
+        Parameters of the S sensors before anything is known, shape (S, 16).
+    options
+        How sure that is, and how to solve.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    MapError
+        There are too few readings.
+    """
+    problem = SuiteProblem(readings_at, assumed, options)
+    sensors, moved = assumed, np.inf
+    for round_ in range(options.rounds):
+        progress("calibrating the suite", round_ / options.rounds)
+        found = problem.solved(sensors)
+        sensors, moved = found.sensors, found.moved(sensors)
+        if moved < SETTLED:
+            break
+    progress("calibrating the suite", 1.0)
+    return SuiteSolution(
+        parameters=sensors,
+        covariance=found.covariance,
+        prior=found.windows.prior,
+        residuals=found.residuals(),
+        independent=found.independent,
+        converged=bool(moved < SETTLED) and found.settled,
+        rounds=round_ + 1,
+    )
+
+
+@dataclass(frozen=True)
+class Found:
+    """Where a round led."""
+
+    sensors: FloatArray
+    windows: SuiteWindows
+    left: tuple[FloatArray, ...]
+    independent: float
+    covariance: FloatArray
+    settled: bool
+
+    def residuals(self) -> tuple[FloatArray, ...]:
+        """Return what is left of each sensor's readings in its own axes, uT."""
+        sensors = range(len(self.sensors))
+        own: list[list[FloatArray]] = [[] for _ in sensors]
+        for window, left in zip(self.windows.parts, self.left, strict=True):
+            readings = window.readings
+            b = -np.einsum("nji,nj->ni", readings.R_map_lidar, left)
+            for i in sensors:
+                rows = readings.rows_of(i)
+                own[i].append(b[rows] @ self.sensors[i, C].reshape(3, 3).T)
+        return tuple(np.concatenate(parts) for parts in own)
+
+    def moved(self, before: FloatArray) -> float:
+        """Return the largest move of a parameter in its sigmas."""
+        away = np.abs(self.sensors - before).ravel()
+        return float((away / np.sqrt(np.diag(self.covariance))).max())
+
+
+class SuiteProblem:
+    """The likelihood of a drive and what is assumed of its sensors.
+
+    Parameters
+    ----------
+    readings_at
+        The drive.
+    assumed
+        Shape (S, 16).
+    options
+        How sure that is.
+    """
+
+    def __init__(self, readings_at: ReadingsAt, assumed: FloatArray, options: SuiteOptions) -> None:
+        self._readings_at, self._assumed, self._options = readings_at, assumed, options
+        self._information = prior_information(len(assumed), options)
+
+    def solved(self, sensors: FloatArray) -> Found:
+        """Lay windows for these sensors and find those that make the readings most likely."""
+        readings = self._readings_at(sensors[:, -1])
+        windows = windows_over(readings, sensors, self._options)
+        score, settled = self._scored(windows, sensors), False
+        for _ in range(self._options.steps):
+            step = self._covariance(score, 1.0) @ score.slope
+            better = self._along(windows, sensors, score, step)
+            if better is None:
+                settled = True
+                break
+            settled = better[1].value - score.value < GAIN
+            sensors, score = better
+            if settled:
+                break
+        alike = likeness(windows, score)
+        count = sum(len(rows) for rows in windows.rows)
+        covariance = self._covariance(score, alike)
+        return Found(sensors, windows, score.residuals, count / alike, covariance, settled)
+
+    def _covariance(self, score: Scored, alike: float) -> FloatArray:
+        """Return the covariance where so many readings count as one, shape (16 S, 16 S)."""
+        return np.asarray(np.linalg.inv(score.information / alike + self._information))
+
+    def _along(
+        self, windows: SuiteWindows, sensors: FloatArray, score: Scored, step: FloatArray
+    ) -> tuple[FloatArray, Scored] | None:
+        """Return sensors along a step that make the readings more likely, if there are any."""
+        share = 1.0
+        while share >= SMALLEST:
+            trial = sensors + share * step.reshape(sensors.shape)
+            new = self._scored(windows, trial)
+            if new.value > score.value:
+                return trial, new
+            share /= 2
+        return None
+
+    def _scored(self, windows: SuiteWindows, sensors: FloatArray) -> Scored:
+        """Return the posterior: slope and value with what is assumed, information without."""
+        readings = self._readings_at(sensors[:, -1])
+        parts = [
+            scored(replace(part, readings=readings[rows]), sensors, windows.prior)
+            for part, rows in zip(windows.parts, windows.rows, strict=True)
+        ]
+        total = reduce(add, parts)
+        off = (sensors - self._assumed).ravel()
+        pull = self._information @ off
+        return Scored(
+            total.value - 0.5 * float(off @ pull),
+            total.slope - pull,
+            total.information,
+            total.residuals,
+        )
+
+
+def likeness(windows: SuiteWindows, score: Scored) -> float:
+    """Return how many readings count as one, from how residuals go together in time.
+
+    Poses of a tracking system, the clock between two of its samples and waves that are left out err
+    alike for a while.
+    """
+    parts, rows, first = [], [], 0
+    for window, residual in zip(windows.parts, score.residuals, strict=True):
+        sensor, stamp = window.readings.sensor, window.readings.stamp_ns
+        for i in np.unique(sensor):
+            own = np.flatnonzero(sensor == i)
+            parts.append(residual[own[np.argsort(stamp[own], kind="stable")]])
+            rows.append(slice(first, first + len(own)))
+            first += len(own)
+    return max(2 * float(correlation_of(np.concatenate(parts), rows).sum()) - 1, 1.0)
+
+
+def prior_information(count: int, options: SuiteOptions) -> FloatArray:
+    """Return the information about so many sensors that is assumed, shape (16 S, 16 S)."""
+    sigma = np.concatenate(
+        [
+            np.full(3, options.position_m),
+            np.full(9, options.matrix),
+            np.full(3, options.offset_ut),
+            [options.clock_s],
+        ]
+    )
+    scale = np.zeros((count, SIZE))
+    scale[:, DIAGONAL] = 1 / (count * len(DIAGONAL))
+    fixed = np.outer(scale, scale) / SAME_SCALE**2
+    return np.asarray(np.diag(np.tile(sigma**-2, count)) + fixed)

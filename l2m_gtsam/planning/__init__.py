@@ -1,0 +1,1 @@
+"""What a drive will determine, before it is calibrated."""

@@ -1,0 +1,297 @@
+"""What a drive will determine, from its poses and the map alone. Pure: no files, no terminal."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.alternation import Progress
+from l2m_gtsam.calibration.explanation import from_priors, undetermined
+from l2m_gtsam.calibration.forecast import Forecast, forecast
+from l2m_gtsam.calibration.joint import SensorSolution
+from l2m_gtsam.calibration.named_priors import priors_of
+from l2m_gtsam.calibration.prepare import prepare
+from l2m_gtsam.calibration.priors import Priors
+from l2m_gtsam.calibration.start.rigid_groups import placed
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.config import CalibrationOptions, PlanOptions
+from l2m_gtsam.data import (
+    FieldSeries,
+    FloatArray,
+    PoseMotion,
+    Readings,
+    Recording,
+    SourceFile,
+    SyncCounts,
+    Synchronised,
+    Trajectory,
+)
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.planning.motion import Motion, extra_motions, loop, places_around, strongest
+from l2m_gtsam.records.plan import DrivePlan, MotionPlan, SensorPlan, Worst
+from l2m_gtsam.solve.explain import Movement, held_offset, movement
+from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
+from l2m_gtsam.solve.rotation import polar_rotation
+
+NANOSECONDS = 1e9
+BREAK_NS = 60_000_000_000  # between a drive and a motion that is added to it
+UNKNOWN = np.diag(np.full(len(PARAMETERS), np.inf))
+NOISE_FACT = "noise of a reading (uT)"  # of the summary of maps that learn it
+
+
+@dataclass(frozen=True)
+class Task:
+    """What every forecast of one plan has in common.
+
+    Attributes
+    ----------
+    field_map
+        The map, in its form for solvers.
+    t
+        Assumed places of the sensors in the lidar frame in metres, shape (S, 3).
+    noise
+        Of the sensors in uT.
+    options
+        How the solve would go.
+    priors
+        What is known of the sensors beforehand.
+    """
+
+    field_map: QueryableMap
+    t: FloatArray
+    noise: float
+    options: CalibrationOptions
+    priors: Priors
+
+    def forecast(self, readings: Readings) -> Forecast:
+        """Return what a solve would say."""
+        options = self.options.solve
+        return forecast(readings, self.field_map, self.t, self.noise, options, self.priors)
+
+    def worst(self, readings: Readings) -> Worst:
+        """Return what would be known least of a sensor by itself."""
+        solved = self.forecast(readings).solved
+        covariance = solved[0].covariance if solved else UNKNOWN
+        return worst(readings.sensors[0], covariance, self.options.solve.rank)
+
+    def of(self, sensor: int) -> "Task":
+        """Return the task of one sensor by itself: baselines to others are left out."""
+        return replace(self, t=self.t[[sensor]], priors=self.priors.of_one(sensor))
+
+
+@one_blas_thread()
+def plan(
+    recording: Recording,
+    field_map: QueryableMap,
+    options: CalibrationOptions,
+    planning: PlanOptions,
+    progress: Progress | None = None,
+) -> DrivePlan:
+    """Say what a drive will determine, to what sigma, and which extra motion would help most.
+
+    Parameters
+    ----------
+    recording
+        The drive; of its readings only the times count.
+    field_map
+        The magnetic map, in the frame of the recording's poses.
+    options
+        How it would be calibrated; sensors are assumed where ``start`` puts them, else where they
+        were measured, else at the lidar, without distortion.
+    planning
+        What is assumed and tried.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    SyncError
+        Readings and poses do not overlap.
+    CalibrationError
+        The map does not cover the drive, or a place is given for an unknown sensor.
+    """
+    tell = progress or (lambda stage, fraction: None)
+    synchronised = prepare(recording, options)
+    readings = synchronised.readings
+    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    noise = _noise(field_map, options, planning)
+    priors = priors_of(options.priors, readings.sensors)
+    task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)
+    tell("what the drive tells", 0.0)
+    found = task.forecast(readings)
+    tell("what the drive tells", 1.0)
+    if not found.view.inside.any():
+        raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
+    sensors = _sensor_plans(synchronised, recording.trajectory, found, task)
+    worsts = [worst(each.sensor, each.covariance, options.solve.rank) for each in sensors]
+    least = max(range(len(sensors)), key=lambda index: worsts[index].badness)
+    # The other sensors are known better: what a motion does for them need not be asked.
+    one, alone = task.of(least), only(readings, least)
+    motions = _with_motions(one, alone, _motions(readings, solver_map, planning), tell)
+    return DrivePlan(
+        sensors=sensors,
+        noise=noise,
+        uncertainty=found.uncertainty,
+        worst=one.worst(alone),
+        motions=motions,
+        doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
+    )
+
+
+def _with_motions(
+    task: Task, readings: Readings, motions: tuple[Motion, ...], tell: Progress
+) -> tuple[MotionPlan, ...]:
+    """Return what each motion would leave of a sensor, the best first."""
+    plans = []
+    for index, motion in enumerate(motions):
+        tell("extra motions", index / len(motions))
+        plans.append(MotionPlan(motion.name, task.worst(with_motion(readings, motion))))
+    tell("extra motions", 1.0)
+    return tuple(sorted(plans, key=lambda each: each.worst.badness))
+
+
+def assumed_recording(
+    trajectory: Trajectory, source: SourceFile, sensors: tuple[str, ...], rate_hz: float
+) -> Recording:
+    """Return a drive with sensors that it does not have yet: readings at a rate, all zero."""
+    first, last = trajectory.stamp_ns[[0, -1]]
+    stamps = np.arange(first, last + 1, int(NANOSECONDS / rate_hz), dtype=np.int64)
+    silent = np.zeros((len(stamps), 3))
+    series = tuple(FieldSeries(name, "", "", stamps, silent) for name in sensors)
+    return Recording(trajectory, series, source)
+
+
+def only(readings: Readings, sensor: int) -> Readings:
+    """Return the readings of one sensor, as the only one."""
+    own = readings[np.flatnonzero(readings.sensor == sensor)]
+    return replace(own, sensors=(readings.sensors[sensor],), sensor=np.zeros_like(own.sensor))
+
+
+def with_motion(readings: Readings, motion: Motion) -> Readings:
+    """Return the readings of a drive to which a motion is added: one per sensor and pose."""
+    S, K, moving, roots = len(readings.sensors), len(motion.p), None, readings.pose_root
+    later = BREAK_NS + np.round(NANOSECONDS * motion.seconds).astype(np.int64)
+    if readings.motion is not None:
+        twist = np.concatenate([readings.motion.twist_lidar, np.tile(motion.twist, (S, 1))])
+        moving = PoseMotion(twist, np.zeros(len(twist)))
+    sensor = np.concatenate([readings.sensor, np.repeat(np.arange(S), K)])
+    joined = Readings(
+        readings.sensors,
+        sensor,
+        np.concatenate([readings.stamp_ns, np.tile(readings.stamp_ns.max() + later, S)]),
+        np.concatenate([readings.R_map_lidar, np.tile(motion.R, (S, 1, 1))]),
+        np.concatenate([readings.p_map_lidar, np.tile(motion.p, (S, 1))]),
+        np.concatenate([readings.field, np.zeros((S * K, 3))]),
+        moving,
+        None if roots is None else np.concatenate([roots, np.tile(roots[:1], (S * K, 1, 1))]),
+    )
+    return joined[np.argsort(sensor, kind="stable")]
+
+
+def worst(sensor: str, covariance: FloatArray, rank: RankOptions) -> Worst:
+    """Return the parameter of a sensor that is known least, from its covariance, (15, 15)."""
+    sigma = np.sqrt(np.diag(covariance))
+    known = np.isfinite(sigma)
+    if not known.any():
+        return Worst(len(sigma), sensor, "", float("inf"), float("inf"))
+    share = np.where(known, sigma / rank.scale(), 0.0)
+    least = int(np.argmax(share))
+    unknown = len(sigma) - int(known.sum())
+    return Worst(unknown, sensor, PARAMETERS[least], float(sigma[least]), float(share[least]))
+
+
+def _noise(field_map: QueryableMap, options: CalibrationOptions, planning: PlanOptions) -> float:
+    """Return the noise to assume in uT: as given, else that of the mapping suite."""
+    if options.solve.sensor_noise_ut is not None:
+        return options.solve.sensor_noise_ut
+    if isinstance(field_map, Summarised):
+        return float(field_map.summary.facts.get(NOISE_FACT, planning.noise_ut))
+    return planning.noise_ut
+
+
+def _places(sensors: tuple[str, ...], options: CalibrationOptions, priors: Priors) -> FloatArray:
+    """Return where sensors are assumed in metres, shape (S, 3)."""
+    if unknown := sorted(set(options.start) - set(sensors)):
+        msg = f"start: no sensor named {unknown[0]!r}; the recording has {', '.join(sensors)}"
+        raise CalibrationError(msg)
+    at_lidar = (0.0, 0.0, 0.0)
+    t = np.array([options.start.get(name, at_lidar) for name in sensors])
+    given = [index for index, name in enumerate(sensors) if name in options.start]
+    return placed(t, given, priors)
+
+
+def _motions(
+    readings: Readings, field_map: QueryableMap, planning: PlanOptions
+) -> tuple[Motion, ...]:
+    """Return the motions to try on a drive."""
+    # Sensors that share their stamps share their poses: each counts once.
+    stamps, first = np.unique(readings.stamp_ns, return_index=True)
+    seconds = (stamps - stamps[0]) / NANOSECONDS
+    drive = Motion("drive", readings.R_map_lidar[first], readings.p_map_lidar[first], seconds)
+    motions = extra_motions(drive, planning.motion)
+    places = places_around(drive, planning.motion)
+    strong = strongest(places, field_map.query(places))
+    return motions if strong is None else (*motions, loop(drive, strong, planning.motion))
+
+
+def _sensor_plans(
+    synchronised: Synchronised, trajectory: Trajectory, found: Forecast, task: Task
+) -> tuple[SensorPlan, ...]:
+    readings, solved = synchronised.readings, {each.sensor: each for each in found.solved}
+    outside = np.bincount(readings.sensor[~found.view.inside], minlength=len(readings.sensors))
+    moved = movement(trajectory.R, trajectory.p)
+    plans = []
+    for index, counts in enumerate(synchronised.counts):
+        inside = counts.kept - int(outside[index])
+        held, late = "", float("inf")
+        known: tuple[str, ...] = ()
+        if index in solved:
+            covariance, words = _foretold(solved[index], found, task)
+            held = held_offset(solved[index].determinacy)
+            known = from_priors(solved[index].determinacy)
+            late = solved[index].offset_sigma
+        else:
+            covariance = UNKNOWN
+            words = (_too_few(counts, inside, moved, task.options.solve.min_readings),)
+        plans.append(
+            SensorPlan(
+                sensor=readings.sensors[index],
+                t_lidar_mag=task.t[index],
+                readings=inside,
+                outside_map=int(outside[index]),
+                covariance=covariance,
+                rotation_covariance=_of_rotation(index, covariance, task),
+                undetermined=words,
+                offset_sigma=late,
+                offset_held=held,
+                from_priors=known,
+            )
+        )
+    return tuple(plans)
+
+
+def _of_rotation(sensor: int, covariance: FloatArray, task: Task) -> FloatArray:
+    """Return the covariance of an ideal sensor's rotation, shape (3, 3), in rad^2."""
+    R_mag_lidar = task.priors.mounts().get(sensor, np.eye(3))
+    return polar_rotation(R_mag_lidar, covariance[3:12, 3:12]).covariance
+
+
+def _foretold(
+    solution: SensorSolution, found: Forecast, task: Task
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return a sensor's covariance, and in words what it leaves open."""
+    used = found.view.readings.select(found.view.readings.sensor == solution.sensor)
+    t, rank = task.t[solution.sensor], task.options.solve.rank
+    words = undetermined(solution.determinacy, used, t, task.field_map, rank)
+    return solution.covariance, words
+
+
+def _too_few(counts: SyncCounts, inside: int, moved: Movement, needed: int) -> str:
+    """Say why nothing will be known of a sensor."""
+    if moved.at_rest:
+        return f"everything: {moved.rest}"
+    return (
+        f"everything: {inside} of {counts.kept} places lie inside the map, at least {needed} must "
+        f"({counts.received} readings in all)"
+    )

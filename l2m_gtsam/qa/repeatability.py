@@ -1,0 +1,153 @@
+"""Parts of what was driven calibrated by themselves. Pure: no files, no terminal.
+
+Of one drive both halves, of several each drive.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.alternation import spread
+from l2m_gtsam.calibration.calibrate import Calibrated
+from l2m_gtsam.calibration.one_key import solve_part
+from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.data import FloatArray, Readings, Recording
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.qa.metrics.drives import compare_drives
+from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
+from l2m_gtsam.records.metrics import Halves
+from l2m_gtsam.records.repeat import Repeatability
+
+STEPS = 3  # alternations from where the whole was found; the joint graph does the rest
+MORE = 4  # times as many readings of a drive as of a half
+
+
+@one_blas_thread()
+def compared_halves(
+    calibrated: Calibrated, options: CalibrationOptions, each_half: int
+) -> dict[str, Halves]:
+    """Calibrate the first and the second half of a drive, and compare them sensor by sensor.
+
+    Each starts where the whole was found, with its time offsets and without priors: what a half
+    leaves open takes no part. Readings that the whole rejected are looked at again: of a sensor
+    that moved on the way they are one half.
+
+    Parameters
+    ----------
+    calibrated
+        The calibration of the whole drive.
+    options
+        That it was computed with.
+    each_half
+        Readings of each sensor that a half is calibrated on, at the most.
+    """
+    readings, t = _usable(calibrated), calibrated.solution.estimate.t
+    solved = [found.sensor for found in calibrated.solution.solved]
+    middle = np.median(readings.stamp_ns)
+    parts = (readings.stamp_ns < middle, readings.stamp_ns >= middle)
+    try:
+        first, second = (
+            _parts(calibrated, readings.select(part), t, options, each_half) for part in parts
+        )
+    except (CalibrationError, np.linalg.LinAlgError) as error:
+        # The whole is calibrated: that a half is not is no reason to lose it.
+        reason = f"a half of the drive cannot be calibrated: {error}"
+        return {readings.sensors[index]: no_halves(reason) for index in solved}
+    return {readings.sensors[index]: _compared(first, second, index) for index in solved}
+
+
+@one_blas_thread()
+def compared_drives(
+    calibrated: Calibrated, recording: Recording, options: CalibrationOptions, each_half: int
+) -> dict[str, Repeatability]:
+    """Calibrate each drive of a recording by itself, and compare them sensor by sensor.
+
+    They start as halves do. All are one graph, in which every drive has a place and a distortion
+    of its own for each sensor, but there is one map: its errors, which drives through the same
+    places share, are known to be shared and do not count as a difference.
+
+    Parameters
+    ----------
+    calibrated
+        The calibration of all drives together.
+    recording
+        The drives.
+    options
+        That it was computed with.
+    each_half
+        Readings of each sensor that half a drive would be calibrated on, a fourth of those here.
+    """
+    readings, count = _usable(calibrated), len(recording.drives)
+    solved = [found.sensor for found in calibrated.solution.solved]
+    own = by_drive(readings, count)
+    t = np.repeat(calibrated.solution.estimate.t, count, axis=0)
+    try:
+        found = _parts(calibrated, own, t, options, MORE * each_half)
+    except (CalibrationError, np.linalg.LinAlgError) as error:
+        found, failed = {}, f"the drives cannot be calibrated by themselves: {error}"
+    else:
+        failed = ""
+    paths = [drive.source.path for drive in recording.drives]
+    return {
+        readings.sensors[index]: compare_drives(
+            [
+                (path, found.get(index * count + k) or failed or _too_few(own, index * count + k))
+                for k, path in enumerate(paths)
+            ]
+        )
+        for index in solved
+    }
+
+
+def by_drive(readings: Readings, count: int) -> Readings:
+    """Return readings as if each of so many drives had sensors of its own.
+
+    Sensor s of drive k then counts as ``s * count + k``.
+    """
+    names = tuple(f"{name} of drive {k + 1}" for name in readings.sensors for k in range(count))
+    return replace(readings, sensors=names, sensor=readings.sensor * count + readings.of_drive)
+
+
+def _too_few(readings: Readings, sensor: int) -> str:
+    rows = readings.rows_of(sensor)
+    read = rows.stop - rows.start
+    if not read:
+        return "nothing usable was read of it in this drive"
+    return f"its {read} usable readings in this drive are too few to calibrate on"
+
+
+def _usable(calibrated: Calibrated) -> Readings:
+    """Return the readings of solved sensors inside the map, at fixed time offsets."""
+    solution = calibrated.solution
+    solved = [found.sensor for found in solution.solved]
+    usable = solution.inside & np.isin(solution.readings.sensor, solved)
+    return replace(solution.readings, motion=None).select(usable)
+
+
+def _parts(
+    calibrated: Calibrated,
+    readings: Readings,
+    t: FloatArray,
+    options: CalibrationOptions,
+    most: int,
+) -> dict[int, Part]:
+    """Return what some of the readings say of each sensor that they are enough for."""
+    few = spread(readings, max(most, options.solve.min_readings))
+    near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
+    solution = solve_part(few, calibrated.solver_map, t, near)
+    return {
+        found.sensor: Part(
+            solution.estimate.vector(found.sensor), found.covariance, found.shared_root
+        )
+        for found in solution.solved
+    }
+
+
+def _compared(first: dict[int, Part], second: dict[int, Part], sensor: int) -> Halves:
+    for name, half in (("first", first), ("second", second)):
+        if sensor not in half:
+            return no_halves(f"the {name} half of the drive has too few readings to calibrate on")
+    # Each half was solved by itself: nothing is known of what their errors share.
+    one, other = (replace(half[sensor], shared_root=None) for half in (first, second))
+    return compare_halves(one, other)

@@ -1,0 +1,1 @@
+"""From a recording to readings with poses: times, joining, odometry faults, pose noise."""

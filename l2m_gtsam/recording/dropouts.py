@@ -1,0 +1,99 @@
+"""Magnetometers that are dead for a part of a drive: they repeat a value, or say nothing. Pure."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.data import BoolArray, FieldSeries, FloatArray, IntArray, Recording, Trajectory
+from l2m_gtsam.recording.sync import STUCK_UT, interpolated
+
+# Readings that are the same to the last digit while the vehicle moves so far, or turns so much.
+LEAST_SAME = 10
+MOVED_M, TURNED_DEG = 0.3, 10.0
+LOOKED_AT = 50  # poses of such a stretch
+TOLD_S = 5.0  # without a reading, from which on it is told
+USUAL = 20.0  # times what usually lies between two readings
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A recording of what its sensors read while they were alive.
+
+    Attributes
+    ----------
+    recording
+        Its readings, NaN where a sensor repeats one value.
+    notes
+        On each sensor that was dead for a while.
+    """
+
+    recording: Recording
+    notes: tuple[str, ...]
+
+
+def heard(recording: Recording) -> Heard:
+    """Take readings for missing that a sensor repeats while the vehicle moves."""
+    trajectory = recording.trajectory
+    series = tuple(_alive(each, trajectory) for each in recording.series)
+    notes = [_note(each, trajectory) for each in series]
+    return Heard(replace(recording, series=series), tuple(note for note in notes if note))
+
+
+def is_dead(series: FieldSeries) -> bool:
+    """Return whether a sensor has no reading at all."""
+    return not np.isfinite(series.field).all(axis=1).any()
+
+
+def _alive(series: FieldSeries, trajectory: Trajectory) -> FieldSeries:
+    rows = np.flatnonzero(np.isfinite(series.field).all(axis=1))
+    field = series.field[rows]
+    if len(rows) and np.ptp(field, axis=0).max() < STUCK_UT:
+        return replace(series, field=np.full_like(series.field, np.nan))
+    stuck = rows[_repeated(field, series.stamp_ns[rows], trajectory)]
+    if not len(stuck):
+        return series
+    alive = series.field.copy()
+    alive[stuck] = np.nan
+    return replace(series, field=alive)
+
+
+def _repeated(field: FloatArray, stamp_ns: IntArray, trajectory: Trajectory) -> BoolArray:
+    """Mark readings in runs of one value over which the vehicle moves, shape (N,)."""
+    repeated = np.zeros(len(field), dtype=np.bool_)
+    changes = np.flatnonzero(np.any(field[1:] != field[:-1], axis=1)) + 1
+    edges = np.concatenate([[0], changes, [len(field)]])
+    for run in np.flatnonzero(np.diff(edges) >= LEAST_SAME):
+        own = slice(edges[run], edges[run + 1])
+        repeated[own] = _moves(trajectory, stamp_ns[own])
+    return repeated
+
+
+def _moves(trajectory: Trajectory, stamp_ns: IntArray) -> bool:
+    """Return whether the vehicle gets away from where it is at the first of these times."""
+    some = np.linspace(0, len(stamp_ns) - 1, min(LOOKED_AT, len(stamp_ns))).astype(np.int64)
+    at = interpolated(trajectory, stamp_ns[some])
+    away = np.linalg.norm(at.p - at.p[0], axis=1).max()
+    trace = np.einsum("ij,nij->n", at.R[0], at.R)
+    turned = np.rad2deg(np.arccos(np.clip((trace.min() - 1) / 2, -1.0, 1.0)))
+    return bool(away > MOVED_M or turned > TURNED_DEG)
+
+
+def _note(series: FieldSeries, trajectory: Trajectory) -> str:
+    """Return for how much of a drive a sensor is dead, and when longest; empty where it lives."""
+    rows = np.isfinite(series.field).all(axis=1)
+    first, last = trajectory.stamp_ns[[0, -1]]
+    read = series.stamp_ns[rows & (series.stamp_ns >= first) & (series.stamp_ns <= last)]
+    if not len(read):
+        return ""
+    stamps = np.concatenate([[first], read, [last]])
+    between = 1e-9 * np.diff(stamps)
+    dead = between > max(TOLD_S, USUAL * float(np.median(between)))
+    if not dead.any():
+        return ""
+    longest = int(np.argmax(between))
+    start, end = (1e-9 * float(stamps[longest + k] - first) for k in (0, 1))
+    share = between[dead].sum() / between.sum()
+    return (
+        f"{series.sensor} is dead for {share:.0%} of the drive, longest from {start:.1f} to "
+        f"{end:.1f} s after its start: it repeats one value there, or reads nothing"
+    )

@@ -1,0 +1,299 @@
+"""Jumps of odometry: steps that no vehicle makes, found and taken out. Pure arrays.
+
+From one pose to the next a vehicle moves as it did just before and does just after, but for what
+it can accelerate meanwhile. A wheel that slips, a scan match that snaps to another place or an
+origin that is set anew makes a step that differs by more. Such a step says nothing of the way: the
+motion of its neighbours takes its place, and all later poses are carried along.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Trajectory
+from l2m_gtsam.geometry import carried_back, moved
+from l2m_gtsam.options import Options
+from l2m_gtsam.records.rigid import compose
+
+NEIGHBOURS = 3  # steps before and after that say how the vehicle moves
+LEAST_STEPS = 4  # of a drive in which a step can be told from the others
+ROUNDS = 20  # of looking again without what was found: a few are taken
+TOLD = 3  # jumps that are told one by one
+
+
+class JumpOptions(Options):
+    """Which steps of odometry no vehicle can have made.
+
+    A step is held against the median motion of three steps before and three after. It is a jump
+    if it differs by more than all of these.
+    """
+
+    position_m: float = Field(default=0.1, gt=0)
+    """Metres, or"""
+    rotation_deg: float = Field(default=5.0, gt=0)
+    """degrees."""
+    acceleration_m_s2: float = Field(default=5.0, gt=0)
+    """What the vehicle may accelerate by in m/s^2, over the time of the step and from there to its
+    neighbours,"""
+    acceleration_deg_s2: float = Field(default=300.0, gt=0)
+    """and how its turning may change in deg/s^2."""
+    scatter: float = Field(default=10.0, ge=1)
+    """So many times what half of the drive's own steps differ by: the noise of the poses."""
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A step of odometry in whose place the motion about it was put.
+
+    Attributes
+    ----------
+    row
+        The pose before it in the trajectory that was mended.
+    seconds
+        When its end was, since the first pose.
+    distance_m, angle_deg
+        What the step differed by.
+    covariance
+        Of a right perturbation of the motion in its place, rotation (rad) before translation (m),
+        shape (6, 6): as the drive's other steps differ from the motion about them.
+    """
+
+    row: int
+    seconds: float
+    distance_m: float
+    angle_deg: float
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class Mended:
+    """A trajectory without jumps.
+
+    Attributes
+    ----------
+    trajectory
+        Its poses.
+    jumps
+        What was taken out, in order of time.
+    left_out
+        Poses that lay elsewhere than those before and after them, and are gone.
+    """
+
+    trajectory: Trajectory
+    jumps: tuple[Jump, ...]
+    left_out: int
+
+    @property
+    def rows(self) -> IntArray:
+        """Poses before and after jumps, ascending."""
+        before = np.array([each.row for each in self.jumps], dtype=np.int64)
+        return np.union1d(before, before + 1)
+
+    def notes(self) -> tuple[str, ...]:
+        """Return a sentence on each of a few jumps, and how many more there are."""
+        told = [
+            f"odometry jumps by {each.distance_m:.2f} m and {each.angle_deg:.1f} deg "
+            f"{each.seconds:.1f} s after its first pose: there it is taken to have moved on as it "
+            "did before and after"
+            for each in self.jumps[:TOLD]
+        ]
+        if len(self.jumps) > TOLD:
+            told.append(f"odometry jumps {len(self.jumps) - TOLD} more times")
+        if self.left_out:
+            told.append(
+                "poses of odometry that lie elsewhere than those before and after them are left "
+                f"out: {self.left_out}"
+            )
+        return tuple(told)
+
+
+def without_jumps(trajectory: Trajectory, options: JumpOptions) -> Mended:
+    """Return odometry without its jumps; as it is where it has none.
+
+    Covariances of poses stay those of the way from the first pose: what the trajectory states for
+    the step that jumped gives way to that of the motion in its place.
+
+    Parameters
+    ----------
+    trajectory
+        Poses of odometry.
+    options
+        What is a jump.
+    """
+    if len(trajectory) <= LEAST_STEPS:
+        return Mended(trajectory, (), 0)
+    kept = np.arange(len(trajectory))
+    for _ in range(ROUNDS):
+        part = trajectory[kept]
+        found = _found(part, options)
+        # Between two jumps in a row lies a pose that belongs to neither side.
+        stray = np.flatnonzero(found.jumped[:-1] & found.jumped[1:]) + 1
+        if not len(stray):
+            break
+        kept = np.delete(kept, stray[::2])
+    jumps = tuple(_jump(part, found, int(row)) for row in np.flatnonzero(found.jumped))
+    mended = _mended(part, found, jumps) if jumps else part
+    return Mended(mended, jumps, len(trajectory) - len(part))
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """N steps between poses.
+
+    Attributes
+    ----------
+    seconds, middle
+        How long each takes, and when its middle is, shape (N,).
+    turn, way
+        Rotation vector in rad, and translation in m along the axes of the pose before, (N, 3).
+    """
+
+    seconds: FloatArray
+    middle: FloatArray
+    turn: FloatArray
+    way: FloatArray
+
+    def velocity(self) -> FloatArray:
+        """Return rad/s and m/s, the latter along the axes that the body has half way, (N, 6).
+
+        On an arc these do not change, however long the steps are.
+        """
+        half = Rotation.from_rotvec(self.turn / 2).inv()
+        return np.hstack([self.turn, half.apply(self.way)]) / self.seconds[:, None]
+
+
+def _steps_of(trajectory: Trajectory) -> _Steps:
+    at = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
+    R_back = trajectory.R[:-1].transpose(0, 2, 1)
+    return _Steps(
+        seconds=np.diff(at),
+        middle=(at[1:] + at[:-1]) / 2,
+        turn=Rotation.from_matrix(R_back @ trajectory.R[1:]).as_rotvec(),
+        way=np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p, axis=0)),
+    )
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What is expected of N steps, and which are jumps.
+
+    Attributes
+    ----------
+    R, t
+        The motion about each, as that of a step, shapes (N, 3, 3) and (N, 3), metres.
+    off
+        What the steps differ from it by: rotation vector in rad and translation in m, (N, 6).
+    reach
+        Time of each times that to its neighbours, s^2, shape (N,).
+    acceleration
+        Mean square per axis from one good step to the next, rad^2/s^4 and m^2/s^4, shape (2,).
+    jumped
+        Which differ too much, shape (N,).
+    """
+
+    R: FloatArray
+    t: FloatArray
+    off: FloatArray
+    reach: FloatArray
+    acceleration: FloatArray
+    jumped: BoolArray
+
+    def sizes(self) -> FloatArray:
+        """Return by how much steps differ in rad and m, shape (N, 2)."""
+        return np.asarray(np.linalg.norm(self.off.reshape(-1, 2, 3), axis=2))
+
+
+def _found(trajectory: Trajectory, options: JumpOptions) -> _Found:
+    """Look for jumps, again without those that were found until the same ones are."""
+    steps = _steps_of(trajectory)
+    jumped = np.zeros(len(steps.seconds), dtype=np.bool_)
+    for _ in range(ROUNDS):
+        found = _compared(steps, ~jumped, options)
+        if 2 * found.jumped.sum() >= len(found.jumped):  # nothing to hold them against
+            return replace(found, jumped=np.zeros_like(jumped))
+        if np.array_equal(found.jumped, jumped):
+            break
+        jumped = found.jumped
+    return found
+
+
+def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _Found:
+    """Hold steps against the good ones about them."""
+    velocity, away = _about(steps, good)
+    expected = velocity * steps.seconds[:, None]
+    turn = Rotation.from_rotvec(expected[:, :3])
+    way = Rotation.from_rotvec(expected[:, :3] / 2).apply(expected[:, 3:])
+    off = np.hstack([(turn.inv() * Rotation.from_rotvec(steps.turn)).as_rotvec(), steps.way - way])
+    off[:, 3:] = turn.inv().apply(off[:, 3:])
+    reach = steps.seconds * away
+    found = _Found(turn.as_matrix(), way, off, reach, _acceleration(steps, good), good)
+    sizes = found.sizes()
+    limits = np.maximum(
+        np.array([np.deg2rad(options.rotation_deg), options.position_m]),
+        options.scatter * np.median(sizes, axis=0),
+    )
+    most = np.array([np.deg2rad(options.acceleration_deg_s2), options.acceleration_m_s2])
+    limits = np.maximum(limits, reach[:, None] * most)
+    return replace(found, jumped=np.any(sizes > limits, axis=1))
+
+
+def _about(steps: _Steps, good: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the median velocity of good steps about each, (N, 6), and their time from it, (N,)."""
+    rows = np.flatnonzero(good)
+    before = np.searchsorted(rows, np.arange(len(good)))
+    after = before + good  # a good step is no neighbour of its own
+    beside = np.arange(NEIGHBOURS)
+    slots = np.hstack([before[:, None] - 1 - beside, after[:, None] + beside])
+    there = (slots >= 0) & (slots < len(rows))
+    near = rows[np.clip(slots, 0, len(rows) - 1)]
+    away = np.where(there, np.abs(steps.middle[near] - steps.middle[:, None]), np.nan)
+    velocity = np.where(there[:, :, None], steps.velocity()[near], np.nan)
+    return np.nanmedian(velocity, axis=1), np.nanmedian(away, axis=1)
+
+
+def _acceleration(steps: _Steps, good: BoolArray) -> FloatArray:
+    """Return mean squares per axis of how velocities change between good steps, shape (2,)."""
+    change = np.diff(steps.velocity()[good], axis=0) / np.diff(steps.middle[good])[:, None]
+    return np.asarray(np.mean(change.reshape(-1, 2, 3) ** 2, axis=(0, 2)))
+
+
+def _jump(trajectory: Trajectory, found: _Found, row: int) -> Jump:
+    angle, distance = found.sizes()[row].tolist()
+    variance = found.acceleration * found.reach[row] ** 2
+    return Jump(
+        row=row,
+        seconds=1e-9 * float(trajectory.stamp_ns[row + 1] - trajectory.stamp_ns[0]),
+        distance_m=distance,
+        angle_deg=float(np.rad2deg(angle)),
+        covariance=np.diag(np.repeat(variance, 3)),
+    )
+
+
+def _mended(trajectory: Trajectory, found: _Found, jumps: tuple[Jump, ...]) -> Trajectory:
+    """Put the motion about jumps in their place, and carry what comes after along."""
+    R, p = trajectory.R.copy(), trajectory.p.copy()
+    stated = trajectory.covariance
+    covariance = None if stated is None else stated.copy()
+    ends = [*(each.row + 1 for each in jumps[1:]), len(trajectory)]
+    for jump, end in zip(jumps, ends, strict=True):
+        k = jump.row
+        step = RigidTransform(found.R[k], found.t[k])
+        first = compose(RigidTransform(R[k], p[k]), step)
+        own = RigidTransform(trajectory.R[k + 1], trajectory.p[k + 1])
+        later = slice(k + 1, end)
+        carry = compose(first, own.inverse())
+        R[later] = carry.R @ trajectory.R[later]
+        p[later] = trajectory.p[later] @ carry.R.T + carry.t
+        if covariance is not None and stated is not None:
+            more = moved(covariance[k][None], step)[0] + jump.covariance - stated[k + 1]
+            back = _from(own, trajectory, later)
+            covariance[later] = stated[later] + back @ more @ back.transpose(0, 2, 1)
+    return replace(trajectory, R=R, p=p, covariance=covariance)
+
+
+def _from(first: RigidTransform, trajectory: Trajectory, later: slice) -> FloatArray:
+    """Return what an error of a pose makes of later ones, shape (K, 6, 6)."""
+    R, p = trajectory.R[later], trajectory.p[later]
+    return carried_back(first.R.T @ R, (p - first.t) @ first.R)

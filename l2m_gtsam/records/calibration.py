@@ -1,0 +1,302 @@
+"""What comes out of a solve: frozen records, with shapes and units.
+
+Frames and units are those of ``data``.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+
+from l2m_gtsam.data import Distortion, FloatArray, SourceFile, SyncCounts
+from l2m_gtsam.records.model_results import ModelComparison, MovingField
+
+
+class SensorStatus(StrEnum):
+    """How the solve of one sensor ended."""
+
+    SOLVED = "solved"
+    UNDETERMINED = "undetermined"
+    NOT_CONVERGED = "not_converged"
+    NO_READINGS = "no_readings"
+    OUTSIDE_MAP = "outside_map"
+    DEAD_AXIS = "dead_axis"
+    AMBIGUOUS = "ambiguous"
+    CONTRADICTED = "contradicted"
+    FLIPPED_AXIS = "flipped_axis"
+
+
+class Uncertainty(StrEnum):
+    """How a calibration counts the map's errors."""
+
+    FULL = "full"
+    INDEPENDENT = "independent"
+
+
+@dataclass(frozen=True)
+class ResidualFigures:
+    """Residuals ``C b + H - z`` of one sensor over the readings used, in microtesla.
+
+    ``chi2_per_dof`` compares them with the noise that the solve assumed: 1 is consistent.
+    """
+
+    readings: int
+    rms_axes: FloatArray
+    rms: float
+    median_norm: float
+    p95_norm: float
+    max_norm: float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True)
+class FoundStart:
+    """Where the search for a start ended for one sensor.
+
+    Attributes
+    ----------
+    t_lidar_mag
+        Where the solve started in the lidar frame in metres, shape (3,).
+    margin
+        How many times more (root mean square) the second best place leaves of the readings;
+        infinite if there is no other. Seen coarsely, which makes it smaller than it is, where
+        that place was too bad to be followed.
+    runner_up
+        That place in the lidar frame in metres, shape (3,), if there is one.
+    """
+
+    t_lidar_mag: FloatArray
+    margin: float
+    runner_up: FloatArray | None
+
+    def moved(self, by: FloatArray) -> "FoundStart":
+        """Return the same for a place that is elsewhere by a vector in metres, shape (3,)."""
+        other = None if self.runner_up is None else self.runner_up + by
+        return replace(self, t_lidar_mag=self.t_lidar_mag + by, runner_up=other)
+
+    def ambiguous(self, clear: float) -> bool:
+        """Return whether the second best place leaves less than so many times as much."""
+        return self.runner_up is not None and self.margin < clear
+
+
+@dataclass(frozen=True)
+class TimeOffset:
+    """How far a sensor's clock is off the lidar's: a reading's pose is that at stamp + offset.
+
+    Attributes
+    ----------
+    seconds
+        The offset; zero where it is held.
+    sigma
+        Its standard deviation in seconds, infinite where it is held.
+    cross_covariance
+        Of (t, C row by row, H) with it, in m s, s and uT s, shape (15,); zero where it is held.
+    held
+        Why it is held at zero; empty where it is estimated.
+    """
+
+    seconds: float
+    sigma: float
+    cross_covariance: FloatArray
+    held: str
+
+    @property
+    def estimated(self) -> bool:
+        """Whether the drive told it."""
+        return not self.held
+
+
+class Return(StrEnum):
+    """What was read when a place was passed again at another time."""
+
+    NEVER = "not passed again"
+    AS_MAPPED = "as mapped"
+    DIFFERS = "differs again"
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """A stretch of a drive over which readings fit neither the map nor any distortion.
+
+    Attributes
+    ----------
+    sensors
+        Names of those that disagree.
+    start_ns, end_ns
+        When, in nanoseconds, in its drive's own time.
+    p_from, p_to
+        Where the lidar was at the first and the last of these readings, metres, map frame, (3,).
+    length
+        Way of the lidar in metres.
+    readings
+        Number of readings rejected.
+    size
+        Median length of their residuals in uT.
+    passed_again
+        What was read at the same place at another time, in any drive.
+    bag
+        Path of its drive, where there are several.
+    """
+
+    sensors: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+    p_from: FloatArray
+    p_to: FloatArray
+    length: float
+    readings: int
+    size: float
+    passed_again: Return
+    bag: str = ""
+
+
+@dataclass(frozen=True)
+class SensorCalibration:
+    """The calibration of one magnetometer and how far to trust it.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    status, message
+        How the solve ended, and a sentence about it.
+    t_lidar_mag
+        Position of the sensor in the lidar frame in metres, shape (3,).
+    distortion
+        C and H.
+    R_lidar_mag
+        Rotation from sensor to lidar: transpose of the proper polar factor of C, shape (3, 3).
+    covariance
+        Covariance of (t, C row by row, H) in m and uT, shape (15, 15); infinite on the diagonal
+        for what the data cannot determine.
+    rotation_covariance
+        Covariance of the rotation error in the sensor frame in rad^2, shape (3, 3): true
+        R_mag_lidar = exp(error) @ estimate.
+    noise
+        Standard deviation of the sensor's noise in microtesla that the solve used.
+    residuals
+        Figures of fit, absent when nothing was solved.
+    undetermined
+        What the data cannot determine, a sentence for each reason with the parameters by name.
+    sync
+        Account of the readings.
+    outside_map
+        Synchronised readings that were not used because the map has no data there.
+    start
+        Where the solve started, if that was looked for; absent where it was given.
+    rejected
+        Readings inside the map that did not count: no distortion explains them beside the others.
+    time_offset
+        Of the sensor's clock; absent where nothing was solved.
+    from_priors
+        What the readings leave open and only priors determine, or mostly: phrases with the
+        parameters by name and what was known beforehand.
+    models
+        Models of the readings side by side; absent where they are not compared.
+    not_compared
+        Why they are not.
+    moving
+        What recorded numbers add to the readings; H is the offset where they are zero. Empty for a
+        sensor to which no model with them is recommended.
+    missing_in
+        Paths of those of several drives in which nothing usable was read.
+    """
+
+    sensor: str
+    status: SensorStatus
+    message: str
+    t_lidar_mag: FloatArray
+    distortion: Distortion
+    R_lidar_mag: FloatArray
+    covariance: FloatArray
+    rotation_covariance: FloatArray
+    noise: float
+    residuals: ResidualFigures | None
+    undetermined: tuple[str, ...]
+    sync: SyncCounts
+    outside_map: int
+    start: FoundStart | None = None
+    rejected: int = 0
+    time_offset: TimeOffset | None = None
+    from_priors: tuple[str, ...] = ()
+    models: ModelComparison | None = None
+    not_compared: str = ""
+    moving: tuple[MovingField, ...] = ()
+    missing_in: tuple[str, ...] = ()
+
+    @property
+    def offset_correlation(self) -> FloatArray:
+        """Correlation of ``t_lidar_mag`` with the time offset, shape (3,); zero if it is held."""
+        if self.time_offset is None or not self.time_offset.estimated:
+            return np.zeros(3)
+        sigmas = self.t_sigma * self.time_offset.sigma
+        return np.asarray(self.time_offset.cross_covariance[:3] / sigmas)
+
+    @property
+    def t_sigma(self) -> FloatArray:
+        """Standard deviations of ``t_lidar_mag`` in metres, shape (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[:3]))
+
+    @property
+    def C_sigma(self) -> FloatArray:
+        """Standard deviations of the entries of C, shape (3, 3)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:12]).reshape(3, 3))
+
+    @property
+    def H_sigma(self) -> FloatArray:
+        """Standard deviations of H in microtesla, shape (3,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[12:]))
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """The outcome of one calibration run over all sensors.
+
+    Attributes
+    ----------
+    sensors
+        One entry per magnetometer, in the order of the recording.
+    iterations
+        Outer steps of the one-key loop that were taken.
+    uncertainty
+        How the sigmas count the map's errors.
+    doubts
+        What speaks against the map, and therefore against the sigmas, a sentence each.
+    disagreements
+        Stretches of the drive over which readings were rejected, in order of time.
+    bag, map
+        Sources with hashes; absent when the data did not come from files. There is no one bag where
+        several drives were calibrated together.
+    options
+        The effective options, plain values.
+    versions
+        Versions of the packages that computed it.
+    bags
+        The drives that were calibrated together, in order of time; empty for a single one.
+    notes
+        What is worth knowing of the drives, a sentence each.
+    """
+
+    sensors: tuple[SensorCalibration, ...]
+    iterations: int
+    uncertainty: Uncertainty
+    doubts: tuple[str, ...]
+    disagreements: tuple[Disagreement, ...]
+    bag: SourceFile | None
+    map: SourceFile | None
+    options: dict[str, Any]
+    versions: dict[str, str]
+    bags: tuple[SourceFile, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def drives(self) -> tuple[SourceFile, ...]:
+        """All drives with hashes; none if the data did not come from files."""
+        return self.bags or (() if self.bag is None else (self.bag,))
+
+    def __getitem__(self, sensor: str) -> SensorCalibration:
+        for entry in self.sensors:
+            if entry.sensor == sensor:
+                return entry
+        raise KeyError(sensor)

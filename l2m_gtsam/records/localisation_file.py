@@ -1,0 +1,290 @@
+"""A localisation as plain numbers: frozen records, which `slam.json` holds.
+
+Positions are in metres, fields in microtesla, angles in degrees, times in seconds, but for
+covariances, which are in rad and m. A number that does not exist is NaN.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from l2m_gtsam.records.localisation import (
+    DriftFigures,
+    Explored,
+    LocalisationStatus,
+    OdometryScale,
+    ScanUse,
+    SensorUse,
+    StartVerdict,
+)
+from l2m_gtsam.records.metrics import Fit, MapPicture, Normalised, Record, Row, Rows, Series
+from l2m_gtsam.records.validation import ChiSquare, NamedSource
+
+POSE_FREEDOM = 6
+
+
+@dataclass(frozen=True)
+class PoseRecord(Record):
+    """T_map_lidar at a key pose.
+
+    Attributes
+    ----------
+    stamp_ns
+        When, in nanoseconds.
+    p, quaternion_xyzw
+        Position and rotation.
+    covariance
+        Of a right perturbation, ``T_true = T_map_lidar Exp(error)``: rotation (rad), then
+        translation (m), along the axes of the lidar, (6, 6); absent where it is unknown.
+    """
+
+    stamp_ns: int
+    p: Row
+    quaternion_xyzw: Row
+    covariance: Rows | None
+
+
+@dataclass(frozen=True)
+class OdometryRecord(Record):
+    """Where odometry alone has the lidar at a key pose, from where the drive is said to begin.
+
+    Attributes
+    ----------
+    p, quaternion_xyzw
+        Position and rotation.
+    sigma
+        How sure it is by then: along x, y, z of the map in m, and about them in degrees.
+    """
+
+    p: Row
+    quaternion_xyzw: Row
+    sigma: Row
+
+
+@dataclass(frozen=True)
+class Timeline(Record):
+    """How many readings of a sensor counted in each of N spans of time.
+
+    Attributes
+    ----------
+    edges
+        Of the spans, since the first key pose, N + 1.
+    used, rejected, outside
+        That counted, that the map does not explain, that it has no data for.
+    """
+
+    edges: Row
+    used: tuple[int, ...]
+    rejected: tuple[int, ...]
+    outside: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class SensorRecord(Record):
+    """One sensor.
+
+    Attributes
+    ----------
+    use
+        What its readings were worth.
+    timeline
+        When they counted.
+    fit, normalised, series
+        How they fit, and their course, in which each has the time of its key pose; absent where
+        none counts.
+    """
+
+    use: SensorUse
+    timeline: Timeline
+    fit: Fit | None
+    normalised: Normalised | None
+    series: Series | None
+
+
+@dataclass(frozen=True)
+class RefinedSensor(Record):
+    """A calibration before and after a drive: t in m, C row by row, H in uT, 15 numbers.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    before, sigma_before, after, sigma_after
+        With standard deviations.
+    change
+        Squared length of the change in units of the covariance before, beside what chance makes
+        of it: at most this if that covariance was true.
+    """
+
+    sensor: str
+    before: Row
+    sigma_before: Row
+    after: Row
+    sigma_after: Row
+    change: ChiSquare
+
+
+@dataclass(frozen=True)
+class PoseErrors(Record):
+    """Distance and angle of poses to the truth: root mean squares and the largest."""
+
+    rms_m: float
+    largest_m: float
+    rms_deg: float
+    largest_deg: float
+
+
+@dataclass(frozen=True)
+class TruthRecord(Record):
+    """A localisation beside the truth, at the key poses that have one.
+
+    Attributes
+    ----------
+    poses
+        How many.
+    odometry, localised
+        Errors of both; nothing is aligned.
+    by_scans
+        Errors of odometry and scans without magnetometers; absent without scans.
+    nees
+        Mean of the squared errors of localised poses in units of their covariances; 6 is honest.
+    beyond_95
+        Share of those beyond the 95 % quantile of chi-square of six; 0.05 is honest.
+    path
+        True places at all K key poses, (K, 3); NaN where there is none.
+    odometry_m, localised_m, squared
+        Distances, and squared errors in units of their covariances, K of each; NaN there, too.
+    """
+
+    poses: int
+    odometry: PoseErrors
+    localised: PoseErrors
+    by_scans: PoseErrors | None
+    nees: float
+    beyond_95: float
+    path: Rows
+    odometry_m: Row
+    localised_m: Row
+    squared: Row
+
+    @property
+    def removed(self) -> float:
+        """Share of odometry's error that is gone, of root mean squares; negative if it grew."""
+        before = self.odometry.rms_m
+        return 1 - self.localised.rms_m / before if before > 0 else float("nan")
+
+    @property
+    def nees_ratio(self) -> float:
+        """NEES per degree of freedom; 1 is honest."""
+        return self.nees / POSE_FREEDOM
+
+
+@dataclass(frozen=True)
+class StartCandidateRecord(Record):
+    """A place where a drive may have begun; see ``StartCandidate``.
+
+    Attributes
+    ----------
+    p, quaternion_xyzw
+        Position and rotation of the first key pose.
+    covariance
+        Of a right perturbation of it, rotation (rad), then translation (m), (6, 6).
+    log_likelihood, inside, explained, chi2_per_dof
+        Of the readings looked at, and how they fit.
+    """
+
+    p: Row
+    quaternion_xyzw: Row
+    covariance: Rows
+    log_likelihood: float
+    inside: float
+    explained: float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True)
+class StartRecord(Record):
+    """A search for the start all over the map; see ``StartSearch``.
+
+    Attributes
+    ----------
+    verdict, message
+        What it came to.
+    margin
+        Natural logarithm of how much likelier the first place is than the second; NaN without one.
+    window_m, readings, looked_at
+        What it rests on.
+    candidates
+        The likeliest first.
+    """
+
+    verdict: StartVerdict
+    message: str
+    margin: float
+    window_m: float
+    readings: int
+    looked_at: int
+    candidates: tuple[StartCandidateRecord, ...]
+
+
+@dataclass(frozen=True)
+class LocalisationRecord(Record):
+    """All that a report on a localisation is made from.
+
+    Attributes
+    ----------
+    status, message
+        How it ended, and a sentence about it.
+    notes
+        What is worth a warning, a sentence each.
+    drift
+        Odometry alone less the localised poses.
+    steps
+        Mean square of the whitened components by which the steps between localised poses differ
+        from odometry's; 1 is consistent.
+    scale
+        Of odometry; absent where it counts as right.
+    map_errors_shared
+        Whether the map says how its errors at two places go together.
+    sensors
+        In the order of the drive.
+    refined
+        Calibrations before and after; empty where they were fixed.
+    poses, odometry
+        At key poses.
+    start
+        Where it was looked for; absent where it was given.
+    explored
+        How the field was found; absent where there was a map.
+    scans
+        What a LiDAR's scans were worth; absent without any.
+    truth
+        Absent where none was given.
+    picture
+        The map around the drive.
+    sources
+        Files that took part.
+    versions
+        Of the packages that computed it.
+    options
+        That it was computed with.
+    """
+
+    status: LocalisationStatus
+    message: str
+    notes: tuple[str, ...]
+    drift: DriftFigures
+    steps: float
+    scale: OdometryScale | None
+    map_errors_shared: bool
+    sensors: tuple[SensorRecord, ...]
+    refined: tuple[RefinedSensor, ...]
+    poses: tuple[PoseRecord, ...]
+    odometry: tuple[OdometryRecord, ...]
+    start: StartRecord | None
+    explored: Explored | None
+    scans: ScanUse | None
+    truth: TruthRecord | None
+    picture: MapPicture
+    sources: tuple[NamedSource, ...]
+    versions: dict[str, str]
+    options: dict[str, Any]

@@ -1,0 +1,360 @@
+"""What a validation finds: frozen records of plain numbers, which `validation.json` holds.
+
+Positions are in metres, fields in microtesla, angles in degrees, times in seconds. A number that
+does not exist is NaN. Rows of axes are in the order x, y, z.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Record, Row, Series
+
+
+class Part(StrEnum):
+    """A part of a calibration that may change by itself."""
+
+    PLACE = "place"
+    ROTATION = "rotation"
+    GAINS = "gains"
+    ANGLES = "angles"
+    OFFSET = "offset"
+    CLOCK = "clock"
+
+
+UNITS = {
+    Part.PLACE: "m",
+    Part.ROTATION: "deg",
+    Part.GAINS: "1",
+    Part.ANGLES: "deg",
+    Part.OFFSET: "uT",
+    Part.CLOCK: "s",
+}
+
+
+@dataclass(frozen=True)
+class FieldError(Record):
+    """Readings less the map's field, along the axes of the lidar.
+
+    Attributes
+    ----------
+    squared
+        Mean of the squared length in uT^2: the paper's e_B.
+    mean, std
+        Of the length.
+    mean_axes, std_axes
+        Of the difference along each axis.
+    """
+
+    squared: float
+    mean: float
+    std: float
+    mean_axes: Row
+    std_axes: Row
+
+
+@dataclass(frozen=True)
+class ChiSquare(Record):
+    """A sum of squares in units of its variances, beside what chance makes of it.
+
+    Attributes
+    ----------
+    value
+        The sum.
+    freedom
+        Its degrees of freedom.
+    low, high
+        Between these it lies in 95 % of all cases if everything is as stated. Of readings it is
+        counted that the sensor's noise was itself estimated from so many others.
+    """
+
+    value: float
+    freedom: int
+    low: float
+    high: float
+
+    @property
+    def ratio(self) -> float:
+        """Per degree of freedom; 1 is consistent."""
+        return self.value / self.freedom if self.freedom else float("nan")
+
+    @property
+    def consistent(self) -> bool:
+        """Whether it lies where chance puts it in 95 % of all cases."""
+        return self.low <= self.value <= self.high
+
+
+@dataclass(frozen=True)
+class Change(Record):
+    """A part of a calibration that is no longer what it was.
+
+    Attributes
+    ----------
+    part
+        Which.
+    change, sigma
+        Now less then, and its standard deviation: place along the lidar's axes in m; degrees by
+        which the sensor turned about its own axes, R_lidar_mag = R_lidar_mag_then exp(change);
+        gains of its axes; angles by which those between its axes x y, y z, z x fell short of 90
+        degrees, in degrees; H in uT; time offset in s.
+    size
+        Length of the vector; of gains and angles the largest change.
+    chance
+        How often chance alone makes as much of it.
+    """
+
+    part: Part
+    change: Row
+    sigma: Row
+    size: float
+    chance: float
+
+
+@dataclass(frozen=True)
+class Noticeable(Record):
+    """The smallest change of a part, all others as calibrated, that a drive surely shows.
+
+    Infinite where it shows none.
+    """
+
+    part: Part
+    size: float
+
+
+@dataclass(frozen=True)
+class ValidatedSensor(Record):
+    """One sensor of a drive beside what map and calibration predict.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    ending
+        What the calibration says against itself; empty where it was simply solved.
+    readings, rejected, outside
+        That count; that no calibration explains beside the others; without map.
+    before, after
+        Readings as they are and corrected, less the map's field.
+    expected
+        What sensor, map and poses lead to expect of a residual per axis, rms.
+    refitted, uniform
+        What any C and H leave of the readings at the calibrated place, with the map and with a
+        field that is the same everywhere, per axis, rms.
+    nis
+        Normalised innovation squared of all readings together.
+    parameters
+        The same of the calibration's own parameters: what this drive says of them beside what the
+        calibration does.
+    changes
+        Parts that are no longer right, the plainest first.
+    noticeable
+        What the drive would have shown.
+    series
+        The course of the drive, thinned.
+    """
+
+    sensor: str
+    ending: str
+    readings: int
+    rejected: int
+    outside: int
+    before: FieldError
+    after: FieldError
+    expected: float
+    refitted: float
+    uniform: float
+    nis: ChiSquare
+    parameters: ChiSquare
+    changes: tuple[Change, ...]
+    noticeable: tuple[Noticeable, ...]
+    series: Series
+
+    @property
+    def unexplained(self) -> float:
+        """What the map leaves beside what a uniform field would: 0 is all explained, 1 nothing."""
+        return self.refitted / self.uniform if self.uniform > 0 else float("nan")
+
+
+@dataclass(frozen=True)
+class NotValidated(Record):
+    """A sensor that nothing can be said of.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    reason
+        Why, as a sentence.
+    faulty
+        Whether something is wrong with it, or it is only not among what was given.
+    """
+
+    sensor: str
+    reason: str
+    faulty: bool
+
+
+@dataclass(frozen=True)
+class DriveValidation(Record):
+    """A calibration beside a drive.
+
+    Attributes
+    ----------
+    sensors, missing
+        Those that could be compared, and the others.
+    drive, picture
+        How the vehicle moved, and the map around it.
+    doubts, notes
+        What speaks against the outcome, and what is worth knowing of it, a sentence each.
+    """
+
+    sensors: tuple[ValidatedSensor, ...]
+    missing: tuple[NotValidated, ...]
+    drive: DriveMetrics
+    picture: MapPicture
+    doubts: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ChangeTest(Record):
+    """Whether a group of parameters differs between two calibrations by more than chance.
+
+    Attributes
+    ----------
+    name
+        Of the group.
+    chi_square, freedom
+        Distance of both in units of their covariances; 0 degrees if nothing can be compared.
+    chance
+        How often chance alone makes as much of it.
+    """
+
+    name: str
+    chi_square: float
+    freedom: int
+    chance: float
+
+
+@dataclass(frozen=True)
+class ComparedSensor(Record):
+    """One sensor in two calibrations.
+
+    Attributes
+    ----------
+    sensor
+        Name.
+    difference, sigma
+        New less old: t in m, C row by row, H in uT, and its standard deviation, shape (15,);
+        NaN and infinite for what one of them leaves open.
+    tests
+        Over t, rotation, gains, angles, C, H and all.
+    changes
+        Parts that have changed beyond both uncertainties, the plainest first.
+    """
+
+    sensor: str
+    difference: Row
+    sigma: Row
+    tests: tuple[ChangeTest, ...]
+    changes: tuple[Change, ...]
+
+    def test(self, name: str) -> ChangeTest:
+        """Return the test of a group by its name."""
+        return next(each for each in self.tests if each.name == name)
+
+
+@dataclass(frozen=True)
+class CalibrationComparison(Record):
+    """A calibration beside an older one.
+
+    Attributes
+    ----------
+    sensors, missing
+        Those in both, and the others.
+    assumption
+        How errors of both are taken to go together, as a sentence.
+    same_bag
+        Whether a drive took part in both.
+    """
+
+    sensors: tuple[ComparedSensor, ...]
+    missing: tuple[NotValidated, ...]
+    assumption: str
+    same_bag: bool
+
+
+@dataclass(frozen=True)
+class Remark(Record):
+    """A sentence and what it makes of the verdict: "pass", "warn" or "fail"."""
+
+    level: str
+    text: str
+
+
+@dataclass(frozen=True)
+class SensorRemarks(Record):
+    """The verdict on one sensor with its reasons, from the gravest."""
+
+    sensor: str
+    level: str
+    remarks: tuple[Remark, ...]
+
+
+@dataclass(frozen=True)
+class ValidationVerdict(Record):
+    """The verdict on the whole, what concerns all sensors, and a verdict on each."""
+
+    level: str
+    remarks: tuple[Remark, ...]
+    sensors: tuple[SensorRemarks, ...]
+
+    def count(self, level: str) -> int:
+        """Return the number of sensors with this verdict."""
+        return sum(each.level == level for each in self.sensors)
+
+
+@dataclass(frozen=True)
+class Threshold(Record):
+    """Where the verdict changed: name of the option, warning, failure, and what it is of."""
+
+    name: str
+    warn: float
+    fail: float
+    text: str
+
+
+@dataclass(frozen=True)
+class NamedSource(Record):
+    """A file that took part: what it was, its path and the SHA-256 of its content."""
+
+    role: str
+    path: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Validation(Record):
+    """All that `l2m validate` finds.
+
+    Attributes
+    ----------
+    verdict
+        With its reasons.
+    drive
+        Absent without a bag.
+    comparison
+        Absent without an older calibration.
+    thresholds
+        Of the verdict.
+    sources
+        Files that took part.
+    versions
+        Of the packages that computed it.
+    """
+
+    verdict: ValidationVerdict
+    drive: DriveValidation | None
+    comparison: CalibrationComparison | None
+    thresholds: tuple[Threshold, ...]
+    sources: tuple[NamedSource, ...]
+    versions: dict[str, str]

@@ -1,0 +1,100 @@
+"""Places that have changed: stretches of a drive whose readings poses were bent to fit.
+
+Steel that was moved adds a field that grows slowly as the vehicle comes near. Poses follow it, as
+far as odometry lets them, and no single reading is far off. It is given away by many readings in
+a row that leave more than noise. Nothing that was read about such a stretch counts then, and
+odometry bridges it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.stats import chi2
+
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.slam.runs import runs
+
+AXES = 3
+ROUNDS = 5  # of leaving out and looking again
+WINDOW = 9  # key poses that are judged together
+CHANCE = 1e-6  # that noise alone leaves so much in a window
+MOST_REJECTED = 0.5  # of every sensor's readings in a window
+# A dipole's field falls with the third power of the distance: a quarter of what is noticed is felt
+# 1.6 times as far, from a source that stands so far beside the way.
+FURTHER, BESIDE_M = 1.6, 1.0
+LEAST_LEFT = 0.5  # of the readings: where fewer are right it is not a place that has changed
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How N readings of a drive of K key poses fit.
+
+    Attributes
+    ----------
+    key_pose, sensor
+        Of each, shape (N,).
+    inside
+        Whether anything is known of the field there, shape (N,).
+    used
+        Whether it counts, shape (N,).
+    squared
+        Squared length of its whitened residual, shape (N,).
+    p
+        Key poses in metres, shape (K, 3).
+    """
+
+    key_pose: IntArray
+    sensor: IntArray
+    inside: BoolArray
+    used: BoolArray
+    squared: FloatArray
+    p: FloatArray
+
+    def per_key_pose(self, values: FloatArray) -> FloatArray:
+        """Return sums of values of readings, shape (N,), in windows about key poses, (K,)."""
+        sums = np.bincount(self.key_pose, weights=values, minlength=len(self.p))
+        return np.asarray(uniform_filter1d(sums, WINDOW, mode="constant") * WINDOW)
+
+
+def changed(fit: Fit) -> BoolArray:
+    """Return the key poses in and about stretches whose readings do not fit, shape (K,)."""
+    wrong = _misfitting(fit) | _rejected(fit)
+    about = np.zeros_like(wrong)
+    for first, last in runs(wrong):
+        about[_reach(fit.p, first, last)] = True
+    return about
+
+
+def _misfitting(fit: Fit) -> BoolArray:
+    """Return where readings that count leave more than noise, together, shape (K,)."""
+    freedom = AXES * np.round(fit.per_key_pose(fit.used.astype(np.float64)))
+    left = fit.per_key_pose(np.where(fit.used, fit.squared, 0.0))
+    there = freedom > 0
+    # Where all of a map errs a little, a window is held against the others.
+    scale = max(1.0, float(np.median(left[there] / freedom[there]))) if there.any() else 1.0
+    return there & (left > scale * chi2.isf(CHANCE / len(fit.p), np.maximum(freedom, 1)))
+
+
+def _rejected(fit: Fit) -> BoolArray:
+    """Return where most readings of every sensor were rejected, shape (K,)."""
+    least, some = np.ones(len(fit.p), dtype=np.bool_), np.zeros(len(fit.p), dtype=np.bool_)
+    for sensor in np.unique(fit.sensor):
+        own = fit.sensor == sensor
+        read = np.round(fit.per_key_pose((own & fit.inside).astype(np.float64)))
+        counted = np.round(fit.per_key_pose((own & fit.inside & fit.used).astype(np.float64)))
+        least &= counted <= (1 - MOST_REJECTED) * read
+        some |= read > 0
+    return least & some
+
+
+def _reach(p: FloatArray, first: int, last: int) -> slice:
+    """Return the key poses before and after a stretch that are as near as a change is felt."""
+    middle = p[first:last].mean(axis=0)
+    away = np.linalg.norm(p - middle, axis=1)
+    radius = FURTHER * np.hypot(away[first:last].max(), BESIDE_M)
+    beyond = away > radius
+    before, after = np.flatnonzero(beyond[:first]), np.flatnonzero(beyond[last:])
+    start = int(before[-1]) + 1 if len(before) else 0
+    end = last + int(after[0]) if len(after) else len(p)
+    return slice(start, end)

@@ -1,0 +1,181 @@
+"""What a localisation rests on: odometry, readings on key poses, calibrations, a start."""
+
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_factors import Calibrations, CarriedReadings
+from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
+from l2m_gtsam.slam.links import Links
+from l2m_gtsam.slam.odometry import OdometrySteps
+
+ARM_M = 1.0  # a turn counts as much as the way at the end of such an arm,
+CREEP_M_S = 1e-6  # and time as much as a motion that is none, where there is no other
+
+
+@dataclass(frozen=True)
+class KnownSensors:
+    """Calibrations of the S sensors of a drive.
+
+    Attributes
+    ----------
+    names
+        In the order that readings count sensors.
+    t, distortion, offset
+        Position in metres (S, 3), C row by row and H in uT (S, 12), clock offset in seconds (S,).
+    noise
+        Standard deviation of each sensor's noise in uT, shape (S,).
+    covariance
+        Of (t, C row by row, H) in m and uT, shape (S, 15, 15).
+    """
+
+    names: tuple[str, ...]
+    t: FloatArray
+    distortion: FloatArray
+    offset: FloatArray
+    noise: FloatArray
+    covariance: FloatArray
+
+    def fixed(self) -> Calibrations:
+        """Return them as constants of factors."""
+        return Calibrations(self.t, self.distortion, self.offset)
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """Where a drive begins in the map.
+
+    Attributes
+    ----------
+    T_map_lidar
+        Pose.
+    covariance
+        Of a right perturbation, rotation (rad) before translation (m), shape (6, 6).
+    """
+
+    T_map_lidar: RigidTransform
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive to be localised.
+
+    Attributes
+    ----------
+    stamp_ns
+        When the K key poses were, shape (K,).
+    steps
+        What odometry says between them.
+    readings
+        N in number, in order of key poses: each hangs on one, and lies between it and the next.
+    start
+        Of the first.
+    sensors
+        That read.
+    links
+        What scans say of key poses.
+    """
+
+    stamp_ns: IntArray
+    steps: OdometrySteps
+    readings: CarriedReadings
+    start: StartPose
+    sensors: KnownSensors
+    links: Links = field(default_factory=Links.none)
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def until(self, count: int) -> "Drive":
+        """Return the drive as it is up to so many key poses."""
+        links = self.links.key_pose < count
+        return replace(
+            self,
+            stamp_ns=self.stamp_ns[:count],
+            steps=self.steps.until(count - 1),
+            readings=self.readings[np.flatnonzero(self.readings.key_pose < count - 1)],
+            links=self.links[links],
+        )
+
+    def dead_reckoning(self) -> list[gtsam.Pose3]:
+        """Return the key poses that odometry alone leads to from the start."""
+        poses = [as_pose(self.start.T_map_lidar)]
+        for step in range(len(self.steps)):
+            poses.append(poses[-1].compose(self.step(step)))
+        return poses
+
+    def step(self, number: int, longer: float = 0.0) -> gtsam.Pose3:
+        """Return the way from a key pose to the next, if ways are longer by so large a share."""
+        return gtsam.Pose3(gtsam.Rot3(self.steps.R[number]), (1 + longer) * self.steps.p[number])
+
+    def with_scale_as_walk(self, over_m: float) -> "Drive":
+        """Return the drive for those who do not estimate odometry's scale; see the steps."""
+        return replace(self, steps=self.steps.with_scale_as_walk(over_m))
+
+
+def as_pose(transform: RigidTransform) -> gtsam.Pose3:
+    """Return a transform as GTSAM's pose."""
+    return gtsam.Pose3(gtsam.Rot3(transform.R), transform.t)
+
+
+def carried(
+    readings: Readings, trajectory: Trajectory, rows: IntArray, most: int
+) -> CarriedReadings:
+    """Hang readings on the key pose before each, and keep not too many.
+
+    One that is as late as a key pose hangs on the one before it: it is the end of that step.
+
+    Parameters
+    ----------
+    readings
+        With poses of odometry.
+    trajectory
+        Odometry.
+    rows
+        Which of its poses are key poses, shape (K,).
+    most
+        Readings of a sensor on a key pose.
+    """
+    key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns) - 1
+    key = np.clip(key, 0, len(rows) - 2)
+    kept = spread(np.column_stack([key, readings.sensor]), most)
+    readings, key = readings[kept], key[kept]
+    R_back, p = trajectory.R[rows[key]].transpose(0, 2, 1), trajectory.p[rows[key]]
+    return CarriedReadings(
+        key_pose=key,
+        sensor=readings.sensor,
+        R_key_lidar=R_back @ readings.R_map_lidar,
+        p_key_lidar=np.einsum("nij,nj->ni", R_back, readings.p_map_lidar - p),
+        fraction=_fractions(trajectory, rows[key], rows[key + 1], readings.stamp_ns),
+        field=readings.field,
+    )
+
+
+def _fractions(
+    trajectory: Trajectory, first: IntArray, last: IntArray, stamp_ns: IntArray
+) -> FloatArray:
+    """Return how much of the motion from a first pose to a last is done at a time, shape (N,)."""
+    turn = Rotation.from_matrix(trajectory.R[:-1].transpose(0, 2, 1) @ trajectory.R[1:]).magnitude()
+    seconds = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
+    way = np.linalg.norm(np.diff(trajectory.p, axis=0), axis=1)
+    done = np.append(0.0, np.cumsum(way + ARM_M * turn + CREEP_M_S * np.diff(seconds)))
+    at = np.interp(1e-9 * (stamp_ns - trajectory.stamp_ns[0]), seconds, done)
+    return np.asarray(np.clip((at - done[first]) / (done[last] - done[first]), 0.0, 1.0))
+
+
+def spread(groups: IntArray, most: int) -> IntArray:
+    """Return at most so many rows of each group, spread over it, ordered by group.
+
+    ``groups`` has a row of labels for each, shape (N, L); members of a group come in order.
+    """
+    order = np.lexsort(groups.T[::-1])
+    ends = np.flatnonzero(np.diff(groups[order], axis=0).any(axis=1)) + 1
+    return np.concatenate([_some(part, most) for part in np.split(order, ends)])
+
+
+def _some(rows: IntArray, most: int) -> IntArray:
+    chosen = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
+    return np.asarray(rows[chosen])

@@ -1,0 +1,282 @@
+"""A localisation -> the record that slam.json holds and a report is drawn from. Pure."""
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.calibration.calibrate import VERSIONED
+from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, SourceFile, Trajectory
+from l2m_gtsam.geometry import moved, to_ros
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
+from l2m_gtsam.qa.metrics.curves import curves, series
+from l2m_gtsam.qa.metrics.evidence import SensorEvidence
+from l2m_gtsam.qa.metrics.fit import fit_figures, normalised_figures
+from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.qa.slam.errors import Ways, truth_record
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.localisation import LocalisationResult, SensorUse, StartSearch
+from l2m_gtsam.records.localisation_file import (
+    LocalisationRecord,
+    OdometryRecord,
+    PoseRecord,
+    RefinedSensor,
+    SensorRecord,
+    StartCandidateRecord,
+    StartRecord,
+    Timeline,
+)
+from l2m_gtsam.records.validation import ChiSquare, NamedSource
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.factors import root_information
+from l2m_gtsam.slam.localised import Localised
+from l2m_gtsam.solve.chi_square import quantile
+from l2m_gtsam.solve.noise import map_covariance
+from l2m_gtsam.solve.rank import PARAMETERS
+
+NO_TRUTH = "no key pose lies between two true ones that are near enough: nothing is compared"
+SPANS = 60  # of a timeline, at most
+POSES = 3  # key poses in a span, at least in the mean
+BAND = np.array([0.025, 0.975])
+DIGITS = 9
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a record tells beside a localisation.
+
+    Attributes
+    ----------
+    calibration
+        Of the sensors, as it was before.
+    field_map
+        The map.
+    options
+        That it was computed with, as plain values.
+    max_pose_gap_s
+        No true pose is interpolated over more.
+    truth, truth_source
+        Poses of the lidar in the map and their file, if they are known.
+    """
+
+    calibration: CalibrationResult
+    field_map: QueryableMap
+    options: dict[str, Any]
+    max_pose_gap_s: float
+    truth: Trajectory | None = None
+    truth_source: SourceFile | None = None
+
+
+@one_blas_thread()
+def localisation_record(
+    result: LocalisationResult, solution: Localised, told: Told
+) -> LocalisationRecord:
+    """Return what is kept of a localisation.
+
+    Parameters
+    ----------
+    result
+        The localisation.
+    solution
+        Of its graph.
+    told
+        What it was made from.
+    """
+    truth = None
+    if told.truth is not None:
+        ways = Ways(result.trajectory, result.odometry, result.by_scans)
+        truth = truth_record(told.truth, ways, told.max_pose_gap_s)
+    now = result.calibration or told.calibration
+    return LocalisationRecord(
+        status=result.status,
+        message=result.message,
+        notes=(*result.notes, *([] if told.truth is None or truth else [NO_TRUTH])),
+        drift=result.drift,
+        steps=solution.bent,
+        scale=result.scale,
+        map_errors_shared=isinstance(told.field_map, UncertainMap),
+        sensors=tuple(_sensor(solution, now[use.sensor], use) for use in result.sensors),
+        refined=_refined(told.calibration, result),
+        poses=_poses(result.trajectory),
+        odometry=_odometry(solution.drive, result.odometry),
+        start=None if result.start is None else _start(result.start),
+        explored=result.explored,
+        scans=result.scans,
+        truth=truth,
+        picture=map_picture(told.field_map, result.trajectory.p),
+        sources=_sources(result, told),
+        versions={name: version(name) for name in VERSIONED},
+        options=told.options,
+    )
+
+
+def _sources(result: LocalisationResult, told: Told) -> tuple[NamedSource, ...]:
+    files = {
+        "drive": result.bag,
+        "map": result.map,
+        "calibration": result.calibration_source,
+        "truth": told.truth_source,
+    }
+    return tuple(
+        NamedSource(role, each.path, each.sha256)
+        for role, each in files.items()
+        if each is not None
+    )
+
+
+def _poses(at: Trajectory) -> tuple[PoseRecord, ...]:
+    quaternions = Rotation.from_matrix(at.R).as_quat().tolist()
+    covariance: list[Any] = [None] * len(at)
+    if at.covariance is not None:
+        covariance = [tuple(map(tuple, each)) for each in at.covariance.tolist()]
+    poses = zip(at.stamp_ns.tolist(), at.p.tolist(), quaternions, covariance, strict=True)
+    return tuple(PoseRecord(stamp, tuple(p), tuple(q), each) for stamp, p, q, each in poses)
+
+
+def _start(search: StartSearch) -> StartRecord:
+    return StartRecord(
+        verdict=search.verdict,
+        message=search.message,
+        margin=search.margin if np.isfinite(search.margin) else float("nan"),
+        window_m=search.window_m,
+        readings=search.readings,
+        looked_at=search.looked_at,
+        candidates=tuple(
+            StartCandidateRecord(
+                p=row(each.T_map_lidar.t, DIGITS),
+                quaternion_xyzw=row(Rotation.from_matrix(each.T_map_lidar.R).as_quat(), DIGITS),
+                covariance=tuple(map(tuple, each.covariance.tolist())),
+                log_likelihood=each.log_likelihood,
+                inside=each.inside,
+                explained=each.explained,
+                chi2_per_dof=each.chi2_per_dof,
+            )
+            for each in search.candidates
+        ),
+    )
+
+
+def _odometry(drive: Drive, at: Trajectory) -> tuple[OdometryRecord, ...]:
+    quaternions = Rotation.from_matrix(at.R).as_quat()
+    variance = np.diagonal(to_ros(odometry_covariance(drive), at.R), axis1=1, axis2=2)
+    sigma = np.sqrt(variance) * np.repeat([1.0, np.rad2deg(1.0)], 3)
+    return tuple(
+        OdometryRecord(row(p, DIGITS), row(q, DIGITS), row(each, DIGITS))
+        for p, q, each in zip(at.p, quaternions, sigma, strict=True)
+    )
+
+
+def odometry_covariance(drive: Drive) -> FloatArray:
+    """Return how sure odometry alone is of each key pose, shape (K, 6, 6).
+
+    Of right perturbations, rotation (rad) before translation (m): the start's, carried along, what
+    each step adds, and what a wrong scale does.
+    """
+    covariance, steps = [drive.start.covariance], drive.steps
+    for R, p, more in zip(steps.R, steps.p, steps.covariance, strict=True):
+        covariance.append(moved(covariance[-1][None], RigidTransform(R, p))[0] + more)
+    by_scale = steps.scale * _moved_by_scale(drive.dead_reckoning())
+    return np.stack(covariance) + by_scale[:, :, None] * by_scale[:, None]
+
+
+def _moved_by_scale(poses: list[gtsam.Pose3]) -> FloatArray:
+    """Return the right perturbations of K poses by longer ways, (K, 6): each leaves the first."""
+    p0 = poses[0].translation()
+    shift = [each.rotation().matrix().T @ (each.translation() - p0) for each in poses]
+    return np.hstack([np.zeros((len(poses), 3)), np.stack(shift)])
+
+
+def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[RefinedSensor, ...]:
+    if result.calibration is None:
+        return ()
+    names = [each.sensor for each in result.sensors]
+    return tuple(_change(before[name], result.calibration[name]) for name in names)
+
+
+def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSensor:
+    old, new = (np.append(each.t_lidar_mag, each.distortion.vector()) for each in (before, after))
+    whitened = root_information(before.covariance) @ (new - old)
+    low, high = quantile(BAND, len(PARAMETERS))
+    return RefinedSensor(
+        sensor=before.sensor,
+        before=row(old, DIGITS),
+        sigma_before=row(np.sqrt(np.diag(before.covariance)), DIGITS),
+        after=row(new, DIGITS),
+        sigma_after=row(np.sqrt(np.diag(after.covariance)), DIGITS),
+        change=ChiSquare(float(whitened @ whitened), len(PARAMETERS), float(low), float(high)),
+    )
+
+
+def _sensor(solution: Localised, sensor: SensorCalibration, use: SensorUse) -> SensorRecord:
+    index = solution.drive.sensors.names.index(sensor.sensor)
+    own = np.flatnonzero(solution.drive.readings.sensor == index)
+    timeline = _timeline(solution, own)
+    if not use.used:
+        return SensorRecord(use, timeline, None, None, None)
+    inside = own[solution.sight.inside[own]]
+    seen = sensor_evidence(solution, inside)
+    most = int(np.clip(DRAWN // len(solution.drive.sensors.names), FEWEST, MOST))
+    start_ns = solution.drive.stamp_ns[:1]
+    return SensorRecord(
+        use=use,
+        timeline=timeline,
+        fit=fit_figures(seen, float(solution.drive.sensors.noise[index])),
+        normalised=normalised_figures(seen),
+        series=series(curves(seen, sensor), seen, start_ns, most),
+    )
+
+
+def sensor_evidence(solution: Localised, inside: IntArray) -> SensorEvidence:
+    """Return readings of one sensor, by their rows, beside what map and calibration make of them.
+
+    Each has the time of its key pose.
+    """
+    drive, sight = solution.drive, solution.sight
+    at, C = sight.place.readings, sight.place.C[inside]
+    R, field, residual = at.R_map_lidar[inside], at.field[inside], sight.residual[inside]
+    H = drive.sensors.distortion[at.sensor[inside], 9:]
+    b = np.asarray(np.linalg.solve(C, (residual + field - H)[:, :, None])[:, :, 0], dtype=float)
+    W = sight.whitening(drive.sensors.noise, more=solution.way_share)[inside]
+    readings = Readings(
+        sensors=drive.sensors.names,
+        sensor=at.sensor[inside],
+        stamp_ns=drive.stamp_ns[drive.readings.key_pose[inside]],
+        R_map_lidar=R,
+        p_map_lidar=at.p_map_lidar[inside],
+        field=field,
+    )
+    return SensorEvidence(
+        readings=readings,
+        used=solution.used[inside],
+        place=sight.place.x[inside],
+        B_map=np.einsum("nij,nj->ni", R, b),
+        b_lidar=b,
+        residual=residual,
+        map_share=map_covariance(C, R, sight.map_variance[inside]),
+        pose_share=solution.way_share[inside],
+        white=np.einsum("nij,nj->ni", W, residual),
+    )
+
+
+def _timeline(solution: Localised, own: IntArray) -> Timeline:
+    """Return when readings of a sensor, by their rows, counted."""
+    drive, sight = solution.drive, solution.sight
+    at = 1e-9 * (drive.stamp_ns - drive.stamp_ns[0])
+    edges = np.linspace(0.0, at[-1], min(SPANS, max(len(drive) // POSES, 1)) + 1)
+    seconds, inside, used = at[drive.readings.key_pose[own]], sight.inside[own], solution.used[own]
+
+    def count(which: FloatArray) -> tuple[int, ...]:
+        return tuple(np.histogram(which, edges)[0].tolist())
+
+    return Timeline(
+        edges=row(edges, 3),
+        used=count(seconds[used]),
+        rejected=count(seconds[inside & ~used]),
+        outside=count(seconds[~inside]),
+    )

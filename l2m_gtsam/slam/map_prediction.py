@@ -1,0 +1,164 @@
+"""What the map says where readings were taken, at an estimate of poses and sensors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from l2m_factors import CarriedReadings, D, MagneticReadings, T, X, skew
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where N readings were taken.
+
+    Attributes
+    ----------
+    readings
+        With the lidar's poses in the map.
+    x
+        Positions of the sensors in the map in metres, shape (N, 3).
+    C
+        Distortion matrix of each one's sensor, shape (N, 3, 3).
+    """
+
+    readings: MagneticReadings
+    x: FloatArray
+    C: FloatArray
+
+    def field(self, sensors: KnownSensors) -> FloatArray:
+        """Return the field that was measured there, in the map's frame in uT, shape (N, 3)."""
+        at = self.readings
+        H = sensors.distortion[at.sensor, 9:]
+        b_lidar = np.linalg.solve(self.C, (at.field - H)[:, :, None])
+        return np.asarray((at.R_map_lidar @ b_lidar)[:, :, 0])
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What the map says there.
+
+    Attributes
+    ----------
+    place
+        Where.
+    inside
+        Whether the map has data there, shape (N,).
+    map_variance
+        Of the map's field per axis of the map in uT^2, shape (N, 3); infinite outside.
+    residual
+        ``C b + H - z`` in uT, shape (N, 3); NaN outside.
+    by_lidar
+        Its derivative by a right perturbation of the lidar's pose, rotation in uT/rad before
+        translation in uT/m, shape (N, 3, 6); zero outside.
+    """
+
+    place: Place
+    inside: BoolArray
+    map_variance: FloatArray
+    residual: FloatArray
+    by_lidar: FloatArray
+
+    def whitening(
+        self,
+        noise: FloatArray,
+        map_variance: FloatArray | None = None,
+        more: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return matrices that make residuals white, 1/uT, (N, 3, 3); zero outside of the map.
+
+        Parameters
+        ----------
+        noise
+            Standard deviations of the sensors' noise in uT, shape (S,).
+        map_variance
+            In place of the map's own, shape (N, 3).
+        more
+            Covariance that residuals have beside, uT^2, shape (N, 3, 3).
+        """
+        of_reading = noise[self.place.readings.sensor]
+        return self.whitening_of(of_reading, map_variance, more)
+
+    def whitening_of(
+        self,
+        noise: FloatArray,
+        map_variance: FloatArray | None = None,
+        more: FloatArray | None = None,
+    ) -> FloatArray:
+        """Return the same where each reading has a noise of its own, shape (N,)."""
+        variance = self.map_variance if map_variance is None else map_variance
+        W = np.zeros((len(self.inside), 3, 3))
+        rows = np.flatnonzero(self.inside)
+        at = self.place.readings
+        share = map_covariance(self.place.C[rows], at.R_map_lidar[rows], variance[rows])
+        if more is not None:
+            share = share + more[rows]
+        W[rows] = whitening(reading_covariance(noise[rows], share))
+        return W
+
+    def squared(self, W: FloatArray) -> FloatArray:
+        """Return squared lengths of whitened residuals, shape (N,); zero outside of the map."""
+        e = np.einsum("nij,nj->ni", W, np.where(self.inside[:, None], self.residual, 0.0))
+        return np.asarray(np.einsum("ni,ni->n", e, e))
+
+
+def place(
+    readings: CarriedReadings, poses: Mapping[int, gtsam.Pose3], sensors: KnownSensors
+) -> Place:
+    """Put readings into the map.
+
+    Parameters
+    ----------
+    readings
+        N readings.
+    poses
+        At least of their key poses, by number.
+    sensors
+        As they are taken for.
+    """
+    numbers, slot = np.unique(readings.key_pose, return_inverse=True)
+    own = [poses[int(k)] for k in numbers]
+    R = np.stack([pose.rotation().matrix() for pose in own])[slot]
+    p = np.stack([pose.translation() for pose in own])[slot]
+    at = readings.placed(R, p)
+    x = np.einsum("nij,nj->ni", at.R_map_lidar, sensors.t[at.sensor]) + at.p_map_lidar
+    C = sensors.distortion[:, :9].reshape(-1, 3, 3)[at.sensor]
+    return Place(at, x, C)
+
+
+def look(field_map: QueryableMap, where: Place, sensors: KnownSensors) -> Sight:
+    """Ask the map, once for all readings."""
+    sample, at = field_map.query(where.x), where.readings
+    R_back = at.R_map_lidar.transpose(0, 2, 1)
+    b = np.einsum("nij,nj->ni", R_back, sample.field)
+    predicted = np.einsum("nij,nj->ni", where.C, b) + sensors.distortion[at.sensor, 9:]
+    by_shift = R_back @ sample.gradient @ at.R_map_lidar
+    by_turn = skew(b) - by_shift @ skew(sensors.t[at.sensor])
+    by_lidar = where.C @ np.concatenate([by_turn, by_shift], axis=2)
+    by_lidar[~sample.inside] = 0.0
+    return Sight(where, sample.inside, sample.variance, predicted - at.field, by_lidar)
+
+
+def poses_in(values: gtsam.Values, count: int) -> dict[int, gtsam.Pose3]:
+    """Return the key poses of a drive by number."""
+    return {k: values.atPose3(X(k)) for k in range(count)}
+
+
+def sensors_in(values: gtsam.Values, known: KnownSensors) -> KnownSensors:
+    """Return sensors with the calibration that values hold, if they hold one."""
+    count = range(len(known.names))
+    if not values.exists(T(0)):
+        return known
+    return KnownSensors(
+        known.names,
+        np.stack([values.atPoint3(T(i)) for i in count]),
+        np.stack([values.atVector(D(i)) for i in count]),
+        known.offset,
+        known.noise,
+        known.covariance,
+    )

@@ -1,0 +1,77 @@
+"""Whether a map explains a drive better than a wrong one would.
+
+Poses bend a little to fit any field, and some readings always do. How many tells nothing by itself:
+a map may be rough, or a place changed here and there. The same drive in the same map half turned,
+which is wrong for certain, tells what chance explains.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.slam.decoy_map import HalfTurned
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.localised import Localised
+
+LARGEST = 21.0  # squared length of a whitened residual, of 10,000 with noise alone one is larger
+AXES = 3
+LEAST_WAY_M = 10.0  # over less, poses bend to the right map and to wrong ones alike
+DOUBTFUL = 1.25  # times the variance of noise, above which a map is held against a wrong one
+# Of what the wrong map leaves. Measured: maps of other places 0.8 to 1.3, the right one 0.3.
+MUCH = 0.7
+LEAST = 0.5  # of the readings inside the map have to be inside the wrong one, too
+
+
+def misfits(solution: Localised) -> FloatArray:
+    """Return mean squares of the sensors' whitened residuals, those rejected among them, (S,).
+
+    What is far off counts as the least that is rejected, what was read near a change not at all.
+    Infinite where a sensor has no reading.
+    """
+    return _misfits(solution, solution.sight.inside & ~solution.near_changes)
+
+
+def _misfits(solution: Localised, judged: BoolArray) -> FloatArray:
+    """Return those by some of the readings, (N,)."""
+    left = np.full(len(solution.drive.sensors.names), np.inf)
+    for sensor in range(len(left)):
+        own = judged & (solution.drive.readings.sensor == sensor)
+        if own.any():
+            left[sensor] = np.minimum(solution.squared[own], LARGEST).mean() / AXES
+    return left
+
+
+def is_doubtful(solution: Localised) -> bool:
+    """Return whether a drive is long enough to tell, and no sensor is explained down to noise."""
+    least, way = misfits(solution).min(), np.linalg.norm(solution.drive.steps.p, axis=1).sum()
+    return bool(way >= LEAST_WAY_M and np.isfinite(least) and least > DOUBTFUL)
+
+
+def wrong_maps(drive: Drive, field_map: QueryableMap) -> tuple[HalfTurned, ...]:
+    """Return the map half turned about the middle of a drive, and about a place beside it."""
+    p = np.stack([pose.translation() for pose in drive.dead_reckoning()])
+    middle, extent = p.mean(axis=0), np.ptp(p, axis=0)
+    beside = np.where(np.arange(AXES) == np.argmax(extent[:2]), extent / 6, 0.0)
+    return HalfTurned(field_map, middle), HalfTurned(field_map, middle + beside)
+
+
+def explains_no_more(solution: Localised, wrong: Sequence[Localised]) -> bool:
+    """Return whether a drive fits a map hardly better than one of some that are wrong."""
+    inside, best = solution.sight.inside.sum(), int(np.argmin(misfits(solution)))
+    others = [each for each in wrong if each.sight.inside.sum() >= LEAST * inside]
+    return any(_fits_no_better(solution, each, best) for each in others)
+
+
+def _fits_no_better(solution: Localised, wrong: Localised, sensor: int) -> bool:
+    """Return whether the readings of a sensor fit hardly better than in a wrong map.
+
+    Those that neither map explains, as beside a door, tell nothing of which of them is right.
+    """
+    told = solution.used | wrong.used
+    left, other = (
+        _misfits(each, each.sight.inside & ~each.near_changes & told)[sensor]
+        for each in (solution, wrong)
+    )
+    return bool(left > MUCH * other)

@@ -1,0 +1,157 @@
+r"""Key poses of a drive, and what odometry says between them.
+
+Where a recording states covariances of its poses that grow as odometry's do,
+``P' = Ad P Ad^T + Q``, the step's covariance is Q. Otherwise it follows from way and turning.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
+from l2m_gtsam.geometry import moved
+from l2m_gtsam.recording.odometry_jumps import Jump
+from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, Usage
+
+# Rounding and interpolation may make a step's covariance a little less than nothing.
+ROUNDING = 1e-6
+
+
+@dataclass(frozen=True)
+class OdometrySteps:
+    """From each key pose to the next.
+
+    Attributes
+    ----------
+    R, p
+        The next key pose in the frame of the one before, shapes (K - 1, 3, 3) and (K - 1, 3),
+        metres.
+    covariance
+        Of a right perturbation of the step, rotation (rad) before translation (m), (K - 1, 6, 6).
+    stated
+        Whether the recording says so.
+    scale
+        Standard deviation of a share by which all ways are too long or too short alike, beside
+        that; 0 where there is none.
+    """
+
+    R: FloatArray
+    p: FloatArray
+    covariance: FloatArray
+    stated: bool
+    scale: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.p)
+
+    def until(self, count: int) -> "OdometrySteps":
+        """Return so many first steps."""
+        return replace(self, R=self.R[:count], p=self.p[:count], covariance=self.covariance[:count])
+
+    def with_scale_as_walk(self, over_m: float) -> "OdometrySteps":
+        """Return steps for those who do not estimate the scale.
+
+        Its errors count as independent, and come to what they are after so many metres.
+        """
+        way = np.linalg.norm(self.p, axis=1)[:, None]
+        along = np.einsum("nji,nj->ni", self.R, self.p) / np.maximum(way, np.finfo(float).tiny)
+        covariance = self.covariance.copy()
+        walk = self.scale * np.sqrt(over_m * way) * along
+        covariance[:, 3:, 3:] += walk[:, :, None] * walk[:, None]
+        return replace(self, covariance=covariance, scale=0.0)
+
+
+def key_pose_rows(trajectory: Trajectory, options: KeyPoseOptions) -> IntArray:
+    """Return which poses of a trajectory are key poses, shape (K,), the first and last among them.
+
+    Way and turning count from the last key pose straight, so that the noise of poses at rest makes
+    no key poses.
+    """
+    rows, least = [0], np.cos(np.deg2rad(options.angle_deg))
+    for row in range(1, len(trajectory)):
+        last = rows[-1]
+        way = np.linalg.norm(trajectory.p[row] - trajectory.p[last])
+        turned = (np.sum(trajectory.R[row] * trajectory.R[last]) - 1) / 2 <= least
+        if way >= options.distance_m or turned:
+            rows.append(row)
+    if rows[-1] != len(trajectory) - 1:
+        rows.append(len(trajectory) - 1)
+    return np.array(rows)
+
+
+def with_rows_at(rows: IntArray, trajectory: Trajectory, stamp_ns: IntArray) -> IntArray:
+    """Return key poses, and beside them the poses that are nearest to these times."""
+    after = np.clip(np.searchsorted(trajectory.stamp_ns, stamp_ns), 1, len(trajectory) - 1)
+    early, late = trajectory.stamp_ns[after - 1], trajectory.stamp_ns[after]
+    return np.union1d(rows, after - (stamp_ns - early < late - stamp_ns))
+
+
+def odometry_steps(
+    trajectory: Trajectory, rows: IntArray, options: DriftOptions, jumps: Sequence[Jump] = ()
+) -> OdometrySteps:
+    """Return what odometry says between key poses.
+
+    Parameters
+    ----------
+    trajectory
+        Poses of odometry.
+    rows
+        Which are key poses, shape (K,).
+    options
+        How wrong odometry becomes.
+    jumps
+        That were taken out of the trajectory; key poses are next to them.
+    """
+    R_back = trajectory.R[rows[:-1]].transpose(0, 2, 1)
+    R = R_back @ trajectory.R[rows[1:]]
+    p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
+    stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
+    if stated is not None:  # with what is said of jumps
+        return OdometrySteps(R, p, stated + _least(options), stated=True, scale=options.scale)
+    covariance = drift_covariance(R, p, options)
+    for jump in jumps:
+        covariance[np.searchsorted(rows, jump.row)] += jump.covariance
+    return OdometrySteps(R, p, covariance, stated=False, scale=options.scale)
+
+
+def _stated(
+    trajectory: Trajectory, rows: IntArray, R: FloatArray, p: FloatArray
+) -> FloatArray | None:
+    """Return the steps' covariances if those of the poses accumulate, shape (K - 1, 6, 6)."""
+    if trajectory.covariance is None:
+        return None
+    P = trajectory.covariance[rows]
+    steps = zip(P[:-1], P[1:], R, p, strict=True)
+    Q = [after - moved(before[None], RigidTransform(*step))[0] for before, after, *step in steps]
+    values, vectors = np.linalg.eigh(np.reshape(Q, (-1, 6, 6)))
+    floor = ROUNDING * np.abs(P[1:]).max(axis=(1, 2), initial=0.0)
+    if not np.any(values > floor[:, None]) or np.any(values < -floor[:, None]):
+        return None
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ vectors.swapaxes(1, 2))
+
+
+def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> FloatArray:
+    """Return covariances of N steps that grow with their way and turning, shape (N, 6, 6).
+
+    Parameters
+    ----------
+    R, p
+        The steps, shapes (N, 3, 3) and (N, 3), metres.
+    options
+        How wrong odometry becomes.
+    """
+    way, turn = np.linalg.norm(p, axis=1), Rotation.from_matrix(R).magnitude()
+    over = options.over_m * way
+    position = options.position_share**2 * over
+    rotation = np.deg2rad(options.rotation_deg_per_m) ** 2 * over
+    rotation += (options.rotation_share * turn) ** 2
+    variance = np.repeat(np.column_stack([rotation, position]), 3, axis=1)
+    return np.asarray(variance[:, :, None] * np.eye(6) + _least(options))
+
+
+def _least(options: DriftOptions) -> FloatArray:
+    """Return the least covariance of a step, shape (6, 6)."""
+    sigma = np.repeat([np.deg2rad(options.least_deg), options.least_m], 3)
+    return np.diag(sigma**2)

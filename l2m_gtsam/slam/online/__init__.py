@@ -1,0 +1,1 @@
+"""A drive localised in a map, key pose by key pose."""

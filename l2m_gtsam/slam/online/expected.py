@@ -1,0 +1,144 @@
+"""What is read between two key poses, and what scans say of one, beside what is expected."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import gtsam
+import numpy as np
+
+from l2m_factors import Whitening
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.slam.factors import root_information
+from l2m_gtsam.slam.map_prediction import place
+from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, Departed, Evidence
+from l2m_gtsam.slam.online.leg import Leg, LegView, Seen
+from l2m_gtsam.slam.online.remembered import RememberedVariance
+from l2m_gtsam.slam.relative_motion import bridge_whitening
+from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
+from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
+
+LOOKS = 3  # at what errors of the way do
+NEAR = 0.03  # m, rad, or of an entry of C: there they do the same
+
+
+@dataclass(frozen=True)
+class Passed:
+    """Readings of a leg that pass for such.
+
+    Attributes
+    ----------
+    rows
+        Which, shape (n,).
+    own
+        What makes the noise of each white, weighted by how far it counts, 1/uT, shape (n, 3, 3).
+    """
+
+    rows: IntArray
+    own: FloatArray
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What is known once the readings of a leg were taken.
+
+    Attributes
+    ----------
+    belief
+        By them.
+    whitening
+        Of their residuals, there.
+    by_step
+        Their derivatives by a right perturbation of the step, shape (n, 3, 6).
+    """
+
+    belief: Departed
+    whitening: Whitening
+    by_step: FloatArray
+
+
+def passed(
+    view: LegView,
+    variance: RememberedVariance,
+    belief: Departed,
+    robust: RobustOptions,
+) -> Passed:
+    """Return the readings of a leg that a belief explains, by what it and they may be off."""
+    leg, seen, sensors = view.leg, view.seen(belief), belief.sensors
+    where = place(seen.readings, {int(k): belief.pose for k in leg.readings.key_pose[:1]}, sensors)
+    known = variance.at(where.x)
+    rows = np.flatnonzero(np.isfinite(known[:, 0]))
+    R, sensor = where.readings.R_map_lidar[rows], leg.readings.sensor[rows]
+    noise = reading_covariance(sensors.noise[sensor], map_covariance(where.C[rows], R, known[rows]))
+    e, S = seen.residuals.reading.residual[rows], spread_of(leg, seen, belief)[rows] + noise
+    r2 = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
+    trust = WEIGHTS[robust.loss](r2, robust.largest, np.inf)
+    good = np.flatnonzero(trust > 0)
+    own = whitening(noise[good]) * np.sqrt(trust[good])[:, None, None]
+    return Passed(rows[good], own)
+
+
+def take(view: LegView, own: FloatArray, belief: Departed) -> Taken:
+    """Return what is known by the readings of a leg, too.
+
+    What the errors of the way do to them goes with the field's gradient and the calibration: it is
+    looked at again where these come out elsewhere than they were taken for.
+
+    Parameters
+    ----------
+    view, belief
+        The readings, and what is known without them.
+    own
+        What makes the noise of each reading white, 1/uT, shape (n, 3, 3).
+    """
+    at, leg = belief, view.leg
+    for _ in range(LOOKS):
+        seen = view.seen(at)
+        white = bridge_whitening(own, seen.by_end, leg.readings.fraction, leg.covariance)
+        found = belief.corrected(partial(evidence, view, white))
+        if found.is_near(at, NEAR):
+            break
+        at = found
+    return Taken(found, white, seen.by_step)
+
+
+def spread_of(leg: Leg, seen: Seen, belief: Departed) -> FloatArray:
+    """Return what an uncertain belief adds to the covariance of residuals, uT^2, (n, 3, 3).
+
+    That is, by the pose, by the calibrations, and by the way from there.
+    """
+    P, sensor, residuals = belief.covariance, leg.readings.sensor, seen.residuals
+    parts = [residuals.de_dX, seen.by_step]
+    at = np.tile(np.append(np.arange(POSE), np.arange(len(P) - POSE, len(P))), (len(leg), 1))
+    if belief.has_calibrations:
+        parts += [residuals.reading.de_dt, residuals.reading.de_dD]
+        at = np.hstack([at, columns_of(sensor)])
+    J = np.concatenate(parts, axis=2)
+    s = leg.readings.fraction[:, None, None]
+    bridge = s * (1 - s) * (seen.by_end @ leg.covariance @ seen.by_end.transpose(0, 2, 1))
+    return np.asarray(J @ P[at[:, :, None], at[:, None, :]] @ J.transpose(0, 2, 1) + bridge)
+
+
+def evidence(view: LegView, white: Whitening, belief: Departed) -> Evidence:
+    """Return the n readings of a leg as evidence."""
+    leg, seen, n = view.leg, view.seen(belief), len(view.leg)
+    J = np.zeros((n, 3, len(belief.covariance)))
+    J[:, :, :POSE], J[:, :, -POSE:] = seen.residuals.de_dX, seen.by_step
+    reading = seen.residuals.reading
+    if belief.has_calibrations:
+        by_sensor = np.concatenate([reading.de_dt, reading.de_dD], axis=2)
+        at = np.arange(n)[:, None, None], np.arange(3)[:, None]
+        J[(*at, columns_of(leg.readings.sensor)[:, None])] = by_sensor
+    return Evidence(white(reading.residual[:, :, None]).ravel(), white(J))
+
+
+def fix_evidence(fix: gtsam.Pose3, covariance: FloatArray, belief: Belief) -> Evidence:
+    """Return a key pose's place in the map, with its covariance (6, 6), as evidence."""
+    W = root_information(covariance)
+    J = np.zeros((POSE, len(belief.covariance)))
+    J[:, :POSE] = W
+    return Evidence(W @ gtsam.Pose3.Logmap(fix.between(belief.pose)), J)
+
+
+def columns_of(sensor: IntArray) -> IntArray:
+    """Return which components of a belief are those of each reading's sensor, shape (n, 15)."""
+    return np.asarray(POSE + SENSOR * sensor[:, None] + np.arange(SENSOR))

@@ -1,0 +1,141 @@
+"""The last key poses of a drive, solved by iSAM2 as they come; all that was before is a prior."""
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from l2m_factors import X
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.covariances import covariance_of, ordered, unless_refused
+from l2m_gtsam.slam.online.belief import POSE
+
+# Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
+# entries of C; never for H, in which readings are linear.
+RELINEARISE = {
+    "X": np.full(6, 0.01),
+    "T": np.full(3, 0.01),
+    "D": np.concatenate([np.full(9, 0.01), np.full(3, np.inf)]),
+}
+CHOLESKY, QR = "CHOLESKY", "QR"
+ANEW = 10  # steps of a section that is solved again from its beginning
+
+
+@dataclass
+class Added:
+    """All that came to a section: factors, and values to begin with."""
+
+    graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    values: gtsam.Values = field(default_factory=gtsam.Values)
+
+
+class Section:
+    """A stretch of a drive that is solved as it grows.
+
+    What it has learnt goes over to the next one as a Gaussian prior of the variables that both
+    have. GTSAM's fixed-lag smoothers, which let go of one pose after the other, hold such variables
+    where they were when the first one went; here calibrations stay free to be linearised anew.
+
+    Linear systems are solved by Cholesky: where calibrations are refined QR takes twice the time.
+    Once a system is refused, the section is solved by QR from its beginning, and so are later ones.
+
+    Parameters
+    ----------
+    calibrations
+        Keys of the calibrations that are variables.
+    solver
+        Of linear systems, to begin with.
+    """
+
+    def __init__(self, calibrations: list[int], solver: str = CHOLESKY) -> None:
+        self._engine, self._calibrations, self._solver = _engine(solver), calibrations, solver
+        self._added = Added()
+        self._told: set[int] = set()  # those of sensors that were heard
+
+    def add(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
+    ) -> None:
+        """Add factors and new variables up to a key pose, and take so many more steps."""
+        for n in range(graph.size()):
+            keys = set(graph.at(n).keys())
+            if not keys.issubset(self._calibrations):
+                self._told |= keys.intersection(self._calibrations)
+        self._added.graph.push_back(graph)
+        self._added.values.insert(values)
+        if self._solver == QR:
+            self._take(graph, values, last, again)
+        elif unless_refused(lambda: self._take(graph, values, last, again)) is None:
+            self._solver, self._engine = QR, _engine(QR)
+            self._take(self._added.graph, self._added.values, last, ANEW)
+
+    def _take(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
+    ) -> gtsam.ISAM2Result:
+        order = self._last_ones(last)
+        result = self._engine.update(graph, values, constrainedKeys=order)
+        for _ in range(again):
+            result = self._engine.update(constrainedKeys=order)
+        return result
+
+    def _last_ones(self, last: int) -> gtsam.KeyGroupMap:
+        """Return which variables are eliminated last.
+
+        What is asked for at each key pose stands in the root of the tree then. The very last are
+        poses: Cholesky takes a part of a calibration that only its prior holds for undetermined.
+        """
+        order = gtsam.KeyGroupMap()
+        for key in self._told:
+            order.insert2(key, 1)
+        order.insert2(X(last), 2 if self._told else 1)  # no group may be empty
+        return order
+
+    def pose(self, number: int) -> gtsam.Pose3:
+        """Return a key pose of the section."""
+        return self._engine.calculateEstimatePose3(X(number))
+
+    def calibration(self) -> gtsam.Values:
+        """Return the calibrations."""
+        return self._engine.calculateEstimate(self._calibrations)
+
+    def values(self) -> gtsam.Values:
+        """Return all its variables."""
+        return self._engine.calculateEstimate()
+
+    def covariance(self, last: int) -> FloatArray:
+        """Return the joint covariance of the last key pose and the calibrations, in this order."""
+        keys = [*self._calibrations, X(last)]
+        engine, found = self._engine, None
+        if self._solver == CHOLESKY:
+            found = unless_refused(lambda: engine.jointMarginalCovariance(keys).fullMatrix())
+        if found is None:
+            left = engine.joint(keys, gtsam.EliminateQR)
+            net = left.eliminateSequential(ordered(keys), gtsam.EliminateQR)
+            found = covariance_of(net.matrix()[0])
+        return np.roll(found, POSE, axis=(0, 1))
+
+    def next(self, last: int) -> "Section":
+        """Return a section that begins with what this one knows of key pose and calibrations."""
+        keys = [*self._calibrations, X(last)]
+        # As it was linearised; what has moved by more than a little was linearised anew.
+        at = self._engine.getLinearizationPoint().extract(keys)
+        told = None
+        if self._solver == CHOLESKY:
+            told = unless_refused(lambda: self._engine.joint(keys))
+        if told is None:
+            told = self._engine.joint(keys, gtsam.EliminateQR)
+        prior = gtsam.LinearContainerFactor.ConvertLinearGraph(told, at)
+        section = Section(self._calibrations, self._solver)
+        section.add(prior, self._engine.calculateEstimate(keys), last, 0)
+        return section
+
+
+def _engine(solver: str) -> gtsam.ISAM2:
+    """Return an empty graph that is solved as it grows."""
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for symbol, steps in RELINEARISE.items():
+        thresholds.insert((symbol, steps))
+    params = gtsam.ISAM2Params()
+    params.setRelinearizeThreshold(thresholds)
+    params.relinearizeSkip = 1
+    params.setFactorization(solver)
+    return gtsam.ISAM2(params)

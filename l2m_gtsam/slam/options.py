@@ -1,0 +1,126 @@
+"""How a drive is localised."""
+
+from enum import StrEnum
+
+from pydantic import Field, model_validator
+
+from l2m_gtsam.options import Options
+from l2m_gtsam.recording.odometry_jumps import JumpOptions
+from l2m_gtsam.slam.start.options import StartSearchOptions
+from l2m_gtsam.slam.unknown_field.field_prior import TileOptions
+from l2m_gtsam.solve.robust import RobustOptions
+
+
+class CalibrationUse(StrEnum):
+    """What becomes of the sensors' calibration."""
+
+    FIXED = "fixed"
+    REFINED = "refined"
+
+
+class Usage(StrEnum):
+    """What becomes of something that a recording may have."""
+
+    USED = "used"
+    IGNORED = "ignored"
+
+
+class KeyPoseOptions(Options):
+    """Which poses of a drive are variables."""
+
+    distance_m: float = Field(default=0.2, gt=0)
+    """A key pose is made after so much way,"""
+    angle_deg: float = Field(default=10.0, gt=0, le=180)
+    """or after so much turning. Readings lie between key poses, as far along as
+    odometry has them, and less surely so the further away both are."""
+    readings: int = Field(default=8, ge=1)
+    """The most readings of a sensor on a key pose, spread over its time: a vehicle that is parked
+    reads one place again and again."""
+
+
+class DriftOptions(Options):
+    """How wrong odometry becomes, where the recording does not say or is not asked.
+
+    Errors of odometry's steps count as independent, so that sigmas grow with the root of the way.
+    Shares are those after `over_m`: over less way than that the odometry is trusted less than a
+    constant share would have it, over more it is trusted more, and there the map speaks.
+    """
+
+    position_share: float = Field(default=0.01, gt=0, lt=1)
+    """Standard deviation of the position per axis, as a share of the way."""
+    rotation_deg_per_m: float = Field(default=0.05, gt=0)
+    """Standard deviation of the rotation about each axis, in degrees per metre of way,"""
+    rotation_share: float = Field(default=0.01, ge=0, lt=1)
+    """and as a share of the turning itself."""
+    over_m: float = Field(default=10.0, gt=0)
+    """The way over which these hold."""
+    scale: float = Field(default=0.0, ge=0, lt=1)
+    """Standard deviation of a share by which all ways are too long or too short alike, as those
+    of wheels are. It is estimated with the poses; the other sigmas are of what odometry errs
+    beside it, and with the wide ones that are the default it is not needed."""
+    stated: Usage = Usage.USED
+    """Whether covariances that a recording states of its odometry count instead, where they grow
+    along the drive."""
+    least_m: float = Field(default=0.001, gt=0)
+    """No step is known better than this,"""
+    least_deg: float = Field(default=0.02, gt=0)
+    """nor than this in rotation. Both are added to what a recording says, too."""
+
+
+class StartPoseOptions(Options):
+    """Where a drive begins in the map."""
+
+    position: tuple[float, float, float] | None = None
+    """Position of the lidar in the map in metres; that of the first recorded pose if not given."""
+    quaternion_xyzw: tuple[float, float, float, float] | None = None
+    """Rotation from lidar to map, of any length but zero; that of the first recorded pose if not
+    given."""
+    position_m: float = Field(default=0.1, gt=0)
+    """Standard deviation of the position per axis in metres."""
+    rotation_deg: float = Field(default=2.0, gt=0, le=45)
+    """Standard deviation of the rotation about each axis in degrees."""
+    anywhere: bool = False
+    """The drive begins anywhere in the map: position and heading are looked for, from readings and
+    odometry alone. What is assumed then: the z axis of odometry's frame is up within
+    `rotation_deg`."""
+    search: StartSearchOptions = StartSearchOptions()
+    """How, with `anywhere`."""
+
+    @model_validator(mode="after")
+    def _known_or_not(self) -> "StartPoseOptions":
+        if self.anywhere and (self.position is not None or self.quaternion_xyzw is not None):
+            raise ValueError("`anywhere` and a `position` or `quaternion_xyzw`: give one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _a_rotation(self) -> "StartPoseOptions":
+        if self.quaternion_xyzw is not None and not any(self.quaternion_xyzw):
+            raise ValueError("`quaternion_xyzw` is all zero, it must be a rotation")
+        return self
+
+
+class SlamOptions(Options):
+    """How a drive is localised."""
+
+    max_pose_gap_s: float = Field(default=0.5, gt=0)
+    """Readings between two odometry poses further apart than this are dropped."""
+    key_poses: KeyPoseOptions = KeyPoseOptions()
+    """Which poses are variables."""
+    drift: DriftOptions = DriftOptions()
+    """How far odometry is trusted."""
+    jumps: JumpOptions = JumpOptions()
+    """Which of its steps are not believed at all."""
+    start: StartPoseOptions = StartPoseOptions()
+    """Where the drive begins."""
+    calibration: CalibrationUse = CalibrationUse.FIXED
+    """`fixed`, or `refined`: estimated with the poses, with its covariance as the prior."""
+    scans: Usage = Usage.USED
+    """`used`: point clouds, if the bag has any, are registered on the cloud of the map, or on each
+    other where places are come to again; or `ignored`."""
+    robust: RobustOptions = RobustOptions()
+    """How readings are treated that the map does not explain. Scans that do not fit odometry and
+    each other are left out with the same `confidence`."""
+    tiles: TileOptions = TileOptions()
+    """How the field is described where there is no map."""
+    max_iterations: int = Field(default=50, ge=1)
+    """The most steps of the optimiser in each round."""

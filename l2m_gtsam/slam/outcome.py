@@ -1,0 +1,190 @@
+"""A solved drive as a result: figures, verdict, refined calibration."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.data import Distortion, Trajectory
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.localisation import (
+    DriftFigures,
+    LocalisationResult,
+    LocalisationStatus,
+    ScanUse,
+    SensorUse,
+)
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.localised import Localised
+from l2m_gtsam.slam.misfit import explains_no_more
+from l2m_gtsam.slam.pose_graph import PoseGraph
+from l2m_gtsam.slam.slips import slip_notes
+from l2m_gtsam.solve.rotation import polar_rotation
+
+# A drive of which less lies in the map is not localised by it.
+LEAST_INSIDE = 0.1
+# A map that explains less than this share of the readings is another place's: of those in a place
+# that has been changed here and there more fit.
+LEAST_EXPLAINED = 0.5
+# Mean square of whitened components, of readings and of odometry: poses can be bent until readings
+# fit the map of another place.
+LARGEST_CHI2 = 4.0
+
+
+def localisation_result(
+    drive: Drive,
+    solution: Localised,
+    by_scans: PoseGraph,
+    refine: CalibrationResult | None,
+    wrong: Sequence[Localised] = (),
+) -> LocalisationResult:
+    """Return what is told of a drive.
+
+    Parameters
+    ----------
+    drive
+        As it was before.
+    solution
+        Of the graph.
+    by_scans
+        Of odometry and scans alone.
+    refine
+        The calibration that was refined; none if it was fixed.
+    wrong
+        The drive in maps that are wrong for certain, if this one was held against such.
+    """
+    alone = drive.dead_reckoning()
+    status, message = _verdict(solution, wrong)
+    odometry = _trajectory(drive, alone)
+    trajectory = replace(_trajectory(drive, solution.poses), covariance=solution.pose_covariance)
+    return LocalisationResult(
+        status=status,
+        message=message,
+        trajectory=trajectory,
+        odometry=odometry,
+        drift=drift_figures(trajectory, odometry),
+        sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
+        calibration=None if refine is None else refined(refine, solution),
+        notes=slip_notes(drive, solution.poses, solution.longer),
+        bag=None,
+        map=None,
+        calibration_source=None,
+        scans=scan_use(solution, by_scans),
+        by_scans=_trajectory(drive, by_scans.poses) if len(by_scans.believed) else None,
+        scale=solution.scale,
+    )
+
+
+def scan_use(solution: Localised, by_scans: PoseGraph) -> ScanUse | None:
+    """Return what scans were worth; None where there were none."""
+    if not len(by_scans.believed):
+        return None
+    links, r2 = solution.drive.links, solution.link_squared
+    return ScanUse(
+        fixes=int(links.in_map.sum()),
+        loops=int((~links.in_map).sum()),
+        rejected=int((~by_scans.believed).sum()),
+        chi2_per_dof=float(r2.mean() / 6) if len(r2) else float("nan"),
+    )
+
+
+def drift_figures(localised: Trajectory, odometry: Trajectory) -> DriftFigures:
+    """Return how far odometry had drifted at the same key poses."""
+    apart = np.linalg.norm(odometry.p - localised.p, axis=1)
+    turned = Rotation.from_matrix(localised.R[-1].T @ odometry.R[-1]).magnitude()
+    return DriftFigures(
+        way_m=float(np.linalg.norm(np.diff(localised.p, axis=0), axis=1).sum()),
+        end_m=float(apart[-1]),
+        end_deg=float(np.rad2deg(turned)),
+        largest_m=float(apart.max()),
+        rms_m=float(np.sqrt(np.mean(apart**2))),
+    )
+
+
+def refined(calibration: CalibrationResult, solution: Localised) -> CalibrationResult:
+    """Return a calibration with the sensors that a drive refined; the others stay."""
+    names = solution.drive.sensors.names
+    sensors = [
+        _refined(entry, solution, names.index(entry.sensor)) if entry.sensor in names else entry
+        for entry in calibration.sensors
+    ]
+    return replace(calibration, sensors=tuple(sensors), disagreements=())
+
+
+def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCalibration:
+    sensors, covariance = solution.drive.sensors, solution.calibration_covariance[i]
+    distortion = Distortion.from_vector(sensors.distortion[i])
+    rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
+    clock = entry.time_offset
+    if clock is not None:
+        # It took no part: what it had in common with the estimate before says nothing now.
+        clock = replace(clock, cross_covariance=np.zeros(15))
+    return replace(
+        entry,
+        message="refined with the poses of a drive",
+        t_lidar_mag=sensors.t[i],
+        distortion=distortion,
+        R_lidar_mag=rotation.R_mag_lidar.T,
+        covariance=covariance,
+        rotation_covariance=rotation.covariance,
+        time_offset=clock,
+    )
+
+
+def _verdict(solution: Localised, wrong: Sequence[Localised]) -> tuple[LocalisationStatus, str]:
+    inside, used = solution.sight.inside, solution.used
+    share = float(inside.mean())
+    explained = float(used.sum() / max(inside.sum(), 1))
+    # What was read near a change says nothing for or against the rest of the map.
+    judged = float(used.sum() / max((inside & ~solution.near_changes).sum(), 1))
+    chi2 = float(solution.squared[used].mean() / 3) if used.any() else np.inf
+    told = f"the map explains {explained:.0%} of the readings"
+    if share < LEAST_INSIDE:
+        message = (
+            f"the map has data for {share:.0%} of the readings: the drive is not in this map, or "
+            "does not begin where it is said to"
+        )
+        return LocalisationStatus.OUTSIDE_MAP, message
+    if judged < LEAST_EXPLAINED or max(chi2, solution.bent) > LARGEST_CHI2:
+        message = (
+            f"{told}, leaves {chi2:.1f} times the variance of their noise, and needs steps that "
+            f"miss odometry by {solution.bent:.1f} times its variance: another place, a wrong "
+            "start, or a wrong calibration"
+        )
+        return LocalisationStatus.NOT_HERE, message
+    if explains_no_more(solution, wrong):
+        message = (
+            f"{told}, hardly more than it does half turned, which is wrong for certain: another "
+            "place, a wrong start, or a wrong calibration"
+        )
+        return LocalisationStatus.NOT_HERE, message
+    if solution.ending is not Ending.TOLERANCE:
+        return LocalisationStatus.NOT_CONVERGED, solution.ending.value
+    return LocalisationStatus.LOCALISED, told
+
+
+def _use(solution: Localised, sensor: int) -> SensorUse:
+    own = solution.drive.readings.sensor == sensor
+    used = own & solution.used
+    residual = solution.sight.residual[used]
+    return SensorUse(
+        sensor=solution.drive.sensors.names[sensor],
+        readings=int(own.sum()),
+        outside_map=int((own & ~solution.sight.inside).sum()),
+        rejected=int((own & solution.sight.inside & ~solution.used).sum()),
+        rms=float(np.sqrt(np.mean(residual**2))) if used.any() else float("nan"),
+        chi2_per_dof=float(solution.squared[used].mean() / 3) if used.any() else float("nan"),
+    )
+
+
+def _trajectory(drive: Drive, poses: list[gtsam.Pose3]) -> Trajectory:
+    return Trajectory(
+        stamp_ns=drive.stamp_ns,
+        R=np.stack([pose.rotation().matrix() for pose in poses]),
+        p=np.stack([pose.translation() for pose in poses]),
+        frame="map",
+        child_frame="lidar",
+    )

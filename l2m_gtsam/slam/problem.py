@@ -1,0 +1,225 @@
+"""The graph of a whole drive in a magnetic map, and how it is solved."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import CarriedBatch, key_pose_factor
+from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.slam.changes import Fit
+from l2m_gtsam.slam.covariances import (
+    Marginals,
+    odometry_scale,
+    pose_covariances,
+    sensor_covariances,
+)
+from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.factors import calibration_graph, link_graph, link_squared, odometry_graph
+from l2m_gtsam.slam.localised import NOTHING, Localised
+from l2m_gtsam.slam.map_prediction import Sight, look, place, poses_in, sensors_in
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.relative_motion import Ways
+from l2m_gtsam.slam.shared import SharedMapErrors, errors_of
+from l2m_gtsam.slam.solving import descended, least_fill
+from l2m_gtsam.solve.robust import WEIGHTS
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A round: variables, how far each reading counted, and how the optimiser ended."""
+
+    values: gtsam.Values
+    weights: FloatArray
+    ending: Ending
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A drive's N readings at an estimate.
+
+    Attributes
+    ----------
+    ways
+        Between the key poses.
+    sight
+        What the map says where they lead to.
+    """
+
+    ways: Ways
+    sight: Sight
+
+    @property
+    def way_share(self) -> FloatArray:
+        """What errors of the ways contribute to the covariance of residuals, (N, 3, 3)."""
+        return self.ways.share(np.arange(len(self.sight.inside)), self.sight.by_lidar)
+
+    def squared(self, noise: FloatArray) -> FloatArray:
+        """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
+        return self.sight.squared(self.sight.whitening(noise, more=self.way_share))
+
+    def independent(self, noise: FloatArray, used: BoolArray) -> FloatArray:
+        """Return squared lengths of residuals without what those of a step have in common, (N,).
+
+        Zero for those that are not used or outside of the map.
+        """
+        sight, squared = self.sight, np.zeros(len(used))
+        own = sight.whitening(noise)
+        rows = np.flatnonzero(used & sight.inside)
+        key = self.ways.readings.key_pose[rows]
+        for part in np.split(rows, np.flatnonzero(np.diff(key)) + 1) if len(rows) else ():
+            white = self.ways.whitening(part, own[part], sight.by_lidar[part])
+            e = white(sight.residual[part, :, None]).reshape(-1, 3)
+            squared[part] = np.einsum("ni,ni->n", e, e)
+        return squared
+
+
+class Problem:
+    """The graph of a drive.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    field_map
+        The map.
+    options
+        How to solve.
+    """
+
+    def __init__(self, drive: Drive, field_map: QueryableMap, options: SlamOptions) -> None:
+        self._drive, self._map, self._options = drive, field_map, options
+        self._odometry, self._links = odometry_graph(drive), link_graph(drive.links)
+
+    @property
+    def free(self) -> bool:
+        """Whether calibrations are variables."""
+        return self._options.calibration is CalibrationUse.REFINED
+
+    def sensors(self, values: gtsam.Values) -> KnownSensors:
+        """Return the sensors as values have them."""
+        return sensors_in(values, self._drive.sensors)
+
+    def look(self, values: gtsam.Values) -> Seen:
+        """Ask the map where values put the readings."""
+        sensors, poses = self.sensors(values), poses_in(values, len(self._drive))
+        ways = Ways.along(self._drive, list(poses.values()))
+        return Seen(ways, look(self._map, place(ways.readings, poses, sensors), sensors))
+
+    def weights(self, seen: Seen, mu: float) -> FloatArray:
+        """Return how far each reading counts at a stage of the graduation, shape (N,)."""
+        robust, r2 = self._options.robust, seen.squared(self._drive.sensors.noise)
+        return np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu) * seen.sight.inside)
+
+    def solved(self, values: gtsam.Values, counts: BoolArray, mu: float) -> Solved:
+        """Solve for everything, with readings weighted as they fit now.
+
+        Parameters
+        ----------
+        values
+            Where to start.
+        counts
+            Which readings may count, shape (N,).
+        mu
+            Stage of the graduation.
+        """
+        seen = self.look(values)
+        weights = self.weights(seen, mu) * counts
+        graph = self.graph(seen, weights, seen.sight.map_variance, None)
+        end = descended(graph, values, least_fill(graph), self._options.max_iterations)
+        return Solved(end.values, weights, end.ending)
+
+    def fit(self, solved: Solved, counts: BoolArray) -> Fit:
+        """Return how the readings that may count fit."""
+        seen, readings = self.look(solved.values), self._drive.readings
+        poses = poses_in(solved.values, len(self._drive)).values()
+        used = solved.weights > NOTHING
+        return Fit(
+            readings.key_pose,
+            readings.sensor,
+            seen.sight.inside & counts,
+            used,
+            seen.independent(self.sensors(solved.values).noise, used),
+            np.stack([pose.translation() for pose in poses]),
+        )
+
+    def graph(
+        self,
+        seen: Seen,
+        weights: FloatArray,
+        map_variance: FloatArray,
+        shared: SharedMapErrors | None,
+    ) -> gtsam.NonlinearFactorGraph:
+        """Return all factors.
+
+        Parameters
+        ----------
+        seen
+            The N readings where they are taken to be.
+        weights
+            How far they count, shape (N,).
+        map_variance
+            Of the map per axis that counts as noise of each reading in uT^2, shape (N, 3).
+        shared
+            The map's errors that do not.
+        """
+        drive, graph = self._drive, gtsam.NonlinearFactorGraph()
+        graph.push_back(self._odometry)
+        graph.push_back(self._links)
+        if self.free:
+            graph.push_back(calibration_graph(drive.sensors))
+        rows = np.flatnonzero(weights > NOTHING)
+        if not len(rows):
+            return graph
+        W = seen.sight.whitening(drive.sensors.noise, map_variance)
+        W = W * np.sqrt(weights)[:, None, None]
+        fixed = None if self.free else drive.sensors.fixed()
+        batch = CarriedBatch(self._map, seen.ways.readings[rows], fixed)
+        for k in batch.key_poses:
+            own = rows[batch.rows_of(k)]
+            errors = () if shared is None else shared.of(own)
+            by_lidar = seen.sight.by_lidar[own]
+            white = seen.ways.whitening(own, W[own], by_lidar)
+            step = seen.ways.step_error(own, by_lidar)
+            graph.add(key_pose_factor(batch, k, white, errors, step))
+        if shared is not None:
+            graph.add(shared.prior())
+        return graph
+
+    def finished(self, solved: Solved) -> Localised:
+        """Solve once more with the map's errors as variables, and take the covariances."""
+        values, ending = solved.values, solved.ending
+        seen = self.look(values)
+        weights = solved.weights * seen.sight.inside
+        shared = None
+        if (weights > NOTHING).any():
+            shared = SharedMapErrors.over(errors_of(self._map), seen.sight)
+            values.insert(shared.values())
+        rest = seen.sight.map_variance if shared is None else shared.rest
+        graph = self.graph(seen, weights, rest, shared)
+        order = least_fill(graph)
+        optimised = descended(graph, values, order, self._options.max_iterations)
+        values, sensors = optimised.values, self.sensors(optimised.values)
+        marginals = Marginals(graph.linearize(values), order)
+        seen = self.look(values)
+        return Localised(
+            drive=replace(self._drive, sensors=sensors),
+            poses=list(poses_in(values, len(self._drive)).values()),
+            pose_covariance=pose_covariances(marginals, len(self._drive)),
+            calibration_covariance=(
+                sensor_covariances(marginals, len(sensors.names))
+                if self.free
+                else sensors.covariance
+            ),
+            sight=seen.sight,
+            way_share=seen.way_share,
+            squared=seen.squared(sensors.noise),
+            weights=weights * seen.sight.inside,
+            near_changes=np.zeros(len(weights), dtype=np.bool_),
+            bent=2 * self._odometry.error(values) / (6 * len(self._drive)),
+            scale=odometry_scale(marginals, values),
+            link_squared=link_squared(self._drive.links, values),
+            ending=optimised.ending if ending is Ending.TOLERANCE else ending,
+        )

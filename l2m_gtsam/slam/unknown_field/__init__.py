@@ -1,0 +1,1 @@
+"""SLAM without a map: the field is estimated together with the poses."""

@@ -1,0 +1,271 @@
+"""A drive through a place whose field is not known: poses and field together, off line.
+
+The field is laid out on tiles that are fixed to key poses. All poses and the tiles' weights are
+solved together by Levenberg-Marquardt, in stages: at first readings count as if their noise were
+many times what it is, so that only the field's long waves speak, and a place that is come to again
+is recognised from as far off as odometry has drifted; then more finely. At each stage tiles are
+laid anew where the poses are by then, and readings that no tile explains lose their weight.
+
+Odometry drifts out of the reach of the longest waves, too. So the drive is first solved coarsely
+piece by piece: each begins where the one before has come out.
+"""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import X
+from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.slam.covariances import (
+    Marginals,
+    odometry_scale,
+    pose_covariances_together,
+    sensor_covariances,
+)
+from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.factors import (
+    calibration_graph,
+    calibration_values,
+    link_graph,
+    link_squared,
+    odometry_graph,
+    scale_values,
+)
+from l2m_gtsam.slam.localised import NOTHING, Localised
+from l2m_gtsam.slam.map_prediction import Sight, place, poses_in, sensors_in
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.relative_motion import Ways
+from l2m_gtsam.slam.solving import descended, weights_first
+from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
+from l2m_gtsam.slam.unknown_field.tiled import TiledDrive
+from l2m_gtsam.solve.robust import WEIGHTS
+
+# How many times its noise a reading may be off, stage by stage, and how sharply good readings are
+# told from wrong ones (mu of ``solve.robust``).
+STAGES = ((16.0, 1.0), (4.0, 1.0), (1.0, 1.0), (1.0, np.inf), (1.0, np.inf))
+PIECE_M = 30.0  # of way: over it odometry drifts less than the longest waves are long
+AWAY_M = 5.0  # of way after which a tile that is entered again closes a loop
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A drive and the field along it.
+
+    Attributes
+    ----------
+    solution
+        Poses, sensors, and what the tiles say of the readings.
+    tiles
+        That the drive was laid out on.
+    returns
+        Key poses in tiles that had been left before.
+    """
+
+    solution: Localised
+    tiles: int
+    returns: IntArray
+
+
+def map_drive(
+    drive: Drive,
+    begin: list[gtsam.Pose3],
+    prior: FieldPrior,
+    options: SlamOptions,
+    progress: Progress,
+) -> Mapped:
+    """Find the poses of a drive and the field along it.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    begin
+        Its key poses by odometry and scans.
+    prior
+        Of the field.
+    options
+        How to solve.
+    progress
+        Called with a stage and the fraction of it that is done.
+    """
+    poses, sensors = grown(drive, begin, prior, options, progress), drive.sensors
+    problem = TiledProblem(drive, prior, options)
+    for stage, (scale, mu) in enumerate(STAGES[:-1]):
+        progress("solving poses and field", stage / len(STAGES))
+        solved = problem.solved(poses, sensors, scale, mu)
+        poses, sensors = solved.poses, solved.sensors
+    scale, mu = STAGES[-1]
+    found = problem.finished(problem.solved(poses, sensors, scale, mu))
+    progress("solving poses and field", 1.0)
+    return found
+
+
+def grown(
+    drive: Drive,
+    begin: list[gtsam.Pose3],
+    prior: FieldPrior,
+    options: SlamOptions,
+    progress: Progress,
+) -> list[gtsam.Pose3]:
+    """Return the poses of a drive as far as they are found piece by piece.
+
+    The last piece is at the poses that follow from the one before it.
+    """
+    way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    poses = begin
+    for end in np.arange(PIECE_M, way[-1], PIECE_M):
+        progress("following the drive", float(end / way[-1]))
+        count = int(np.searchsorted(way, end))
+        part = TiledProblem(drive.until(count), prior, options)
+        solved = part.solved(poses[:count], drive.sensors, *STAGES[0])
+        shift = solved.poses[-1].compose(poses[count - 1].inverse())
+        poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
+    return poses
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A stage: tiles as they were laid, the graph and where it led."""
+
+    tiled: TiledDrive
+    graph: gtsam.NonlinearFactorGraph
+    weights: FloatArray
+    values: gtsam.Values
+    poses: list[gtsam.Pose3]
+    sensors: KnownSensors
+    ending: Ending
+
+
+class TiledProblem:
+    """The graph of a drive in an unknown field.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    prior
+        Of the field.
+    options
+        How to solve.
+    """
+
+    def __init__(self, drive: Drive, prior: FieldPrior, options: SlamOptions) -> None:
+        self._drive, self._prior, self._options = drive, prior, options
+        self._odometry, self._links = odometry_graph(drive), link_graph(drive.links)
+        self._free = options.calibration is CalibrationUse.REFINED
+
+    def solved(
+        self, poses: list[gtsam.Pose3], sensors: KnownSensors, scale: float, mu: float
+    ) -> Solved:
+        """Lay tiles at these poses and solve for poses and weights.
+
+        Parameters
+        ----------
+        poses, sensors
+            Where to start.
+        scale
+            How many times its noise a reading may be off.
+        mu
+            Stage of the graduation of the readings' weights.
+        """
+        ways = Ways.along(self._drive, poses)
+        tiled = TiledDrive.lay(ways, poses, sensors, self._prior)
+        noise = scale * sensors.noise
+        values = tiled.weights(sensors, noise)
+        values.insert(scale_values(self._drive))
+        for k, pose in enumerate(poses):
+            values.insert(X(k), pose)
+        sights = tiled.sights(values, sensors)
+        whitenings = [sight.whitening(noise) for sight in sights]
+        W = self._gathered(tiled, whitenings)
+        r2 = self._squared(tiled, ways, sights, noise)
+        robust = self._options.robust
+        weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
+        doubts = tiled.doubts(noise, weights, self._own_squared(tiled, sights, whitenings))
+        chosen = np.flatnonzero(weights > NOTHING)
+        fixed = None if self._free else self._drive.sensors.fixed()
+        W = W * np.sqrt(weights)[:, None, None]
+        by_lidar = self._gathered(tiled, [sight.by_lidar for sight in sights])
+        graph = tiled.graph(ways, doubts, W, by_lidar, chosen, fixed)
+        graph.push_back(self._odometry)
+        graph.push_back(self._links)
+        if self._free:
+            graph.push_back(calibration_graph(self._drive.sensors))
+            values.insert(calibration_values(sensors))
+        order = weights_first(graph, values)
+        end = descended(graph, values, order, self._options.max_iterations)
+        found = list(poses_in(end.values, len(poses)).values())
+        after = sensors_in(end.values, sensors)
+        return Solved(tiled, graph, weights, end.values, found, after, end.ending)
+
+    def finished(self, solved: Solved) -> Mapped:
+        """Return a solved stage with its covariances and residuals."""
+        drive, sensors = self._drive, solved.sensors
+        order = weights_first(solved.graph, solved.values)
+        marginals = Marginals(solved.graph.linearize(solved.values), order)
+        ways = Ways.along(drive, solved.poses)
+        tiled = solved.tiled.moved(ways, solved.poses, sensors)
+        sights = tiled.sights(solved.values, sensors)
+        solution = Localised(
+            drive=replace(drive, sensors=sensors),
+            poses=solved.poses,
+            pose_covariance=pose_covariances_together(marginals, len(drive)),
+            calibration_covariance=(
+                sensor_covariances(marginals, len(sensors.names))
+                if self._free
+                else sensors.covariance
+            ),
+            sight=self._sight(solved, ways, tiled, sights),
+            way_share=self._gathered(tiled, way_shares(tiled, ways, sights)),
+            squared=self._squared(tiled, ways, sights, sensors.noise),
+            weights=solved.weights,
+            near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
+            bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
+            scale=odometry_scale(marginals, solved.values),
+            link_squared=link_squared(drive.links, solved.values),
+            ending=solved.ending,
+        )
+        way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+        returns = tiled.anchoring.returns(way, AWAY_M)
+        return Mapped(solution, len(tiled.tiles), returns)
+
+    def _gathered(self, tiled: TiledDrive, parts: list[FloatArray]) -> FloatArray:
+        """Return what tiles say of their readings in the order of the drive's."""
+        whole = np.zeros((len(self._drive.readings), *parts[0].shape[1:]))
+        for tile, part in zip(tiled.tiles, parts, strict=True):
+            whole[tile.rows] = part
+        return whole
+
+    def _squared(
+        self, tiled: TiledDrive, ways: Ways, sights: list[Sight], noise: FloatArray
+    ) -> FloatArray:
+        """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
+        pairs = zip(sights, way_shares(tiled, ways, sights), strict=True)
+        parts = [sight.squared(sight.whitening(noise, more=share)) for sight, share in pairs]
+        return self._gathered(tiled, parts)
+
+    def _own_squared(
+        self, tiled: TiledDrive, sights: list[Sight], whitenings: list[FloatArray]
+    ) -> FloatArray:
+        """Return squared lengths of residuals as these make them white, without the ways, (N,)."""
+        pairs = zip(sights, whitenings, strict=True)
+        return self._gathered(tiled, [sight.squared(white) for sight, white in pairs])
+
+    def _sight(self, solved: Solved, ways: Ways, tiled: TiledDrive, sights: list[Sight]) -> Sight:
+        """Return what the tiles say, with places and axes of the map."""
+        where = place(ways.readings, dict(enumerate(solved.poses)), solved.sensors)
+        anchors = [solved.poses[tile.anchor].rotation().matrix() for tile in tiled.tiles]
+        pairs = zip(sights, anchors, strict=True)
+        variance = self._gathered(tiled, [each.map_variance @ (R**2).T for each, R in pairs])
+        residual = self._gathered(tiled, [sight.residual for sight in sights])
+        by_lidar = self._gathered(tiled, [sight.by_lidar for sight in sights])
+        return Sight(where, np.ones(len(residual), bool), variance, residual, by_lidar)
+
+
+def way_shares(tiled: TiledDrive, ways: Ways, sights: list[Sight]) -> list[FloatArray]:
+    """Return of each tile what errors of the ways contribute to its residuals, (n, 3, 3)."""
+    pairs = zip(tiled.tiles, sights, strict=True)
+    return [ways.share(tile.rows, sight.by_lidar) for tile, sight in pairs]

@@ -1,0 +1,212 @@
+"""The last stretch of a drive through an unknown field, solved again as it grows."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import M, X
+from l2m_gtsam.data import IntArray
+from l2m_gtsam.slam.covariances import joint_covariance
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.factors import step_factor
+from l2m_gtsam.slam.map_prediction import Place, place
+from l2m_gtsam.slam.online.belief import POSE, Belief
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.solving import descended, least_fill
+from l2m_gtsam.slam.unknown_field.field_memory import ExploredTile, FieldMemory, tile_of
+from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
+from l2m_gtsam.slam.unknown_field.gaussian_prior import prior_factors
+from l2m_gtsam.slam.unknown_field.joint_gaussian import JointGaussian, part_of
+from l2m_gtsam.slam.unknown_field.tile_readings import TileReadings
+from l2m_gtsam.slam.unknown_field.tiled import LaidTile
+from l2m_gtsam.slam.unknown_field.tiles import WaveTile, level_axes
+
+# How many times their noise new readings may be off, stage by stage: where the vehicle was just
+# before, and where it comes to a tile of an earlier section, as far off as odometry has drifted.
+ONWARDS = (4.0, 1.0)
+AGAIN = (16.0, 4.0, 1.0)
+CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
+SOFT = 1.0  # how sharply good ones among them are told from wrong ones, mu of ``solve.robust``
+
+
+class OpenSection:
+    """A stretch of a drive, and what was known where it began.
+
+    Parameters
+    ----------
+    drive, prior, options
+        The drive, the prior of its field, how to solve.
+    memory
+        What is known of ``X(first)`` and all that is remembered.
+    first
+        Its first key pose. Readings on it count if it is that of the drive; otherwise they have
+        counted already, as the last of another section.
+    """
+
+    def __init__(
+        self, drive: Drive, prior: FieldPrior, options: SlamOptions, memory: FieldMemory, first: int
+    ) -> None:
+        self._drive, self._field_prior, self._options = drive, prior, options
+        self._memory, self._tiles = memory, list(memory.tiles)
+        self._first, self._last = first, first if first else -1
+        self._begin = int(np.searchsorted(drive.readings.key_pose, self._last + 1))
+        self._shared = [X(first)]  # with the memory
+        self._values = part_of(memory.known.values, [X(first)])
+        self._tile_of: dict[int, int] = {}
+        self._counted: list[TileReadings] = []
+        self._prior: gtsam.NonlinearFactorGraph | None = None
+        self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
+
+    def extend(self, last: int) -> Belief:
+        """Take the key poses up to one, and return what is known of it then."""
+        new = np.arange(self._last + 1, last + 1)
+        self._predict(new, last)
+        entered = [self._enter(k) for k in new.tolist()]
+        stages = AGAIN if any(entered) else ONWARDS
+        for scale in stages[:-1]:
+            self._solve(self._factors(int(new[0]), scale), 1)
+        graph = self._factors(int(new[0]), stages[-1])
+        for each in self._counted:
+            tile = self._tiles[each.laid.number]
+            for factor in each.doubts(self._drive, tile):
+                graph.add(factor)
+        self._solve(graph, self._options.max_iterations)
+        return self._belief()
+
+    def closed(self) -> FieldMemory:
+        """Return what is known at its end."""
+        known = self._memory.known.told(self._known(self._kept()))
+        tiles = list(self._tiles)
+        for each in self._counted:
+            tile = tiles[each.laid.number]
+            tiles[tile.number] = replace(tile, taught=tile.taught + each.information())
+        let_go = {X(self._first)} - {X(tile.anchor) for tile in tiles} - {X(self._last)}
+        kept = [key for key in known.sizes if key not in let_go]
+        return FieldMemory(known.marginal(kept), tuple(tiles))
+
+    def next(self, memory: FieldMemory, first: int) -> "OpenSection":
+        """Return a section that begins with a key pose and what is known there."""
+        return OpenSection(self._drive, self._field_prior, self._options, memory, first)
+
+    def pose(self, number: int) -> gtsam.Pose3:
+        """Return a key pose of the section, or one that is remembered, as its values are now."""
+        known = self._memory.known.values
+        return (self._values if self._values.exists(X(number)) else known).atPose3(X(number))
+
+    def tile(self, number: int) -> ExploredTile:
+        """Return the tile that a key pose of the section lies in."""
+        return self._tiles[self._tile_of[number]]
+
+    def _predict(self, new: IntArray, last: int) -> None:
+        """Put new key poses where odometry leads."""
+        for k in new.tolist():
+            if k > self._first:
+                there = self.pose(k - 1).compose(self._drive.step(k - 1))
+                self._values.insert(X(k), there)
+        self._last = last
+
+    def _rows(self) -> IntArray:
+        """Return the readings of the section so far."""
+        end = np.searchsorted(self._drive.readings.key_pose, self._last + 1)
+        return np.arange(self._begin, end)
+
+    def _enter(self, k: int) -> bool:
+        """Lay a key pose on its tile; return whether that is new here, and known from earlier."""
+        anchors = [self.pose(tile.anchor) for tile in self._tiles]
+        number = tile_of(self.pose(k), anchors, self._field_prior.options.core)
+        self._tile_of[k] = number
+        if number == len(self._tiles):
+            field = self._waves(k)
+            self._tiles.append(ExploredTile.new(number, k, field))
+            self._values.insert(M(number), np.zeros(len(field)))
+            return False
+        if self._values.exists(M(number)):
+            return False
+        for key in (X(self._tiles[number].anchor), M(number)):
+            if not self._values.exists(key):
+                self._values.insert(part_of(self._memory.known.values, [key]))
+            self._shared.append(key)
+        self._shared, self._prior = list(dict.fromkeys(self._shared)), None
+        return True
+
+    def _waves(self, anchor: int) -> WaveTile:
+        """Return the waves of a tile about a key pose; sensors and readings tell their heights."""
+        R, rows = self.pose(anchor).rotation().matrix(), self._rows()
+        level, options = R.T @ level_axes(R[None])[0], self._field_prior.options
+        x = self._drive.sensors.t
+        if len(rows):
+            x = np.vstack([x, self._place(rows, anchor).x])
+        near = np.abs(x @ level[:, :2]).max(axis=1) <= options.edge / 2
+        return WaveTile.about(self._field_prior, level, x[near] if near.any() else x)
+
+    def _place(self, rows: IntArray, anchor: int) -> Place:
+        readings, origin = self._drive.readings[rows], self.pose(anchor)
+        own = {int(k): origin.between(self.pose(int(k))) for k in np.unique(readings.key_pose)}
+        return place(readings, own, self._drive.sensors)
+
+    def _factors(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
+        """Return odometry, the prior of new tiles, and readings, those from ``new`` on scaled."""
+        graph, old = gtsam.NonlinearFactorGraph(), len(self._memory.tiles)
+        for k in range(self._first, self._last):
+            graph.add(step_factor(self._drive, k))
+        for tile in self._tiles[old:]:
+            unit = gtsam.noiseModel.Unit.Create(len(tile.field))
+            graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
+        rows = self._rows()
+        owner = np.array([self._tile_of[int(k)] for k in self._drive.readings.key_pose[rows]])
+        self._counted = [
+            self._weighed(self._tiles[number], rows[owner == number], new, scale)
+            for number in np.unique(owner).tolist()
+        ]
+        for each in self._counted:
+            for factor in each.factors(self._drive):
+                graph.add(factor)
+        return graph
+
+    def _weighed(self, tile: ExploredTile, rows: IntArray, new: int, scale: float) -> TileReadings:
+        """Return the readings of a tile with their weights, by what it says of them by now."""
+        sensors, readings = self._drive.sensors, self._drive.readings
+        laid = LaidTile(tile.number, tile.anchor, rows, tile.field, self._place(rows, tile.anchor))
+        recent = readings.key_pose[rows] >= new
+        if not self._values.atVector(M(tile.number)).any():
+            likely = laid.likely_weights(sensors, scale * sensors.noise)
+            self._values.update(M(tile.number), likely)
+        sight = laid.sight(self._values.atVector(M(tile.number)), sensors)
+        noise = sensors.noise[readings.sensor[rows]] * np.where(recent, scale, 1.0)
+        mu = np.where(recent, SOFT, np.inf)
+        return TileReadings.weighed(laid, sight, noise, mu, self._options.robust)
+
+    def _solve(self, graph: gtsam.NonlinearFactorGraph, most: int) -> None:
+        """Solve for all variables of the section, in so many steps at most."""
+        if self._prior is None:
+            self._prior = gtsam.NonlinearFactorGraph()
+            for factor in prior_factors(self._memory.known.marginal(self._shared)):
+                self._prior.add(factor)
+        graph.push_back(self._prior)
+        self._graph = graph
+        found = descended(graph, self._values, least_fill(graph), most, CLOSE)
+        self._values = found.values
+
+    def _kept(self) -> list[int]:
+        """Return the variables that outlive the section or began it, the last pose at the end."""
+        tiles = [self._tiles[number] for number in sorted(set(self._tile_of.values()))]
+        last = X(self._last)
+        own = dict.fromkeys([X(self._first), *(X(tile.anchor) for tile in tiles)])
+        own.pop(last, None)
+        return [*own, *(M(tile.number) for tile in tiles), last]
+
+    def _size(self, key: int) -> int:
+        if gtsam.symbolChr(key) == ord("M"):
+            return len(self._tiles[gtsam.symbolIndex(key)].field)
+        return POSE
+
+    def _known(self, keys: list[int]) -> JointGaussian:
+        """Return what is known of some variables now."""
+        sizes = {key: self._size(key) for key in keys}
+        covariance = joint_covariance(self._graph.linearize(self._values), keys)
+        return JointGaussian(part_of(self._values, keys), sizes, covariance)
+
+    def _belief(self) -> Belief:
+        known = self._known([X(self._last)])
+        return Belief(self.pose(self._last), self._drive.sensors, known.covariance)

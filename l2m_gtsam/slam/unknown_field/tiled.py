@@ -1,0 +1,207 @@
+"""A drive whose readings are laid out on tiles of an unknown field, at an estimate of its poses."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import (
+    Calibrations,
+    CarriedReadings,
+    FieldDoubt,
+    M,
+    TileBatch,
+    doubt_factor,
+    tile_factor,
+)
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.localised import NOTHING
+from l2m_gtsam.slam.map_prediction import Place, Sight, look, place
+from l2m_gtsam.slam.relative_motion import Ways
+from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
+from l2m_gtsam.slam.unknown_field.tiles import AXES, Anchoring, WaveTile, anchored, level_axes
+
+
+@dataclass(frozen=True)
+class LaidTile:
+    """A tile and the readings in it.
+
+    Attributes
+    ----------
+    number, anchor
+        Its own, and of the key pose that it is fixed to.
+    rows
+        Readings of the drive that lie in it, shape (n,).
+    field
+        What its weights mean.
+    place
+        Where the readings are in the anchor's frame.
+    """
+
+    number: int
+    anchor: int
+    rows: IntArray
+    field: WaveTile
+    place: Place
+
+    def likely_weights(self, sensors: KnownSensors, noise: FloatArray) -> FloatArray:
+        """Return the weights that the readings make most likely where they are taken to be."""
+        own = noise[self.place.readings.sensor, None] ** 2
+        variance = own + self.field.unresolved(self.place.x)
+        b = self.place.field(sensors)
+        return self.field.likely_weights(self.place.x, b, variance)
+
+    def doubt(self, rows: IntArray, noise: FloatArray) -> FieldDoubt:
+        """Return what these of the tile's readings, which teach it, count for; see there."""
+        own = np.searchsorted(self.rows, rows)
+        x = self.place.x[own]
+        variance = noise[self.place.readings.sensor[own], None] ** 2 + self.field.unresolved(x)
+        return self.field.doubt(x, variance)
+
+    def sight(self, weights: FloatArray, sensors: KnownSensors) -> Sight:
+        """Return what the tile says of its readings, in the anchor's frame."""
+        return look(_TileMap(self.field, weights), self.place, sensors)
+
+
+class _TileMap:
+    """A tile with weights that are given, as a map in the anchor's frame."""
+
+    def __init__(self, tile: WaveTile, weights: FloatArray) -> None:
+        self._tile, self._weights = tile, weights
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        return self._tile.field_and_gradient(points, self._weights)
+
+    def query(self, points: FloatArray) -> FieldSample:
+        field, gradient = self.field_and_gradient(points)
+        inside = np.ones(len(points), bool)
+        return FieldSample(field, gradient, self._tile.unresolved(points), inside)
+
+
+@dataclass(frozen=True)
+class TiledDrive:
+    """All tiles of a drive.
+
+    Attributes
+    ----------
+    anchoring
+        Which key pose lies in which.
+    tiles
+        Those with readings.
+    """
+
+    anchoring: Anchoring
+    tiles: tuple[LaidTile, ...]
+
+    @classmethod
+    def lay(
+        cls, ways: Ways, poses: list[gtsam.Pose3], sensors: KnownSensors, prior: FieldPrior
+    ) -> "TiledDrive":
+        """Lay a drive out on tiles, with ways, key poses and sensors taken for these."""
+        R = np.stack([pose.rotation().matrix() for pose in poses])
+        p = np.stack([pose.translation() for pose in poses])
+        anchoring = anchored(R, p, prior.options.core)
+        axes = level_axes(R)
+        owner = anchoring.tile[ways.readings.key_pose]
+        tiles = []
+        for number, anchor in enumerate(anchoring.anchor.tolist()):
+            rows = np.flatnonzero(owner == number)
+            if len(rows):
+                where = _relative_place(ways.readings[rows], poses, anchor, sensors)
+                field = WaveTile.about(prior, R[anchor].T @ axes[anchor], where.x)
+                tiles.append(LaidTile(number, anchor, rows, field, where))
+        return cls(anchoring, tuple(tiles))
+
+    def moved(self, ways: Ways, poses: list[gtsam.Pose3], sensors: KnownSensors) -> "TiledDrive":
+        """Return the same tiles with their readings where these poses and sensors put them."""
+        own = ways.readings
+        tiles = (
+            replace(tile, place=_relative_place(own[tile.rows], poses, tile.anchor, sensors))
+            for tile in self.tiles
+        )
+        return TiledDrive(self.anchoring, tuple(tiles))
+
+    def weights(self, sensors: KnownSensors, noise: FloatArray) -> gtsam.Values:
+        """Return the most likely weights of all tiles."""
+        values = gtsam.Values()
+        for tile in self.tiles:
+            values.insert(M(tile.number), tile.likely_weights(sensors, noise))
+        return values
+
+    def sights(self, values: gtsam.Values, sensors: KnownSensors) -> list[Sight]:
+        """Return what each tile says of its readings."""
+        return [tile.sight(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
+
+    def doubts(
+        self, noise: FloatArray, weights: FloatArray, squared: FloatArray
+    ) -> tuple[FieldDoubt, ...]:
+        """Return what readings that count teach each tile, with noise as large as they show.
+
+        Parameters
+        ----------
+        noise
+            Standard deviation of each sensor's noise in uT, shape (S,).
+        weights
+            How far each of all N readings counts, shape (N,).
+        squared
+            Squared lengths of their residuals, whitened by noise and what waves left out hold,
+            shape (N,).
+        """
+        chosen = np.flatnonzero(weights > NOTHING)
+        whole = [tile.doubt(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
+        freedom = AXES * weights.sum() - sum(each.parameters for each in whole)
+        share = weights @ squared / freedom if freedom > 0 else 1.0
+        # More than the noise is what poses that are still off leave.
+        return tuple(each.share(min(share, 1.0)) for each in whole)
+
+    def graph(
+        self,
+        ways: Ways,
+        doubts: tuple[FieldDoubt, ...],
+        whitening: FloatArray,
+        by_lidar: FloatArray,
+        chosen: IntArray,
+        fixed: Calibrations | None,
+    ) -> gtsam.NonlinearFactorGraph:
+        """Return the factors of readings, and the prior of the tiles' weights.
+
+        Parameters
+        ----------
+        ways
+            Of the drive that was laid out, when it was.
+        doubts
+            What readings that count teach each tile.
+        whitening
+            Of the residuals of all its N readings but for errors of the ways, 1/uT, (N, 3, 3).
+        by_lidar
+            Their derivatives by a right perturbation of the lidar's pose, shape (N, 3, 6).
+        chosen
+            Readings that count.
+        fixed
+            Calibrations that are no variables; without them all are.
+        """
+        graph = gtsam.NonlinearFactorGraph()
+        for tile, doubt in zip(self.tiles, doubts, strict=True):
+            rows = np.intersect1d(tile.rows, chosen)
+            unit = gtsam.noiseModel.Unit.Create(len(tile.field))
+            graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
+            if len(rows):
+                readings = ways.readings[rows]
+                batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
+                for k in batch.key_poses:
+                    own = rows[batch.rows_of(k)]
+                    white = ways.whitening(own, whitening[own], by_lidar[own])
+                    graph.add(tile_factor(batch, k, white, ways.step_error(own, by_lidar[own])))
+                    factor = doubt_factor(batch, k, doubt[batch.rows_of(k)])
+                    if factor is not None:
+                        graph.add(factor)
+        return graph
+
+
+def _relative_place(
+    readings: CarriedReadings, poses: list[gtsam.Pose3], anchor: int, sensors: KnownSensors
+) -> Place:
+    origin = poses[anchor]
+    own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
+    return place(readings, own, sensors)

@@ -1,0 +1,235 @@
+"""Tiles of an unknown field, each fixed to a key pose of the drive."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky
+from scipy.spatial.transform import Rotation
+
+from l2m_factors import FieldDoubt
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.frame import TileFrame
+from l2m_gtsam.maps.harmonic.furnish import UNIFORM_SIGMA
+from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
+from l2m_gtsam.maps.harmonic.uniform import UniformField
+from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
+
+# Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
+# with more of it passed for a lower one, by 0.1-0.4 m with sigmas of 0.04 m. The pull falls with
+# the square of this; what is lost is small, for readings are dense along the way.
+WIDER = 10.0
+REWEIGHTINGS = 15
+AXES = 3
+SIDE_M = 1e-3  # of a finite difference
+LARGE = 2.0  # length of a whitened residual beyond which a reading counts for less
+
+
+@dataclass(frozen=True)
+class WaveTile:
+    """Uniform field, floor and ceiling waves of a level box about an anchor, in its frame.
+
+    Attributes
+    ----------
+    basis
+        Waves.
+    scale
+        Prior standard deviation of each one's weight, shape (m,).
+    prior
+        They follow from.
+    """
+
+    basis: Basis
+    scale: FloatArray
+    prior: FieldPrior
+
+    @classmethod
+    def about(cls, prior: FieldPrior, R_anchor_level: FloatArray, points: FloatArray) -> "WaveTile":
+        """Return the tile of some readings.
+
+        Parameters
+        ----------
+        prior
+            Of the field.
+        R_anchor_level
+            Axes of the box in the anchor's frame, shape (3, 3); the last points up.
+        points
+            Where the readings are in the anchor's frame in metres, shape (N, 3).
+        """
+        edge, z = prior.options.edge, points @ R_anchor_level[:, 2]
+        low, high = float(z.min()), float(z.max())
+        size, corner = np.array([edge, edge]), np.array([-edge / 2, -edge / 2, low])
+        frame = TileFrame(R_anchor_level, R_anchor_level @ corner, size, high - low)
+        floor = modes_up_to(FLOOR, size, 0.0, prior.resolution.floor)
+        ceiling = modes_up_to(CEILING, size, frame.height, prior.resolution.ceiling)
+        waves = [side for side in (floor, ceiling) if len(side)]  # a weak side has none
+        basis = Basis(frame, (UniformField(UNIFORM_SIGMA), *waves))
+        learnt = np.exp(0.5 * basis.prior(prior.hyperparameters).log_variance)
+        wider = np.append(np.ones(3), np.full(len(basis) - 3, WIDER))  # the uniform field is wide
+        return cls(basis, wider * learnt, prior)
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    def features(self, points: FloatArray, /) -> FloatArray:
+        """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
+        return self.basis.features(points) * self.scale
+
+    def field_and_gradient(
+        self, points: FloatArray, weights: FloatArray, /
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
+        return self.basis.field_and_gradient(points, self.scale * weights)
+
+    def unresolved(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis that waves left out hold, uT^2, shape (N, 3)."""
+        h, kept = self.prior.hyperparameters, self.prior.resolution
+        z = self.basis.frame.localise(points)[:, 2]
+        over = self.basis.frame.height - z
+        # Nearer to the sources than half their depth the tile says nothing any more.
+        z, over = np.maximum(z, -0.5 * h.floor_depth), np.maximum(over, -0.5 * h.ceiling_depth)
+        vertical = left_out(h.floor_scale, h.floor_depth, kept.floor, z)
+        vertical = vertical + left_out(h.ceiling_scale, h.ceiling_depth, kept.ceiling, over)
+        return np.asarray(vertical[:, None] * np.array([0.5, 0.5, 1.0]))
+
+    def likely_weights(
+        self, points: FloatArray, field: FloatArray, variance: FloatArray
+    ) -> FloatArray:
+        """Return weights that readings make likely, wrong ones among them, shape (m,).
+
+        By reweighted least squares, each reading as in least absolute deviations beyond its noise.
+
+        Parameters
+        ----------
+        points, field
+            Readings in the anchor's frame, metres and uT, shapes (N, 3).
+        variance
+            Of each one's noise per axis in uT^2, shape (N, 3).
+        """
+        root = 1 / np.sqrt(variance)
+        F = (self.features(points) * root[:, :, None]).reshape(-1, len(self))
+        y, trust = (field * root).ravel(), np.ones(len(points))
+        weights: FloatArray = np.zeros(len(self))
+        for _ in range(REWEIGHTINGS):
+            by = np.repeat(trust, AXES)
+            information = F.T @ (F * by[:, None]) + np.eye(len(self))
+            weights = np.asarray(np.linalg.solve(information, F.T @ (by * y)))
+            off = np.linalg.norm((F @ weights - y).reshape(-1, AXES), axis=1)
+            trust = 1 / np.maximum(off / LARGE, 1.0)
+        return weights
+
+    def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
+        """Return what readings say of the weights, shape (m, m); the parameters are ``doubt``'s."""
+        F = (self.features(points) / np.sqrt(variance)[:, :, None]).reshape(-1, len(self))
+        return np.asarray(F.T @ F)
+
+    def doubt(
+        self, points: FloatArray, variance: FloatArray, taught: FloatArray | None = None
+    ) -> FieldDoubt:
+        """Return what readings contribute to the number of parameters that they determine.
+
+        Parameters
+        ----------
+        points
+            In the anchor's frame in metres, shape (N, 3).
+        variance
+            Of each reading's noise per axis in uT^2, shape (N, 3).
+        taught
+            Information of others about the weights, shape (m, m).
+        """
+        known = np.eye(len(self)) + self.information(points, variance)
+        lower = cholesky(known if taught is None else known + taught, lower=True)
+        spread = cho_solve((lower, True), np.eye(len(self)))
+        root = 1 / np.sqrt(variance)[:, :, None]
+        share = root * (self.features(points) @ spread)
+        value = np.sqrt(np.einsum("nam,nam->n", share, share))
+        by_features = root * (share @ spread) / value[:, None, None]
+        steps = SIDE_M * np.eye(AXES)
+        slopes = [
+            np.einsum("nam,nam->n", by_features, self.features(points + step))
+            for step in (*steps, *-steps)
+        ]
+        slope = (np.stack(slopes[:AXES], axis=1) - np.stack(slopes[AXES:], axis=1)) / (2 * SIDE_M)
+        return FieldDoubt(points, value, slope)
+
+
+@dataclass(frozen=True)
+class Anchoring:
+    """Which tile each key pose lies in.
+
+    Attributes
+    ----------
+    anchor
+        The key pose that each of B tiles is fixed to, shape (B,).
+    tile
+        Of each of K key poses, shape (K,).
+    """
+
+    anchor: IntArray
+    tile: IntArray
+
+    def __len__(self) -> int:
+        return len(self.anchor)
+
+    def returns(self, way: FloatArray, least_m: float) -> IntArray:
+        """Return the key poses of visits to tiles that were left at least so far ago on the way.
+
+        Parameters
+        ----------
+        way
+            From the start to each key pose in metres, shape (K,).
+        least_m
+                What counts as having been away.
+        """
+        left_at = np.full(len(self), np.nan)
+        found, returned = [], False
+        for k, (before, tile) in enumerate(zip([-1, *self.tile[:-1]], self.tile, strict=True)):
+            if tile != before:
+                left_at[before] = way[k - 1]
+                returned = bool(way[k] - left_at[tile] >= least_m)
+            if returned:
+                found.append(k)
+        return np.array(found, dtype=np.int64)
+
+
+def anchored(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
+    """Lay tiles where the vehicle goes: a new one wherever it is in the core of none.
+
+    Parameters
+    ----------
+    R, p
+        Key poses in the map, shapes (K, 3, 3) and (K, 3), metres.
+    core
+        Of a tile in metres.
+    """
+    anchors, tile, axes = [0], np.zeros(len(p), dtype=np.int64), level_axes(R)
+    for k in range(1, len(p)):
+        at = np.array(anchors)
+        tile[k] = tile_about(p[k], axes[at], p[at], core)
+        if tile[k] == len(anchors):
+            anchors.append(k)
+    return Anchoring(np.array(anchors), tile)
+
+
+def tile_about(p: FloatArray, axes: FloatArray, anchors: FloatArray, core: float) -> int:
+    """Return the tile of B whose anchor is nearest; B where a place is in the core of none.
+
+    Parameters
+    ----------
+    p
+        The place in the map in metres, shape (3,).
+    axes, anchors
+        Of the tiles: level axes, shape (B, 3, 3), and where they are fixed, shape (B, 3), metres.
+    core
+        Of a tile in metres.
+    """
+    away = np.einsum("bji,bj->bi", axes, p - anchors)[:, :2]
+    distance = np.abs(away).max(axis=1)
+    nearest = int(distance.argmin())
+    return nearest if distance[nearest] <= core / 2 else len(anchors)
+
+
+def level_axes(R: FloatArray) -> FloatArray:
+    """Return axes in the map that turn about its vertical with the vehicle, (K, 3, 3)."""
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    return np.asarray(Rotation.from_euler("z", yaw[:, None]).as_matrix())

@@ -1,0 +1,119 @@
+"""The figures of one sensor that was tested on another drive than its calibration's."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2, f
+
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import IntArray
+from l2m_gtsam.qa.metrics.changes import change_of
+from l2m_gtsam.qa.metrics.curves import curves, series
+from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
+from l2m_gtsam.qa.metrics.field_error import field_error, refitted
+from l2m_gtsam.qa.metrics.fit import fit_figures
+from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
+from l2m_gtsam.records.validation import Change, ChiSquare, Noticeable, ValidatedSensor
+from l2m_gtsam.validation.alterations import COLUMNS, PARAMETERS, columns_of, noticeable, width
+from l2m_gtsam.validation.recheck import Recheck, SensorDrive
+
+BAND = np.array([0.025, 0.975])
+NOTICED_SIGMAS = 5.0  # a change of so many is missed once in a hundred times, or less often
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a drive is kept: since when, shape (1,), and in how many readings at most."""
+
+    start_ns: IntArray
+    most: int
+
+
+def offset_s(sensor: SensorCalibration) -> float:
+    """Return the time offset of a sensor in seconds; zero if its file does not speak of it."""
+    return 0.0 if sensor.time_offset is None else sensor.time_offset.seconds
+
+
+def sensor_figures(
+    drive: SensorDrive,
+    field_map: QueryableMap,
+    sensor: SensorCalibration,
+    found: Recheck,
+    course: Course,
+) -> ValidatedSensor:
+    """Return the figures of one sensor.
+
+    Parameters
+    ----------
+    drive
+        Its readings.
+    field_map
+        The map.
+    sensor
+        Its calibration.
+    found
+        What the drive says of that.
+    course
+        How much of the drive is kept.
+    """
+    readings = drive.at(offset_s(sensor))
+    place = readings.R_map_lidar @ sensor.t_lidar_mag + readings.p_map_lidar
+    within = field_map.query(place).inside
+    evidence = sensor_evidence(
+        DriveEvidence(readings, within, within & ~found.used), sensor, field_map
+    )
+    used, fields = evidence.used, curves(evidence, sensor)
+    fit = fit_figures(evidence, sensor.noise)
+    told, freedom = found.told, found.freedom
+    return ValidatedSensor(
+        sensor=sensor.sensor,
+        ending="" if sensor.status is SensorStatus.SOLVED else sensor.message,
+        readings=int(used.sum()),
+        rejected=int(np.sum(~used)),
+        outside=int(np.sum(~within)),
+        before=field_error(fields.before[used], fields.map[used]),
+        after=field_error(fields.after[used], fields.map[used]),
+        expected=float(np.sqrt(fit.sensor_noise**2 + fit.map_noise**2 + fit.pose_noise**2)),
+        refitted=refitted(evidence.b_lidar[used], evidence.readings.field[used]),
+        uniform=fit.without_map,
+        nis=_of_readings(told.squared, freedom[0], sensor),
+        parameters=_chi_square(told.explained(range(PARAMETERS)), freedom[1]),
+        changes=_changes(found),
+        noticeable=tuple(
+            Noticeable(part, noticeable(told, part, NOTICED_SIGMAS)) for part in COLUMNS
+        ),
+        series=series(fields, evidence, course.start_ns, course.most),
+    )
+
+
+def _of_readings(value: float, freedom: int, sensor: SensorCalibration) -> ChiSquare:
+    """Return the sum over readings; the noise that it counts in was itself estimated from others.
+
+    Then it is Fisher's distribution that says what chance does, not chi-square's.
+    """
+    if sensor.residuals is None:
+        return _chi_square(value, freedom)
+    freedom, others = max(freedom, 1), max(3 * sensor.residuals.readings - PARAMETERS, 1)
+    low, high = freedom * f.ppf(BAND, freedom, others)
+    return ChiSquare(value, freedom, float(low), float(high))
+
+
+def _chi_square(value: float, freedom: int) -> ChiSquare:
+    low, high = chi2.ppf(BAND, max(freedom, 1))
+    return ChiSquare(value, freedom, float(low), float(high))
+
+
+def _changes(found: Recheck) -> tuple[Change, ...]:
+    """Return the changes with what chance makes of each beside the others."""
+    changes = []
+    for part in found.parts:
+        others = [each for each in found.parts if each is not part]
+        gain = found.told.explained(columns_of(found.parts)) - found.told.explained(
+            columns_of(others)
+        )
+        first = len(columns_of(found.parts[: found.parts.index(part)]))
+        at = slice(first, first + width(part))
+        sigma = np.sqrt(np.diag(found.covariance)[at])
+        chance = float(chi2.sf(gain, width(part)))
+        changes.append(change_of(part, found.change[at], sigma, chance))
+    return tuple(changes)

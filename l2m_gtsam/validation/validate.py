@@ -1,0 +1,229 @@
+"""Recording + map + calibration -> how far the calibration still holds. Pure: no files."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.prepare import prepare
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
+from l2m_gtsam.errors import CalibrationError, ConfigError
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
+from l2m_gtsam.qa.metrics.coverage import drive_metrics
+from l2m_gtsam.recording.sync import stuck_sensors
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.validation import DriveValidation, NotValidated, ValidatedSensor
+from l2m_gtsam.solve.correction import without_moving
+from l2m_gtsam.validation.figures import Course, offset_s, sensor_figures
+from l2m_gtsam.validation.innovation import KnownCalibration
+from l2m_gtsam.validation.recheck import SensorDrive, recheck
+from l2m_gtsam.validation.remarks import is_sound, missing_sensors, nothing_shared, remarks
+
+
+@one_blas_thread()
+def validate(
+    recording: Recording,
+    field_map: QueryableMap,
+    calibration: CalibrationResult,
+    options: CalibrationOptions,
+    chance: float,
+    map_source: SourceFile | None = None,
+    progress: Progress | None = None,
+) -> DriveValidation:
+    """Compare the readings of a drive with what map and calibration predict.
+
+    Parameters
+    ----------
+    recording
+        A drive through the mapped place.
+    field_map
+        The magnetic map, in the frame of the recording's poses.
+    calibration
+        To be tested.
+    options
+        Synchronisation, the loss, and how wrong poses are.
+    chance
+        Share of unchanged sensors of which it may be said that something changed.
+    map_source
+        Where the map came from.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    CalibrationError
+        Calibration and recording have no sensor in common.
+    ConfigError
+        Readings follow a number that was not recorded.
+    SyncError
+        Readings and poses do not overlap.
+    """
+    tell = progress or (lambda stage, fraction: None)
+    missing = missing_sensors(recording, calibration)
+    here = {each.sensor for each in recording.series}
+    known = [each for each in calibration.sensors if each.sensor in here and is_sound(each)]
+    if not known:
+        raise CalibrationError(nothing_shared(recording, calibration, missing))
+    test = _test_of(recording, field_map, known, options, chance)
+    found: list[ValidatedSensor | NotValidated] = []
+    for index, sensor in enumerate(known):
+        tell("validating", index / len(known))
+        found.append(_tested(test, sensor))
+    tell("validating", 1.0)
+    places = np.concatenate([_places(test.readings, each) for each in known])
+    doubts, notes = remarks(recording, field_map, calibration, map_source)
+    return DriveValidation(
+        sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
+        missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
+        drive=drive_metrics(recording),
+        picture=map_picture(field_map, places),
+        doubts=doubts,
+        notes=notes,
+    )
+
+
+@dataclass(frozen=True)
+class _Test:
+    """What all sensors are tested on.
+
+    Attributes
+    ----------
+    recording, readings
+        The drive, and what its sensors read with the poses.
+    field_map
+        The map, ready to be asked often.
+    stuck
+        Names of sensors that report one value.
+    options, chance
+        As of `validate`.
+    course
+        How much of the drive is kept.
+    """
+
+    recording: Recording
+    readings: Readings
+    field_map: QueryableMap
+    stuck: frozenset[str]
+    options: CalibrationOptions
+    chance: float
+    course: Course
+
+
+def _test_of(
+    recording: Recording,
+    field_map: QueryableMap,
+    known: Sequence[SensorCalibration],
+    options: CalibrationOptions,
+    chance: float,
+) -> _Test:
+    """Return what sensors that are known are tested on; others take no part."""
+    shared = {each.sensor for each in known}
+    kept = tuple(each for each in recording.series if each.sensor in shared)
+    readings = prepare(replace(recording, series=kept), options).readings
+    return _Test(
+        recording=recording,
+        readings=readings,
+        field_map=field_map.compile() if isinstance(field_map, Compilable) else field_map,
+        stuck=frozenset(readings.sensors[k] for k in stuck_sensors(readings)),
+        options=options,
+        chance=chance,
+        course=Course(
+            readings.stamp_ns.min(keepdims=True), int(np.clip(DRAWN // len(known), FEWEST, MOST))
+        ),
+    )
+
+
+def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:
+    """Return what the drive says of one sensor, or why it says nothing."""
+    drive, options = drive_of(test.readings, test.recording, sensor), test.options
+    if reason := _why_silent(drive, test.field_map, sensor, options, sensor.sensor in test.stuck):
+        return NotValidated(sensor.sensor, reason, faulty=True)
+    known, covariance = _known(test.recording, sensor), joint_covariance(sensor)
+    found = recheck(drive, test.field_map, known, covariance, options.solve, test.chance)
+    return sensor_figures(drive, test.field_map, sensor, found, test.course)
+
+
+def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration) -> SensorDrive:
+    """Return what one sensor read, without what follows recorded numbers.
+
+    Raises
+    ------
+    ConfigError
+        Such a number was not recorded.
+    """
+    index = readings.sensors.index(sensor.sensor)
+    own = readings[np.arange(len(readings))[readings.rows_of(index)]]
+    own = replace(own, sensors=(sensor.sensor,), sensor=np.zeros(len(own), dtype=np.int64))
+    names = [each.name for each in recording.scalars]
+    if unknown := [each.name for each in sensor.moving if each.name not in names]:
+        raise ConfigError(
+            f"a part of the readings of {sensor.sensor} follows {unknown[0]!r}, which "
+            "`bag.regressors` does not name; say in --config where it is recorded"
+        )
+    if own.regressors is not None and sensor.moving:
+        h = _of_numbers(names, {each.name: each.h for each in sensor.moving})
+        own = replace(own, field=without_moving(own.field, own.regressors, h))
+    return SensorDrive(own, recording.trajectory)
+
+
+def joint_covariance(sensor: SensorCalibration) -> FloatArray:
+    """Return the covariance of (t, C row by row, H, time offset), shape (16, 16).
+
+    The variance of a time offset that was held, or that the file does not speak of, is infinite:
+    nothing is known of that clock.
+    """
+    joint = np.zeros((16, 16))
+    joint[:15, :15] = sensor.covariance
+    joint[15, 15] = np.inf
+    offset = sensor.time_offset
+    if offset is not None and offset.estimated:
+        joint[15, :15] = joint[:15, 15] = offset.cross_covariance
+        joint[15, 15] = offset.sigma**2
+    return joint
+
+
+def _known(recording: Recording, sensor: SensorCalibration) -> KnownCalibration:
+    offset = np.array([offset_s(sensor)])
+    vector = [sensor.t_lidar_mag, sensor.distortion.vector(), offset]
+    names = [each.name for each in recording.scalars]
+    sigma = _of_numbers(names, {each.name: each.sigma for each in sensor.moving})
+    return KnownCalibration(np.concatenate(vector), sensor.noise, sigma)
+
+
+def _of_numbers(names: Sequence[str], values: dict[str, FloatArray]) -> FloatArray:
+    """Return a vector for each number, zero where there is none, shape (K, 3)."""
+    rows = [values.get(name, np.zeros(3)) for name in names]
+    return np.reshape(np.array(rows, dtype=float), (-1, 3))
+
+
+def _places(readings: Readings, sensor: SensorCalibration) -> FloatArray:
+    own = readings.rows_of(readings.sensors.index(sensor.sensor))
+    return np.asarray(readings.R_map_lidar[own] @ sensor.t_lidar_mag + readings.p_map_lidar[own])
+
+
+def _why_silent(
+    drive: SensorDrive,
+    field_map: QueryableMap,
+    sensor: SensorCalibration,
+    options: CalibrationOptions,
+    stuck: bool,
+) -> str:
+    """Return why nothing can be said of a sensor; nothing if something can."""
+    readings, needed = drive.at(offset_s(sensor)), options.solve.min_readings
+    if stuck:
+        return "It reports one constant value: it is stuck."
+    if len(readings) < needed:
+        return f"Only {len(readings)} of its readings have a pose; at least {needed} are needed."
+    place = readings.R_map_lidar @ sensor.t_lidar_mag + readings.p_map_lidar
+    within = int(field_map.query(place).inside.sum())
+    if within < needed:
+        return (
+            f"{len(place) - within} of its {len(place)} readings lie outside the map; at least "
+            f"{needed} must lie inside. Is it the map of this place, and are the poses in its "
+            "frame?"
+        )
+    return ""

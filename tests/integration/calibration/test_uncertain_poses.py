@@ -1,0 +1,125 @@
+"""The one-key solve with pose errors that last, against generalised least squares."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
+from l2m_gtsam.calibration.pose_errors import error_of_poses
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
+from l2m_gtsam.solve.robust import Loss, RobustOptions
+from tests.drives.uncertain import NOISE, SENSORS, STARTS
+from tests.integration.calibration.test_uncertain_calibration import (
+    all_features,
+    dense_rows,
+    field_map,
+    readings,
+)
+
+__all__ = ["field_map", "readings"]  # fixtures
+
+LASTS_S = 0.7
+OPTIONS = OneKeyOptions(
+    sensor_noise_ut=NOISE,
+    pose_noise=PoseNoiseOptions(correlation_s=LASTS_S),
+    robust=RobustOptions(loss=Loss.SQUARED),
+)
+
+
+@pytest.fixture(scope="module")
+def uncertain(readings: Readings, field_map: HarmonicMap) -> Readings:
+    """Those of the first sensor in one tile: elsewhere tiles cut a segment's bridge in two.
+
+    Roots are those of 1 cm and 0.3 deg, mixed.
+    """
+    x = np.einsum("nij,j->ni", readings.R_map_lidar, SENSORS[0].t_lidar_mag)
+    owner = field_map.errors_over(x + readings.p_map_lidar).owner(x + readings.p_map_lidar)
+    own = readings.sensor == 0
+    tile = np.bincount(owner[own]).argmax()
+    some = readings.select(own & (owner == tile))
+    rng = np.random.default_rng(3)
+    root = np.diag(np.repeat([np.deg2rad(0.3), 0.01], 3)) @ (
+        np.eye(6) + 0.3 * rng.normal(size=(len(some), 6, 6))
+    )
+    return replace(some, sensors=some.sensors[:1], pose_root=root)
+
+
+@pytest.fixture(scope="module")
+def solution(uncertain: Readings, field_map: HarmonicMap) -> OneKeySolution:
+    return solve_one_key(uncertain, field_map, STARTS[:1], OPTIONS)
+
+
+def noise_covariance(readings: Readings, field_map: HarmonicMap, estimate: Estimate) -> FloatArray:
+    """Return the covariance of all residuals, shape (3 N, 3 N), readings in order."""
+    C, N = estimate.C()[0], len(readings)
+    x = np.einsum("nij,j->ni", readings.R_map_lidar, estimate.t[0]) + readings.p_map_lidar
+    errors, R_lidar_map = field_map.errors_over(x), readings.R_map_lidar.transpose(0, 2, 1)
+    A = all_features(errors, x)
+    rest = np.maximum(field_map.variance(x) - np.einsum("nir,nir->ni", A, A), 0.0)
+    CR = C @ R_lidar_map
+    own = NOISE**2 * np.eye(3) + np.einsum("nij,nj,nkj->nik", CR, rest, CR)
+    by_map = (CR @ A).reshape(3 * N, -1)
+    seconds = 1e-9 * readings.stamp_ns
+    like = np.exp(-np.abs(seconds[:, None] - seconds) / LASTS_S)
+    by_pose = (C @ error_of_poses(readings, field_map, estimate)).reshape(3 * N, 6)
+    return np.asarray(
+        block_diag(*own)
+        + by_map @ errors.covariance @ by_map.T
+        + (by_pose @ by_pose.T) * np.kron(like, np.ones((3, 3)))
+    )
+
+
+def test_marginals_and_estimate_are_those_of_all_covariances_at_once(
+    uncertain: Readings, field_map: HarmonicMap, solution: OneKeySolution
+) -> None:
+    estimate, (found,) = solution.estimate, solution.solved
+    assert solution.settled
+    e, J = dense_rows(
+        uncertain,
+        field_map,
+        np.concatenate([estimate.vector(0)] * len(SENSORS)),
+        np.zeros((len(uncertain), 3, 0)),
+    )
+    J = J[:, :, :15].reshape(-1, 15)
+    noise = noise_covariance(uncertain, field_map, estimate)
+    ridge = estimate.ridge[0] * np.diag(np.repeat([0.0, 1.0, 0.0], [3, 9, 3]))
+    information = J.T @ np.linalg.solve(noise, J) + ridge
+    expected, sigma = np.linalg.inv(information), np.sqrt(np.diag(found.covariance))
+    scale = np.outer(sigma, sigma)
+    # Derivatives by C are taken with the errors' estimates in the field: a hundredth.
+    np.testing.assert_allclose(found.covariance / scale, expected / scale, rtol=0, atol=0.02)
+    ideal = np.concatenate([np.zeros(3), np.eye(3).ravel(), np.zeros(3)])
+    pull = J.T @ np.linalg.solve(noise, e.ravel()) + ridge @ (estimate.vector(0) - ideal)
+    # What a Newton step of the marginal model still wants, in sigmas.
+    assert np.abs(expected @ pull / sigma).max() < 0.1
+
+
+def test_errors_of_poses_make_a_calibration_less_sure(
+    uncertain: Readings, field_map: HarmonicMap, solution: OneKeySolution
+) -> None:
+    sure = solve_one_key(replace(uncertain, pose_root=None), field_map, STARTS[:1], OPTIONS)
+    (one,), (other,) = solution.solved, sure.solved
+    assert (np.diag(one.covariance) > np.diag(other.covariance)).all()
+
+
+def test_errors_that_vanish_change_nothing(uncertain: Readings, field_map: HarmonicMap) -> None:
+    tiny = replace(uncertain, pose_root=np.broadcast_to(1e-9 * np.eye(6), (len(uncertain), 6, 6)))
+    one, other = (
+        solve_one_key(each, field_map, STARTS[:1], OPTIONS)
+        for each in (tiny, replace(uncertain, pose_root=None))
+    )
+    sigma = np.sqrt(np.diag(other.solved[0].covariance))
+    away = (one.estimate.vector(0) - other.estimate.vector(0)) / sigma
+    # Each stops within a hundredth of a sigma of the optimum.
+    np.testing.assert_allclose(away, 0, atol=0.02)
+    np.testing.assert_allclose(
+        one.solved[0].covariance / np.outer(sigma, sigma),
+        other.solved[0].covariance / np.outer(sigma, sigma),
+        atol=3e-3,
+    )

@@ -1,0 +1,154 @@
+"""Suites that are calibrated from their own drive, through a field that nobody told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.config import MappingOptions
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, Trajectory
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.mapping.mapping import suite_readings
+from l2m_gtsam.mapping.suite.calibrate_suite import calibrate_suite
+from l2m_gtsam.mapping.suite.options import SuiteOptions
+from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
+from tests.drives.slam import SlamDrive, slam_drive
+from tests.integration.slam.test_slam import quiet
+from tests.worlds.exact import DipoleWorld
+from tests.worlds.surveyed import strange_hall, wandering
+
+CLOCK = 0.02  # seconds by which readings are late
+QUICK = SuiteOptions.model_validate(
+    {
+        "sync": {"thin_distance_m": 0.05, "thin_angle_deg": 5.0},
+        "windows": 1,
+        "readings": 600,
+        "modes": 150,
+    }
+)
+
+
+def suite(seed: int, count: int) -> tuple[KnownSensor, ...]:
+    """Return sensors as a mapping suite has them: nearly aligned, not where they were meant."""
+    rng, sensors = np.random.default_rng(seed), []
+    for index in range(count):
+        R = Rotation.from_rotvec(rng.normal(0, 0.02, 3)).as_matrix()
+        C = (np.eye(3) + rng.normal(0, 0.02, (3, 3))) @ R
+        t = rng.normal(0, 0.15, 3)
+        sensors.append(KnownSensor(f"mag_{index:02d}", t, Distortion(C, rng.normal(0, 5, 3))))
+    return tuple(sensors)
+
+
+def tilted(drive: Trajectory, rng: np.random.Generator) -> Trajectory:
+    """Return a drive by hand: with all headings and tilts of 0.15 rad, heaving by 0.2 m."""
+    at = 1e-9 * (drive.stamp_ns - drive.stamp_ns[0])
+    tilts = 0.15 * np.sin(np.outer(at, [0.9, 1.1]) + rng.uniform(0, 6, 2))
+    R = drive.R @ Rotation.from_euler("yx", tilts).as_matrix()
+    p = drive.p + 0.2 * np.outer(np.sin(0.7 * at), [0, 0, 1])
+    return replace(drive, R=R, p=p)
+
+
+def surveyed(seed: int, sensors: tuple[KnownSensor, ...], world: DipoleWorld) -> Recording:
+    """Return a survey with poses that are true and clocks that are late."""
+    rng = np.random.default_rng(seed)
+    truth = tilted(wandering(rng, 50.0, within=1.5), rng)
+    drive: SlamDrive = slam_drive(world, sensors, truth, rng, noise=0.1)
+    late = [replace(s, stamp_ns=s.stamp_ns + round(1e9 * CLOCK)) for s in drive.recording.series]
+    return replace(drive.recording, trajectory=truth, series=tuple(late))
+
+
+def errors(found: CalibrationResult, truth: tuple[KnownSensor, ...]) -> FloatArray:
+    """Return what 15 parameters of each sensor are off by, but for the scale that all share."""
+    scale = np.mean([np.trace(each.distortion.C) / 3 for each in truth])
+    off = []
+    for each in truth:
+        own = found[each.sensor]
+        C = own.distortion.C - each.distortion.C / scale
+        H = own.distortion.H - each.distortion.H
+        off.append(np.concatenate([own.t_lidar_mag - each.t_lidar_mag, C.ravel(), H]))
+    return np.stack(off)
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[tuple[KnownSensor, ...], Recording, CalibrationResult]:
+    truth = suite(2, 2)
+    recording = surveyed(2, truth, strange_hall(2))
+    return truth, recording, calibrate_suite([recording], None, QUICK, quiet)
+
+
+def test_sensors_are_found_with_the_field(
+    found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
+) -> None:
+    """Assumed at the lidar without distortion, truly 0.15 m and 5 uT off: within 2 cm, and told."""
+    truth, _, result = found
+    off = errors(result, truth)
+    assert all(each.status is SensorStatus.SOLVED for each in result.sensors)
+    assert np.linalg.norm(off[:, :3], axis=1).max() < 0.02
+    assert np.abs(off[:, 3:12]).max() < 0.02
+    assert np.abs(off[:, 12:]).max() < 0.5
+    for own, wrong in zip(result.sensors, off, strict=True):
+        # Chi squared of 15 degrees of freedom passes 37.7 once in 1,000.
+        assert wrong @ np.linalg.solve(own.covariance, wrong) < 37.7
+        assert own.time_offset is not None
+        assert own.time_offset.seconds == pytest.approx(-CLOCK, abs=4 * own.time_offset.sigma)
+        assert own.time_offset.sigma < 0.002
+        assert own.noise == pytest.approx(0.1, rel=0.3)
+    assert result.doubts == ()
+
+
+def test_a_map_of_the_suite_counts_its_clocks(
+    found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
+) -> None:
+    """Readings of known sensors are the world's field, but for noise, once clocks are known."""
+    truth, recording, _ = found
+    misfits = []
+    for offset in (0.0, -CLOCK):
+        known = {each.sensor: replace(each, time_offset=offset) for each in truth}
+        readings = suite_readings([recording], known, MappingOptions().sync)
+        field, _ = strange_hall(2).field_and_gradient(readings.points)
+        misfits.append(float(np.sqrt(np.mean((readings.field - field) ** 2))))
+    # Poses between two samples are interpolated: 0.02 uT here.
+    assert misfits[1] < 0.13
+    assert misfits[0] > 2 * misfits[1]
+
+
+def test_a_drive_that_never_turns_says_what_it_does_not_tell() -> None:
+    truth = suite(4, 1)
+    rng = np.random.default_rng(4)
+    way = wandering(rng, 40.0, within=1.5)
+    straight = replace(way, R=np.tile(np.eye(3), (len(way), 1, 1)))
+    drive = slam_drive(strange_hall(4), truth, straight, rng, noise=0.1)
+    result = calibrate_suite([replace(drive.recording, trajectory=straight)], None, QUICK, quiet)
+    (doubt,) = result.doubts
+    assert "t_lidar_mag x, t_lidar_mag y, t_lidar_mag z" in doubt
+    assert "H x" in doubt
+    assert result.sensors[0].t_sigma.min() > 0.1
+
+
+def test_a_stuck_sensor_is_refused(
+    found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
+) -> None:
+    _, recording, _ = found
+    first, second = recording.series
+    stuck = replace(second, field=np.tile(second.field[:1], (len(second), 1)))
+    with pytest.raises(MapError, match="'mag_01' is stuck on one value"):
+        calibrate_suite([replace(recording, series=(first, stuck))], None, QUICK, quiet)
+
+
+def test_what_is_known_is_where_it_begins(
+    found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
+) -> None:
+    """From the truth it comes to the same place as from nothing, in a fraction of a sigma."""
+    truth, recording, result = found
+    scale = np.mean([np.trace(each.distortion.C) / 3 for each in truth])
+    known = {
+        each.sensor: replace(
+            each, distortion=Distortion(each.distortion.C / scale, each.distortion.H)
+        )
+        for each in truth
+    }
+    again = calibrate_suite([recording], known, QUICK, quiet)
+    for one, other in zip(result.sensors, again.sensors, strict=True):
+        assert np.all(np.abs(one.t_lidar_mag - other.t_lidar_mag) < one.t_sigma)
+        assert np.all(np.abs(one.distortion.H - other.distortion.H) < one.H_sigma)

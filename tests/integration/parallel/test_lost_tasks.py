@@ -1,0 +1,73 @@
+"""Tasks that kill their workers: reported where that is wanted, and nobody else is blamed."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import dask
+import distributed  # its configuration is loaded before a part of it is changed
+import pytest
+
+from l2m_gtsam.errors import ClusterError
+from l2m_gtsam.parallel import cluster
+from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
+
+ROOT = Path(__file__).parents[3]
+KILLER, DEADLY_PLACE = 3, 100
+
+
+@pytest.fixture(autouse=True)
+def _workers_find_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(ROOT / "factors")]))
+
+
+def place(key: int) -> int:
+    return key // DEADLY_PLACE * DEADLY_PLACE
+
+
+def prepare(place: int) -> int:
+    if place == DEADLY_PLACE:
+        os._exit(1)
+    return 10
+
+
+def task(key: int, prepared: int) -> str:
+    if key == KILLER:
+        os._exit(1)
+    return f"{key + prepared}"
+
+
+def lost(key: int, reason: str) -> str:
+    return f"{key}: {reason}"
+
+
+def results(keys: list[int], what: Callable[[int, str], str] | None) -> dict[int, str]:
+    # A task is given up when it kills one worker: they take a while to start again.
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        return dict(computed(Work(place, prepare, task, what), keys, ClusterOptions(workers=1)))
+
+
+def test_a_killer_is_lost_and_nobody_else() -> None:
+    """With one failure allowed to none, all that wait on the worker are given up with it."""
+    found = results([1, KILLER, 2, 4, DEADLY_PLACE, DEADLY_PLACE + 1], lost)
+    assert {key: found[key] for key in (1, 2, 4)} == {1: "11", 2: "12", 4: "14"}
+    for key in (KILLER, DEADLY_PLACE, DEADLY_PLACE + 1):
+        assert found[key].startswith(f"{key}: every worker that began it died; give ")
+
+
+def test_without_a_word_for_it_a_killer_ends_all() -> None:
+    with pytest.raises(ClusterError, match=r"^3: every worker that began it died"):
+        results([KILLER], None)
+
+
+def test_a_scheduler_without_workers_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "CONNECT_S", 2)
+    with distributed.LocalCluster(
+        n_workers=0, host=cluster.LOOPBACK, dashboard_address=f"{cluster.LOOPBACK}:0"
+    ) as empty:
+        options = ClusterOptions(scheduler=empty.scheduler_address)
+        with pytest.raises(ClusterError) as error:
+            list(computed(Work(place, prepare, task, lost), [1], options))
+    told = str(error.value)
+    assert told.startswith(f"--scheduler {empty.scheduler_address}: has no workers; start some: ")
+    assert "\n" not in told

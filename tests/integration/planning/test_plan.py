@@ -1,0 +1,82 @@
+"""The plan is the solve's own covariance, and what it assumes where nothing is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.calibrate import calibrate
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.config import CalibrationOptions, PlanOptions
+from l2m_gtsam.data import FieldSeries, Recording, SourceFile
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.planning.plan import assumed_recording, plan
+from l2m_gtsam.records.calibration import Uncertainty
+from tests.drives.degenerate import STRONG, eight
+from tests.worlds.harmonic import PRIOR, fitted_map
+
+PLACE = (0.1, -0.05, 0.05)
+GIVEN = OneKeyOptions(sensor_noise_ut=0.1)
+SOURCE = SourceFile("drive.bag", "ab12")
+
+
+@pytest.fixture(scope="module")
+def learnt() -> HarmonicMap:
+    return fitted_map()
+
+
+def ideal(field_map: QueryableMap) -> Recording:
+    """A small figure of eight; an ideal sensor without noise that sees what the map says."""
+    drive = replace(eight(), p=eight().p * [0.35, 0.45, 1.0])
+    field, _ = field_map.field_and_gradient(drive.R @ np.array(PLACE) + drive.p)
+    reading = np.einsum("nji,nj->ni", drive.R, field)
+    return Recording(drive, (FieldSeries("mag", "/m", "m", drive.stamp_ns, reading),), SOURCE)
+
+
+def options(solve: OneKeyOptions = GIVEN) -> CalibrationOptions:
+    return CalibrationOptions(start={"mag": PLACE}, solve=solve)
+
+
+@pytest.mark.parametrize("kind", list(Uncertainty))
+def test_an_ideal_sensor_gets_the_covariance_that_was_planned(
+    learnt: HarmonicMap, kind: Uncertainty
+) -> None:
+    """Nothing differs then but the rounds in which weights settle."""
+    chosen = options(GIVEN.model_copy(update={"uncertainty": kind}))
+    recording = ideal(learnt.compile())
+    before = plan(recording, learnt, chosen, PlanOptions())
+    after = calibrate(recording, learnt, chosen)
+    assert before.uncertainty is after.uncertainty is kind
+    sigma = before["mag"].sigma
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(
+        after["mag"].covariance / scale, before["mag"].covariance / scale, atol=5e-3
+    )
+    np.testing.assert_allclose(
+        after["mag"].rotation_covariance, before["mag"].rotation_covariance, rtol=0.02, atol=1e-9
+    )
+
+
+def test_readings_do_not_matter() -> None:
+    recording = ideal(STRONG)
+    silent = assumed_recording(recording.trajectory, SOURCE, ("mag",), 20.0)
+    assert len(silent.series[0]) == len(recording.series[0])
+    one, other = (
+        plan(each, STRONG, options(), PlanOptions())["mag"] for each in (recording, silent)
+    )
+    np.testing.assert_array_equal(one.covariance, other.covariance)
+
+
+def test_the_noise_is_given_or_the_maps_or_assumed(learnt: HarmonicMap) -> None:
+    recording, open_ = ideal(STRONG), options(OneKeyOptions())
+    assert plan(recording, STRONG, options(), PlanOptions()).noise == GIVEN.sensor_noise_ut
+    assert plan(recording, learnt, open_, PlanOptions()).noise == PRIOR.noise
+    assert plan(recording, STRONG, open_, PlanOptions(noise_ut=0.7)).noise == 0.7
+
+
+def test_a_place_for_an_unknown_sensor_is_refused() -> None:
+    wrong = CalibrationOptions(start={"compass": PLACE})
+    with pytest.raises(CalibrationError, match="no sensor named 'compass'; the recording has mag"):
+        plan(ideal(STRONG), STRONG, wrong, PlanOptions())

@@ -1,0 +1,117 @@
+"""Drives through places without a map: what an unknown field takes out of the drift."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import KnownSensor, Trajectory
+from l2m_gtsam.records.localisation import LocalisationStatus
+from l2m_gtsam.slam.explore import Exploration, explore
+from l2m_gtsam.slam.options import SlamOptions
+from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
+from tests.integration.slam.test_slam import pose_nees, position_error, quiet
+from tests.worlds.exact import dipole_world, random_sensors
+
+SENSORS = 4
+COARSE = {"distance_m": 0.3, "readings": 2}  # enough, and quick
+
+
+def drive_in(seed: int, truth: Trajectory) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
+    known = random_sensors(seed, SENSORS)
+    return known, slam_drive(dipole_world(seed), known, truth, np.random.default_rng(seed))
+
+
+def explored(drive: SlamDrive, sensors: tuple[KnownSensor, ...], **options: object) -> Exploration:
+    chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
+    return explore(drive.recording, calibrated(sensors), chosen, quiet)
+
+
+@pytest.fixture(scope="module")
+def lapped() -> tuple[tuple[KnownSensor, ...], SlamDrive]:
+    """Two and a half laps of 21 m, with odometry that slips by 1 % of the way."""
+    return drive_in(1, laps(90))
+
+
+@pytest.fixture(scope="module")
+def plain(lapped: tuple[tuple[KnownSensor, ...], SlamDrive]) -> Exploration:
+    return explored(lapped[1], lapped[0])
+
+
+def test_a_place_that_is_come_to_again_takes_the_drift_out(
+    lapped: tuple[tuple[KnownSensor, ...], SlamDrive], plain: Exploration
+) -> None:
+    """Eight tenths of the drift over 53 m (contract), and sigmas that cover what is left."""
+    truth, result = lapped[1].truth, plain.result
+    assert result.status is LocalisationStatus.LOCALISED
+    before = position_error(truth, result.odometry)
+    assert before > 0.3
+    assert position_error(truth, result.trajectory) < 0.2 * before
+    # Poses of one drive err together: no more than twice the six of one pose in the mean.
+    assert pose_nees(truth, result.trajectory).mean() < 12
+    assert result.notes == ()
+
+
+def test_the_field_along_the_way_is_what_it_was(
+    lapped: tuple[tuple[KnownSensor, ...], SlamDrive], plain: Exploration
+) -> None:
+    """Where readings are said to be, the true field is theirs but for noise and poses' errors."""
+    truth = dipole_world(1).field_and_gradient(plain.points)[0]
+    assert np.sqrt(np.mean((plain.field - truth) ** 2)) < 0.5
+    assert len(plain.points) == plain.solution.used.sum()
+
+
+def test_readings_that_no_tile_explains_are_rejected(
+    lapped: tuple[tuple[KnownSensor, ...], SlamDrive], plain: Exploration
+) -> None:
+    """Spikes of 30 uT on a twentieth of the readings: nearly all are found, and little is lost."""
+    sensors, drive = lapped
+    rng, series = np.random.default_rng(7), []
+    for each in drive.recording.series:
+        spiked = rng.random(len(each.field)) < 0.05
+        field = each.field + 30 * spiked[:, None] * rng.choice([-1, 1], (len(each.field), 3))
+        series.append(replace(each, field=field))
+    spoilt = replace(drive, recording=replace(drive.recording, series=tuple(series)))
+    found = explored(spoilt, sensors)
+    rejected = sum(each.rejected for each in found.result.sensors)
+    readings = sum(each.readings for each in found.result.sensors)
+    assert 0.04 < rejected / readings < 0.07
+    error = position_error(drive.truth, found.result.trajectory)
+    assert error < position_error(drive.truth, plain.result.trajectory) + 0.03
+
+
+def test_where_no_place_is_come_to_again_it_is_said() -> None:
+    """Less than a lap: little can be taken out, and sigmas say so."""
+    sensors, drive = drive_in(2, laps(24))
+    found = explored(drive, sensors)
+    assert any("no place was come to twice" in note for note in found.result.notes)
+    trajectory = found.result.trajectory
+    assert pose_nees(drive.truth, trajectory).mean() < 12
+    assert trajectory.covariance is not None
+    assert np.sqrt(trajectory.covariance[-1, 3:, 3:].diagonal()).min() > 0.05
+
+
+def test_a_calibration_is_refined_without_a_map() -> None:
+    """Places on the vehicle known to 5 cm: those of sensors to each other come out; all is covered.
+
+    Where the whole array sits is told by turns alone, and hardly: the map shifts with it.
+    """
+    sensors, drive = drive_in(3, laps(60))
+    sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
+    rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
+    # Tiles that are a little larger than by default: fewer, in less than half the time.
+    chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0}}
+    options = SlamOptions.model_validate(chosen)
+    found = explore(drive.recording, rough, options, quiet).result
+    assert found.calibration is not None
+    before, after, nees = [], [], []
+    for truth, start in zip(sensors, rough.sensors, strict=True):
+        refined = found.calibration[truth.sensor]
+        ideal = np.concatenate([truth.t_lidar_mag, truth.distortion.vector()])
+        error = np.concatenate([refined.t_lidar_mag, refined.distortion.vector()]) - ideal
+        before.append(start.t_lidar_mag - truth.t_lidar_mag)
+        after.append(error[:3])
+        nees.append(error @ np.linalg.solve(refined.covariance, error))
+    assert np.std(after, axis=0).mean() < 0.6 * np.std(before, axis=0).mean()
+    # Chi squared of 15 degrees of freedom passes 37.7 once in 1,000.
+    assert max(nees) < 37.7

@@ -1,0 +1,179 @@
+"""Drives through places without a map, key pose by key pose."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
+from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.explore import HERE
+from l2m_gtsam.slam.localise import prepared
+from l2m_gtsam.slam.online.belief import Belief
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.unknown_field.drive_prior import drive_prior
+from l2m_gtsam.slam.unknown_field.exploring import Explorer, ExploringOptions
+from l2m_gtsam.slam.unknown_field.mapping import map_drive
+from tests.drives.slam import calibrated, laps, slam_drive
+from tests.integration.slam.test_slam import quiet
+from tests.worlds.exact import dipole_world, random_sensors
+
+SMALL = (1.9, 1.4)  # radii of laps of 10 m
+TILES = {"modes": 100, "learn_over_m": 9.0}
+QUICK = {"key_poses": {"distance_m": 0.3, "readings": 2}, "tiles": TILES}
+
+
+@dataclass(frozen=True)
+class OnLine:
+    """What was known of each key pose when it came, and where it truly was."""
+
+    explorer: Explorer
+    drive: Drive
+    beliefs: list[Belief]
+    truth: list[gtsam.Pose3]
+    sizes: list[int]
+
+    @classmethod
+    def over(
+        cls,
+        drive: Drive,
+        truth: list[gtsam.Pose3],
+        options: SlamOptions,
+        pace: ExploringOptions,
+    ) -> "OnLine":
+        """Follow a drive."""
+        explorer, beliefs, sizes = Explorer(drive, options, pace=pace), [], []
+        for number in range(len(drive)):
+            beliefs.append(explorer.step(number))
+            sizes.append(len(explorer.memory.known.covariance))
+        return cls(explorer, drive, beliefs, truth, sizes)
+
+    def off(self, poses: list[gtsam.Pose3]) -> FloatArray:
+        """Return how far poses are off, in metres."""
+        pairs = zip(poses, self.truth, strict=True)
+        return np.array([np.linalg.norm(a.translation() - b.translation()) for a, b in pairs])
+
+    def nees(self) -> FloatArray:
+        errors = [
+            gtsam.Pose3.Logmap(belief.pose.between(true))
+            for belief, true in zip(self.beliefs, self.truth, strict=True)
+        ]
+        pairs = zip(errors, self.beliefs, strict=True)
+        return np.array([e @ np.linalg.solve(known.pose_covariance, e) for e, known in pairs])
+
+
+def rms(off: FloatArray) -> float:
+    return float(np.sqrt(np.mean(off**2)))
+
+
+def prepared_drive(
+    seed: int,
+    truth: Trajectory,
+    sensors: tuple[KnownSensor, ...],
+    known: CalibrationResult,
+    options: SlamOptions,
+) -> tuple[Drive, list[gtsam.Pose3]]:
+    """Return a drive through a hall, from its first pose on, and its true key poses."""
+    recorded = slam_drive(dipole_world(seed), sensors, truth, np.random.default_rng(seed))
+    drive, _ = prepared(recorded.recording, known, options)
+    rows = np.searchsorted(truth.stamp_ns, drive.stamp_ns)
+    true = [gtsam.Pose3(gtsam.Rot3(truth.R[row]), truth.p[row]) for row in rows]
+    return replace(drive, start=replace(drive.start, covariance=HERE)), true
+
+
+def on_line(seed: int, truth: Trajectory, sensors: int, section_m: float) -> OnLine:
+    options, own = SlamOptions.model_validate(QUICK), random_sensors(seed, sensors)
+    drive, true = prepared_drive(seed, truth, own, calibrated(own), options)
+    return OnLine.over(drive, true, options, ExploringOptions(section_m=section_m))
+
+
+@pytest.fixture(scope="module")
+def round_and_round() -> OnLine:
+    """Three laps of 10 m, with odometry that slips by 1 % of the way."""
+    return on_line(2, laps(54, SMALL), 6, 6.0)
+
+
+def test_laps_take_the_drift_out_while_they_are_driven(round_and_round: OnLine) -> None:
+    """After the first lap less than half of the drift is left, in the end a quarter of all poses'.
+
+    And sigmas cover it: poses of one drive err together, so that twice the six of one is allowed.
+    """
+    found, drift = round_and_round, round_and_round.off(round_and_round.drive.dead_reckoning())
+    third = len(drift) // 3
+    now = found.off([belief.pose for belief in found.beliefs])
+    assert rms(now[third:]) < 0.5 * rms(drift[third:])
+    assert rms(found.off(found.explorer.poses())) < rms(drift) / 4
+    assert found.nees().mean() < 12
+
+
+def test_poses_are_where_all_solved_together_are(round_and_round: OnLine) -> None:
+    """To 3 cm: tiles are laid anew there, and poses that were let go hang on anchors here."""
+    drive, options = round_and_round.drive, SlamOptions.model_validate(QUICK)
+    begin = drive.dead_reckoning()
+    prior = drive_prior(drive, begin, options.tiles)
+    batch = map_drive(drive, begin, prior, options, quiet).solution.poses
+    pairs = zip(round_and_round.explorer.poses(), batch, strict=True)
+    apart = np.array([np.linalg.norm(a.translation() - b.translation()) for a, b in pairs])
+    assert rms(apart) < 0.03
+
+
+def test_what_is_remembered_grows_with_the_place_alone(round_and_round: OnLine) -> None:
+    """A lap and a half tell all tiles, to one at the rim; laps add nothing to that."""
+    sizes = np.array(round_and_round.sizes)
+    memory = round_and_round.explorer.memory
+    assert sizes[-1] - sizes[len(sizes) // 2] <= max(len(each.field) + 6 for each in memory.tiles)
+    kinds = [chr(gtsam.symbolChr(key)) for key in memory.known.sizes]
+    assert kinds.count("M") == len(memory.tiles)
+    assert kinds.count("X") <= len(memory.tiles) + 1  # anchors, and the last key pose
+
+
+def test_what_is_remembered_stays_a_covariance(round_and_round: OnLine) -> None:
+    P = round_and_round.explorer.memory.known.covariance
+    sigma = np.sqrt(np.diag(P))
+    assert np.linalg.eigvalsh(P / np.outer(sigma, sigma)).min() > 0
+
+
+def test_before_the_prior_is_learnt_poses_are_those_of_odometry(round_and_round: OnLine) -> None:
+    found, way = round_and_round, np.cumsum(np.linalg.norm(round_and_round.drive.steps.p, axis=1))
+    early = int(np.searchsorted(way, TILES["learn_over_m"]))
+    for belief, pose in zip(found.beliefs[:early], found.drive.dead_reckoning(), strict=False):
+        assert belief.pose.equals(pose, 1e-9)
+    assert not found.beliefs[early + 1].pose.equals(found.drive.dead_reckoning()[early + 1], 1e-3)
+
+
+def test_sections_know_what_one_section_would() -> None:
+    """Sections of 4 m and one of the whole drive, a lap and a bit: alike within sigmas."""
+    short, whole = (on_line(4, laps(22, SMALL), 3, length) for length in (4.0, 1000.0))
+    last, other = short.beliefs[-1], whole.beliefs[-1]
+    apart = gtsam.Pose3.Logmap(other.pose.between(last.pose))
+    sigma = np.sqrt(np.diag(other.pose_covariance))
+    # Poses that were let go are held where they were linearised, robust weights as they were.
+    assert np.abs(apart / sigma).max() < 0.5
+    ratio = np.sqrt(np.diag(last.pose_covariance)) / sigma
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.3
+
+
+def test_where_nothing_is_read_odometry_carries_on() -> None:
+    """A stretch of 7 m without readings, and spikes of 30 uT on the key poses before it."""
+    options, own = SlamOptions.model_validate(QUICK), random_sensors(5, 3)
+    drive, truth = prepared_drive(5, laps(32, SMALL), own, calibrated(own), options)
+    at = drive.readings.key_pose
+    spiked = np.where((at >= 34) & (at < 36), 30.0, 0.0)[:, None]
+    readings = replace(drive.readings, field=drive.readings.field + spiked)
+    kept = np.flatnonzero((at < 36) | (at > 60))
+    found = OnLine.over(replace(drive, readings=readings[kept]), truth, options, ExploringOptions())
+    sigma = [np.sqrt(np.trace(belief.pose_covariance[3:, 3:])) for belief in found.beliefs]
+    assert sigma[60] > 1.3 * sigma[34]  # 7 m more of odometry: by its variance 1.4 times
+    assert found.nees().mean() < 12
+    drift = found.off(drive.dead_reckoning())
+    assert rms(found.off([belief.pose for belief in found.beliefs])) < 1.2 * rms(drift)
+
+
+def test_calibrations_are_not_refined_on_line(round_and_round: OnLine) -> None:
+    refined = SlamOptions.model_validate({**QUICK, "calibration": "refined"})
+    with pytest.raises(ConfigError, match="works off line"):
+        Explorer(round_and_round.drive, refined)

@@ -1,0 +1,101 @@
+"""A browser that looks at a page, and what every page of ours must be."""
+
+import json
+import os
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from l2m_gtsam.storage.pdf import find_browser
+
+PROGRAMS = Path(__file__).parents[1] / "browser"
+TIMEOUT_S = 280
+GRAVE = {"serious", "critical"}  # of axe-core
+SMALLEST_PX = 9.0  # text in figures; below it labels are not read on a phone
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What a browser found: everything that ``look.js`` tells, and the folder of screenshots."""
+
+    looks: list[dict[str, Any]]
+    tabbed: list[dict[str, Any]]
+    folder: Path
+
+
+def find_tools() -> str:
+    """Return the path of a browser; node and what `npm ci` installs are there, too."""
+    found = find_browser()
+    if found is None:
+        missing("no chromium: apt-get install chromium")
+    if shutil.which("node") is None:
+        missing("no node: apt-get install nodejs npm")
+    if not (PROGRAMS / "node_modules" / "puppeteer-core").is_dir():
+        missing("no puppeteer-core: run `npm ci` in tests/browser")
+    assert found is not None
+    return found
+
+
+def missing(reason: str) -> None:
+    """Skip, or fail where browsers are required."""
+    if os.environ.get("L2M_REQUIRE_BROWSER") == "1":
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+def told_by(program: str, browser: str, *arguments: str | Path) -> dict[str, Any]:
+    """Return what one of our programs for a browser tells."""
+    run = subprocess.run(
+        ["node", PROGRAMS / program, *arguments],  # noqa: S607 - node is looked up, as a user would
+        capture_output=True,
+        text=True,
+        env={**os.environ, "L2M_BROWSER": browser},
+        check=False,
+        timeout=TIMEOUT_S,
+    )
+    assert run.returncode == 0, run.stderr
+    told: dict[str, Any] = json.loads(run.stdout)
+    return told
+
+
+def look(browser: str, page: Path, folder: Path) -> Looked:
+    """Open a page on a desk and on a phone, light and dark, and tell what is found."""
+    told = told_by("look.js", browser, page, folder)
+    return Looked(told["looks"], told["tabbed"], folder)
+
+
+def check_silence(looked: Looked) -> None:
+    """Nothing is reported on the console, and nothing is asked of any address."""
+    assert len(looked.looks) == 4
+    for each in looked.looks:
+        assert each["errors"] == []
+        assert each["requests"] == []
+
+
+def check_figures(looked: Looked, count: int) -> None:
+    """So many figures are seen, and drawn."""
+    for each in looked.looks:
+        assert len(each["figures"]) == count
+        for figure in each["figures"]:
+            assert figure["alt"]
+            assert figure["visible"]
+            assert figure["inside"]
+            assert figure["drawn"] > 5
+            assert min(figure["width"], figure["height"]) > 100
+
+
+def check_phone(looked: Looked) -> None:
+    """Nothing is wider than the screen or too small to be read."""
+    for each in looked.looks:
+        assert not each["wider"]
+        assert each["smallest_text"] >= SMALLEST_PX
+
+
+def check_accessibility(looked: Looked) -> None:
+    """Axe-core has no serious finding."""
+    for each in looked.looks:
+        assert [fault for fault in each["accessibility"] if fault["impact"] in GRAVE] == []

@@ -1,0 +1,83 @@
+"""A map that is asked for no place twice."""
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from l2m_gtsam.calibration import remembered_map
+from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.remembered_map import RememberedMap
+from l2m_gtsam.data import FieldSample, FloatArray
+from tests.worlds.exact import dipole_world
+
+
+class Counting:
+    """A world with a made-up variance that counts the places it is asked for."""
+
+    def __init__(self) -> None:
+        self.world, self.asked = dipole_world(1), 0
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        return self.world.field_and_gradient(points)
+
+    def query(self, points: FloatArray, /) -> FieldSample:
+        self.asked += len(points)
+        field, gradient = self.world.field_and_gradient(points)
+        return FieldSample(field, gradient, points**2, points[:, 0] > 0)
+
+
+@settings(max_examples=30)
+@given(rows=st.lists(st.lists(st.integers(0, 30), max_size=20), min_size=1, max_size=6))
+def test_answers_are_the_maps_own_and_places_are_asked_once(rows: list[list[int]]) -> None:
+    """Any order, any repetition, also within one question, to the last bit."""
+    places = np.random.default_rng(0).normal(size=(31, 3))
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    for chosen in rows:
+        at = places[np.array(chosen, dtype=np.int64)]
+        found, own = remembered.query(at), Counting().query(at)
+        for name in ("field", "gradient", "variance", "inside"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(own, name))
+        asked = counting.asked
+        remembered.query(at)
+        assert counting.asked == asked
+
+
+def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond it all is forgotten, and answers stay right."""
+    monkeypatch.setattr(remembered_map, "MOST", 10)
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    places = np.random.default_rng(0).normal(size=(12, 3))
+    for at in (places[:8], places[4:], places[:8]):
+        np.testing.assert_array_equal(remembered.query(at).variance, at**2)
+    assert counting.asked == 24
+
+
+def test_it_knows_of_errors_what_the_map_does() -> None:
+    """A map that does not know how its errors are correlated does not learn it so."""
+    assert not isinstance(RememberedMap(Counting()), UncertainMap)
+
+
+def test_threads_may_ask_at_once() -> None:
+    """Many questions from four threads, places in common: each gets its own answer."""
+    places = np.random.default_rng(0).normal(size=(400, 3))
+    chosen = [np.random.default_rng(seed).permutation(400)[:150] for seed in range(60)]
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda at: remembered.query(places[at]), chosen))
+    for at, each in zip(chosen, found, strict=True):
+        np.testing.assert_array_equal(each.variance, places[at] ** 2)
+    assert counting.asked <= 400
+
+
+def test_it_goes_to_another_process_without_its_memory() -> None:
+    remembered = RememberedMap(Counting())
+    remembered.query(np.ones((2, 3)))
+    there = pickle.loads(pickle.dumps(remembered))  # noqa: S301  our own, a moment ago
+    np.testing.assert_array_equal(there.query(np.ones((1, 3))).variance, np.ones((1, 3)))

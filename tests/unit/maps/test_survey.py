@@ -1,0 +1,46 @@
+"""What speaks against a survey."""
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.survey import narrow, survey_doubts
+from l2m_gtsam.maps.training import TrainingSet
+from tests.worlds.harmonic import readings
+
+
+def doubts(points: FloatArray, field: FloatArray) -> str:
+    return "; ".join(survey_doubts(TrainingSet(points, field, np.ones(len(points)))))
+
+
+def test_nothing_speaks_against_a_good_survey() -> None:
+    assert doubts(*readings()) == ""
+
+
+def test_a_straight_line_is_named_and_a_lane_beside_it_is_enough() -> None:
+    points, _ = readings(300)
+    one_lane = points * np.array([10.0, 0.02, 0.0])
+    assert "on one line" in narrow(one_lane)
+    two_lanes = np.concatenate([one_lane, one_lane + np.array([0.0, 0.5, 0.0])])
+    assert narrow(two_lanes) == ""
+
+
+@pytest.mark.parametrize("by", [12.0, 100.0])
+def test_a_place_with_two_fields_is_named(by: float) -> None:
+    """Two readings within a millimetre; no field changes so fast outside of steel."""
+    points, field = readings()
+    points = np.vstack([points, np.floor(points[:1] / 0.05) * 0.05 + [[0.02, 0.02, 0.02]]])
+    points[0] = points[-1] + 1e-3
+    field = np.vstack([field, field[:1] + np.array([by, 0.0, 0.0])])
+    said = doubts(points, field)
+    assert "differ at 1 of" in said
+    assert f"by {by:.0f} uT" in said
+
+
+def test_a_metal_cage_is_named() -> None:
+    """300 uT, and nothing is said of a few spikes of this strength."""
+    points, field = readings()
+    caged = field * (300.0 / np.linalg.norm(field, axis=1, keepdims=True))
+    assert "100% of the readings exceed 130 uT, the strongest is 300" in doubts(points, caged)
+    field[:3] *= 5
+    assert "exceed" not in doubts(points, field)

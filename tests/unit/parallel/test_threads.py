@@ -1,0 +1,131 @@
+"""BLAS has one thread inside, and afterwards what the caller gave it."""
+
+from collections.abc import Callable, Iterator
+from threading import Barrier, Thread
+from typing import Any
+
+import pytest
+import scipy.linalg  # noqa: F401 - brings a BLAS of its own
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from l2m_gtsam.calibration import calibrate
+from l2m_gtsam.mapping import mapping
+from l2m_gtsam.mapping.suite import calibrate_suite as suite
+from l2m_gtsam.parallel.threads import in_threads, one_blas_thread
+from l2m_gtsam.planning import plan
+from l2m_gtsam.qa import evaluate as appraise
+from l2m_gtsam.qa import repeatability
+from l2m_gtsam.slam import explore, localise
+from l2m_gtsam.slam import figures as slam_figures
+from l2m_gtsam.validation import validate
+
+GIVEN = 2
+ENTRIES = (
+    appraise.appraise,
+    appraise.scene_of,
+    calibrate.calibrate,
+    calibrate.calibrated,
+    explore.explore,
+    localise.localise,
+    mapping.compare_recordings,
+    mapping.map_recordings,
+    mapping.suite_readings,
+    mapping.update_map,
+    plan.plan,
+    repeatability.compared_drives,
+    repeatability.compared_halves,
+    slam_figures.localisation_record,
+    suite.calibrate_suite,
+    validate.validate,
+)
+
+
+@pytest.fixture(autouse=True)
+def given() -> Iterator[None]:
+    """What a caller has set: more than one thread."""
+    with threadpool_limits(GIVEN, user_api="blas"):
+        yield
+
+
+def blas_threads() -> set[int]:
+    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+
+def test_one_thread_inside_and_those_of_before_afterwards() -> None:
+    assert blas_threads() == {GIVEN}
+    with one_blas_thread():
+        assert blas_threads() == {1}
+        with one_blas_thread():
+            assert blas_threads() == {1}
+        assert blas_threads() == {1}
+    assert blas_threads() == {GIVEN}
+
+
+def test_an_exception_restores_them() -> None:
+    @one_blas_thread()
+    def fails() -> None:
+        assert blas_threads() == {1}
+        raise ValueError("wrong")
+
+    with pytest.raises(ValueError, match="wrong"):
+        fails()
+    assert blas_threads() == {GIVEN}
+
+
+def test_work_in_threads_inside_and_outside() -> None:
+    def found(_: int) -> set[int]:
+        return blas_threads()
+
+    assert in_threads(found, range(3)) == [{1}] * 3
+    assert blas_threads() == {GIVEN}
+    with one_blas_thread():
+        assert in_threads(found, range(3)) == [{1}] * 3
+        assert blas_threads() == {1}
+    assert blas_threads() == {GIVEN}
+
+
+def test_two_callers_at_once_leave_the_setting_as_it_was() -> None:
+    """The first to enter leaves before the second, which saw what the first had set."""
+    both, first_left = Barrier(2), Barrier(2)
+
+    def first() -> None:
+        with one_blas_thread():
+            both.wait(10)
+        first_left.wait(10)
+
+    def second() -> None:
+        with one_blas_thread():
+            both.wait(10)
+            first_left.wait(10)
+
+    threads = [Thread(target=each) for each in (first, second)]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join(10)
+    assert blas_threads() == {GIVEN}
+
+
+@pytest.mark.parametrize("entry", ENTRIES, ids=lambda each: each.__name__)
+def test_public_functions_compute_with_one_thread(entry: Callable[..., Any]) -> None:
+    """Whatever they first ask of their arguments, they ask inside of the limit."""
+    seen: list[set[int]] = []
+
+    class Watched:
+        def __getattr__(self, name: str) -> Any:
+            seen.append(blas_threads())
+            raise LookupError(name)
+
+        def __iter__(self) -> Iterator[Any]:
+            seen.append(blas_threads())
+            raise LookupError
+
+        def __len__(self) -> int:
+            seen.append(blas_threads())
+            raise LookupError
+
+    count = entry.__wrapped__.__code__.co_argcount if hasattr(entry, "__wrapped__") else 5
+    with pytest.raises(LookupError):
+        entry(*[Watched() for _ in range(count)])
+    assert seen == [{1}]
+    assert blas_threads() == {GIVEN}

@@ -1,0 +1,185 @@
+"""Figures of a calibration against closed forms and plain loops."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.qa.metrics.autocorrelation import correlation, lasting
+from l2m_gtsam.qa.metrics.coverage import sphere
+from l2m_gtsam.qa.metrics.evidence import cross
+from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
+from l2m_gtsam.qa.metrics.misfit import halves_agree
+from l2m_gtsam.qa.metrics.mounting import axis_order, gains, skews_deg
+from l2m_gtsam.qa.metrics.plain import evenly
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.records.metrics import Halves
+from l2m_gtsam.storage.metrics_file import read_metrics
+
+SEEDS = st.integers(0, 10_000)
+
+
+@given(SEEDS)
+def test_gains_and_skews_do_not_depend_on_the_mounting(seed: int) -> None:
+    """C = K R with the sensor's own K: turned otherwise it has the same gains and angles."""
+    rng = np.random.default_rng(seed)
+    K = np.eye(3) + rng.normal(0, 0.1, (3, 3))
+    R = Rotation.random(random_state=seed).as_matrix()
+    np.testing.assert_allclose(gains(K @ R), gains(K), rtol=1e-12)
+    np.testing.assert_allclose(skews_deg(K @ R), skews_deg(K), atol=1e-9)
+
+
+def test_a_skew_is_the_angle_that_was_put_in() -> None:
+    lean = np.deg2rad(3.0)
+    C = np.array([[1.0, 0, 0], [2 * np.sin(lean), 2 * np.cos(lean), 0], [0, 0, 1.0]])
+    np.testing.assert_allclose(skews_deg(C), [3.0, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(gains(C), [1, 2, 1])
+
+
+@given(SEEDS)
+def test_any_order_of_axes_is_found_again(seed: int) -> None:
+    """Rows in any order with any signs, turned by up to 20 degrees."""
+    rng = np.random.default_rng(seed)
+    order = np.eye(3)[rng.permutation(3)] * rng.choice([-1.0, 1.0], 3)[:, None]
+    turn = Rotation.from_rotvec(np.deg2rad(20) * rng.uniform(-1, 1, 3) / 3**0.5).as_matrix()
+    found = axis_order(order @ turn)
+    names = [f"{'+' if row.sum() > 0 else '-'}{'xyz'[np.abs(row).argmax()]}" for row in order]
+    assert found.along == tuple(names)
+    assert found.mirrored == (np.linalg.det(order) < 0)
+    assert found.off_deg <= 20 + 1e-9
+
+
+@given(SEEDS, st.integers(5, 60))
+def test_the_correlation_is_that_of_plain_loops(seed: int, count: int) -> None:
+    series = np.random.default_rng(seed).normal(size=(count, 3))
+    centred = series - series.mean(axis=0)
+    lags = count // 3
+    slow = [np.sum(centred[: count - k] * centred[k:]) for k in range(lags + 1)]
+    # The fast transform loses a few digits of 16.
+    np.testing.assert_allclose(correlation(series, lags), np.array(slow) / slow[0], atol=1e-10)
+
+
+def test_a_lasting_error_is_worth_fewer_readings() -> None:
+    """Of an autoregressive series with correlation rho, (1 + rho) / (1 - rho) count as one."""
+    rng, rho = np.random.default_rng(3), 0.8
+    e = rng.normal(size=40_000)
+    for k in range(1, len(e)):
+        e[k] = rho * e[k - 1] + np.sqrt(1 - rho**2) * e[k]
+    found = lasting(correlation(e[:, None], 60))
+    # 40,000 readings are worth 4,400: the sum of 60 correlations is known to about a tenth.
+    assert found == pytest.approx((1 + rho) / (1 - rho), rel=0.15)
+
+
+def test_a_constant_series_has_no_correlation() -> None:
+    np.testing.assert_array_equal(correlation(np.ones((10, 2)), 3), [1, 0, 0, 0])
+
+
+@given(SEEDS)
+def test_cross_products(seed: int) -> None:
+    a, b = np.random.default_rng(seed).normal(size=(2, 4, 3))
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", cross(a), b), np.cross(a, b), atol=1e-12)
+
+
+def test_directions_are_spread_evenly() -> None:
+    """Any cap of space holds its share of them: here of 30 degrees about random axes."""
+    points = sphere(400)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1)
+    share = (1 - np.cos(np.deg2rad(30))) / 2
+    axes = Rotation.random(50, random_state=1).apply([0.0, 0.0, 1.0])
+    held = np.mean(points @ axes.T > np.cos(np.deg2rad(30)), axis=0)
+    # 27 points of 400; those at the edge of a cap come and go.
+    np.testing.assert_allclose(held, share, atol=5 / 400)
+
+
+@given(st.integers(1, 500), st.integers(2, 60))
+def test_thinning_keeps_both_ends(count: int, most: int) -> None:
+    kept = evenly(count, most)
+    assert len(kept) == min(count, most)
+    assert (kept[0], kept[-1]) == (0, count - 1)
+    assert (np.diff(kept) > 0).all()
+
+
+def half(seed: int, covariance: np.ndarray) -> Part:
+    rng = np.random.default_rng(seed)
+    true = np.concatenate([[0.1, 0.2, 0.3], np.eye(3).ravel(), [1.0, 2.0, 3.0]])
+    return Part(rng.multivariate_normal(true, covariance), covariance)
+
+
+def covariance(seed: int) -> np.ndarray:
+    """Of parameters in units as different as metres and microtesla."""
+    root = np.random.default_rng(seed).normal(size=(15, 40))
+    scale = np.repeat([1e-3, 1e-3, 1e-1], [3, 9, 3])
+    return np.asarray(root @ root.T / 40 * np.outer(scale, scale))
+
+
+def test_honest_halves_are_one_sigma_apart() -> None:
+    """The mean square of the distance over 400 pairs is 1: its spread is sqrt(2 / 15 / 400)."""
+    squares = []
+    for seed in range(400):
+        S = covariance(seed)
+        found = compare_halves(half(2 * seed + 1, S), half(2 * seed + 2, S))
+        assert found.determined == 15
+        squares.append(found.distance**2)
+    assert np.mean(squares) == pytest.approx(1, abs=4 * np.sqrt(2 / 15 / 400))
+
+
+def test_what_a_half_leaves_open_takes_no_part() -> None:
+    S = covariance(1)
+    open_ = S.copy()
+    open_[2, :] = open_[:, 2] = 0.0
+    open_[2, 2] = np.inf
+    found = compare_halves(half(1, S), Part(half(2, S).vector, open_))
+    assert found.determined == 14
+    assert np.isinf(found.sigma[2])
+    assert np.isfinite(found.distance)
+
+
+def test_halves_of_nothing_say_why() -> None:
+    nothing = Part(np.zeros(15), np.diag(np.full(15, np.inf)))
+    assert "determine nothing" in compare_halves(nothing, nothing).reason
+
+
+def test_halves_that_differ_by_what_nobody_minds_agree() -> None:
+    """Ten sigmas, but half a millimetre."""
+    vector = np.concatenate([[0.0, 0, 0], np.eye(3).ravel(), [0.0, 0, 0]])
+    S = np.diag(np.repeat([5e-5, 1e-4, 1e-2], [3, 9, 3]) ** 2)
+    near, far = vector.copy(), vector.copy()
+    near[:3] += 5e-4
+    far[:3] += 5e-2
+    options = QaOptions()
+    assert halves_agree(compare_halves(Part(vector, S), Part(near, S)), options)
+    assert not halves_agree(compare_halves(Part(vector, S), Part(far, S)), options)
+    assert halves_agree(no_halves("not looked at"), options)
+
+
+def test_a_turn_between_halves_is_its_angle() -> None:
+    S, turn = covariance(1), Rotation.from_rotvec([0.0, 0.0, np.deg2rad(7)]).as_matrix()
+    one, two = (
+        np.concatenate([np.zeros(3), C.ravel(), np.zeros(3)]) for C in (1.1 * np.eye(3), turn)
+    )
+    found: Halves = compare_halves(Part(one, S), Part(two, S))
+    assert found.turned_deg == pytest.approx(7)
+
+
+@pytest.mark.parametrize(
+    ("content", "pattern"),
+    [
+        (None, "no such file; `l2m calibrate` writes it"),
+        ("", "not a metrics file of this program"),
+        ('{"format": "l2m-metrics", "version": 2}', "not a metrics file.*version"),
+        ("[1]", "not a metrics file"),
+    ],
+)
+def test_a_damaged_metrics_file_is_one_line(
+    tmp_path: Path, content: str | None, pattern: str
+) -> None:
+    path = tmp_path / "metrics.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(CalibrationError, match=pattern) as error:
+        read_metrics(path)
+    assert "\n" not in str(error.value)

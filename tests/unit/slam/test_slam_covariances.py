@@ -1,0 +1,119 @@
+"""Covariances of many poses, one by one and together, and where Cholesky is refused."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from l2m_factors import T, X
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.slam.covariances import (
+    TOGETHER,
+    Marginals,
+    joint_covariance,
+    pose_covariances,
+    pose_covariances_together,
+    well_scaled,
+)
+from l2m_gtsam.slam.solving import descended, least_fill
+
+COUNT = TOGETHER + 30  # poses: more than are eliminated for at once
+
+
+def test_poses_together_are_as_sure_as_one_by_one() -> None:
+    """A chain of poses that all see one landmark, of which they know little."""
+    rng, graph, values = np.random.default_rng(3), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    step = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.01, 0.02, 0.05, 0.05, 0.03]))
+    pose = gtsam.Pose3()
+    graph.add(gtsam.PriorFactorPose3(X(0), pose, step))
+    graph.add(gtsam.PriorFactorPoint3(T(0), np.ones(3), gtsam.noiseModel.Isotropic.Sigma(3, 2.0)))
+    values.insert(T(0), np.ones(3))
+    for k in range(COUNT):
+        values.insert(X(k), pose)
+        away = np.linalg.norm(pose.transformTo(np.ones(3)))
+        seen = gtsam.noiseModel.Isotropic.Sigma(1, 0.02)
+        graph.add(gtsam.RangeFactor3D(X(k), T(0), away, seen))
+        move = gtsam.Pose3.Expmap(rng.normal(0, 0.2, 6))
+        if k + 1 < COUNT:
+            graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), move, step))
+        pose = pose.compose(move)
+    marginals = Marginals(graph.linearize(values), least_fill(graph))
+    alone = pose_covariances(marginals, COUNT)
+    together = pose_covariances_together(marginals, COUNT)
+    np.testing.assert_allclose(together, alone, rtol=1e-7, atol=1e-9 * alone.max())
+
+
+# Of a start and of steps, rotation (rad) before translation (m).
+FAR_APART = [
+    ([1e-9, 1e-9, 1e-9, 1e3, 1e3, 1e3], [1e-2] * 6),
+    ([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1e4], [1e-3] * 6),
+    ([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1.0], [1e-2] * 5 + [1e5]),
+]
+
+
+def chain(
+    start: list[float], step: list[float]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[FloatArray]]:
+    """Return poses with these sigmas, and their covariances."""
+    rng, graph, values = np.random.default_rng(1), gtsam.NonlinearFactorGraph(), gtsam.Values()
+    sigmas, pose = gtsam.noiseModel.Diagonal.Sigmas, gtsam.Pose3()
+    graph.add(gtsam.PriorFactorPose3(X(0), pose, sigmas(np.array(start))))
+    values.insert(X(0), pose)
+    P = [np.diag(np.square(start))]
+    for k in range(8):
+        move = gtsam.Pose3.Expmap(rng.normal(0, 0.2, 6))
+        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), move, sigmas(np.array(step))))
+        pose = pose.compose(move)
+        values.insert(X(k + 1), pose)
+        Ad = move.inverse().AdjointMap()
+        P.append(Ad @ P[-1] @ Ad.T + np.diag(np.square(step)))
+    return graph, values, P
+
+
+def off(found: FloatArray, P: FloatArray) -> float:
+    """Return how far a covariance is off, in units of the sigmas."""
+    sigma = np.sqrt(np.diag(P))
+    return float(np.abs((found - P) / np.outer(sigma, sigma)).max())
+
+
+@pytest.mark.parametrize(("start", "step"), FAR_APART)
+def test_where_cholesky_is_refused_covariances_come_from_qr(
+    start: list[float], step: list[float]
+) -> None:
+    graph, values, P = chain(start, step)
+    with pytest.raises(RuntimeError, match="ndetermina"):
+        gtsam.Marginals(graph, values).marginalCovariance(X(8))
+    linear = graph.linearize(values)
+    marginals = Marginals(linear, least_fill(graph))
+    alone = pose_covariances(marginals, len(P))
+    together = pose_covariances_together(marginals, len(P))
+    pair, last = joint_covariance(linear, [X(5), X(2)]), joint_covariance(linear, [X(8)])
+    for k, true in enumerate(P):
+        assert off(alone[k], true) < 1e-5
+        assert off(together[k], true) < 1e-5
+    assert off(pair[:6, :6], P[5]) < 1e-5
+    assert off(pair[6:, 6:], P[2]) < 1e-5
+    assert off(last, P[8]) < 1e-5
+
+
+@pytest.mark.parametrize(("start", "step"), FAR_APART)
+def test_where_cholesky_is_refused_descents_go_on_by_qr(
+    start: list[float], step: list[float]
+) -> None:
+    """Poses away from where start and odometry have them come there."""
+    graph, values, _ = chain(start, step)
+    rng, begin = np.random.default_rng(2), gtsam.Values()
+    for key in values.keys():  # noqa: SIM118
+        begin.insert(key, values.atPose3(key).retract(0.1 * rng.normal(size=6)))
+    found = descended(graph, begin, least_fill(graph), 50).values
+    assert graph.error(found) < 1e-3
+
+
+def test_what_no_factor_tells_is_refused_in_one_line() -> None:
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    step = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    graph.add(gtsam.BetweenFactorPose3(X(0), X(1), gtsam.Pose3(), step))
+    for k in (0, 1):
+        values.insert(X(k), gtsam.Pose3())
+    with pytest.raises(CalibrationError, match="orders of magnitude"), well_scaled():
+        joint_covariance(graph.linearize(values), [X(1)])

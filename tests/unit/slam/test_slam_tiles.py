@@ -1,0 +1,127 @@
+"""Tiles of an unknown field: where they are laid, what they can say, what they learn."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.tiling import Resolution
+from l2m_gtsam.slam.unknown_field.field_prior import (
+    FieldPrior,
+    TileOptions,
+    field_prior,
+    within_budget,
+)
+from l2m_gtsam.slam.unknown_field.tiles import Anchoring, WaveTile, anchored
+from tests.worlds.exact import dipole_world
+
+OPTIONS = TileOptions(core=3.0, modes=150)
+PRIOR = FieldPrior(Hyperparameters(), Resolution(4.0, 3.0), OPTIONS)
+SIDE, SHIFT = 1e-4, np.eye(3)
+
+
+def walk(seed: int, steps: int = 120) -> tuple[FloatArray, FloatArray]:
+    """Return poses of a vehicle that turns at random, rotations and places in metres."""
+    rng = np.random.default_rng(seed)
+    yaw = np.cumsum(rng.normal(0, 0.3, steps))
+    tilt = rng.normal(0, 0.05, (steps, 2))
+    p = np.cumsum(0.3 * np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(steps)]), axis=0)
+    return Rotation.from_euler("ZYX", np.column_stack([yaw, tilt])).as_matrix(), p
+
+
+def tilted(seed: int) -> FloatArray:
+    return np.asarray(
+        Rotation.from_rotvec(np.random.default_rng(seed).normal(0, 0.3, 3)).as_matrix()
+    )
+
+
+def places(seed: int, count: int = 200) -> FloatArray:
+    return np.random.default_rng(seed).uniform([-1.5, -1.5, 0.0], [1.5, 1.5, 0.6], (count, 3))
+
+
+@given(seed=st.integers(0, 1000), core=st.floats(1.0, 6.0))
+@settings(deadline=None, max_examples=30)
+def test_every_key_pose_lies_in_the_core_of_its_tile(seed: int, core: float) -> None:
+    R, p = walk(seed)
+    laid = anchored(R, p, core)
+    anchor = laid.anchor[laid.tile]
+    yaw = np.arctan2(R[anchor, 1, 0], R[anchor, 0, 0])
+    level = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+    away = np.einsum("kji,kj->ki", level, p - p[anchor])
+    assert np.abs(away[:, :2]).max() <= core / 2 + 1e-9
+    assert np.array_equal(laid.tile[laid.anchor], np.arange(len(laid)))
+    assert np.all(laid.anchor[laid.tile] <= np.arange(len(p)))  # a tile begins with its anchor
+
+
+def test_a_tile_is_come_to_again_after_the_vehicle_was_away() -> None:
+    anchoring = Anchoring(np.array([0, 2]), np.array([0, 0, 1, 1, 0, 0, 1]))
+    way = np.array([0.0, 1.0, 2.0, 9.0, 10.0, 11.0, 12.0])
+    np.testing.assert_array_equal(anchoring.returns(way, 5.0), [4, 5])
+    np.testing.assert_array_equal(anchoring.returns(way, 2.5), [4, 5, 6])
+    assert not len(anchoring.returns(way, 50.0))
+
+
+@given(seed=st.integers(0, 1000))
+@settings(deadline=None, max_examples=10)
+def test_a_tile_obeys_maxwell_whichever_way_its_box_is_turned(seed: int) -> None:
+    R, points = tilted(seed), places(seed, 20)
+    tile = WaveTile.about(PRIOR, R, points @ R.T)
+    at, weights = points @ R.T, np.random.default_rng(seed).normal(size=len(tile))
+    field, gradient = tile.field_and_gradient(at, weights)
+    np.testing.assert_allclose(tile.features(at) @ weights, field, atol=1e-9)
+    numeric = np.stack(
+        [
+            (
+                tile.field_and_gradient(at + SIDE * axis, weights)[0]
+                - tile.field_and_gradient(at - SIDE * axis, weights)[0]
+            )
+            / (2 * SIDE)
+            for axis in SHIFT
+        ],
+        axis=-1,
+    )
+    scale = np.abs(gradient).max()
+    np.testing.assert_allclose(numeric, gradient, atol=1e-5 * scale)  # of a central difference
+    assert np.abs(np.trace(gradient, axis1=1, axis2=2)).max() < 1e-9 * scale
+    assert np.abs(gradient - gradient.transpose(0, 2, 1)).max() < 1e-9 * scale
+
+
+def test_the_likely_weights_predict_what_was_not_read() -> None:
+    """Readings of a hall in one tile: places between them to a few times the noise."""
+    world, noise = dipole_world(3), 0.2
+    read, held = places(1, 400), places(2, 100)
+    rng = np.random.default_rng(4)
+    field = world.field_and_gradient(read)[0] + noise * rng.normal(size=(400, 3))
+    prior = field_prior(read, field, OPTIONS)
+    tile = WaveTile.about(prior, np.eye(3), read)
+    variance = noise**2 + tile.unresolved(read)
+    weights = tile.likely_weights(read, field, variance)
+    error = tile.field_and_gradient(held, weights)[0] - world.field_and_gradient(held)[0]
+    assert np.sqrt(np.mean(error**2)) < 2 * noise
+    assert np.std(world.field_and_gradient(held)[0], axis=0).max() > 5 * noise
+
+
+def test_waves_stay_within_their_number() -> None:
+    rough = within_budget(Resolution(20.0, 12.0), OPTIONS)
+    tile = WaveTile.about(FieldPrior(Hyperparameters(), rough, OPTIONS), np.eye(3), places(1))
+    # The count is that of a disc of half waves; its rim and the uniform field add to it.
+    assert OPTIONS.modes < len(tile) < 1.3 * OPTIONS.modes
+    assert rough.floor / rough.ceiling == pytest.approx(20.0 / 12.0)
+    assert within_budget(Resolution(1.0, 1.0), OPTIONS) == Resolution(1.0, 1.0)
+
+
+def test_a_prior_is_not_learnt_from_nothing() -> None:
+    with pytest.raises(MapError, match="training readings"):
+        field_prior(np.zeros((3, 3)), np.ones((3, 3)), OPTIONS)
+
+
+def test_a_side_too_weak_for_any_wave_is_left_out() -> None:
+    """A ceiling so far off that readings could tell none of its waves."""
+    weak = FieldPrior(Hyperparameters(), Resolution(4.0, 0.1), OPTIONS)
+    tile = WaveTile.about(weak, np.eye(3), places(3))
+    assert len(tile) == len(WaveTile.about(PRIOR, np.eye(3), places(3)).basis.families[1]) + 3
+    assert tile.features(places(4)).shape == (200, 3, len(tile))

@@ -1,0 +1,93 @@
+"""A drive laid out on tiles: how much noise the tiles are thought to take up."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.tiling import Resolution
+from l2m_gtsam.slam.options import DriftOptions
+from l2m_gtsam.slam.relative_motion import Ways
+from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior, TileOptions
+from l2m_gtsam.slam.unknown_field.tiled import TiledDrive
+from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.drives.slam import rounds
+from tests.worlds.exact import DipoleWorld, random_sensors
+
+EXACT, NOISE = np.full(15, 1e-6), 0.2
+# No odometry error to speak of, and no source: residuals are noise and nothing else.
+STILL = DriftOptions(
+    position_share=1e-6, rotation_deg_per_m=1e-6, rotation_share=0, least_m=1e-6, least_deg=1e-6
+)
+UNIFORM = DipoleWorld(np.array([22.0, 3.0, -38.0]), np.zeros((1, 3)) - 9.0, np.zeros((1, 3)))
+WEAK = Hyperparameters(floor_scale=1e-3, ceiling_scale=1e-3)
+PRIOR = FieldPrior(WEAK, Resolution(4.0, 3.0), TileOptions(modes=100))
+
+
+@pytest.fixture(scope="module")
+def drawn() -> DrawnDrive:
+    rng = np.random.default_rng(2)
+    return drawn_drive(
+        UNIFORM, random_sensors(2, 6), rounds(20), rng, EXACT, NOISE, every=4, drift=STILL
+    )
+
+
+def counted(drawn: DrawnDrive, stated: float, spoilt: FloatArray, weights: FloatArray) -> float:
+    """Return the parameters that are counted, as a share of those with noise as stated.
+
+    ``spoilt`` is added to the squared lengths of residuals, shape (N,).
+    """
+    drive = drawn.drive
+    poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    tiled = TiledDrive.lay(Ways.along(drive, poses), poses, drive.sensors, PRIOR)
+    noise = np.full(len(drive.sensors.names), stated)
+    sights = tiled.sights(tiled.weights(drive.sensors, noise), drive.sensors)
+    squared = spoilt.copy()
+    for tile, sight in zip(tiled.tiles, sights, strict=True):
+        squared[tile.rows] += sight.squared(sight.whitening(noise))
+    of_noise = sum(each.parameters for each in tiled.doubts(noise, weights, squared))
+    chosen = np.flatnonzero(weights)
+    as_stated = (
+        tile.doubt(np.intersect1d(tile.rows, chosen), noise).parameters for tile in tiled.tiles
+    )
+    return of_noise / sum(as_stated)
+
+
+@pytest.mark.parametrize(("stated", "share"), [(0.2, 1.0), (0.4, 0.25), (3.2, 1 / 256), (0.1, 1.0)])
+def test_tiles_take_up_the_noise_that_there_is(
+    drawn: DrawnDrive, stated: float, share: float
+) -> None:
+    """By the residuals, however large noise is said to be; more than is said never counts.
+
+    The squares of 3 N normal numbers scatter by sqrt(2 / 3 N) of their mean: four times that.
+    """
+    count = len(drawn.drive.readings)
+    found = counted(drawn, stated, np.zeros(count), np.ones(count))
+    assert found == pytest.approx(share, rel=4 * np.sqrt(2 / (3 * count)))
+    assert found <= 1.0
+
+
+def test_readings_that_do_not_count_say_nothing_of_the_noise(drawn: DrawnDrive) -> None:
+    count = len(drawn.drive.readings)
+    wrong = np.arange(count) % 7 == 0
+    found = counted(drawn, 0.4, 1e6 * wrong, 1.0 - wrong)
+    assert found == pytest.approx(0.25, rel=4 * np.sqrt(2 / (3 * (~wrong).sum())))
+
+
+def test_a_tile_without_readings_is_not_laid(drawn: DrawnDrive) -> None:
+    """Its readings gone, the others keep their numbers and all of theirs."""
+    drive = drawn.drive
+    poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
+    ways = Ways.along(drive, poses)
+    whole = TiledDrive.lay(ways, poses, drive.sensors, PRIOR)
+    assert len(whole.tiles) > 1
+    gone = whole.tiles[0]
+    kept = np.setdiff1d(np.arange(len(drive.readings)), gone.rows)
+    left = replace(ways, readings=ways.readings[kept])
+    fewer = TiledDrive.lay(left, poses, drive.sensors, PRIOR)
+    assert [each.number for each in fewer.tiles] == [each.number for each in whole.tiles[1:]]
+    for after, before in zip(fewer.tiles, whole.tiles[1:], strict=True):
+        np.testing.assert_array_equal(kept[after.rows], before.rows)

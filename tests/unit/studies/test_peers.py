@@ -1,0 +1,177 @@
+"""The peers of the studies: right where their assumptions hold, one line where they cannot run."""
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import polar
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, KnownSensor, PoseMotion, Readings
+from l2m_gtsam.errors import MapError, PeerError
+from l2m_gtsam.studies.peers.estimate import soft_iron
+from l2m_gtsam.studies.peers.magyc import ChipDrive, magyc_peer, magyc_python
+from l2m_gtsam.studies.peers.naive import NaiveOptions, naive_map, naive_peer
+from tests.worlds.exact import DipoleWorld, drive, random_sensors
+
+NOISE = 0.05  # uT, of surveys and drives
+EARTH = np.array([22.0, 3.0, -38.0])
+OPTIONS = NaiveOptions(reach=1.0, spacing=0.01, places=500, learning=200, readings=60)
+
+
+def smooth_world() -> DipoleWorld:
+    """Twelve strong dipoles 3 m off: waves much longer than the survey's spacing."""
+    rng = np.random.default_rng(3)
+    positions = rng.uniform([-5, -5, 0], [5, 5, 1], (12, 3))
+    positions[:, 2] = np.where(np.arange(12) % 2 == 0, -3.0, 4.0)
+    return DipoleWorld(EARTH, positions, rng.normal(0, 600, (12, 3)))
+
+
+def survey(world: DipoleWorld, count: int = 500) -> tuple[FloatArray, FloatArray]:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-5, -5, -0.4], [5, 5, 1.4], (count, 3))
+    field, _ = world.field_and_gradient(points)
+    return points, field + rng.normal(0, NOISE, field.shape)
+
+
+def turning(seed: int, sensor: KnownSensor, rate: float = 20.0) -> ChipDrive:
+    """A minute of turning through all attitudes at one place, in a uniform field."""
+    rng = np.random.default_rng(seed)
+    seconds = np.arange(int(60 * rate)) / rate
+    now, before, after = (attitude_at(seconds + shift) for shift in (0.0, -1e-4, 1e-4))
+    turn_rate = (before.inv() * after).as_rotvec() / 2e-4
+    R = now.as_matrix()
+    field = sensor.distortion.apply(np.einsum("nji,j->ni", R, EARTH))
+    count = len(seconds)
+    readings = Readings(
+        (sensor.sensor,),
+        np.zeros(count, np.int64),
+        (seconds * 1e9).round().astype(np.int64),
+        R,
+        np.zeros((count, 3)),
+        field + rng.normal(0, NOISE, field.shape),
+        PoseMotion(np.column_stack([turn_rate, np.zeros((count, 3))]), np.zeros(count)),
+    )
+    return ChipDrive(readings, polar(sensor.distortion.C)[0])
+
+
+def attitude_at(seconds: FloatArray) -> Rotation:
+    """Three turns at once, with periods that have no common multiple within a minute."""
+    angles = np.array([0.61, 0.37, 0.23])[None] * seconds[:, None]
+    return Rotation.from_euler("ZYX", angles)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.1, 10.0))
+def test_soft_iron_is_what_a_turn_and_a_scale_leave(seed: int, scale: float) -> None:
+    rng = np.random.default_rng(seed)
+    C = np.eye(3) + rng.uniform(-0.2, 0.2, (3, 3))
+    turned = scale * C @ Rotation.random(random_state=seed).as_matrix()
+    S = soft_iron(C)
+    # A few roundings of numbers near one.
+    np.testing.assert_allclose(S, soft_iron(turned), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(S, S.T, rtol=0, atol=1e-14)
+    assert np.linalg.det(S) == pytest.approx(1.0, abs=1e-13)
+    # C C^T and S S are the same ellipsoid, but for its size.
+    ellipsoid = C @ C.T / np.cbrt(np.linalg.det(C)) ** 2
+    np.testing.assert_allclose(S @ S, ellipsoid, rtol=0, atol=1e-13)
+
+
+def test_the_naive_peer_finds_a_sensor_on_easy_ground() -> None:
+    world, sensors = smooth_world(), random_sensors(2, 1)
+    readings = drive(2, sensors, world, noise=NOISE)
+    field_map = naive_map(*survey(world), readings.p_map_lidar, OPTIONS)
+    truth = sensors[0]
+    found = naive_peer(readings, field_map, truth.t_lidar_mag + 0.15, OPTIONS)
+    # 60 readings of noise 0.05 uT in gradients of 1 uT/m tell t to 6 mm, five of which are allowed
+    # for; C and H to what that moves the field by, C relative to its 44 uT, H in height alone.
+    np.testing.assert_allclose(found.t, truth.t_lidar_mag, rtol=0, atol=0.03)
+    np.testing.assert_allclose(found.C, truth.distortion.C, rtol=0, atol=0.01)
+    np.testing.assert_allclose(found.H, truth.distortion.H, rtol=0, atol=0.3)
+    np.testing.assert_array_equal(found.soft_iron, soft_iron(found.C))
+    assert found.seconds > 0
+
+
+def test_the_naive_map_takes_survey_near_the_drive_only() -> None:
+    points, field = survey(smooth_world())
+    path = np.zeros((1, 3))
+    near = np.linalg.norm(points, axis=1) <= 2.0
+    options = OPTIONS.model_copy(update={"reach": 2.0, "spacing": 0.01})
+    assert naive_map(points, field, path, options).places == np.count_nonzero(near) > 20
+    cubes = len(np.unique(np.floor(points[near] / 0.8), axis=0))
+    coarse = options.model_copy(update={"spacing": 0.8})
+    assert naive_map(points, field, path, coarse).places == cubes
+    few = options.model_copy(update={"places": 21})
+    assert naive_map(points, field, path, few).places == 21
+
+
+def test_too_little_survey_near_the_drive_is_one_line() -> None:
+    points, field = survey(smooth_world())
+    with pytest.raises(MapError, match=r"^naive peer: 0 of 500 survey readings .* wider reach$"):
+        naive_map(points, field, np.full((1, 3), 50.0), OPTIONS)
+
+
+def test_a_missing_scikit_learn_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sklearn.gaussian_process", None)
+    points, field = survey(smooth_world())
+    with pytest.raises(PeerError, match=r"^the naive peer needs .*l2m-gtsam\[studies\]'$"):
+        naive_map(points, field, points, OPTIONS)
+
+
+@pytest.fixture(scope="module")
+def python_of_magyc(repository: Path) -> Path:
+    python = Path(os.environ.get("L2M_MAGYC_PYTHON", repository / ".venv-magyc/bin/python"))
+    if not python.is_file():
+        reason = f"no magyc at {python}: `make magyc` makes its environment"
+        if os.environ.get("L2M_REQUIRE_MAGYC") == "1":
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return python
+
+
+def test_magyc_finds_offset_and_soft_iron_in_a_uniform_field(python_of_magyc: Path) -> None:
+    sensors = random_sensors(5, 3)
+    drives = [turning(seed, sensor) for seed, sensor in enumerate(sensors)]
+    for sensor, found in zip(sensors, magyc_peer(drives, python_of_magyc), strict=True):
+        # It differences readings backwards, so that its rates are half of 50 ms late: at 0.8 rad/s
+        # 2 % of 44 uT, 0.8 uT, in directions that turn. A quarter of it is left for what stays.
+        np.testing.assert_allclose(found.H, sensor.distortion.H, rtol=0, atol=0.2)
+        expected = soft_iron(sensor.distortion.C)
+        np.testing.assert_allclose(found.soft_iron, expected, rtol=0, atol=0.005)
+        assert np.isnan(found.t).all()
+        assert np.isnan(found.C).all()
+        assert found.seconds > 0
+
+
+def test_magyc_without_a_result_says_nan(python_of_magyc: Path) -> None:
+    good = turning(0, random_sensors(5, 1)[0])
+    readings = replace(good.readings, field=np.full_like(good.readings.field, np.nan))
+    nothing, found = magyc_peer([replace(good, readings=readings), good], python_of_magyc)
+    assert np.isnan([*nothing.H, *nothing.soft_iron.ravel()]).all()
+    assert np.isfinite([*found.H, *found.soft_iron.ravel()]).all()
+
+
+def test_readings_without_motion_are_one_line() -> None:
+    chip = turning(0, random_sensors(5, 1)[0], rate=1.0)
+    still = replace(chip, readings=replace(chip.readings, motion=None))
+    with pytest.raises(PeerError, match=r"^magyc needs turn rates: .* drive 0 have no motion$"):
+        magyc_peer([still], Path(sys.executable))
+
+
+def test_an_environment_without_magyc_is_one_line() -> None:
+    chip = turning(0, random_sensors(5, 1)[0], rate=1.0)
+    # The environment of the tests is one: magyc cannot be installed beside what we need.
+    with pytest.raises(PeerError, match=r"^magyc does not run .* No module named 'magyc'; .*$"):
+        magyc_peer([chip], Path(sys.executable))
+
+
+def test_no_environment_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("L2M_MAGYC_PYTHON", str(tmp_path / "python"))
+    with pytest.raises(PeerError, match=r"^magyc has no environment at .*python: run `make magyc`"):
+        magyc_python()
+    (tmp_path / "python").touch()
+    assert magyc_python() == tmp_path / "python"
