@@ -47,3 +47,7 @@ class PeerError(L2MError):
 
 class LidarError(L2MError):
     """Poses that cannot be had from point clouds."""
+
+
+class Notice(UserWarning):
+    """One line, such as that of a file that was damaged and is made anew."""

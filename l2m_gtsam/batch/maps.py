@@ -9,18 +9,25 @@ from typing import Any
 from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.survey import read_survey, scanned_place
-from l2m_gtsam.cli.tables.tables import MapDescription
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.mapping import compare_recordings, map_recordings, update_map
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
-from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.field_map import FieldMap, MapSummary
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.figures import map_figure, save_figure
 from l2m_gtsam.storage.digest import source_file
 from l2m_gtsam.storage.map_file import save_map
+
+
+@dataclass(frozen=True)
+class MapDescription:
+    """A map's figures and where it came from: plain values of its file."""
+
+    summary: MapSummary
+    provenance: dict[str, Any]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.calibration.calibrate import VERSIONED
-from l2m_gtsam.config import CalibrationOptions, Config, load_config
+from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.progress import Progress

@@ -10,6 +10,7 @@ from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem, solve_moving
 from l2m_gtsam.calibration.named_priors import priors_of
 from l2m_gtsam.calibration.one_key import OneKeySolution
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.remembered_map import RememberedMap
@@ -17,7 +18,6 @@ from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import (
     FloatArray,
     Readings,

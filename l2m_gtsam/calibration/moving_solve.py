@@ -18,7 +18,7 @@ from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings, Trajectory
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.records.model_results import ModelComparison, MovingField
+from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.solve.model_comparison import ModelOptions, compare_models
 
 ROUNDS = 5  # of taking fields off; two or three settle

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Recording, Synchronised
 from l2m_gtsam.recording.joining import joined_readings
 from l2m_gtsam.recording.pose_noise import pose_roots

@@ -10,7 +10,7 @@ from l2m_gtsam.calibration.contradictions import Contradiction
 from l2m_gtsam.calibration.explanation import Explained
 from l2m_gtsam.calibration.moving_solve import MovingSolution
 from l2m_gtsam.calibration.one_key import OneKeySolution
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import (
     Distortion,
     Readings,

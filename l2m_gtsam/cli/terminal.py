@@ -27,7 +27,7 @@ def shown_notices() -> Iterator[None]:
     """Show notices of this program as its warnings; others appear as Python has them."""
     import warnings
 
-    from l2m_gtsam.records.notices import Notice
+    from l2m_gtsam.errors import Notice
 
     with warnings.catch_warnings():
         usual = warnings.showwarning

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.geometry import as_matrix, from_matrix
 from l2m_gtsam.lidar.extra import library
-from l2m_gtsam.records.rigid import as_matrix, from_matrix
 
 
 class KissFollower:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError
-from l2m_gtsam.geometry import moved
+from l2m_gtsam.geometry import compose, moved
 from l2m_gtsam.lidar.odometry import CHILD_FRAME, ScanStep
 from l2m_gtsam.lidar.registration import (
     PoseEstimate,
@@ -23,7 +23,6 @@ from l2m_gtsam.lidar.registration import (
 )
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.rigid import compose
 from l2m_gtsam.records.scans import PoseFix
 
 

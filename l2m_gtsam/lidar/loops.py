@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.data import RigidTransform
+from l2m_gtsam.geometry import between
 from l2m_gtsam.lidar.odometry import ScanStep
 from l2m_gtsam.lidar.registration import Refusal, RegistrationOptions, by_scan, register
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.rigid import between
 from l2m_gtsam.records.scans import Loop
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
-from l2m_gtsam.geometry import moved
+from l2m_gtsam.geometry import IDENTITY, between, compose, difference, moved, perturbed
 from l2m_gtsam.lidar.kiss import KissFollower
 from l2m_gtsam.lidar.registration import (
     PoseEstimate,
@@ -24,7 +24,6 @@ from l2m_gtsam.lidar.registration import (
 )
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.rigid import IDENTITY, between, compose, difference, perturbed
 from l2m_gtsam.records.scans import Scan, taken_at_once
 
 FRAME, CHILD_FRAME = "odom", "lidar"

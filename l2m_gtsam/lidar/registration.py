@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.geometry import as_matrix, difference, from_matrix, perturbed
 from l2m_gtsam.lidar.extra import library
 from l2m_gtsam.lidar.information import (
     Planes,
@@ -17,7 +18,6 @@ from l2m_gtsam.lidar.information import (
 )
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.rigid import as_matrix, difference, from_matrix, perturbed
 
 # Steps smaller than this end a registration: far below any error of it.
 STEP_RAD, STEP_M = 1e-4, 1e-4

@@ -6,10 +6,10 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, LidarMap, RigidTransform
 from l2m_gtsam.errors import LidarError
+from l2m_gtsam.geometry import difference
 from l2m_gtsam.lidar.registration import Registration, RegistrationOptions, register
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.rigid import difference
 
 # Points of the scan that rank the candidates.
 FEW_POINTS = 400

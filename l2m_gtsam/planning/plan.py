@@ -9,11 +9,11 @@ from l2m_gtsam.calibration.explanation import from_priors, undetermined
 from l2m_gtsam.calibration.forecast import Forecast, forecast
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.named_priors import priors_of
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.start.rigid_groups import placed
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.config import CalibrationOptions, PlanOptions
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
@@ -29,6 +29,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.planning.motion import Motion, extra_motions, loop, places_around, strongest
+from l2m_gtsam.planning.options import PlanOptions
 from l2m_gtsam.records.plan import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions

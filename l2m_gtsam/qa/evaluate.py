@@ -1,7 +1,7 @@
 """A calibration -> the figures that it is judged by, and its view. Pure: no files, no terminal."""
 
 from l2m_gtsam.calibration.calibrate import Calibrated
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Recording
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
@@ -10,8 +10,7 @@ from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.repeatability import compared_drives, compared_halves
 from l2m_gtsam.qa.scene import calibration_scene
-from l2m_gtsam.records.metrics import Halves, Metrics
-from l2m_gtsam.records.repeat import Repeatability
+from l2m_gtsam.records.metrics import Halves, Metrics, Repeatability
 from l2m_gtsam.records.scene import Scene
 
 FIGURES = "figures"

@@ -10,14 +10,13 @@ import numpy as np
 from l2m_gtsam.calibration.alternation import spread
 from l2m_gtsam.calibration.calibrate import Calibrated
 from l2m_gtsam.calibration.one_key import solve_part
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.qa.metrics.drives import compare_drives
 from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
-from l2m_gtsam.records.metrics import Halves
-from l2m_gtsam.records.repeat import Repeatability
+from l2m_gtsam.records.metrics import Halves, Repeatability
 
 STEPS = 3  # alternations from where the whole was found; the joint graph does the rest
 MORE = 4  # times as many readings of a drive as of a half

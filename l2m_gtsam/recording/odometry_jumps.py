@@ -13,9 +13,8 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Trajectory
-from l2m_gtsam.geometry import carried_back, moved
+from l2m_gtsam.geometry import carried_back, compose, moved
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.rigid import compose
 
 NEIGHBOURS = 3  # steps before and after that say how the vehicle moves
 LEAST_STEPS = 4  # of a drive in which a step can be told from the others

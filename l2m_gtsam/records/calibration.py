@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from l2m_gtsam.data import Distortion, FloatArray, SourceFile, SyncCounts
-from l2m_gtsam.records.model_results import ModelComparison, MovingField
+from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 
 
 class SensorStatus(StrEnum):

@@ -1,11 +1,29 @@
 """What a LiDAR saw in one turn, and what registering it says of poses: frozen records."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
+from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.options import Options
+
+
+class ScanOptions(Options):
+    """What is taken of a scan."""
+
+    min_range: float = Field(default=0.5, ge=0)
+    """Nearer points are dropped, metres from the lidar: they are the vehicle itself."""
+    max_range: float = Field(default=30.0, gt=0, le=1000)
+    """Further points are dropped, metres from the lidar."""
+
+    @model_validator(mode="after")
+    def _leave_room(self) -> Self:
+        if self.min_range >= self.max_range:
+            raise ValueError("`min_range` must be less than `max_range`")
+        return self
 
 
 @dataclass(frozen=True)

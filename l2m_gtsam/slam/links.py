@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Trajectory
-from l2m_gtsam.geometry import moved
+from l2m_gtsam.geometry import between, compose, moved
 from l2m_gtsam.recording.sync import interpolated
-from l2m_gtsam.records.rigid import between, compose
 from l2m_gtsam.records.scans import Loop, PoseFix, ScanEvidence
 from l2m_gtsam.slam.odometry import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions

@@ -5,11 +5,11 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
+from l2m_gtsam.geometry import IDENTITY, between
 from l2m_gtsam.lidar.odometry import LEAST_POINTS, ScanStep
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.recording.odometry_jumps import Mended
 from l2m_gtsam.recording.sync import has_pose, interpolated, twists
-from l2m_gtsam.records.rigid import IDENTITY, between
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.odometry import drift_covariance
 from l2m_gtsam.slam.options import SlamOptions

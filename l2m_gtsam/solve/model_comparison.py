@@ -26,8 +26,7 @@ from pydantic import Field
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.model_results import ModelComparison, ModelFigures
-from l2m_gtsam.records.sensor_models import ONE_DRIVE, Model, Samples
+from l2m_gtsam.records.sensor_models import ONE_DRIVE, Model, ModelComparison, ModelFigures, Samples
 from l2m_gtsam.solve.model_choice import Choice, HeldOut, Trial, choose, reason_of, standard_error
 from l2m_gtsam.solve.model_fits import Fit, Spread, compress, fit_model, inflation, spread_of
 

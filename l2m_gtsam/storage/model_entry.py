@@ -5,8 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.records.model_results import ModelComparison, ModelFigures, MovingField
-from l2m_gtsam.records.sensor_models import Coefficients, Model
+from l2m_gtsam.records.sensor_models import (
+    Coefficients,
+    Model,
+    ModelComparison,
+    ModelFigures,
+    MovingField,
+)
 from l2m_gtsam.storage.file_model import Lenient, Matrix, Vector
 
 

@@ -3,34 +3,17 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
-from pydantic import Field, model_validator
 
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.options import Options
-from l2m_gtsam.records.scans import Scan
+from l2m_gtsam.records.scans import Scan, ScanOptions
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.messages import header_ns
 from l2m_gtsam.storage.open_bag import Progress, open_bag
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE, chosen_cloud_topic, points_of, times_of
-
-
-class ScanOptions(Options):
-    """What is taken of a scan."""
-
-    min_range: float = Field(default=0.5, ge=0)
-    """Nearer points are dropped, metres from the lidar: they are the vehicle itself."""
-    max_range: float = Field(default=30.0, gt=0, le=1000)
-    """Further points are dropped, metres from the lidar."""
-
-    @model_validator(mode="after")
-    def _leave_room(self) -> Self:
-        if self.min_range >= self.max_range:
-            raise ValueError("`min_range` must be less than `max_range`")
-        return self
 
 
 @dataclass(frozen=True)

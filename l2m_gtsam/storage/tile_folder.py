@@ -11,9 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Lock
 
-from l2m_gtsam.errors import ConfigError, MapError, OutputError
+from l2m_gtsam.errors import ConfigError, MapError, Notice, OutputError
 from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, Entry, Made, TileStore
-from l2m_gtsam.records.notices import Notice
 from l2m_gtsam.storage.tile_file import fingerprint_of, read_tile, write_tile
 
 SUFFIX, FILE_SUFFIX = ".tiles", ".tile"

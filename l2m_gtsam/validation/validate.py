@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.config import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.parallel.threads import one_blas_thread

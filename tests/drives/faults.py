@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
-from l2m_gtsam.records.rigid import compose
+from l2m_gtsam.geometry import compose
 from tests.drives.slam import SlamDrive
 from tests.worlds.exact import DipoleWorld
 

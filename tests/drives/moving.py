@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from l2m_gtsam.calibration.calibrate import calibrate
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import (
     Distortion,
     FloatArray,

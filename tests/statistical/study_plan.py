@@ -8,14 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrate
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.start.global_start import StartOptions
-from l2m_gtsam.config import CalibrationOptions, PlanOptions
 from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.planning.motion import MotionOptions
+from l2m_gtsam.planning.options import PlanOptions
 from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.records.calibration import SensorStatus
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors

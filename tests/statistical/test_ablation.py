@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from l2m_gtsam.calibration.start.global_start import StartOptions
-from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions

@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrate
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.maps.field_map import FieldMap

@@ -4,8 +4,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.model_results import ModelComparison, ModelFigures, MovingField
-from l2m_gtsam.records.sensor_models import Model
+from l2m_gtsam.records.sensor_models import Model, ModelComparison, ModelFigures, MovingField
 
 HEADINGS = (
     "parameters",

@@ -1,14 +1,13 @@
 """Results as tables in the terminal."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from l2m_gtsam.batch.maps import MapDescription
 from l2m_gtsam.data import FloatArray, KnownSensor
-from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     Disagreement,
@@ -129,14 +128,6 @@ def _topic_row(topic: TopicReport) -> tuple[str, ...]:
 
 def _number(value: float, form: str) -> str:
     return "" if np.isnan(value) else format(value, form)
-
-
-@dataclass(frozen=True)
-class MapDescription:
-    """A map's figures and where it came from: plain values of its file."""
-
-    summary: MapSummary
-    provenance: dict[str, Any]
 
 
 def map_table(description: MapDescription) -> Table:

@@ -20,8 +20,7 @@ from l2m_gtsam.qa.metrics.halves import NOT_DONE, SEVERAL, no_halves
 from l2m_gtsam.qa.metrics.mounting import mounting
 from l2m_gtsam.qa.metrics.plain import row, rows
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.metrics import Halves, MapPicture, Metrics, SensorMetrics
-from l2m_gtsam.records.repeat import Repeatability
+from l2m_gtsam.records.metrics import Halves, MapPicture, Metrics, Repeatability, SensorMetrics
 
 DRAWN = 6000  # readings of all sensors together, so that a report stays small
 FEWEST, MOST = 100, 500  # of each

@@ -8,7 +8,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.records.repeat import DriveRepeat, Repeatability
+from l2m_gtsam.records.metrics import DriveRepeat, Repeatability
 from l2m_gtsam.solve.chi_square import quantile
 
 TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas

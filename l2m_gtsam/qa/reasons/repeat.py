@@ -7,8 +7,7 @@ from l2m_gtsam.qa.metrics.misfit import halves_agree
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.reasons.reason import Case, Level, Reason, level_of
 from l2m_gtsam.records.calibration import SensorStatus
-from l2m_gtsam.records.metrics import Halves, SensorMetrics
-from l2m_gtsam.records.repeat import DriveRepeat, Repeatability
+from l2m_gtsam.records.metrics import DriveRepeat, Halves, Repeatability, SensorMetrics
 
 # What a solve that ended otherwise says of its halves says nothing of the mounting.
 JUDGED = (SensorStatus.SOLVED, SensorStatus.CONTRADICTED, SensorStatus.NOT_CONVERGED)

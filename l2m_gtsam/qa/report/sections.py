@@ -16,8 +16,7 @@ from l2m_gtsam.qa.report.figures.drives import drive_names, drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.svg import as_svg
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.metrics import Metrics, SensorMetrics
-from l2m_gtsam.records.repeat import Repeatability
+from l2m_gtsam.records.metrics import Metrics, Repeatability, SensorMetrics
 
 
 @dataclass(frozen=True)

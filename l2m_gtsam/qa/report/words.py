@@ -6,8 +6,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.report.figures.correlations import NAMES, correlations
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
-from l2m_gtsam.records.metrics import SensorMetrics
-from l2m_gtsam.records.repeat import Repeatability
+from l2m_gtsam.records.metrics import Repeatability, SensorMetrics
 from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
 
 

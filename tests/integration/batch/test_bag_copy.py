@@ -28,7 +28,7 @@ from l2m_gtsam.batch.corrected_bag import Application, Applied, apply_calibratio
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import BagError, CalibrationError, ConfigError, L2MError, OutputError
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
-from l2m_gtsam.records.model_results import MovingField
+from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.storage import calibrated_topics
 from l2m_gtsam.storage.bag import read_fields
 from l2m_gtsam.storage.bag_options import BagOptions

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.geometry import between, difference
 from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, accumulated, follow, odometry
-from l2m_gtsam.records.rigid import between, difference
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from tests.worlds.lidar_rooms import CORRIDOR, ROOM, Room, round_trip, rows, scans, straight, swept
 

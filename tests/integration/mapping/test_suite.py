@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.config import MappingOptions
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, Trajectory
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.mapping import suite_readings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.suite.calibrate_suite import calibrate_suite
 from l2m_gtsam.mapping.suite.options import SuiteOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus

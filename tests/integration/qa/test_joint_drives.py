@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.batch.reports import REPORT_FILE, write_report
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrate, calibrated
-from l2m_gtsam.config import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.qa.evaluate import appraise
 from l2m_gtsam.qa.judge import Verdict, judge

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2m_gtsam.config import Config, MappingOptions
+from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording, Trajectory
 from l2m_gtsam.mapping.mapping import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.suite.calibrate_suite import calibrate_suite
 from l2m_gtsam.mapping.suite.options import SuiteOptions
 from l2m_gtsam.maps.field_map import FieldMap

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import KnownSensor, RigidTransform, Trajectory
+from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.loops import LoopOptions, find_loops
 from l2m_gtsam.lidar.registration import PoseEstimate, RegistrationOptions
 from l2m_gtsam.lidar.surface import Surface, smoothed
 from l2m_gtsam.recording.odometry_jumps import Mended, without_jumps
 from l2m_gtsam.records.localisation import LocalisationResult
-from l2m_gtsam.records.rigid import compose
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.explore import explore
 from l2m_gtsam.slam.localise import localise

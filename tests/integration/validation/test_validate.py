@@ -24,7 +24,7 @@ from l2m_gtsam.qa.metrics.changes import compare_calibrations
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
-from l2m_gtsam.records.model_results import MovingField
+from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.records.validation import (
     DriveValidation,
     NamedSource,

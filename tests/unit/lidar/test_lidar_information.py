@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.geometry import difference, perturbed
 from l2m_gtsam.lidar.information import (
     Planes,
     distances,
@@ -12,7 +13,6 @@ from l2m_gtsam.lidar.information import (
     plane_information,
     tempered,
 )
-from l2m_gtsam.records.rigid import difference, perturbed
 
 
 def unit(vectors: FloatArray) -> FloatArray:

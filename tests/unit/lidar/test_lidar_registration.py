@@ -7,6 +7,7 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError
+from l2m_gtsam.geometry import difference, perturbed
 from l2m_gtsam.lidar.registration import (
     Refusal,
     Registration,
@@ -15,7 +16,6 @@ from l2m_gtsam.lidar.registration import (
     register,
 )
 from l2m_gtsam.lidar.surface import Surface, smoothed
-from l2m_gtsam.records.rigid import difference, perturbed
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.worlds.lidar_rooms import CORRIDOR, ROOM, Room, round_trip, rows, scans, seen, straight
 

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
-from l2m_gtsam.geometry import moved
+from l2m_gtsam.geometry import between, difference, moved
 from l2m_gtsam.recording.odometry_jumps import JumpOptions, Mended, without_jumps
-from l2m_gtsam.records.rigid import between, difference
 from l2m_gtsam.slam.odometry import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 from tests.drives.faults import jumped, shift

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.records.calibration import SensorStatus, TimeOffset
-from l2m_gtsam.records.model_results import MovingField
+from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.storage.exports.bias_scale import (
     bias_scale_notes,
     bias_scale_text,

@@ -12,10 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from l2m_gtsam.errors import ConfigError, MapError
+from l2m_gtsam.errors import ConfigError, MapError, Notice
 from l2m_gtsam.maps.harmonic.compiled_arrays import near_from_arrays
 from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, Entry
-from l2m_gtsam.records.notices import Notice
 from l2m_gtsam.storage import tile_file
 from l2m_gtsam.storage.tile_file import fingerprint_of, read_tile, write_tile
 from l2m_gtsam.storage.tile_folder import LIMIT, TileFolder, tiles_beside

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from l2m_gtsam.qa.report.svg import GRID, INK, MUTED, SMALL, X, new_figure
 from l2m_gtsam.records.calibration import SensorCalibration
-from l2m_gtsam.records.repeat import Repeatability
+from l2m_gtsam.records.metrics import Repeatability
 
 MANY = 12  # drives beyond which only some are numbered
 

@@ -1,0 +1,40 @@
+"""Options of poses from point clouds, composed of those of their steps."""
+
+from enum import StrEnum
+
+from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, ScanStartOptions
+from l2m_gtsam.lidar.loops import LoopOptions
+from l2m_gtsam.lidar.odometry import OdometryOptions
+from l2m_gtsam.lidar.search import SearchOptions
+from l2m_gtsam.options import Options
+from l2m_gtsam.records.scans import ScanOptions
+
+
+class PoseSource(StrEnum):
+    """Where the poses of a drive in a map come from."""
+
+    AUTO = "auto"
+    CLOUDS = "clouds"
+
+
+class LidarOptions(Options):
+    """How poses come from point clouds."""
+
+    poses: PoseSource = PoseSource.AUTO
+    """`auto`: from the clouds where a bag has no poses of its own, and the map has a cloud; or
+    `clouds`: from the clouds, whatever else there is."""
+    topic: str | None = None
+    """Topic of type sensor_msgs/PointCloud2; if not given, the only one of the bag. Scans are in
+    the frame of the lidar."""
+    scan: ScanOptions = ScanOptions()
+    """What is taken of each scan."""
+    odometry: OdometryOptions = OdometryOptions()
+    """How the lidar is followed from scan to scan."""
+    start: ScanStartOptions | None = None
+    """Where the drive begins in the map; looked for along the mapping drives if it is not given."""
+    search: SearchOptions = SearchOptions()
+    """How it is looked for."""
+    localisation: ScanLocalisationOptions = ScanLocalisationOptions()
+    """How scans are localised on the map's cloud."""
+    loops: LoopOptions = LoopOptions()
+    """How places are recognised that a drive returns to."""
