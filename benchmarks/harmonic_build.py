@@ -18,7 +18,7 @@ from benchmarks.compiled_map import once
 from benchmarks.map_queries import READINGS, SIZE, survey, warehouse
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.mapping.mapping import suite_readings
+from l2m_gtsam.mapping.map_building import suite_readings
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.sliding_gp import SlidingGP

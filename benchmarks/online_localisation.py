@@ -18,7 +18,7 @@ from benchmarks.one_key import NOISE, hall, survey
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.slam.online.following import SECTION, Follower
+from l2m_gtsam.slam.online.follower import SECTION, Follower
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.worlds.exact import random_sensors

@@ -14,11 +14,9 @@ from rich.table import Table
 
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.covariances import joint_covariance
 from l2m_gtsam.slam.online.belief import gain_of
-from l2m_gtsam.slam.solving import descended, least_fill
-from l2m_gtsam.slam.unknown_field.gaussian_prior import prior_factors
-from l2m_gtsam.slam.unknown_field.joint_gaussian import JointGaussian
+from l2m_gtsam.slam.solver import descended, joint_covariance, least_fill
+from l2m_gtsam.slam.unknown_field.field_memory import JointGaussian, prior_factors
 from tests.reference.dense_newton import newton
 
 STEPS = 3  # of a section's last stage, as measured

@@ -12,7 +12,7 @@ from l2m_gtsam.batch.survey import read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.mapping import compare_recordings, map_recordings, update_map
+from l2m_gtsam.mapping.map_building import compare_recordings, map_recordings, update_map
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary

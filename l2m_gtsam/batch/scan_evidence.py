@@ -10,16 +10,16 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording, RigidTransform
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.geometry import compose
-from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
-from l2m_gtsam.lidar.loops import find_loops
+from l2m_gtsam.lidar.loop_closures import find_loops
 from l2m_gtsam.lidar.registration import PoseEstimate
+from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.odometry_jumps import without_jumps
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.slam.localise import NO_SCANS, start_pose
+from l2m_gtsam.slam.localisation import NO_SCANS, start_pose
+from l2m_gtsam.slam.odometry import carried_scans
 from l2m_gtsam.slam.options import Usage
-from l2m_gtsam.slam.scan_odometry import carried_scans
 from l2m_gtsam.storage.scan_topic import has_clouds
 
 # Along what a scan does not show a fix says nothing, nor do some hundreds of them; more than this

@@ -14,11 +14,10 @@ from l2m_gtsam.batch.opening import (
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import BagError, LidarError
-from l2m_gtsam.lidar.localisation import ScanLocalisation, localise_scans
 from l2m_gtsam.lidar.odometry import ScanStep, follow, odometry
 from l2m_gtsam.lidar.options import LidarOptions, PoseSource
 from l2m_gtsam.lidar.registration import PoseEstimate, unseen_covariance
-from l2m_gtsam.lidar.search import find_start
+from l2m_gtsam.lidar.scan_localisation import ScanLocalisation, find_start, localise_scans
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.recording.joining import joined

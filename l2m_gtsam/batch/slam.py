@@ -26,11 +26,11 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.slam.explore import explore
-from l2m_gtsam.slam.figures import Told, localisation_record
-from l2m_gtsam.slam.g2o import write_g2o
-from l2m_gtsam.slam.localise import Sources, localise
-from l2m_gtsam.slam.localised import Localised
+from l2m_gtsam.slam.exploration import explore
+from l2m_gtsam.slam.localisation import Sources, localise
+from l2m_gtsam.slam.pose_graph import write_g2o
+from l2m_gtsam.slam.record import Told, localisation_record
+from l2m_gtsam.slam.solution import Localised
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.digest import source_file

@@ -7,7 +7,7 @@ from pathlib import Path
 from l2m_gtsam.batch.opening import check_bags, read_drive
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.config import Config
-from l2m_gtsam.mapping.suite.calibrate_suite import calibrate_suite
+from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.storage.calibration_file import write_calibration

@@ -2,10 +2,13 @@
 
 from enum import StrEnum
 
-from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, ScanStartOptions
-from l2m_gtsam.lidar.loops import LoopOptions
+from l2m_gtsam.lidar.loop_closures import LoopOptions
 from l2m_gtsam.lidar.odometry import OdometryOptions
-from l2m_gtsam.lidar.search import SearchOptions
+from l2m_gtsam.lidar.scan_localisation import (
+    ScanLocalisationOptions,
+    ScanStartOptions,
+    SearchOptions,
+)
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import ScanOptions
 

@@ -8,15 +8,15 @@ from pydantic import Field
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.geometry import as_matrix, difference, from_matrix, perturbed
-from l2m_gtsam.lidar.extra import library
-from l2m_gtsam.lidar.information import (
+from l2m_gtsam.lidar.surface import (
     Planes,
+    Surface,
     distances,
+    library,
     plane_information,
     plane_step,
     tempered,
 )
-from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
 
 # Steps smaller than this end a registration: far below any error of it.

@@ -1,51 +1,261 @@
-"""Localisation of a whole drive in a magnetic map, off line.
+"""Recording + map + calibration -> poses in the map. Pure: no files, no terminal."""
 
-The drive is followed from its start, then all poses are solved together by Levenberg-Marquardt:
-in rounds, with the weights that the residuals of the last round give each reading (graduated
-non-convexity, see ``solve.robust``), at last with the map's errors as variables.
-"""
-
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.data import (
+    FloatArray,
+    Readings,
+    Recording,
+    RigidTransform,
+    SourceFile,
+    Trajectory,
+)
+from l2m_gtsam.errors import CalibrationError, SyncError
+from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.slam.changes import LEAST_LEFT, ROUNDS, changed
-from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.factors import scale_values
-from l2m_gtsam.slam.localised import Localised
-from l2m_gtsam.slam.online.following import Follower, follow
-from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.problem import Problem
+from l2m_gtsam.recording.dropouts import heard, is_dead
+from l2m_gtsam.recording.odometry_jumps import without_jumps
+from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.localisation import LocalisationResult
+from l2m_gtsam.records.scans import ScanEvidence
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, carried, link_stamps, linked
+from l2m_gtsam.slam.misfit import is_doubtful, wrong_maps
+from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
+from l2m_gtsam.slam.pose_graph import solve_pose_graph
+from l2m_gtsam.slam.result import localisation_result
+from l2m_gtsam.slam.smoother import localise_drive
+from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.start.search import find_start, start_found
+from l2m_gtsam.solve.noise import NOISE_RANGE
 
-# Stages of the graduation: the drive was followed, so that no good reading is far off any more.
-GRADUATION = (1.0, 10.0, float("inf"), float("inf"))
+NO_SCANS = ScanEvidence()
+DEAD = "it has no readings, or repeats one value"
 
 
-def localise_drive(
-    drive: Drive, field_map: QueryableMap, options: SlamOptions, progress: Progress
-) -> Localised:
-    """Find the poses of a drive, and its sensors' calibration if that is to be refined."""
-    problem = Problem(drive, field_map, options)
-    followed = drive.with_scale_as_walk(options.drift.over_m)
-    follower = Follower(followed, field_map, options.robust, free=problem.free)
-    values = follow(follower, len(drive), progress)
-    values.insert(scale_values(drive))
-    counts = np.ones(len(drive.readings), dtype=np.bool_)
-    for round_, mu in enumerate(GRADUATION):
-        progress("solving all poses", round_ / len(GRADUATION))
-        solved = problem.solved(values, counts, mu)
-        values = solved.values
-    whole = solved
-    for _ in range(ROUNDS):
-        left_out = changed(problem.fit(solved, counts))[drive.readings.key_pose]
-        if not (left_out & counts).any():
-            break
-        counts = counts & ~left_out
-        if np.mean(counts) < LEAST_LEFT:  # this is no change of a place, but another one
-            solved, counts = whole, np.ones_like(counts)
-            break
-        solved = problem.solved(solved.values, counts, np.inf)
-    progress("solving all poses", 1.0)
-    return replace(problem.finished(solved), near_changes=~counts)
+@dataclass(frozen=True)
+class Sources:
+    """Where map and calibration came from, for the record."""
+
+    map: SourceFile | None = None
+    calibration: SourceFile | None = None
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """A localisation with what it rests on.
+
+    Attributes
+    ----------
+    result
+        The poses, and what else is told.
+    solution
+        Of the graph.
+    """
+
+    result: LocalisationResult
+    solution: Localised
+
+
+@one_blas_thread()
+def localise(
+    recording: Recording,
+    field_map: QueryableMap,
+    calibration: CalibrationResult,
+    options: SlamOptions,
+    progress: Progress,
+    sources: Sources | None = None,
+    seen: ScanEvidence = NO_SCANS,
+) -> Localisation:
+    """Find where a vehicle was in a magnetic map.
+
+    Parameters
+    ----------
+    recording
+        A drive; its poses are odometry, whose first is in the map unless the options give another.
+    field_map
+        The magnetic map.
+    calibration
+        Of the sensors.
+    options
+        Key poses, odometry, start, and what becomes of the calibration.
+    progress
+        Called with a stage and the fraction of it that is done.
+    sources
+        Of map and calibration.
+    seen
+        What the drive's scans say of its poses.
+
+    Raises
+    ------
+    CalibrationError
+        No sensor of the recording is calibrated.
+    SyncError
+        Readings and poses do not overlap, or there are fewer than two poses.
+    MapError
+        The start was looked for, and is not the only one that fits, or none does.
+    """
+    drive, notes = prepared(recording, calibration, options, seen)
+    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    search = None
+    if options.start.anywhere:
+        search = find_start(drive, solver_map, options, progress)
+        drive = replace(drive, start=start_found(search, options.start))
+    scaled = drive.with_scale_as_walk(options.drift.over_m)
+    by_scans = solve_pose_graph(scaled, options.robust.confidence)
+    drive = replace(drive, links=drive.links[by_scans.believed])
+    solution = localise_drive(drive, solver_map, options, progress)
+    others = wrong_maps(drive, solver_map) if is_doubtful(solution) else ()
+    wrong = [localise_drive(drive, each, options, progress) for each in others]
+    refined = options.calibration is CalibrationUse.REFINED
+    kept = calibration if refined else None
+    result = localisation_result(drive, solution, by_scans, kept, wrong)
+    sources = sources or Sources()
+    result = replace(
+        result,
+        notes=(*notes, *result.notes),
+        bag=recording.source,
+        map=sources.map,
+        calibration_source=sources.calibration,
+        start=search,
+    )
+    return Localisation(result, solution)
+
+
+def prepared(
+    recording: Recording,
+    calibration: CalibrationResult,
+    options: SlamOptions,
+    seen: ScanEvidence = NO_SCANS,
+) -> tuple[Drive, tuple[str, ...]]:
+    """Return a recording as a drive of its calibrated sensors, and what is worth a warning.
+
+    Parameters
+    ----------
+    recording, calibration, options, seen
+        As of ``localise``.
+
+    Raises
+    ------
+    CalibrationError
+        No sensor of the recording is calibrated.
+    SyncError
+        Readings and poses do not overlap, there are fewer than two poses, or all sensors are dead.
+    """
+    if len(recording.trajectory) < 2:
+        raise SyncError(f"{recording.source.path}: odometry of one pose; two or more are needed")
+    mended = without_jumps(recording.trajectory, options.jumps)
+    odometry = mended.trajectory
+    alive = heard(replace(recording, trajectory=odometry))
+    calibrated, left_out = usable_sensors(alive.recording, calibration)
+    readings = drive_readings(alive.recording, calibrated, options)
+    rows = np.union1d(key_pose_rows(odometry, options.key_poses), mended.rows)
+    if len(seen):
+        rows = with_rows_at(rows, odometry, link_stamps(seen))
+    drive = Drive(
+        stamp_ns=odometry.stamp_ns[rows],
+        steps=odometry_steps(odometry, rows, options.drift, mended.jumps),
+        readings=carried(readings, odometry, rows, options.key_poses.readings),
+        start=start_pose(odometry, options.start),
+        sensors=known_sensors(calibrated),
+        links=linked(seen, odometry, rows, options.drift),
+    )
+    recorded = (note for part in recording.parts for note in part.notes)
+    return drive, (*recorded, *mended.notes(), *left_out, *alive.notes)
+
+
+def usable_sensors(
+    recording: Recording, calibration: CalibrationResult
+) -> tuple[tuple[SensorCalibration, ...], tuple[str, ...]]:
+    """Return the calibrated sensors of a recording, and a note on each of the others.
+
+    Raises
+    ------
+    CalibrationError
+        There is none.
+    SyncError
+        Those that are have no readings.
+    """
+    entries = {each.sensor: each for each in calibration.sensors}
+    usable, notes, dead = [], list[str](), list[str]()
+    for series in recording.series:
+        entry = entries.get(series.sensor)
+        if entry is None:
+            notes.append(f"{series.sensor} is left out: it has no calibration")
+        elif not is_determined(entry):
+            notes.append(f"{series.sensor} is left out: its calibration is {entry.status.value}")
+        elif entry.moving:
+            numbers = ", ".join(each.name for each in entry.moving)
+            notes.append(f"{series.sensor} is left out: a part of its readings follows {numbers}")
+        elif is_dead(series):
+            dead.append(series.sensor)
+        else:
+            usable.append(entry)
+    notes += [f"{each} is left out: {DEAD}" for each in dead]
+    if dead and not usable:
+        raise SyncError(f"{recording.source.path}: {', '.join(dead)}: {DEAD}")
+    if not usable:
+        sensors = ", ".join(series.sensor for series in recording.series)
+        raise CalibrationError(
+            f"{recording.source.path}: none of its sensors ({sensors}) is calibrated; the "
+            f"calibration has {', '.join(entries) or 'no sensor'}"
+        )
+    return tuple(usable), tuple(notes)
+
+
+def is_determined(sensor: SensorCalibration) -> bool:
+    """Return whether all 15 parameters of a sensor are known, how well, and its noise."""
+    values = np.append(sensor.distortion.vector(), [*sensor.t_lidar_mag, sensor.noise])
+    return bool(np.isfinite(values).all() and np.isfinite(sensor.covariance).all())
+
+
+def known_sensors(calibrated: tuple[SensorCalibration, ...]) -> KnownSensors:
+    """Return calibrations as arrays."""
+    return KnownSensors(
+        names=tuple(each.sensor for each in calibrated),
+        t=np.stack([each.t_lidar_mag for each in calibrated]),
+        distortion=np.stack([each.distortion.vector() for each in calibrated]),
+        offset=clock_offsets(calibrated),
+        noise=np.maximum([each.noise for each in calibrated], NOISE_RANGE[0]),
+        covariance=np.stack([each.covariance for each in calibrated]),
+    )
+
+
+def clock_offsets(calibrated: tuple[SensorCalibration, ...]) -> FloatArray:
+    """Return the sensors' clock offsets in seconds, shape (S,)."""
+    offsets = [each.time_offset for each in calibrated]
+    return np.array([0.0 if each is None else each.seconds for each in offsets])
+
+
+def drive_readings(
+    recording: Recording, calibrated: tuple[SensorCalibration, ...], options: SlamOptions
+) -> Readings:
+    """Return the readings of calibrated sensors with poses of odometry.
+
+    All are kept, also where the vehicle comes again: what is thinned out of a calibration is what
+    closes a loop.
+    """
+    names, offset = [each.sensor for each in calibrated], clock_offsets(calibrated)
+    chosen = tuple(each for each in recording.series if each.sensor in names)
+    sync = SyncOptions(
+        max_pose_gap_s=options.max_pose_gap_s, thin_distance_m=0.0, thin_angle_deg=0.0
+    )
+    largest = float(np.abs(offset).max())
+    readings = synchronise(replace(recording, series=chosen), sync, largest).readings
+    return with_offsets(readings, recording.trajectory, offset)
+
+
+def start_pose(odometry: Trajectory, options: StartPoseOptions) -> StartPose:
+    """Return where a drive begins in the map."""
+    R, p = odometry.R[0], odometry.p[0]
+    if options.position is not None:
+        p = np.array(options.position)
+    if options.quaternion_xyzw is not None:
+        R = Rotation.from_quat(options.quaternion_xyzw).as_matrix()
+    sigma = np.repeat([np.deg2rad(options.rotation_deg), options.position_m], 3)
+    return StartPose(RigidTransform(R, p), np.diag(sigma**2))

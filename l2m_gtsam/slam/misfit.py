@@ -1,8 +1,8 @@
-"""Whether a map explains a drive better than a wrong one would.
+"""Whether a map explains a drive better than a decoy does: the null hypothesis of the misfit test.
 
-Poses bend a little to fit any field, and some readings always do. How many tells nothing by itself:
-a map may be rough, or a place changed here and there. The same drive in the same map half turned,
-which is wrong for certain, tells what chance explains.
+Poses bend a little to fit any field, and some readings always do. Their share alone decides
+nothing: a map may be rough, or a place changed here and there. The same drive in the same map
+turned by 180 degrees, a decoy that is certainly wrong, shows what chance explains.
 """
 
 from collections.abc import Sequence
@@ -10,10 +10,39 @@ from collections.abc import Sequence
 import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.slam.decoy_map import HalfTurned
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.localised import Localised
+from l2m_gtsam.slam.solution import Localised
+
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+
+
+class HalfTurned:
+    """The field of a map as it is on the other side of a vertical axis, in the map's own axes.
+
+    How strong it is, how it changes along a way and how well it is known stay about the same.
+
+    Parameters
+    ----------
+    field_map
+        The map.
+    middle
+        A point on the axis in metres, shape (3,).
+    """
+
+    def __init__(self, field_map: QueryableMap, middle: FloatArray) -> None:
+        self._map, self._middle = field_map, middle
+
+    def query(self, points: FloatArray) -> FieldSample:
+        """Return the field there, points in metres of shape (N, 3)."""
+        there = self._map.query((points - self._middle) @ HALF_TURN + self._middle)
+        return FieldSample(there.field, there.gradient @ HALF_TURN, there.variance, there.inside)
+
+    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m there."""
+        sample = self.query(points)
+        return sample.field, sample.gradient
+
 
 LARGEST = 21.0  # squared length of a whitened residual, of 10,000 with noise alone one is larger
 AXES = 3

@@ -8,8 +8,7 @@ from pydantic import Field
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.mapping.mapping import suite_readings
-from l2m_gtsam.mapping.options import MappingOptions
+from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options

@@ -8,9 +8,9 @@ import numpy as np
 from l2m_gtsam.data import Recording, SourceFile
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.slam.figures import Told, localisation_record
-from l2m_gtsam.slam.localise import Localisation, Sources, localise
+from l2m_gtsam.slam.localisation import Localisation, Sources, localise
 from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.record import Told, localisation_record
 from tests.drives.slam import SlamDrive, calibrated, rounds, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 

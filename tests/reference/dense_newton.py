@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.covariances import ordered
-from l2m_gtsam.slam.unknown_field.joint_gaussian import (
+from l2m_gtsam.slam.solver import ordered
+from l2m_gtsam.slam.unknown_field.field_memory import (
     JointGaussian,
     columns_of,
     local,

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.mapping.options import MappingOptions
+from l2m_gtsam.mapping.map_building import MappingOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions

@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.start.global_start import find_starts
-from l2m_gtsam.mapping.options import MappingOptions
+from l2m_gtsam.mapping.map_building import MappingOptions
 from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions

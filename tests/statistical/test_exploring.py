@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.unknown_field.drive_prior import drive_prior
-from l2m_gtsam.slam.unknown_field.exploring import Explorer, ExploringOptions
-from l2m_gtsam.slam.unknown_field.mapping import map_drive
+from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
+from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
+from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from tests.drives.slam import calibrated, laps
 from tests.integration.slam.test_exploring import OnLine, prepared_drive, rms
 from tests.integration.slam.test_slam import quiet

@@ -7,7 +7,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.localisation import LocalisationStatus
-from l2m_gtsam.slam.localise import localise
+from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
 from tests.drives.slam import calibrated, rounds, slam_drive
 from tests.integration.slam.test_slam import pose_nees, position_error, quiet

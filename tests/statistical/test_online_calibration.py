@@ -8,9 +8,9 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.localisation import localise_drive
-from l2m_gtsam.slam.online.following import Follower
+from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_gtsam.calibration.start.global_start import StartOptions
-from l2m_gtsam.mapping.options import MappingOptions
+from l2m_gtsam.mapping.map_building import MappingOptions
 from l2m_gtsam.maps.training import training_set
 from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
 from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares

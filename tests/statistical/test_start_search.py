@@ -5,7 +5,7 @@ import pytest
 
 from l2m_gtsam.calibration.view import Compilable
 from l2m_gtsam.records.localisation import StartVerdict
-from l2m_gtsam.slam.localise import prepared
+from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
 from tests.drives.slam import calibrated, slam_drive

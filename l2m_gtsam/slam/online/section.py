@@ -7,8 +7,8 @@ import numpy as np
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.covariances import covariance_of, ordered, unless_refused
 from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.solver import covariance_of, ordered, unless_refused
 
 # Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
 # entries of C; never for H, in which readings are linear.

@@ -1,7 +1,8 @@
-"""Tiles of an unknown field, each fixed to a key pose of the drive."""
+"""Tiles of an unknown field, each fixed to a key pose, and the prior of their waves."""
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, cholesky
 from scipy.spatial.transform import Rotation
@@ -11,9 +12,81 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.furnish import UNIFORM_SIGMA
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
+from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
+from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
+from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_area
 from l2m_gtsam.maps.harmonic.uniform import UniformField
-from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
+from l2m_gtsam.maps.training import merged, training_set
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.map_prediction import place
+from l2m_gtsam.slam.options import TileOptions
+
+
+@dataclass(frozen=True)
+class FieldPrior:
+    """The prior of every tile of an unknown field.
+
+    Attributes
+    ----------
+    hyperparameters
+        Strength and depth of the sources.
+    resolution
+        Shortest waves that are kept.
+    options
+        Core, margin.
+    """
+
+    hyperparameters: Hyperparameters
+    resolution: Resolution
+    options: TileOptions
+
+
+def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> FieldPrior:
+    """Learn the prior from readings at places that are known well enough.
+
+    Parameters
+    ----------
+    points, field
+        Places in metres and the field there in uT, in one frame, shapes (N, 3).
+    options
+        Of the tiles.
+
+    Raises
+    ------
+    MapError
+        There are too few readings.
+    """
+    defaults = HarmonicOptions()
+    readings = merged(training_set(points, field), defaults.merge, defaults.independent)
+    hyperparameters = options.hyperparameters
+    if hyperparameters is None:
+        learning = LearningOptions(modes=options.modes)
+        tiling, share = defaults.tiling, defaults.mode_share
+        hyperparameters = learn(readings, NO_SOURCES, tiling, share, learning).hyperparameters
+    density = float(readings.weight.sum()) / surveyed_area(readings.points)
+    wanted = resolution_of(hyperparameters, density, defaults.mode_share)
+    return FieldPrior(hyperparameters, within_budget(wanted, options), options)
+
+
+def within_budget(resolution: Resolution, options: TileOptions) -> Resolution:
+    """Return the resolution, coarser where a tile would have more waves than allowed."""
+    over = float(np.sqrt(max(resolution.modes(options.edge) / options.modes, 1.0)))
+    return Resolution(resolution.floor / over, resolution.ceiling / over)
+
+
+def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:
+    """Learn the prior of the field from the first part of a drive, at poses by odometry."""
+    way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    early = np.flatnonzero(way[drive.readings.key_pose] <= options.learn_over_m)
+    readings = drive.readings[early]
+    where = place(
+        readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
+    )
+    return field_prior(where.x, where.field(drive.sensors), options)
+
 
 # Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
 # with more of it passed for a lower one, by 0.1-0.4 m with sigmas of 0.04 m. The pull falls with

@@ -9,7 +9,7 @@ import pytest
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.data import FloatArray, KnownSensor
-from l2m_gtsam.mapping.mapping import map_fields, map_recordings, sensor_positions
+from l2m_gtsam.mapping.map_building import map_fields, map_recordings, sensor_positions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.recording.sync import synchronise
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus

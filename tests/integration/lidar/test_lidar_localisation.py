@@ -10,11 +10,15 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import LidarMap, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.geometry import between, difference, perturbed
-from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans
-from l2m_gtsam.lidar.loops import LoopOptions, find_loops
+from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loops
 from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, follow
 from l2m_gtsam.lidar.registration import PoseEstimate, Refusal, unseen_covariance
-from l2m_gtsam.lidar.search import SearchOptions, find_start
+from l2m_gtsam.lidar.scan_localisation import (
+    ScanLocalisationOptions,
+    SearchOptions,
+    find_start,
+    localise_scans,
+)
 from l2m_gtsam.lidar.surface import Surface, smoothed
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.worlds.lidar_rooms import ROOM, Room, round_trip, rows, scans, straight, swept

@@ -8,10 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, Trajectory
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.mapping import suite_readings
-from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.mapping.suite.calibrate_suite import calibrate_suite
-from l2m_gtsam.mapping.suite.options import SuiteOptions
+from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
+from l2m_gtsam.mapping.suite_calibration import calibrate_suite
+from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from tests.drives.slam import SlamDrive, slam_drive
 from tests.integration.slam.test_slam import quiet

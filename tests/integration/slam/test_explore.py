@@ -7,7 +7,7 @@ import pytest
 
 from l2m_gtsam.data import KnownSensor, Trajectory
 from l2m_gtsam.records.localisation import LocalisationStatus
-from l2m_gtsam.slam.explore import Exploration, explore
+from l2m_gtsam.slam.exploration import Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
 from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
 from tests.integration.slam.test_slam import pose_nees, position_error, quiet

@@ -10,13 +10,13 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.explore import HERE
-from l2m_gtsam.slam.localise import prepared
+from l2m_gtsam.slam.exploration import HERE
+from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.unknown_field.drive_prior import drive_prior
-from l2m_gtsam.slam.unknown_field.exploring import Explorer, ExploringOptions
-from l2m_gtsam.slam.unknown_field.mapping import map_drive
+from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
+from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
+from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from tests.drives.slam import calibrated, laps, slam_drive
 from tests.integration.slam.test_slam import quiet
 from tests.worlds.exact import dipole_world, random_sensors

@@ -10,12 +10,12 @@ import pytest
 from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.figures import odometry_covariance
-from l2m_gtsam.slam.g2o import write_g2o
-from l2m_gtsam.slam.localisation import localise_drive
-from l2m_gtsam.slam.localised import Localised
+from l2m_gtsam.slam.disturbances import slips
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
-from l2m_gtsam.slam.slips import slips
+from l2m_gtsam.slam.pose_graph import write_g2o
+from l2m_gtsam.slam.record import odometry_covariance
+from l2m_gtsam.slam.smoother import localise_drive
+from l2m_gtsam.slam.solution import Localised
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds
 from tests.integration.slam.test_slam import quiet

@@ -12,14 +12,13 @@ import pytest
 
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording, Trajectory
-from l2m_gtsam.mapping.mapping import map_recordings
-from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.mapping.suite.calibrate_suite import calibrate_suite
-from l2m_gtsam.mapping.suite.options import SuiteOptions
+from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.mapping.suite_calibration import calibrate_suite
+from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.slam.explore import explore
-from l2m_gtsam.slam.localise import localise
+from l2m_gtsam.slam.exploration import explore
+from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.bag import read_recording
 from tests.drives.slam import drifted

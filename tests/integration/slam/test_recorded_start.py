@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import Recording, Trajectory
-from l2m_gtsam.mapping.suite.calibrate_suite import calibrate_suite
-from l2m_gtsam.mapping.suite.options import SuiteOptions
+from l2m_gtsam.mapping.suite_calibration import calibrate_suite
+from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import StartVerdict
-from l2m_gtsam.slam.localise import prepared
+from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
 from tests.drives.slam import drifted

@@ -13,7 +13,7 @@ from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Trajectory
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
-from l2m_gtsam.slam.localise import localise
+from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import CalibrationUse, KeyPoseOptions, SlamOptions, StartPoseOptions
 from tests.drives.slam import SlamDrive, calibrated, rounds, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors

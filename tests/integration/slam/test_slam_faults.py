@@ -12,9 +12,9 @@ from l2m_gtsam.qa.slam.judge import judge_localisation
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.scans import PoseFix, ScanEvidence
-from l2m_gtsam.slam.figures import Told, localisation_record
-from l2m_gtsam.slam.localise import Localisation, localise
+from l2m_gtsam.slam.localisation import Localisation, localise
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.record import Told, localisation_record
 from tests.drives.faults import jumped, opened, shift, with_steel
 from tests.drives.slam import SlamDrive, calibrated, rounds, slam_drive
 from tests.integration.slam.test_slam import COARSE, WIDE, pose_nees, position_error, quiet

@@ -7,10 +7,10 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.localisation import localise_drive
-from l2m_gtsam.slam.localise import prepared
-from l2m_gtsam.slam.online.following import Follower
+from l2m_gtsam.slam.localisation import prepared
+from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.smoother import localise_drive
 from tests.drives.slam import calibrated
 from tests.integration.slam.test_slam import COARSE, quiet, small_hall
 from tests.worlds.exact import dipole_world

@@ -7,18 +7,17 @@ import pytest
 
 from l2m_gtsam.data import KnownSensor, RigidTransform, Trajectory
 from l2m_gtsam.geometry import compose
-from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, localise_scans, spaced
-from l2m_gtsam.lidar.loops import LoopOptions, find_loops
+from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loops
 from l2m_gtsam.lidar.registration import PoseEstimate, RegistrationOptions
+from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.surface import Surface, smoothed
 from l2m_gtsam.recording.odometry_jumps import Mended, without_jumps
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.slam.explore import explore
-from l2m_gtsam.slam.localise import localise
-from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.scan_odometry import carried_scans
-from l2m_gtsam.slam.unknown_field.field_prior import TileOptions
+from l2m_gtsam.slam.exploration import explore
+from l2m_gtsam.slam.localisation import localise
+from l2m_gtsam.slam.odometry import carried_scans
+from l2m_gtsam.slam.options import SlamOptions, TileOptions
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.drives.slam import SlamDrive, calibrated, laps, rounds, slam_drive
 from tests.integration.slam.test_slam import COARSE, pose_nees, position_error, quiet

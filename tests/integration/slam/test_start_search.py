@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.records.localisation import LocalisationStatus, StartSearch, StartVerdict
-from l2m_gtsam.slam.localise import localise, prepared
+from l2m_gtsam.slam.localisation import localise, prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
 from tests.drives.slam import SlamDrive, calibrated, slam_drive

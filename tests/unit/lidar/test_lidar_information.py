@@ -6,13 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.geometry import difference, perturbed
-from l2m_gtsam.lidar.information import (
-    Planes,
-    distances,
-    fitted_planes,
-    plane_information,
-    tempered,
-)
+from l2m_gtsam.lidar.surface import Planes, distances, fitted_planes, plane_information, tempered
 
 
 def unit(vectors: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from l2m_gtsam.data import FloatArray, PoseMotion, Readings
-from l2m_gtsam.mapping.suite.evidence import SIZE, SuiteWindow, scored, undistorted
+from l2m_gtsam.mapping.suite_likelihood import SIZE, SuiteWindow, scored, undistorted
 from tests.worlds.harmonic import GIVEN, TILTED, basis, places
 
 SENSORS = 2

@@ -9,14 +9,12 @@ import scipy.linalg  # noqa: F401 - brings a BLAS of its own
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from l2m_gtsam.calibration import calibrate
-from l2m_gtsam.mapping import mapping
-from l2m_gtsam.mapping.suite import calibrate_suite as suite
+from l2m_gtsam.mapping import map_building, suite_calibration
 from l2m_gtsam.parallel.threads import in_threads, one_blas_thread
 from l2m_gtsam.planning import plan
 from l2m_gtsam.qa import evaluate as appraise
 from l2m_gtsam.qa import repeatability
-from l2m_gtsam.slam import explore, localise
-from l2m_gtsam.slam import figures as slam_figures
+from l2m_gtsam.slam import exploration, localisation, record
 from l2m_gtsam.validation import validate
 
 GIVEN = 2
@@ -25,17 +23,17 @@ ENTRIES = (
     appraise.scene_of,
     calibrate.calibrate,
     calibrate.calibrated,
-    explore.explore,
-    localise.localise,
-    mapping.compare_recordings,
-    mapping.map_recordings,
-    mapping.suite_readings,
-    mapping.update_map,
+    exploration.explore,
+    localisation.localise,
+    map_building.compare_recordings,
+    map_building.map_recordings,
+    map_building.suite_readings,
+    map_building.update_map,
     plan.plan,
     repeatability.compared_drives,
     repeatability.compared_halves,
-    slam_figures.localisation_record,
-    suite.calibrate_suite,
+    record.localisation_record,
+    suite_calibration.calibrate_suite,
     validate.validate,
 )
 

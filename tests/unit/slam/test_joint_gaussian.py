@@ -8,10 +8,14 @@ from hypothesis import strategies as st
 
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.covariances import joint_covariance, ordered
-from l2m_gtsam.slam.solving import descended, least_fill
-from l2m_gtsam.slam.unknown_field.gaussian_prior import prior_factors
-from l2m_gtsam.slam.unknown_field.joint_gaussian import JointGaussian, conditioned, local, retracted
+from l2m_gtsam.slam.solver import descended, joint_covariance, least_fill, ordered
+from l2m_gtsam.slam.unknown_field.field_memory import (
+    JointGaussian,
+    conditioned,
+    local,
+    prior_factors,
+    retracted,
+)
 from tests.reference.dense_newton import newton
 
 ROUNDING = 1e-8  # of matrices of condition 1e4, with 1e-12 added to correlations

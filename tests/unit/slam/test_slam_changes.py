@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_gtsam.slam.changes import Fit, changed
-from l2m_gtsam.slam.decoy_map import HalfTurned
+from l2m_gtsam.slam.disturbances import Fit, changed
+from l2m_gtsam.slam.misfit import HalfTurned
 from tests.worlds.exact import dipole_world
 
 KEY_POSES, SENSORS, READINGS = 200, 3, 3

@@ -7,15 +7,16 @@ import pytest
 from l2m_factors import T, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.slam.covariances import (
+from l2m_gtsam.slam.solver import (
     TOGETHER,
     Marginals,
+    descended,
     joint_covariance,
+    least_fill,
     pose_covariances,
     pose_covariances_together,
     well_scaled,
 )
-from l2m_gtsam.slam.solving import descended, least_fill
 
 COUNT = TOGETHER + 30  # poses: more than are eliminated for at once
 

@@ -10,14 +10,13 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import D, T, X
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FieldSample, FloatArray, Trajectory
-from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.factors import calibration_values, odometry_graph
-from l2m_gtsam.slam.links import MAP, Links
+from l2m_gtsam.slam.drive import MAP, Drive, Links
 from l2m_gtsam.slam.online.belief import Belief
-from l2m_gtsam.slam.online.following import Follower
-from l2m_gtsam.slam.online.remembered import CELL_M, RememberedVariance
+from l2m_gtsam.slam.online.follower import Follower
+from l2m_gtsam.slam.online.measurements import CELL_M, RememberedVariance
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.problem import Problem
+from l2m_gtsam.slam.pose_graph import calibration_values, odometry_graph
+from l2m_gtsam.slam.smoother import Problem
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds

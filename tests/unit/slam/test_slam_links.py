@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 from l2m_factors import CarriedReadings
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, compose, difference, perturbed
-from l2m_gtsam.lidar.localisation import ScanLocalisationOptions, spaced
+from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, spaced
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.scans import Loop, PoseFix, ScanEvidence
-from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
-from l2m_gtsam.slam.links import MAP, link_stamps, linked
+from l2m_gtsam.slam.drive import MAP, Drive, KnownSensors, StartPose, link_stamps, linked
 from l2m_gtsam.slam.odometry import drift_covariance, key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph

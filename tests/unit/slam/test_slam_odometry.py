@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import moved
 from l2m_gtsam.slam.drive import carried, spread
-from l2m_gtsam.slam.factors import root_information
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
+from l2m_gtsam.slam.pose_graph import root_information
 from tests.drives.slam import rounds
 
 

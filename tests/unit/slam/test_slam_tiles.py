@@ -10,13 +10,15 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
-from l2m_gtsam.slam.unknown_field.field_prior import (
+from l2m_gtsam.slam.options import TileOptions
+from l2m_gtsam.slam.unknown_field.tiles import (
+    Anchoring,
     FieldPrior,
-    TileOptions,
+    WaveTile,
+    anchored,
     field_prior,
     within_budget,
 )
-from l2m_gtsam.slam.unknown_field.tiles import Anchoring, WaveTile, anchored
 from tests.worlds.exact import dipole_world
 
 OPTIONS = TileOptions(core=3.0, modes=150)

@@ -10,12 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from l2m_factors import CarriedReadings, CarriedResiduals, Whitening, X, carried_residuals
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
-from l2m_gtsam.slam.localisation import localise_drive
 from l2m_gtsam.slam.odometry import odometry_steps
-from l2m_gtsam.slam.online.following import Follower
+from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
-from l2m_gtsam.slam.problem import Problem
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
+from l2m_gtsam.slam.smoother import Problem, localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive, moved, perturbations
 from tests.drives.slam import rounds

@@ -7,11 +7,9 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.localise import prepared
+from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.start.fit import WindowFit
-from l2m_gtsam.slam.start.prior import Beforehand
-from l2m_gtsam.slam.start.roots import root_of, steps_root
+from l2m_gtsam.slam.start.likelihood import Beforehand, WindowFit, root_of, steps_root
 from l2m_gtsam.slam.start.window import Window, window_of
 from tests.drives.slam import SlamDrive, calibrated, slam_drive
 from tests.worlds.exact import random_sensors

@@ -10,10 +10,21 @@ from hypothesis import strategies as st
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.training import TrainingSet
-from l2m_gtsam.slam.start.field_lattice import FieldLattice, lattice_over
-from l2m_gtsam.slam.start.options import StartSearchOptions
-from l2m_gtsam.slam.start.scores import LARGEST, Rules, row_of, score_at
-from l2m_gtsam.slam.start.screen import MOST_KEPT, about_z, heading, heading_step, nodes_of, screen
+from l2m_gtsam.slam.options import StartSearchOptions
+from l2m_gtsam.slam.start.screening import (
+    LARGEST,
+    MOST_KEPT,
+    FieldLattice,
+    Rules,
+    about_z,
+    heading,
+    heading_step,
+    lattice_over,
+    nodes_of,
+    row_of,
+    score_at,
+    screen,
+)
 from l2m_gtsam.slam.start.window import Pattern
 from tests.worlds.surveyed import SurveyedWorld, strange_hall, surveyed
 

@@ -9,10 +9,10 @@ import pytest
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
-from l2m_gtsam.slam.options import DriftOptions
+from l2m_gtsam.slam.options import DriftOptions, TileOptions
 from l2m_gtsam.slam.relative_motion import Ways
-from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior, TileOptions
-from l2m_gtsam.slam.unknown_field.tiled import TiledDrive
+from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
+from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds
 from tests.worlds.exact import DipoleWorld, random_sensors

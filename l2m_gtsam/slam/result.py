@@ -17,11 +17,11 @@ from l2m_gtsam.records.localisation import (
     ScanUse,
     SensorUse,
 )
+from l2m_gtsam.slam.disturbances import slip_notes
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.localised import Localised
 from l2m_gtsam.slam.misfit import explains_no_more
 from l2m_gtsam.slam.pose_graph import PoseGraph
-from l2m_gtsam.slam.slips import slip_notes
+from l2m_gtsam.slam.solution import Localised
 from l2m_gtsam.solve.rotation import polar_rotation
 
 # A drive of which less lies in the map is not localised by it.

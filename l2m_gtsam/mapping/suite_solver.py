@@ -14,9 +14,15 @@ from operator import add
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.mapping.suite.evidence import SIZE, C, Scored, scored
-from l2m_gtsam.mapping.suite.options import SuiteOptions
-from l2m_gtsam.mapping.suite.windows import SuiteWindows, windows_over
+from l2m_gtsam.mapping.suite_likelihood import (
+    SIZE,
+    C,
+    Scored,
+    SuiteOptions,
+    SuiteWindows,
+    scored,
+    windows_over,
+)
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.solve.model_comparison import correlation_of

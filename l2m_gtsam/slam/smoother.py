@@ -1,4 +1,9 @@
-"""The graph of a whole drive in a magnetic map, and how it is solved."""
+"""All poses of a drive in a known magnetic map, estimated together (batch smoothing).
+
+The drive is followed from its start, then all poses are solved together by Levenberg-Marquardt:
+in rounds, with the weights that the residuals of the last round give each reading (graduated
+non-convexity, see ``solve.robust``), at last with the map's errors as variables.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -9,21 +14,37 @@ from l2m_factors import CarriedBatch, key_pose_factor
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.slam.changes import Fit
-from l2m_gtsam.slam.covariances import (
+from l2m_gtsam.progress import Progress
+from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, Fit, changed
+from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.map_prediction import (
+    SharedMapErrors,
+    Sight,
+    errors_of,
+    look,
+    place,
+    poses_in,
+    sensors_in,
+)
+from l2m_gtsam.slam.online.follower import Follower, follow
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.pose_graph import (
+    calibration_graph,
+    link_graph,
+    link_squared,
+    odometry_graph,
+    scale_values,
+)
+from l2m_gtsam.slam.relative_motion import Ways
+from l2m_gtsam.slam.solution import NOTHING, Localised
+from l2m_gtsam.slam.solver import (
     Marginals,
+    descended,
+    least_fill,
     odometry_scale,
     pose_covariances,
     sensor_covariances,
 )
-from l2m_gtsam.slam.drive import Drive, KnownSensors
-from l2m_gtsam.slam.factors import calibration_graph, link_graph, link_squared, odometry_graph
-from l2m_gtsam.slam.localised import NOTHING, Localised
-from l2m_gtsam.slam.map_prediction import Sight, look, place, poses_in, sensors_in
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.relative_motion import Ways
-from l2m_gtsam.slam.shared import SharedMapErrors, errors_of
-from l2m_gtsam.slam.solving import descended, least_fill
 from l2m_gtsam.solve.robust import WEIGHTS
 
 
@@ -223,3 +244,35 @@ class Problem:
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
         )
+
+
+# Stages of the graduation: the drive was followed, so that no good reading is far off any more.
+GRADUATION = (1.0, 10.0, float("inf"), float("inf"))
+
+
+def localise_drive(
+    drive: Drive, field_map: QueryableMap, options: SlamOptions, progress: Progress
+) -> Localised:
+    """Find the poses of a drive, and its sensors' calibration if that is to be refined."""
+    problem = Problem(drive, field_map, options)
+    followed = drive.with_scale_as_walk(options.drift.over_m)
+    follower = Follower(followed, field_map, options.robust, free=problem.free)
+    values = follow(follower, len(drive), progress)
+    values.insert(scale_values(drive))
+    counts = np.ones(len(drive.readings), dtype=np.bool_)
+    for round_, mu in enumerate(GRADUATION):
+        progress("solving all poses", round_ / len(GRADUATION))
+        solved = problem.solved(values, counts, mu)
+        values = solved.values
+    whole = solved
+    for _ in range(ROUNDS):
+        left_out = changed(problem.fit(solved, counts))[drive.readings.key_pose]
+        if not (left_out & counts).any():
+            break
+        counts = counts & ~left_out
+        if np.mean(counts) < LEAST_LEFT:  # this is no change of a place, but another one
+            solved, counts = whole, np.ones_like(counts)
+            break
+        solved = problem.solved(solved.values, counts, np.inf)
+    progress("solving all poses", 1.0)
+    return replace(problem.finished(solved), near_changes=~counts)

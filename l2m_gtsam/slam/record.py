@@ -34,8 +34,8 @@ from l2m_gtsam.records.localisation_file import (
 )
 from l2m_gtsam.records.validation import ChiSquare, NamedSource
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.factors import root_information
-from l2m_gtsam.slam.localised import Localised
+from l2m_gtsam.slam.pose_graph import root_information
+from l2m_gtsam.slam.solution import Localised
 from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS

@@ -19,14 +19,10 @@ from l2m_factors import X
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.slam.covariances import (
-    Marginals,
-    odometry_scale,
-    pose_covariances_together,
-    sensor_covariances,
-)
 from l2m_gtsam.slam.drive import Drive, KnownSensors
-from l2m_gtsam.slam.factors import (
+from l2m_gtsam.slam.map_prediction import Sight, place, poses_in, sensors_in
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
     calibration_values,
     link_graph,
@@ -34,13 +30,18 @@ from l2m_gtsam.slam.factors import (
     odometry_graph,
     scale_values,
 )
-from l2m_gtsam.slam.localised import NOTHING, Localised
-from l2m_gtsam.slam.map_prediction import Sight, place, poses_in, sensors_in
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.relative_motion import Ways
-from l2m_gtsam.slam.solving import descended, weights_first
-from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
-from l2m_gtsam.slam.unknown_field.tiled import TiledDrive
+from l2m_gtsam.slam.solution import NOTHING, Localised
+from l2m_gtsam.slam.solver import (
+    Marginals,
+    descended,
+    odometry_scale,
+    pose_covariances_together,
+    sensor_covariances,
+    weights_first,
+)
+from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
+from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from l2m_gtsam.solve.robust import WEIGHTS
 
 # How many times its noise a reading may be off, stage by stage, and how sharply good readings are

@@ -30,9 +30,19 @@ from l2m_factors import (
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.slam.covariances import well_scaled
 from l2m_gtsam.slam.drive import Drive, as_pose
-from l2m_gtsam.slam.factors import (
+from l2m_gtsam.slam.map_prediction import sensors_in
+from l2m_gtsam.slam.online.belief import POSE, Belief, Departed
+from l2m_gtsam.slam.online.measurements import (
+    Leg,
+    LegView,
+    RememberedVariance,
+    fix_evidence,
+    passed,
+    take,
+)
+from l2m_gtsam.slam.online.section import Section
+from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
     calibration_values,
     link_factor,
@@ -40,13 +50,8 @@ from l2m_gtsam.slam.factors import (
     start_factor,
     step_factor,
 )
-from l2m_gtsam.slam.map_prediction import sensors_in
-from l2m_gtsam.slam.online.belief import POSE, Belief, Departed
-from l2m_gtsam.slam.online.expected import fix_evidence, passed, take
-from l2m_gtsam.slam.online.leg import Leg, LegView
-from l2m_gtsam.slam.online.remembered import RememberedVariance
-from l2m_gtsam.slam.online.section import Section
 from l2m_gtsam.slam.relative_motion import hung_anew
+from l2m_gtsam.slam.solver import well_scaled
 from l2m_gtsam.solve.robust import RobustOptions
 
 SECTION = 200  # key poses that are solved together

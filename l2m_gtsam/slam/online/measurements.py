@@ -1,21 +1,154 @@
-"""What is read between two key poses, and what scans say of one, beside what is expected."""
+"""Measurements of the filter: readings between two key poses, and scans, against predictions."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
 import numpy as np
 
-from l2m_factors import Whitening
+from l2m_factors import CarriedReadings, CarriedResiduals, Whitening, carried_residuals
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.slam.factors import root_information
+from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place
 from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, Departed, Evidence
-from l2m_gtsam.slam.online.leg import Leg, LegView, Seen
-from l2m_gtsam.slam.online.remembered import RememberedVariance
-from l2m_gtsam.slam.relative_motion import bridge_whitening
+from l2m_gtsam.slam.pose_graph import root_information
+from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
+
+# Of cells over which the variance counts as constant: sigmas are off by a tenth, seldom a quarter.
+CELL_M = 0.25
+
+
+class RememberedVariance:
+    """A map's variance, asked once in each cell that is come to.
+
+    A harmonic map needs a hundred times as long for it as for the field.
+
+    Parameters
+    ----------
+    field_map
+        The map.
+    """
+
+    def __init__(self, field_map: QueryableMap) -> None:
+        self._map = field_map
+        self._known: dict[tuple[int, ...], FloatArray] = {}
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis in uT^2, shape (N, 3); infinite outside of the map.
+
+        It is that of the middle of the cell that a point lies in.
+
+        Parameters
+        ----------
+        points
+            In the map in metres, shape (N, 3).
+        """
+        cells = [tuple(cell) for cell in np.floor(points / CELL_M).astype(np.int64).tolist()]
+        new = list({cell for cell in cells if cell not in self._known})
+        if new:
+            told = self._map.query(CELL_M * (np.array(new) + 0.5)).variance
+            self._known.update(zip(new, told, strict=True))
+        return np.stack([self._known[cell] for cell in cells])
+
+
+@dataclass(frozen=True)
+class Leg:
+    """Readings between two key poses.
+
+    Attributes
+    ----------
+    readings
+        As odometry hangs them on the first of these, n in number.
+    step
+        The step to the second by odometry.
+    covariance
+        Of a right perturbation of it, shape (6, 6).
+    """
+
+    readings: CarriedReadings
+    step: gtsam.Pose3
+    covariance: FloatArray
+
+    @classmethod
+    def of(cls, drive: Drive, rows: IntArray, number: int) -> "Leg":
+        """Return some of a drive's readings, all on a key pose of this number."""
+        return cls(drive.readings[rows], drive.step(number), drive.steps.covariance[number])
+
+    def __getitem__(self, rows: IntArray) -> "Leg":
+        return replace(self, readings=self.readings[rows])
+
+    def __len__(self) -> int:
+        return len(self.readings)
+
+    def shifted(self, step: gtsam.Pose3) -> CarriedReadings:
+        """Return the readings where they are if the step is this."""
+        if step.equals(self.step, 0.0):
+            return self.readings
+        R, p = self.step.rotation(), self.step.translation()
+        turn, shift = gtsam.Rot3.Logmap(R.between(step.rotation())), step.translation() - p
+        return shifted_readings(self.readings, R.matrix(), p, turn, shift)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Readings of a leg beside what a map predicts.
+
+    Attributes
+    ----------
+    readings
+        Where they are.
+    residuals
+        Residuals and derivatives.
+    by_end
+        Derivatives by a perturbation of the end of the step that the lidar were rigidly fixed to,
+        shape (n, 3, 6).
+    """
+
+    readings: CarriedReadings
+    residuals: CarriedResiduals
+    by_end: FloatArray
+
+    @property
+    def by_step(self) -> FloatArray:
+        """Derivatives by a right perturbation of the step, shape (n, 3, 6)."""
+        return np.asarray(self.readings.fraction[:, None, None] * self.by_end)
+
+
+class LegView:
+    """A leg beside a map, which is asked once where a belief is looked at again.
+
+    Parameters
+    ----------
+    leg
+        n readings.
+    field_map
+        The map.
+    """
+
+    def __init__(self, leg: Leg, field_map: QueryableMap) -> None:
+        self.leg, self._map = leg, field_map
+        self._at: Departed | None = None
+        self._seen: Seen | None = None
+
+    def of(self, rows: IntArray) -> "LegView":
+        """Return the view of some readings: this one if they are all."""
+        return self if len(rows) == len(self.leg) else LegView(self.leg[rows], self._map)
+
+    def seen(self, belief: Departed) -> Seen:
+        """Compare the readings with what the map predicts from a belief."""
+        if self._seen is None or self._at is not belief:
+            self._at, self._seen = belief, self._compared(belief)
+        return self._seen
+
+    def _compared(self, belief: Departed) -> Seen:
+        n, pose, readings = len(self.leg), belief.pose, self.leg.shifted(belief.step)
+        R, p = np.tile(pose.rotation().matrix(), (n, 1, 1)), np.tile(pose.translation(), (n, 1))
+        seen = carried_residuals(readings, self._map, R, p, belief.sensors.fixed())
+        return Seen(readings, seen, seen.de_dX @ belief.step.AdjointMap())
+
 
 LOOKS = 3  # at what errors of the way do
 NEAR = 0.03  # m, rad, or of an entry of C: there they do the same

@@ -12,13 +12,13 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import Explored, LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.localise import NO_SCANS, prepared
-from l2m_gtsam.slam.localised import Localised
+from l2m_gtsam.slam.localisation import NO_SCANS, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.outcome import localisation_result
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
-from l2m_gtsam.slam.unknown_field.drive_prior import drive_prior
-from l2m_gtsam.slam.unknown_field.mapping import map_drive
+from l2m_gtsam.slam.result import localisation_result
+from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
+from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 
 NOWHERE_TWICE = (
     "no place was come to twice: readings of an unknown field take out little drift then"

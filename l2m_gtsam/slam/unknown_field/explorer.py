@@ -17,14 +17,13 @@ from pydantic import Field
 
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.options import Options
-from l2m_gtsam.slam.covariances import well_scaled
 from l2m_gtsam.slam.drive import Drive, as_pose
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.unknown_field.drive_prior import drive_prior
+from l2m_gtsam.slam.solver import well_scaled
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory
-from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
 from l2m_gtsam.slam.unknown_field.open_section import OpenSection
+from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior
 
 GROUP, SECTION = 20, 100  # key poses that are as good as these ways, for a vehicle that turns
 

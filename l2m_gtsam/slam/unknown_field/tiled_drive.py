@@ -16,11 +16,17 @@ from l2m_factors import (
 )
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.localised import NOTHING
 from l2m_gtsam.slam.map_prediction import Place, Sight, look, place
 from l2m_gtsam.slam.relative_motion import Ways
-from l2m_gtsam.slam.unknown_field.field_prior import FieldPrior
-from l2m_gtsam.slam.unknown_field.tiles import AXES, Anchoring, WaveTile, anchored, level_axes
+from l2m_gtsam.slam.solution import NOTHING
+from l2m_gtsam.slam.unknown_field.tiles import (
+    AXES,
+    Anchoring,
+    FieldPrior,
+    WaveTile,
+    anchored,
+    level_axes,
+)
 
 
 @dataclass(frozen=True)

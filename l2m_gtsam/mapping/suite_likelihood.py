@@ -12,13 +12,55 @@ The last term is the price of a distortion that makes all fields small.
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import Field
 from scipy.linalg import solve_triangular
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Evidence, evidence, normal_of
+from l2m_gtsam.maps.harmonic.furnish import basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
+from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
+from l2m_gtsam.maps.harmonic.representatives import spread_tiles
+from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
+from l2m_gtsam.maps.harmonic.tiling import (
+    Tiling,
+    affordable,
+    resolution_of,
+    surveyed_area,
+    tiling_of,
+)
+from l2m_gtsam.maps.training import TrainingSet, merged, training_set
+from l2m_gtsam.options import Options
+from l2m_gtsam.recording.sync import SyncOptions
+
+
+class SuiteOptions(Options):
+    """How the sensors of a mapping suite are calibrated from their own drive."""
+
+    sync: SyncOptions = SyncOptions(thin_distance_m=0.03, thin_angle_deg=5.0)
+    """Which readings enter. One place seen with two headings tells most of the sensors."""
+    position_m: float = Field(default=0.3, gt=0)
+    """How far a sensor may sit from where it is assumed, along each axis: standard deviation in
+    metres. Assumed is the lidar's origin, or what a suite says that is given to start from."""
+    matrix: float = Field(default=0.1, gt=0, lt=1)
+    """How far each entry of C may be from what is assumed, the identity if nothing is given."""
+    offset_ut: float = Field(default=20.0, gt=0)
+    """How far H may be from what is assumed, zero if nothing is given, in microtesla."""
+    clock_s: float = Field(default=0.02, gt=0)
+    """How far a sensor's clock may be off, in seconds."""
+    windows: int = Field(default=4, ge=1)
+    """Parts of the survey that are looked at, spread over it."""
+    readings: int = Field(default=3000, ge=100)
+    """The most readings of one of them."""
+    modes: int = Field(default=300, ge=50)
+    """About how many waves describe the field in one of them; time goes with the square."""
+    rounds: int = Field(default=6, ge=1)
+    """How often strength and depth of the field's sources are learnt anew, at the most."""
+    steps: int = Field(default=10, ge=1)
+    """The most steps of the solve in one round."""
+
 
 SIZE = 16  # t, C row by row, H, time offset
 T, C, H, TAU = slice(0, 3), slice(3, 12), slice(12, 15), 15
@@ -213,3 +255,73 @@ def _information(
         shared += basis.features(points[at]).reshape(-1, len(D)).T @ flat
     known = solve_triangular(found.factor, D[:, None] * shared / noise, lower=True)
     return np.asarray((own - known.T @ known) / noise**2)
+
+
+@dataclass(frozen=True)
+class SuiteWindows:
+    """Windows of a survey, each with readings of its own, and the prior of the field in them.
+
+    Attributes
+    ----------
+    parts
+        Windows.
+    rows
+        Which readings of the survey each has.
+    prior
+        Of the field, and the readings' noise.
+    """
+
+    parts: tuple[SuiteWindow, ...]
+    rows: tuple[IntArray, ...]
+    prior: Hyperparameters
+
+
+def windows_over(readings: Readings, sensors: FloatArray, options: SuiteOptions) -> SuiteWindows:
+    """Learn the prior of the field where sensors with these parameters saw it, and lay windows.
+
+    Parameters
+    ----------
+    readings
+        Of the survey, at the sensors' clocks.
+    sensors
+        Parameters of S sensors, shape (S, 16).
+    options
+        How many windows.
+
+    Raises
+    ------
+    MapError
+        There are too few readings.
+    """
+    seen, defaults = undistorted(readings, sensors), HarmonicOptions()
+    raw = training_set(seen.points, seen.field)
+    survey = merged(raw, defaults.merge, defaults.independent)
+    learning = LearningOptions(windows=options.windows, rough=0, modes=options.modes)
+    share = defaults.mode_share
+    prior = learn(survey, NO_SOURCES, defaults.tiling, share, learning).hyperparameters
+    density = float(survey.weight.sum()) / surveyed_area(survey.points)
+    wanted = resolution_of(prior, density, share)
+    resolution = affordable(wanted, defaults.tiling, learning.modes)
+    tiling = tiling_of(survey.points, resolution, defaults.tiling, learning.modes, reach=0.0)
+    parts, of = [], []
+    for tile, rows in _dealt(tiling, seen.points, options):
+        own = TrainingSet(seen.points[rows], seen.field[rows], np.ones(len(rows)))
+        centre = tiling.grid.centres[tile]
+        basis = basis_of(own, centre, tiling.edge, resolution, [], np.empty(0))
+        parts.append(SuiteWindow(basis, own.points.mean(axis=0), readings[rows]))
+        of.append(rows)
+    return SuiteWindows(tuple(parts), tuple(of), prior)
+
+
+def _dealt(tiling: Tiling, points: FloatArray, options: SuiteOptions) -> list[tuple[int, IntArray]]:
+    """Return tiles spread over a survey, with readings of which none belongs to two of them."""
+    members = tiling.grid.members(points, tiling.overlap)
+    tiles = spread_tiles(tiling, [len(rows) for rows in members], options.windows)
+    away = np.abs(points[:, None, :2] - tiling.grid.centres[tiles]).max(axis=2)
+    nearest = np.argmin(away, axis=1)
+    dealt = []
+    for number, tile in enumerate(tiles):
+        rows = members[tile][nearest[members[tile]] == number]
+        some = np.linspace(0, len(rows) - 1, min(len(rows), options.readings)).astype(np.int64)
+        dealt.append((tile, rows[some]))
+    return [(tile, rows) for tile, rows in dealt if len(rows)]

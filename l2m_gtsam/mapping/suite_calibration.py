@@ -15,9 +15,8 @@ from l2m_gtsam.data import (
     SyncCounts,
 )
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.suite.evidence import SIZE, TAU
-from l2m_gtsam.mapping.suite.options import SuiteOptions
-from l2m_gtsam.mapping.suite.solve import SuiteSolution, solve_suite
+from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteOptions
+from l2m_gtsam.mapping.suite_solver import SuiteSolution, solve_suite
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.joining import joined

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import skew
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.slam.start.screen import Places, about_z
+from l2m_gtsam.slam.start.screening import Places, about_z
 from l2m_gtsam.slam.start.window import Pattern
 
 SCALE2 = 9.0  # squared residual in sigmas from which on a reading pulls less (Cauchy)

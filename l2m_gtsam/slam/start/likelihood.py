@@ -18,26 +18,110 @@ is asked for is likelihoods; the drive from the best place is solved by GTSAM.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import carried_residuals
+from l2m_factors import carried_residuals, skew
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, RigidTransform
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.records.localisation import StartCandidate
-from l2m_gtsam.slam.map_prediction import Place, Sight, look
-from l2m_gtsam.slam.shared import SharedMapErrors, errors_of
-from l2m_gtsam.slam.start.prior import Beforehand
-from l2m_gtsam.slam.start.roots import (
-    block_diagonal,
-    diagonal_blocks,
-    inverse,
-    map_root,
-    root_of,
-    steps_root,
-)
+from l2m_gtsam.slam.map_prediction import Place, SharedMapErrors, Sight, errors_of, look
 from l2m_gtsam.slam.start.window import Window
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance
+
+UNKNOWN = np.repeat([10.0, 1e3], 3)  # rad and m: sigmas of what nothing is known of
+
+
+@dataclass(frozen=True)
+class Beforehand:
+    """What is known before readings are looked at.
+
+    Attributes
+    ----------
+    up
+        The map's z axis in the frame of the first key pose, shape (3,).
+    tilt
+        Its standard deviation about each axis, rad.
+    height, height_m
+        Of the first key pose in the map, and its standard deviation, metres.
+    spread
+        Standard deviation per axis of the map's field from place to place, uT.
+    largest
+        Largest squared length of a whitened residual that passes for noise.
+    """
+
+    up: FloatArray
+    tilt: float
+    height: float
+    height_m: float
+    spread: float
+    largest: float
+
+    def said(self, at: RigidTransform) -> tuple[float, FloatArray, FloatArray]:
+        """Return half the squared error in sigmas of a pose, with its derivatives (6,) and (6, 6).
+
+        By a right perturbation, rotation before translation.
+        """
+        leans = at.R[2] - self.up
+        rises = at.t[2] - self.height
+        J = np.zeros((4, 6))
+        J[:3, :3], J[3, 3:] = skew(at.R[2:])[0] / self.tilt, at.R[2] / self.height_m
+        e = np.append(leans / self.tilt, rises / self.height_m)
+        return float(0.5 * e @ e), J.T @ e, J.T @ J + np.diag(UNKNOWN**-2)
+
+
+ROUNDING = 1e-12  # of a variance in m^2 or uT^2: as good as none
+
+
+def steps_root(window: Window) -> FloatArray:
+    """Return what a unit of each step's errors moves the first frame by, shape (K - 1, 6, 6).
+
+    As seen from what comes after the step.
+    """
+    back = carried_back(window.R[1:], window.p[1:])
+    return np.asarray(np.linalg.solve(back, np.linalg.cholesky(window.covariance)))
+
+
+def root_of(covariance: FloatArray) -> FloatArray:
+    """Return L with ``L L^T`` a covariance that may be singular."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), ROUNDING))
+    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    return np.asarray(sigma[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def map_root(errors: SharedMapErrors, C: FloatArray) -> FloatArray:
+    """Return a root of what the map's errors add to S, shape (3N, K)."""
+    columns = []
+    for tile, size in errors.sizes.items():
+        F = np.zeros((len(C), 3, size))
+        own = errors.owner == tile
+        F[own] = C[own] @ errors.features[tile]
+        columns.append(F.reshape(-1, size))
+    W = errors.root_information
+    return np.asarray(
+        solve_triangular(W, np.concatenate(columns, axis=1).T, lower=True, trans="T").T
+    )
+
+
+def block_diagonal(blocks: FloatArray) -> FloatArray:
+    """Return N blocks, shape (N, 3, 3), as one matrix, shape (3N, 3N)."""
+    N = len(blocks)
+    S = np.zeros((N, 3, N, 3))
+    S[np.arange(N), :, np.arange(N)] = blocks
+    return S.reshape(3 * N, 3 * N)
+
+
+def diagonal_blocks(S: FloatArray) -> FloatArray:
+    """Return the blocks of three rows on the diagonal, shape (N, 3, 3)."""
+    N = len(S) // 3
+    return np.asarray(S.reshape(N, 3, N, 3)[np.arange(N), :, np.arange(N)])
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of matrices, shape (..., n, n)."""
+    return np.asarray(np.linalg.inv(matrices))
+
 
 ROUNDS = 3  # with covariances of their own
 STEPS = 4  # in each

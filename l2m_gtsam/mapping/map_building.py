@@ -6,14 +6,33 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.maps.build import KINDS, build_map
-from l2m_gtsam.maps.compare import MapComparison, compare_maps
+from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
+from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
+from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
+from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
+from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
+
+
+class MappingOptions(Options):
+    """How a map is built from mapping bags."""
+
+    sync: SyncOptions = SyncOptions(thin_distance_m=0.05, thin_angle_deg=10.0)
+    """Which readings enter; a map needs its readings spread in space, not in heading."""
+    model: MapOptions = MapOptions()
+    """The kind of map and its options."""
+    structure: CloudTopicOptions = CloudTopicOptions(edge=0.05)
+    """How a structure cloud is read: from a file, which is in the map frame, only `edge` counts."""
+    lidar: CloudTopicOptions = CloudTopicOptions(edge=0.1, max_range=30.0)
+    """How scans become the cloud that is saved with the map; their topic is `lidar.topic`."""
+    compare: CompareOptions = CompareOptions()
+    """How `l2m map compare` holds readings out."""
+    suite: SuiteOptions = SuiteOptions()
+    """How `l2m map suite` calibrates the sensors that map."""
 
 
 @one_blas_thread()

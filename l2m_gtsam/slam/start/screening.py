@@ -1,0 +1,400 @@
+r"""Which places and headings of a lattice can be where a pattern of fields was read.
+
+Within half a step of the truth a reading's residual is that of the truth, e, and at most a
+tolerance more: slope times displacement, what half a heading turns the field by, and what the
+tangent leaves. By Cauchy and Schwarz
+
+.. math::
+    (|e| + \tau)^2 \le (\sigma^2 + \tau^2) \, (|e|^2 / \sigma^2 + 1)
+
+so that with the tolerance as a further variance the truth's node scores no more than the truth
+itself, and one for each reading. The tilt of the pattern is common to all readings and solved for
+on the way, which only lowers a score. Nodes beyond what noise and outliers leave are given up as
+soon as a part of the readings says so: most of them after a few.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from scipy.ndimage import distance_transform_edt
+
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.slam.options import StartSearchOptions
+from l2m_gtsam.slam.start.window import Pattern
+
+MOST_BOX = 10_000_000  # nodes; those that the map has data for take 150 bytes each
+NEAR = 1.0  # metres from a reading of the survey: further off no map is asked
+AXES = 3
+FURTHEST = np.sqrt(AXES) / 2  # steps from a place to its nearest node
+
+
+@dataclass(frozen=True)
+class FieldLattice:
+    """M nodes of a cubic lattice about the places that a map has data for.
+
+    Attributes
+    ----------
+    step
+        Metres.
+    lowest
+        The first node of the box in steps, shape (3,).
+    rows
+        Which node of the lattice each of the box is, -1 for none, shape (nx, ny, nz).
+    at
+        Where each node is in the box, shape (M, 3).
+    field, gradient
+        Of the map, uT and uT/m, shapes (M, 3) and (M, 3, 3).
+    slope
+        Largest change of the field per metre, its gradient's largest singular value, shape (M,).
+    bend
+        How far the field may be from the tangent within a node's cell, uT, shape (M,).
+    variance
+        Of the map, mean of the axes, uT^2, shape (M,).
+    """
+
+    step: float
+    lowest: IntArray
+    rows: IntArray
+    at: IntArray
+    field: FloatArray
+    gradient: FloatArray
+    slope: FloatArray
+    bend: FloatArray
+    variance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.at)
+
+    def places(self, nodes: IntArray) -> FloatArray:
+        """Return where nodes are in the map, metres, shape (N, 3)."""
+        return np.asarray(self.step * (self.lowest + self.at[nodes]))
+
+    def between(self, low: float, high: float) -> IntArray:
+        """Return the nodes at some heights in metres, and no further off than half a step."""
+        z = self.step * (self.lowest[2] + self.at[:, 2])
+        half = 0.5 * self.step
+        return np.flatnonzero((z >= low - half) & (z <= high + half))
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the field over the lattice, per axis, uT."""
+        return float(np.sqrt(np.mean((self.field - self.field.mean(axis=0)) ** 2)))
+
+
+def lattice_over(field_map: QueryableMap, survey: TrainingSet, step: float) -> FieldLattice:
+    """Ask a map at the nodes of a lattice.
+
+    Parameters
+    ----------
+    field_map
+        The map.
+    survey
+        What it was made of.
+    step
+        Metres.
+
+    Raises
+    ------
+    MapError
+        The lattice would not fit in memory.
+    """
+    lowest, near = nodes_near(survey, step)
+    asked = np.argwhere(near)
+    sample = field_map.query(np.asarray(step * (lowest + asked)))
+    at = asked[sample.inside]
+    if not len(at):
+        raise MapError("the map has no data at any place of the lattice; choose a smaller step_m")
+    rows = np.full(near.shape, -1)
+    rows[tuple(at.T)] = np.arange(len(at))
+    field, gradient = sample.field[sample.inside], sample.gradient[sample.inside]
+    slope = np.asarray(np.linalg.svd(gradient, compute_uv=False)[:, 0])
+    bend = FURTHEST**2 * remainder(rows, at, field, gradient, step)
+    variance = sample.variance[sample.inside].mean(axis=1)
+    return FieldLattice(step, lowest, rows, at, field, gradient, slope, np.asarray(bend), variance)
+
+
+def nodes_near(survey: TrainingSet, step: float) -> tuple[IntArray, BoolArray]:
+    """Return the first node of a box in steps, and which of its nodes are near readings."""
+    low, high = survey.points.min(axis=0) - NEAR, survey.points.max(axis=0) + NEAR
+    lowest = np.floor(low / step).astype(np.int64)
+    shape = np.ceil(high / step).astype(np.int64) - lowest + 1
+    if np.prod(shape.astype(float)) > MOST_BOX:
+        raise MapError(
+            f"the map spans {' x '.join(f'{extent:.0f}' for extent in high - low)} m, too much for "
+            f"a lattice of {step:g} m; choose a larger slam.start.search.step_m, or give "
+            "slam.start.position and slam.start.quaternion_xyzw"
+        )
+    empty = np.ones(shape, dtype=np.bool_)
+    empty[tuple((np.round(survey.points / step).astype(np.int64) - lowest).T)] = False
+    near = step * distance_transform_edt(empty) <= NEAR
+    return lowest, np.asarray(near)
+
+
+def remainder(
+    rows: IntArray, at: IntArray, field: FloatArray, gradient: FloatArray, step: float
+) -> FloatArray:
+    """Return how far the field of neighbours is from a node's tangent at most, uT, shape (M,)."""
+    padded = np.pad(rows, 1, constant_values=-1)
+    most = np.zeros(len(at))
+    for axis in range(AXES):
+        for way in (-1, 1):
+            beside = at + 1
+            beside[:, axis] += way
+            neighbour = padded[tuple(beside.T)]
+            off = field[neighbour] - field - way * step * gradient[:, :, axis]
+            away = np.where(neighbour >= 0, np.linalg.norm(off, axis=1), 0.0)
+            most = np.maximum(most, away)
+    return most
+
+
+LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
+MEAN = 3.0  # of it, by noise
+
+
+class Heading(NamedTuple):
+    """A pattern of N readings with a heading, in the map's axes.
+
+    Attributes
+    ----------
+    node
+        The node nearest to each reading, in steps from that of the origin, shape (N, 3).
+    rest
+        The way from there, metres, shape (N, 3).
+    field
+        What was read, uT, shape (N, 3).
+    variance
+        Of it without the map's, uT^2, shape (N,).
+    drift2
+        Of its place by odometry, m^2, shape (N,).
+    moved
+        The largest displacement within half a cell and half a heading, metres, shape (N,).
+    swung
+        What half a heading turns the field by, uT, shape (N,).
+    """
+
+    node: IntArray
+    rest: FloatArray
+    field: FloatArray
+    variance: FloatArray
+    drift2: FloatArray
+    moved: FloatArray
+    swung: FloatArray
+
+
+class Rules(NamedTuple):
+    """What rules a place out: its score, or how many readings are where the map has no data.
+
+    ``tilt2`` is the variance of the pattern's tilt about each axis, rad^2.
+    """
+
+    limit: float
+    most_unknown: int
+    tilt2: float
+
+
+class Nodes(NamedTuple):
+    """A lattice as the kernel takes it; see ``FieldLattice``."""
+
+    rows: IntArray
+    field: FloatArray
+    gradient: FloatArray
+    slope: FloatArray
+    bend: FloatArray
+    variance: FloatArray
+
+
+@njit(cache=True, nogil=True)
+def write_scores(
+    at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules, score: FloatArray
+) -> None:
+    """Write the score of each node, shape (M, 3), as the pattern's place."""
+    for m in range(len(at)):
+        score[m] = score_at(at[m], nodes, pattern, rules)
+
+
+@njit(cache=True, nogil=True)
+def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> float:
+    """Return the score of a node, shape (3,), as the pattern's place; infinite beyond the limit.
+
+    It is the least over the tilt (u, v) about the x and y axes of the squared residuals in sigmas,
+    which turn by (v fz, -u fz, u fy - v fx), and the squared tilt in its own.
+    """
+    total, unknown, per_tilt2 = 0.0, 0, 1 / rules.tilt2
+    a, b, c, g, h = per_tilt2, 0.0, per_tilt2, 0.0, 0.0  # [[a, b], [b, c]] (u, v) = (g, h)
+    r = np.empty(3)
+    for n in range(len(pattern.node)):
+        row = row_of(nodes.rows, at, pattern.node[n])
+        if row < 0:
+            unknown += 1
+            total += MEAN + 1
+        else:
+            r2 = 0.0
+            for axis in range(3):
+                r[axis] = pattern.field[n, axis] - nodes.field[row, axis]
+                for along in range(3):
+                    r[axis] -= nodes.gradient[row, axis, along] * pattern.rest[n, along]
+                r2 += r[axis] ** 2
+            slope = nodes.slope[row]
+            tolerance = slope * pattern.moved[n] + pattern.swung[n] + nodes.bend[row]
+            s2 = pattern.variance[n] + nodes.variance[row] + slope**2 * pattern.drift2[n]
+            s2 += tolerance**2
+            x, y, z = pattern.field[n, 0], pattern.field[n, 1], pattern.field[n, 2]
+            leaning = rules.tilt2 * (x * x + y * y + 2 * z * z)
+            if r2 > (LARGEST + 1) * (s2 + leaning):
+                total += LARGEST + 1
+            else:
+                total += r2 / s2
+                a += (z * z + y * y) / s2
+                b -= x * y / s2
+                c += (z * z + x * x) / s2
+                g += (y * r[2] - z * r[1]) / s2
+                h += (z * r[0] - x * r[2]) / s2
+        taken = (c * g * g - 2 * b * g * h + a * h * h) / (a * c - b * b)
+        if total - taken > rules.limit or unknown > rules.most_unknown:
+            return np.inf
+    return total - taken
+
+
+@njit(cache=True, nogil=True)
+def row_of(rows: IntArray, at: IntArray, node: IntArray) -> int:
+    """Return which node of the lattice is so many steps from another, shapes (3,), or -1."""
+    i, j, k = at[0] + node[0], at[1] + node[1], at[2] + node[2]
+    if i < 0 or j < 0 or k < 0:
+        return -1
+    if i >= rows.shape[0] or j >= rows.shape[1] or k >= rows.shape[2]:
+        return -1
+    return int(rows[i, j, k])
+
+
+MOST_KEPT = 20_000  # places that are looked at further, the best
+COARSEST = np.deg2rad(10.0)  # between headings
+SIGMAS = 4.0  # of their sum
+GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+@dataclass(frozen=True)
+class Places:
+    """N hypotheses of where a pattern lies in a map.
+
+    Attributes
+    ----------
+    p
+        The pattern's origin in the map, metres, shape (N, 3).
+    yaw
+        Heading of its x axis, rad, shape (N,).
+    score
+        The lower the better, shape (N,).
+    """
+
+    p: FloatArray
+    yaw: FloatArray
+    score: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.yaw)
+
+    def __getitem__(self, rows: IntArray) -> "Places":
+        return Places(self.p[rows], self.yaw[rows], self.score[rows])
+
+
+@dataclass(frozen=True)
+class Screened:
+    """The places that readings do not rule out, the best first, and how many were looked at."""
+
+    places: Places
+    looked_at: int
+
+
+def screen(
+    pattern: Pattern, lattice: FieldLattice, nodes: IntArray, options: StartSearchOptions
+) -> Screened:
+    """Return the places that readings do not rule out, at most ``MOST_KEPT``.
+
+    Parameters
+    ----------
+    pattern
+        What was read.
+    lattice
+        What the map says.
+    nodes
+        Where on it the pattern's origin may be, indices of shape (M,).
+    options
+        What rules a place out.
+    """
+    turn = heading_step(pattern.radius, lattice.step)
+    headings = turn * np.arange(round(2 * np.pi / turn))
+    pattern = in_turn(pattern)
+    rules, told, at = rules_of(pattern, options), nodes_of(lattice), lattice.at[nodes]
+
+    def look(yaw: float) -> Places:
+        score = np.empty(len(nodes))
+        write_scores(at, told, heading(pattern, lattice.step, yaw, turn), rules, score)
+        kept = np.flatnonzero(np.isfinite(score))
+        return Places(lattice.places(nodes[kept]), np.full(len(kept), yaw), score[kept])
+
+    return Screened(best_of(in_threads(look, headings)), len(headings) * len(nodes))
+
+
+def heading_step(radius: float, step: float) -> float:
+    """Return the angle between headings: a whole part of the circle, rad.
+
+    At ``radius`` metres it moves a reading by no more than a ``step``.
+    """
+    angle = min(COARSEST, step / max(radius, step))
+    return float(2 * np.pi / np.ceil(2 * np.pi / angle))
+
+
+def rules_of(pattern: Pattern, options: StartSearchOptions) -> Rules:
+    """Return what noise and outliers leave at most."""
+    N = len(pattern.x)
+    wrong = options.outliers * N
+    noise = (N - wrong) * (MEAN + 1) + SIGMAS * np.sqrt(2 * MEAN * N) + LARGEST
+    return Rules(
+        float(noise + wrong * (LARGEST + 1)), int((1 - options.least_inside) * N), pattern.tilt**2
+    )
+
+
+def in_turn(pattern: Pattern) -> Pattern:
+    """Return the readings in an order in which neighbours come late: the first ones tell most."""
+    return pattern[np.argsort(GOLDEN * np.arange(len(pattern.x)) % 1, kind="stable")]
+
+
+def nodes_of(lattice: FieldLattice) -> Nodes:
+    """Return a lattice as the kernel takes it."""
+    return Nodes(*(getattr(lattice, name) for name in Nodes._fields))
+
+
+def heading(pattern: Pattern, step: float, yaw: float, turn: float) -> Heading:
+    """Return a pattern with a heading, among headings ``turn`` apart; both in rad."""
+    Rz = about_z(yaw)
+    x, field = pattern.x @ Rz.T, pattern.field @ Rz.T
+    node = np.round(x / step)
+    return Heading(
+        node=node.astype(np.int64),
+        rest=x - step * node,
+        field=field,
+        variance=pattern.variance,
+        drift2=pattern.drift_m**2,
+        moved=0.5 * (np.sqrt(3) * step + turn * np.linalg.norm(x[:, :2], axis=1)),
+        swung=0.5 * turn * np.linalg.norm(field[:, :2], axis=1),
+    )
+
+
+def about_z(yaw: float) -> FloatArray:
+    """Return the rotation about the z axis by an angle in rad, shape (3, 3)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def best_of(parts: list[Places]) -> Places:
+    """Return the places with the least scores, the best first."""
+    p = np.concatenate([part.p for part in parts])
+    yaw = np.concatenate([part.yaw for part in parts])
+    score = np.concatenate([part.score for part in parts])
+    return Places(p, yaw, score)[np.argsort(score, kind="stable")[:MOST_KEPT]]
