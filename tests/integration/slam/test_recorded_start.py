@@ -55,7 +55,7 @@ def part(recording: Recording, start_s: float, seconds: float, seed: int) -> Rec
 def test_a_recorded_drive_is_found_in_the_map_of_another(
     known: tuple[Recording, FieldMap, CalibrationResult], start_s: float
 ) -> None:
-    """Within 20 cm, in windows of 3 m: over 22 starts it was 1 to 15 cm (docs/slam-measurements.md)."""
+    """Within 20 cm, in windows of 3 m: of 22 starts 1 to 15 cm (docs/slam-measurements.md)."""
     run, field_map, calibration = known
     drive, _ = prepared(part(run, start_s, 25.0, seed=int(start_s)), calibration, OPTIONS)
     found = find_start(drive, field_map, OPTIONS, quiet)
