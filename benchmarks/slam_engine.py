@@ -14,8 +14,8 @@ from rich.table import Table
 
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.online.belief import gain_of
-from l2m_gtsam.slam.solver import descended, joint_covariance, least_fill
+from l2m_gtsam.slam.online.belief import kalman_gain
+from l2m_gtsam.slam.solver import colamd_ordering, descended, joint_covariance
 from l2m_gtsam.slam.unknown_field.field_memory import JointGaussian, prior_factors
 from tests.reference.dense_newton import newton
 
@@ -91,7 +91,7 @@ def open_section(tiles: int, weights: int) -> list[str]:
         whole = gtsam.NonlinearFactorGraph(given.graph)
         for factor in priors:
             whole.add(factor)
-        found = descended(whole, given.start, least_fill(whole), STEPS, 0.0)
+        found = descended(whole, given.start, colamd_ordering(whole), STEPS, 0.0)
         joint_covariance(whole.linearize(found.values), [last])
 
     dense = seconds(lambda: newton(given.graph, given.known, given.start, given.sizes, STEPS), 3)
@@ -105,7 +105,7 @@ def kalman(count: int, seen: int) -> list[str]:
     P, J, e = root @ root.T + 0.1 * np.eye(count), rng.normal(size=(seen, count)), np.ones(seen)
 
     def own() -> None:
-        gain = gain_of(P, J)
+        gain = kalman_gain(P, J)
         _ = -gain @ e, P - gain @ (J @ P)
 
     def by_gtsam() -> None:

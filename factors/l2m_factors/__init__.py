@@ -1,17 +1,17 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
-from l2m_factors.carried import (
-    Calibrations,
-    CarriedReadings,
-    CarriedResiduals,
-    carried_residuals,
-)
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.doubt import FieldDoubt, doubt_factor
 from l2m_factors.field_map import FieldMap
+from l2m_factors.key_pose_readings import (
+    Calibrations,
+    KeyPoseReadings,
+    KeyPoseResiduals,
+    key_pose_residuals,
+)
 from l2m_factors.keys import D, G, M, P, Q, S, T, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
-from l2m_factors.pose import CarriedBatch, key_pose_factor
+from l2m_factors.pose import MapBatch, key_pose_factor
 from l2m_factors.priors import (
     distance_prior,
     distortion_prior,
@@ -39,15 +39,15 @@ from l2m_factors.whitening import Whitening
 __all__ = [
     "BatchedReadings",
     "Calibrations",
-    "CarriedBatch",
-    "CarriedReadings",
-    "CarriedResiduals",
     "D",
     "FieldDoubt",
     "FieldMap",
     "G",
+    "KeyPoseReadings",
+    "KeyPoseResiduals",
     "M",
     "MagneticReadings",
+    "MapBatch",
     "P",
     "PoseMotion",
     "Q",
@@ -66,13 +66,13 @@ __all__ = [
     "X",
     "assert_jacobians_match",
     "block_factor",
-    "carried_residuals",
     "distance_prior",
     "distortion_prior",
     "doubt_factor",
     "field_rate",
     "held_directions",
     "key_pose_factor",
+    "key_pose_residuals",
     "map_weights_information",
     "map_weights_prior",
     "moved",

@@ -6,8 +6,13 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals, carried_residuals
 from l2m_factors.field_map import FieldMap
+from l2m_factors.key_pose_readings import (
+    Calibrations,
+    KeyPoseReadings,
+    KeyPoseResiduals,
+    key_pose_residuals,
+)
 from l2m_factors.sensor_variables import SensorVariables
 
 
@@ -29,13 +34,13 @@ class KeyPoseBatch(ABC):
         ``S(i)``.
     """
 
-    def __init__(self, readings: CarriedReadings, fixed: Calibrations | None) -> None:
+    def __init__(self, readings: KeyPoseReadings, fixed: Calibrations | None) -> None:
         self._readings, self._variables = readings, SensorVariables(readings, fixed)
         numbers, self._slot = np.unique(readings.key_pose, return_inverse=True)
         self._rows = {int(k): np.flatnonzero(self._slot == n) for n, k in enumerate(numbers)}
         self._sensors = {k: self._variables.on(rows) for k, rows in self._rows.items()}
         self._seen: dict[int, bytes] = {}
-        self._residuals: CarriedResiduals | None = None
+        self._residuals: KeyPoseResiduals | None = None
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -49,7 +54,7 @@ class KeyPoseBatch(ABC):
         """Return the indices of the readings on a key pose."""
         return self._rows[key_pose]
 
-    def residuals(self, values: gtsam.Values, key_pose: int) -> CarriedResiduals:
+    def residuals(self, values: gtsam.Values, key_pose: int) -> KeyPoseResiduals:
         """Return all residuals, evaluated anew if the variables of this key pose changed.
 
         Those of key poses without values mean nothing, as when one factor is used alone.
@@ -81,7 +86,7 @@ class KeyPoseBatch(ABC):
         of_sensors = self._variables.stamp(values, self._sensors[key_pose])
         return self._own_stamp(values, key_pose) + of_sensors
 
-    def _evaluated(self, values: gtsam.Values, present: list[int]) -> CarriedResiduals:
+    def _evaluated(self, values: gtsam.Values, present: list[int]) -> KeyPoseResiduals:
         R, p = np.tile(np.eye(3), (len(self._rows), 1, 1)), np.zeros((len(self._rows), 3))
         slots = {k: slot for slot, k in enumerate(self._rows)}
         for k in present:
@@ -89,4 +94,4 @@ class KeyPoseBatch(ABC):
             R[slots[k]], p[slots[k]] = pose.rotation().matrix(), pose.translation()
         sensors = self._variables.calibrations(values, self._variables.on(np.arange(len(self))))
         field = self._field(values)
-        return carried_residuals(self._readings, field, R[self._slot], p[self._slot], sensors)
+        return key_pose_residuals(self._readings, field, R[self._slot], p[self._slot], sensors)

@@ -5,16 +5,16 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals
 from l2m_factors.field_map import FieldMap, FloatArray
 from l2m_factors.key_pose_batch import KeyPoseBatch
+from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import X
 from l2m_factors.shared_errors import SharedError, shared_error
 from l2m_factors.step import Slots, StepError
 from l2m_factors.whitening import Whitening
 
 
-class CarriedBatch(KeyPoseBatch):
+class MapBatch(KeyPoseBatch):
     """Readings on key poses over one map.
 
     Parameters
@@ -26,7 +26,7 @@ class CarriedBatch(KeyPoseBatch):
     """
 
     def __init__(
-        self, field_map: FieldMap, readings: CarriedReadings, fixed: Calibrations | None = None
+        self, field_map: FieldMap, readings: KeyPoseReadings, fixed: Calibrations | None = None
     ) -> None:
         super().__init__(readings, fixed)
         self._map = field_map
@@ -36,7 +36,7 @@ class CarriedBatch(KeyPoseBatch):
         return [X(key_pose), *self._variables.keys(self._sensors[key_pose])]
 
     def jacobians(
-        self, residuals: CarriedResiduals, key_pose: int, more: FloatArray
+        self, residuals: KeyPoseResiduals, key_pose: int, more: FloatArray
     ) -> list[FloatArray]:
         """Return derivatives by each of ``keys_of``, each of shape (n, 3, .).
 
@@ -71,7 +71,7 @@ class CarriedBatch(KeyPoseBatch):
 
 
 def key_pose_factor(
-    batch: CarriedBatch,
+    batch: MapBatch,
     key_pose: int,
     whitening: Whitening,
     errors: Sequence[SharedError] = (),

@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.carried import Calibrations, CarriedReadings
 from l2m_factors.field_map import FloatArray
+from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import ReadingResiduals
 
@@ -24,7 +24,7 @@ class SensorVariables:
         sensor, and ``S(i)`` for readings with motion.
     """
 
-    def __init__(self, readings: CarriedReadings, fixed: Calibrations | None) -> None:
+    def __init__(self, readings: KeyPoseReadings, fixed: Calibrations | None) -> None:
         self._sensor, self._fixed = readings.sensor, fixed
         self._timed = fixed is None and readings.motion is not None
 

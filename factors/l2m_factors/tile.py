@@ -21,9 +21,9 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
-from l2m_factors.carried import Calibrations, CarriedReadings, CarriedResiduals
 from l2m_factors.field_map import FieldMap, FloatArray
 from l2m_factors.key_pose_batch import KeyPoseBatch
+from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import M, X
 from l2m_factors.motion import skew
 from l2m_factors.step import Slots, StepError
@@ -96,7 +96,7 @@ class TileBatch(KeyPoseBatch):
         number: int,
         anchor: int,
         field: TileField,
-        readings: CarriedReadings,
+        readings: KeyPoseReadings,
         fixed: Calibrations | None = None,
     ) -> None:
         super().__init__(readings, fixed)
@@ -111,7 +111,7 @@ class TileBatch(KeyPoseBatch):
         return [*poses, M(self._number), *self._variables.keys(self._sensors[key_pose])]
 
     def jacobians(
-        self, residuals: CarriedResiduals, values: gtsam.Values, key_pose: int
+        self, residuals: KeyPoseResiduals, values: gtsam.Values, key_pose: int
     ) -> list[FloatArray]:
         """Return derivatives by each of ``keys_of`` of n readings, each of shape (n, 3, .)."""
         rows, relative = self._rows[key_pose], self._pose(values, key_pose)

@@ -10,7 +10,7 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording, RigidTransform
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.geometry import compose
-from l2m_gtsam.lidar.loop_closures import find_loops
+from l2m_gtsam.lidar.loop_closures import find_loop_closures
 from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.surface import Surface
@@ -18,7 +18,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.odometry_jumps import without_jumps
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.localisation import NO_SCANS, start_pose
-from l2m_gtsam.slam.odometry import carried_scans
+from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.options import Usage
 from l2m_gtsam.storage.scan_topic import has_clouds
 
@@ -75,8 +75,8 @@ def _loops(bag: Path, recording: Recording, config: Config, progress: Progress) 
     options, scans = config.lidar.loops, bag_scans(bag, config, progress)
     edge = options.registration.edge
     mended = without_jumps(recording.trajectory, config.slam.jumps)
-    steps = carried_scans(scans, mended, edge, config.slam)
-    return ScanEvidence(loops=find_loops(steps, options).loops)
+    steps = scan_odometry(scans, mended, edge, config.slam)
+    return ScanEvidence(loops=find_loop_closures(steps, options).loops)
 
 
 def _fixes(
@@ -85,7 +85,7 @@ def _fixes(
     options, scans = _localisation(config), bag_scans(bag, config, progress)
     edge = options.registration.edge
     mended = without_jumps(recording.trajectory, config.slam.jumps)
-    steps = carried_scans(scans, mended, edge, config.slam)
+    steps = scan_odometry(scans, mended, edge, config.slam)
     first = next(steps, None)
     if first is None:
         raise LidarError("no scan has points enough, at a time that has odometry")

@@ -30,7 +30,7 @@ from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import Sources, localise
 from l2m_gtsam.slam.pose_graph import write_g2o
 from l2m_gtsam.slam.record import Told, localisation_record
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.digest import source_file
@@ -94,7 +94,7 @@ class _Found:
 
     recording: Recording
     result: LocalisationResult
-    solution: Localised
+    solution: DriveSolution
     field_map: FieldMap
 
 

@@ -13,7 +13,7 @@ from l2m_gtsam.lidar.odometry import ScanStep
 from l2m_gtsam.lidar.registration import Refusal, RegistrationOptions, by_scan, register
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
-from l2m_gtsam.records.scans import Loop
+from l2m_gtsam.records.scans import LoopClosure
 
 
 class LoopOptions(Options):
@@ -36,7 +36,7 @@ class LoopOptions(Options):
 
 
 @dataclass(frozen=True)
-class LoopSearch:
+class LoopClosureSearch:
     """Loops of a drive.
 
     Attributes
@@ -47,7 +47,7 @@ class LoopSearch:
         How many others were compared, by reason.
     """
 
-    loops: tuple[Loop, ...]
+    loops: tuple[LoopClosure, ...]
     refused: dict[Refusal, int]
 
 
@@ -64,7 +64,7 @@ class _Kept:
         return Surface(self.points.astype(np.float64))
 
 
-def find_loops(steps: Iterable[ScanStep], options: LoopOptions) -> LoopSearch:
+def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopClosureSearch:
     """Look for loops in a drive.
 
     Memory grows with the way, by about 0.1 MB for each scan that is kept.
@@ -76,7 +76,7 @@ def find_loops(steps: Iterable[ScanStep], options: LoopOptions) -> LoopSearch:
     options
         Where to look, and what to believe.
     """
-    kept, loops, refused = list[_Kept](), list[Loop](), Counter[Refusal]()
+    kept, loops, refused = list[_Kept](), list[LoopClosure](), Counter[Refusal]()
     way, last = 0.0, None
     for step in steps:
         way += float(np.linalg.norm(step.step.t))
@@ -87,12 +87,12 @@ def find_loops(steps: Iterable[ScanStep], options: LoopOptions) -> LoopSearch:
         here = _Kept(step.stamp_ns, points, step.T_odom_lidar, way)
         for earlier in _candidates(kept, here, options):
             closed = _closed(earlier, here, step.surface, options.registration)
-            if isinstance(closed, Loop):
+            if isinstance(closed, LoopClosure):
                 loops.append(closed)
             else:
                 refused[closed] += 1
         kept.append(here)
-    return LoopSearch(tuple(loops), dict(refused))
+    return LoopClosureSearch(tuple(loops), dict(refused))
 
 
 def _candidates(kept: list[_Kept], here: _Kept, options: LoopOptions) -> list[_Kept]:
@@ -105,7 +105,7 @@ def _candidates(kept: list[_Kept], here: _Kept, options: LoopOptions) -> list[_K
 
 def _closed(
     earlier: _Kept, here: _Kept, scan: Surface, options: RegistrationOptions
-) -> Loop | Refusal:
+) -> LoopClosure | Refusal:
     """Return the loop between two scans, or why there is none."""
     first, guess = earlier.surface(), between(earlier.T, here.T)
     found = register(scan, first, guess, options)
@@ -114,4 +114,4 @@ def _closed(
     if refusal is not None:
         return refusal
     estimate = by_scan(found, guess, options)
-    return Loop(earlier.stamp_ns, here.stamp_ns, estimate.T, estimate.covariance)
+    return LoopClosure(earlier.stamp_ns, here.stamp_ns, estimate.T, estimate.covariance)

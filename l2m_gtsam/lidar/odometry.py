@@ -36,7 +36,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import Scan, taken_at_once
 
 
-class KissFollower:
+class KissOdometry:
     """Follows a lidar by KISS-ICP.
 
     Parameters
@@ -191,7 +191,7 @@ class _Follower:
         self.first = ScanStep(scan.stamp_ns, IDENTITY, IDENTITY, exact, surface, True)
         self.twist = twist
         self._options = options
-        self._kiss = KissFollower(options.voxel_m, options.map_range_m)
+        self._kiss = KissOdometry(options.voxel_m, options.map_range_m)
         self._kiss.follow(points, IDENTITY)
         self._key = self._last = _Placed(surface, IDENTITY, exact)
         self._stamp_ns = scan.stamp_ns

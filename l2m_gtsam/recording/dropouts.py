@@ -16,7 +16,7 @@ USUAL = 20.0  # times what usually lies between two readings
 
 
 @dataclass(frozen=True)
-class Heard:
+class MaskedRecording:
     """A recording of what its sensors read while they were alive.
 
     Attributes
@@ -31,12 +31,12 @@ class Heard:
     notes: tuple[str, ...]
 
 
-def heard(recording: Recording) -> Heard:
+def heard(recording: Recording) -> MaskedRecording:
     """Take readings for missing that a sensor repeats while the vehicle moves."""
     trajectory = recording.trajectory
     series = tuple(_alive(each, trajectory) for each in recording.series)
     notes = [_note(each, trajectory) for each in series]
-    return Heard(replace(recording, series=series), tuple(note for note in notes if note))
+    return MaskedRecording(replace(recording, series=series), tuple(note for note in notes if note))
 
 
 def is_dead(series: FieldSeries) -> bool:

@@ -67,7 +67,7 @@ class Jump:
 
 
 @dataclass(frozen=True)
-class Mended:
+class RepairedOdometry:
     """A trajectory without jumps.
 
     Attributes
@@ -108,7 +108,7 @@ class Mended:
         return tuple(told)
 
 
-def without_jumps(trajectory: Trajectory, options: JumpOptions) -> Mended:
+def without_jumps(trajectory: Trajectory, options: JumpOptions) -> RepairedOdometry:
     """Return odometry without its jumps; as it is where it has none.
 
     Covariances of poses stay those of the way from the first pose: what the trajectory states for
@@ -122,7 +122,7 @@ def without_jumps(trajectory: Trajectory, options: JumpOptions) -> Mended:
         What is a jump.
     """
     if len(trajectory) <= LEAST_STEPS:
-        return Mended(trajectory, (), 0)
+        return RepairedOdometry(trajectory, (), 0)
     kept = np.arange(len(trajectory))
     for _ in range(ROUNDS):
         part = trajectory[kept]
@@ -134,7 +134,7 @@ def without_jumps(trajectory: Trajectory, options: JumpOptions) -> Mended:
         kept = np.delete(kept, stray[::2])
     jumps = tuple(_jump(part, found, int(row)) for row in np.flatnonzero(found.jumped))
     mended = _mended(part, found, jumps) if jumps else part
-    return Mended(mended, jumps, len(trajectory) - len(part))
+    return RepairedOdometry(mended, jumps, len(trajectory) - len(part))
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ class PoseFix:
 
 
 @dataclass(frozen=True)
-class Loop:
+class LoopClosure:
     """Where a lidar was, seen from where it had been before.
 
     Attributes
@@ -103,7 +103,7 @@ class ScanEvidence:
     """
 
     fixes: tuple[PoseFix, ...] = ()
-    loops: tuple[Loop, ...] = ()
+    loops: tuple[LoopClosure, ...] = ()
 
     def __len__(self) -> int:
         return len(self.fixes) + len(self.loops)

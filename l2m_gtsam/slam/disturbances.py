@@ -141,7 +141,7 @@ class Slip:
         )
 
 
-def slip_notes(drive: Drive, poses: list[gtsam.Pose3], longer: float = 0.0) -> tuple[str, ...]:
+def slip_notes(drive: Drive, poses: list[gtsam.Pose3], scale_error: float = 0.0) -> tuple[str, ...]:
     """Return a sentence on each of the largest slips, and how many more there are.
 
     Parameters
@@ -150,22 +150,22 @@ def slip_notes(drive: Drive, poses: list[gtsam.Pose3], longer: float = 0.0) -> t
         With odometry's steps.
     poses
         Key poses as they were found.
-    longer
-        Share by which ways are longer than odometry has them.
+    scale_error
+        Relative error of odometry's lengths.
     """
-    found = sorted(slips(drive, poses, longer), key=lambda each: -each.times)
+    found = sorted(slips(drive, poses, scale_error), key=lambda each: -each.times)
     told = [str(each) for each in sorted(found[:TOLD], key=lambda each: each.start_s)]
     more = [f"the same is true of {len(found) - TOLD} more stretches"]
     return (*told, *(more if len(found) > TOLD else []))
 
 
-def slips(drive: Drive, poses: list[gtsam.Pose3], longer: float = 0.0) -> Iterator[Slip]:
+def slips(drive: Drive, poses: list[gtsam.Pose3], scale_error: float = 0.0) -> Iterator[Slip]:
     """Yield where poses and odometry part, in order of time; arguments as above."""
     if not len(drive.steps):
         return
     errors = np.array(
         [
-            gtsam.Pose3.Logmap(drive.step(k, longer).between(poses[k].between(poses[k + 1])))
+            gtsam.Pose3.Logmap(drive.step(k, scale_error).between(poses[k].between(poses[k + 1])))
             for k in range(len(drive.steps))
         ]
     )

@@ -6,11 +6,11 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import Calibrations, CarriedReadings
+from l2m_factors import Calibrations, KeyPoseReadings
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, compose, moved
 from l2m_gtsam.recording.sync import interpolated
-from l2m_gtsam.records.scans import Loop, PoseFix, ScanEvidence
+from l2m_gtsam.records.scans import LoopClosure, PoseFix, ScanEvidence
 from l2m_gtsam.slam.odometry import OdometrySteps, drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 
@@ -69,7 +69,7 @@ def link_stamps(seen: ScanEvidence) -> IntArray:
     return np.array([*(each.stamp_ns for each in seen.fixes), *loops], dtype=np.int64)
 
 
-def linked(
+def key_pose_links(
     seen: ScanEvidence, trajectory: Trajectory, rows: IntArray, options: DriftOptions
 ) -> Links:
     """Hang what scans say on the key poses next to them.
@@ -135,7 +135,7 @@ class _Carrier:
         covariance = moved(fix.covariance[None], T_scan_key)[0] + self._drift(T_scan_key)
         return _Link(MAP, k, compose(fix.T_map_lidar, T_scan_key), covariance)
 
-    def loop(self, loop: Loop) -> _Link:
+    def loop(self, loop: LoopClosure) -> _Link:
         """Return a key pose in the frame of an earlier one."""
         origin, T_first_origin = self._hung[loop.from_ns]
         k, T_second_key = self._hung[loop.to_ns]
@@ -225,7 +225,7 @@ class Drive:
 
     stamp_ns: IntArray
     steps: OdometrySteps
-    readings: CarriedReadings
+    readings: KeyPoseReadings
     start: StartPose
     sensors: KnownSensors
     links: Links = field(default_factory=Links.none)
@@ -251,13 +251,15 @@ class Drive:
             poses.append(poses[-1].compose(self.step(step)))
         return poses
 
-    def step(self, number: int, longer: float = 0.0) -> gtsam.Pose3:
+    def step(self, number: int, scale_error: float = 0.0) -> gtsam.Pose3:
         """Return the way from a key pose to the next, if ways are longer by so large a share."""
-        return gtsam.Pose3(gtsam.Rot3(self.steps.R[number]), (1 + longer) * self.steps.p[number])
+        return gtsam.Pose3(
+            gtsam.Rot3(self.steps.R[number]), (1 + scale_error) * self.steps.p[number]
+        )
 
-    def with_scale_as_walk(self, over_m: float) -> "Drive":
+    def with_scale_as_drift(self, over_m: float) -> "Drive":
         """Return the drive for those who do not estimate odometry's scale; see the steps."""
-        return replace(self, steps=self.steps.with_scale_as_walk(over_m))
+        return replace(self, steps=self.steps.with_scale_as_drift(over_m))
 
 
 def as_pose(transform: RigidTransform) -> gtsam.Pose3:
@@ -265,9 +267,9 @@ def as_pose(transform: RigidTransform) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(transform.R), transform.t)
 
 
-def carried(
+def key_pose_readings(
     readings: Readings, trajectory: Trajectory, rows: IntArray, most: int
-) -> CarriedReadings:
+) -> KeyPoseReadings:
     """Hang readings on the key pose before each, and keep not too many.
 
     One that is as late as a key pose hangs on the one before it: it is the end of that step.
@@ -285,10 +287,10 @@ def carried(
     """
     key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns) - 1
     key = np.clip(key, 0, len(rows) - 2)
-    kept = spread(np.column_stack([key, readings.sensor]), most)
+    kept = evenly_spread(np.column_stack([key, readings.sensor]), most)
     readings, key = readings[kept], key[kept]
     R_back, p = trajectory.R[rows[key]].transpose(0, 2, 1), trajectory.p[rows[key]]
-    return CarriedReadings(
+    return KeyPoseReadings(
         key_pose=key,
         sensor=readings.sensor,
         R_key_lidar=R_back @ readings.R_map_lidar,
@@ -310,16 +312,16 @@ def _fractions(
     return np.asarray(np.clip((at - done[first]) / (done[last] - done[first]), 0.0, 1.0))
 
 
-def spread(groups: IntArray, most: int) -> IntArray:
+def evenly_spread(groups: IntArray, most: int) -> IntArray:
     """Return at most so many rows of each group, spread over it, ordered by group.
 
     ``groups`` has a row of labels for each, shape (N, L); members of a group come in order.
     """
     order = np.lexsort(groups.T[::-1])
     ends = np.flatnonzero(np.diff(groups[order], axis=0).any(axis=1)) + 1
-    return np.concatenate([_some(part, most) for part in np.split(order, ends)])
+    return np.concatenate([_evenly(part, most) for part in np.split(order, ends)])
 
 
-def _some(rows: IntArray, most: int) -> IntArray:
+def _evenly(rows: IntArray, most: int) -> IntArray:
     chosen = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
     return np.asarray(rows[chosen])

@@ -16,13 +16,11 @@ from l2m_gtsam.slam.localisation import NO_SCANS, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 
-NOWHERE_TWICE = (
-    "no place was come to twice: readings of an unknown field take out little drift then"
-)
+NO_REVISITS = "no place was come to twice: readings of an unknown field take out little drift then"
 NO_FIELD = (
     "no field explains the readings at poses that odometry allows: is the calibration that of "
     "these sensors, and does the odometry jump?"
@@ -47,7 +45,7 @@ class Exploration:
     """
 
     result: LocalisationResult
-    solution: Localised
+    solution: DriveSolution
     points: FloatArray
     field: FloatArray
 
@@ -96,7 +94,7 @@ def explore(
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=HERE))
     progress("learning the field's prior", 0.0)
-    scaled = drive.with_scale_as_walk(options.drift.over_m)
+    scaled = drive.with_scale_as_drift(options.drift.over_m)
     by_scans = solve_pose_graph(scaled, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
     prior = drive_prior(drive, by_scans.poses, options.tiles)
@@ -108,7 +106,7 @@ def explore(
     explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
     result = replace(
         told(result, explored),
-        notes=(*notes, *result.notes, *([] if explored.returned else [NOWHERE_TWICE])),
+        notes=(*notes, *result.notes, *([] if explored.returned else [NO_REVISITS])),
         bag=recording.source,
         calibration_source=calibration_source,
         explored=explored,
@@ -130,8 +128,8 @@ def told(result: LocalisationResult, explored: Explored) -> LocalisationResult:
     return replace(result, status=LocalisationStatus.NOT_CONVERGED, message=NO_FIELD)
 
 
-def surveyed(drive: Drive, solution: Localised) -> tuple[FloatArray, FloatArray]:
+def surveyed(drive: Drive, solution: DriveSolution) -> tuple[FloatArray, FloatArray]:
     """Return places in metres and the field there in uT of the readings that count, (N, 3)."""
     rows = np.flatnonzero(solution.used)
-    where = solution.sight.place
+    where = solution.prediction.placed
     return where.x[rows], where.field(drive.sensors)[rows]

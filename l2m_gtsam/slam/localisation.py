@@ -23,14 +23,21 @@ from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, carried, link_stamps, linked
-from l2m_gtsam.slam.misfit import is_doubtful, wrong_maps
+from l2m_gtsam.slam.drive import (
+    Drive,
+    KnownSensors,
+    StartPose,
+    key_pose_links,
+    key_pose_readings,
+    link_stamps,
+)
+from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.smoother import localise_drive
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.start.search import find_start, start_found
 from l2m_gtsam.solve.noise import NOISE_RANGE
 
@@ -59,7 +66,7 @@ class Localisation:
     """
 
     result: LocalisationResult
-    solution: Localised
+    solution: DriveSolution
 
 
 @one_blas_thread()
@@ -106,11 +113,11 @@ def localise(
     if options.start.anywhere:
         search = find_start(drive, solver_map, options, progress)
         drive = replace(drive, start=start_found(search, options.start))
-    scaled = drive.with_scale_as_walk(options.drift.over_m)
+    scaled = drive.with_scale_as_drift(options.drift.over_m)
     by_scans = solve_pose_graph(scaled, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
     solution = localise_drive(drive, solver_map, options, progress)
-    others = wrong_maps(drive, solver_map) if is_doubtful(solution) else ()
+    others = decoy_maps(drive, solver_map) if needs_misfit_test(solution) else ()
     wrong = [localise_drive(drive, each, options, progress) for each in others]
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
@@ -160,10 +167,10 @@ def prepared(
     drive = Drive(
         stamp_ns=odometry.stamp_ns[rows],
         steps=odometry_steps(odometry, rows, options.drift, mended.jumps),
-        readings=carried(readings, odometry, rows, options.key_poses.readings),
+        readings=key_pose_readings(readings, odometry, rows, options.key_poses.readings),
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
-        links=linked(seen, odometry, rows, options.drift),
+        links=key_pose_links(seen, odometry, rows, options.drift),
     )
     recorded = (note for part in recording.parts for note in part.notes)
     return drive, (*recorded, *mended.notes(), *left_out, *alive.notes)

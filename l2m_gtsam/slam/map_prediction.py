@@ -13,8 +13,8 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from l2m_factors import (
-    CarriedReadings,
     D,
+    KeyPoseReadings,
     M,
     MagneticReadings,
     SharedError,
@@ -31,7 +31,7 @@ from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 
 
 @dataclass(frozen=True)
-class Place:
+class PlacedReadings:
     """Where N readings were taken.
 
     Attributes
@@ -57,12 +57,12 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Sight:
+class MapPrediction:
     """What the map says there.
 
     Attributes
     ----------
-    place
+    placed
         Where.
     inside
         Whether the map has data there, shape (N,).
@@ -75,7 +75,7 @@ class Sight:
         translation in uT/m, shape (N, 3, 6); zero outside.
     """
 
-    place: Place
+    placed: PlacedReadings
     inside: BoolArray
     map_variance: FloatArray
     residual: FloatArray
@@ -98,7 +98,7 @@ class Sight:
         more
             Covariance that residuals have beside, uT^2, shape (N, 3, 3).
         """
-        of_reading = noise[self.place.readings.sensor]
+        of_reading = noise[self.placed.readings.sensor]
         return self.whitening_of(of_reading, map_variance, more)
 
     def whitening_of(
@@ -111,8 +111,8 @@ class Sight:
         variance = self.map_variance if map_variance is None else map_variance
         W = np.zeros((len(self.inside), 3, 3))
         rows = np.flatnonzero(self.inside)
-        at = self.place.readings
-        share = map_covariance(self.place.C[rows], at.R_map_lidar[rows], variance[rows])
+        at = self.placed.readings
+        share = map_covariance(self.placed.C[rows], at.R_map_lidar[rows], variance[rows])
         if more is not None:
             share = share + more[rows]
         W[rows] = whitening(reading_covariance(noise[rows], share))
@@ -124,9 +124,9 @@ class Sight:
         return np.asarray(np.einsum("ni,ni->n", e, e))
 
 
-def place(
-    readings: CarriedReadings, poses: Mapping[int, gtsam.Pose3], sensors: KnownSensors
-) -> Place:
+def place_readings(
+    readings: KeyPoseReadings, poses: Mapping[int, gtsam.Pose3], sensors: KnownSensors
+) -> PlacedReadings:
     """Put readings into the map.
 
     Parameters
@@ -145,10 +145,10 @@ def place(
     at = readings.placed(R, p)
     x = np.einsum("nij,nj->ni", at.R_map_lidar, sensors.t[at.sensor]) + at.p_map_lidar
     C = sensors.distortion[:, :9].reshape(-1, 3, 3)[at.sensor]
-    return Place(at, x, C)
+    return PlacedReadings(at, x, C)
 
 
-def look(field_map: QueryableMap, where: Place, sensors: KnownSensors) -> Sight:
+def predict(field_map: QueryableMap, where: PlacedReadings, sensors: KnownSensors) -> MapPrediction:
     """Ask the map, once for all readings."""
     sample, at = field_map.query(where.x), where.readings
     R_back = at.R_map_lidar.transpose(0, 2, 1)
@@ -158,7 +158,7 @@ def look(field_map: QueryableMap, where: Place, sensors: KnownSensors) -> Sight:
     by_turn = skew(b) - by_shift @ skew(sensors.t[at.sensor])
     by_lidar = where.C @ np.concatenate([by_turn, by_shift], axis=2)
     by_lidar[~sample.inside] = 0.0
-    return Sight(where, sample.inside, sample.variance, predicted - at.field, by_lidar)
+    return MapPrediction(where, sample.inside, sample.variance, predicted - at.field, by_lidar)
 
 
 def poses_in(values: gtsam.Values, count: int) -> dict[int, gtsam.Pose3]:
@@ -206,12 +206,12 @@ class SharedMapErrors:
     root_information: FloatArray
 
     @classmethod
-    def over(cls, errors: UncertainMap, sight: Sight) -> "SharedMapErrors":
+    def over(cls, errors: UncertainMap, prediction: MapPrediction) -> "SharedMapErrors":
         """Ask a map for its errors where readings were taken."""
-        rows = np.flatnonzero(sight.inside)
-        x, R = sight.place.x[rows], sight.place.readings.R_map_lidar[rows]
+        rows = np.flatnonzero(prediction.inside)
+        x, R = prediction.placed.x[rows], prediction.placed.readings.R_map_lidar[rows]
         told = errors.errors_over(x)
-        owner, rest = np.full(len(sight.inside), -1), sight.map_variance.copy()
+        owner, rest = np.full(len(prediction.inside), -1), prediction.map_variance.copy()
         owner[rows] = told.owner(x)
         features: dict[int, FloatArray] = {}
         for tile in told.sizes():

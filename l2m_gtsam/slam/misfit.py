@@ -12,12 +12,12 @@ import numpy as np
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 
-class HalfTurned:
+class DecoyMap:
     """The field of a map as it is on the other side of a vertical axis, in the map's own axes.
 
     How strong it is, how it changes along a way and how well it is known stay about the same.
@@ -53,16 +53,16 @@ MUCH = 0.7
 LEAST = 0.5  # of the readings inside the map have to be inside the wrong one, too
 
 
-def misfits(solution: Localised) -> FloatArray:
+def misfits(solution: DriveSolution) -> FloatArray:
     """Return mean squares of the sensors' whitened residuals, those rejected among them, (S,).
 
     What is far off counts as the least that is rejected, what was read near a change not at all.
     Infinite where a sensor has no reading.
     """
-    return _misfits(solution, solution.sight.inside & ~solution.near_changes)
+    return _misfits(solution, solution.prediction.inside & ~solution.near_changes)
 
 
-def _misfits(solution: Localised, judged: BoolArray) -> FloatArray:
+def _misfits(solution: DriveSolution, judged: BoolArray) -> FloatArray:
     """Return those by some of the readings, (N,)."""
     left = np.full(len(solution.drive.sensors.names), np.inf)
     for sensor in range(len(left)):
@@ -72,35 +72,35 @@ def _misfits(solution: Localised, judged: BoolArray) -> FloatArray:
     return left
 
 
-def is_doubtful(solution: Localised) -> bool:
+def needs_misfit_test(solution: DriveSolution) -> bool:
     """Return whether a drive is long enough to tell, and no sensor is explained down to noise."""
     least, way = misfits(solution).min(), np.linalg.norm(solution.drive.steps.p, axis=1).sum()
     return bool(way >= LEAST_WAY_M and np.isfinite(least) and least > DOUBTFUL)
 
 
-def wrong_maps(drive: Drive, field_map: QueryableMap) -> tuple[HalfTurned, ...]:
+def decoy_maps(drive: Drive, field_map: QueryableMap) -> tuple[DecoyMap, ...]:
     """Return the map half turned about the middle of a drive, and about a place beside it."""
     p = np.stack([pose.translation() for pose in drive.dead_reckoning()])
     middle, extent = p.mean(axis=0), np.ptp(p, axis=0)
     beside = np.where(np.arange(AXES) == np.argmax(extent[:2]), extent / 6, 0.0)
-    return HalfTurned(field_map, middle), HalfTurned(field_map, middle + beside)
+    return DecoyMap(field_map, middle), DecoyMap(field_map, middle + beside)
 
 
-def explains_no_more(solution: Localised, wrong: Sequence[Localised]) -> bool:
+def fits_decoy_as_well(solution: DriveSolution, wrong: Sequence[DriveSolution]) -> bool:
     """Return whether a drive fits a map hardly better than one of some that are wrong."""
-    inside, best = solution.sight.inside.sum(), int(np.argmin(misfits(solution)))
-    others = [each for each in wrong if each.sight.inside.sum() >= LEAST * inside]
+    inside, best = solution.prediction.inside.sum(), int(np.argmin(misfits(solution)))
+    others = [each for each in wrong if each.prediction.inside.sum() >= LEAST * inside]
     return any(_fits_no_better(solution, each, best) for each in others)
 
 
-def _fits_no_better(solution: Localised, wrong: Localised, sensor: int) -> bool:
+def _fits_no_better(solution: DriveSolution, wrong: DriveSolution, sensor: int) -> bool:
     """Return whether the readings of a sensor fit hardly better than in a wrong map.
 
     Those that neither map explains, as beside a door, tell nothing of which of them is right.
     """
     told = solution.used | wrong.used
     left, other = (
-        _misfits(each, each.sight.inside & ~each.near_changes & told)[sensor]
+        _misfits(each, each.prediction.inside & ~each.near_changes & told)[sensor]
         for each in (solution, wrong)
     )
     return bool(left > MUCH * other)

@@ -14,7 +14,7 @@ from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import IDENTITY, between, moved
 from l2m_gtsam.lidar.odometry import LEAST_POINTS, ScanStep
 from l2m_gtsam.lidar.surface import Surface
-from l2m_gtsam.recording.odometry_jumps import Jump, Mended
+from l2m_gtsam.recording.odometry_jumps import Jump, RepairedOdometry
 from l2m_gtsam.recording.sync import has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, SlamOptions, Usage
@@ -54,7 +54,7 @@ class OdometrySteps:
         """Return so many first steps."""
         return replace(self, R=self.R[:count], p=self.p[:count], covariance=self.covariance[:count])
 
-    def with_scale_as_walk(self, over_m: float) -> "OdometrySteps":
+    def with_scale_as_drift(self, over_m: float) -> "OdometrySteps":
         """Return steps for those who do not estimate the scale.
 
         Its errors count as independent, and come to what they are after so many metres.
@@ -164,8 +164,8 @@ def _least(options: DriftOptions) -> FloatArray:
 NEIGHBOURHOOD_NS = 1_000_000_000  # of odometry about a scan, in which its motion is looked up
 
 
-def carried_scans(
-    scans: Iterable[Scan], mended: Mended, edge: float, options: SlamOptions
+def scan_odometry(
+    scans: Iterable[Scan], mended: RepairedOdometry, edge: float, options: SlamOptions
 ) -> Iterator[ScanStep]:
     """Yield the scans that have points enough and a pose, each with that pose.
 
@@ -198,7 +198,7 @@ def carried_scans(
         last, last_ns = here, scan.stamp_ns
 
 
-def _jumps_between(mended: Mended, first_ns: int, last_ns: int) -> FloatArray:
+def _jumps_between(mended: RepairedOdometry, first_ns: int, last_ns: int) -> FloatArray:
     """Return what jumps in some time add to the covariance of a step over it, shape (6, 6)."""
     stamps = mended.trajectory.stamp_ns
     return sum(

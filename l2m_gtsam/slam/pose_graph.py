@@ -15,7 +15,7 @@ from l2m_factors import D, G, T, X, held_directions, scaled_step_factor
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.slam.drive import MAP, Drive, KnownSensors, Links, StartPose, as_pose
 from l2m_gtsam.slam.map_prediction import poses_in
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 
 EXACT = 1e-9  # m, uT, or of an entry of C: what no reading can tell from nothing
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
@@ -27,10 +27,12 @@ def start_factor(start: StartPose) -> gtsam.NonlinearFactor:
     return gtsam.PriorFactorPose3(X(0), as_pose(start.T_map_lidar), noise)
 
 
-def step_factor(drive: Drive, number: int, longer: float = 0.0) -> gtsam.NonlinearFactor:
+def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.NonlinearFactor:
     """Return what odometry says from a key pose to the next, if ways are longer by this share."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
-    return gtsam.BetweenFactorPose3(X(number), X(number + 1), drive.step(number, longer), noise)
+    return gtsam.BetweenFactorPose3(
+        X(number), X(number + 1), drive.step(number, scale_error), noise
+    )
 
 
 def scaled_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
@@ -170,7 +172,7 @@ def _values(poses: list[gtsam.Pose3]) -> gtsam.Values:
     return values
 
 
-def write_g2o(path: Path, solution: Localised) -> None:
+def write_g2o(path: Path, solution: DriveSolution) -> None:
     """Write localised key poses as vertices and odometry as edges.
 
     The format knows no magnetic readings, no prior and no scale: ways are as long as they came
@@ -178,7 +180,7 @@ def write_g2o(path: Path, solution: Localised) -> None:
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for number in range(len(solution.drive.steps)):
-        graph.add(step_factor(solution.drive, number, solution.longer))
+        graph.add(step_factor(solution.drive, number, solution.scale_error))
     for k, pose in enumerate(solution.poses):
         values.insert(X(k), pose)
     gtsam.writeG2o(graph, values, str(path))

@@ -35,7 +35,7 @@ from l2m_gtsam.records.localisation_file import (
 from l2m_gtsam.records.validation import ChiSquare, NamedSource
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.pose_graph import root_information
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
@@ -75,7 +75,7 @@ class Told:
 
 @one_blas_thread()
 def localisation_record(
-    result: LocalisationResult, solution: Localised, told: Told
+    result: LocalisationResult, solution: DriveSolution, told: Told
 ) -> LocalisationRecord:
     """Return what is kept of a localisation.
 
@@ -213,13 +213,13 @@ def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSenso
     )
 
 
-def _sensor(solution: Localised, sensor: SensorCalibration, use: SensorUse) -> SensorRecord:
+def _sensor(solution: DriveSolution, sensor: SensorCalibration, use: SensorUse) -> SensorRecord:
     index = solution.drive.sensors.names.index(sensor.sensor)
     own = np.flatnonzero(solution.drive.readings.sensor == index)
     timeline = _timeline(solution, own)
     if not use.used:
         return SensorRecord(use, timeline, None, None, None)
-    inside = own[solution.sight.inside[own]]
+    inside = own[solution.prediction.inside[own]]
     seen = sensor_evidence(solution, inside)
     most = int(np.clip(DRAWN // len(solution.drive.sensors.names), FEWEST, MOST))
     start_ns = solution.drive.stamp_ns[:1]
@@ -232,17 +232,17 @@ def _sensor(solution: Localised, sensor: SensorCalibration, use: SensorUse) -> S
     )
 
 
-def sensor_evidence(solution: Localised, inside: IntArray) -> SensorEvidence:
+def sensor_evidence(solution: DriveSolution, inside: IntArray) -> SensorEvidence:
     """Return readings of one sensor, by their rows, beside what map and calibration make of them.
 
     Each has the time of its key pose.
     """
-    drive, sight = solution.drive, solution.sight
-    at, C = sight.place.readings, sight.place.C[inside]
-    R, field, residual = at.R_map_lidar[inside], at.field[inside], sight.residual[inside]
+    drive, prediction = solution.drive, solution.prediction
+    at, C = prediction.placed.readings, prediction.placed.C[inside]
+    R, field, residual = at.R_map_lidar[inside], at.field[inside], prediction.residual[inside]
     H = drive.sensors.distortion[at.sensor[inside], 9:]
     b = np.asarray(np.linalg.solve(C, (residual + field - H)[:, :, None])[:, :, 0], dtype=float)
-    W = sight.whitening(drive.sensors.noise, more=solution.way_share)[inside]
+    W = prediction.whitening(drive.sensors.noise, more=solution.interpolation_covariance)[inside]
     readings = Readings(
         sensors=drive.sensors.names,
         sensor=at.sensor[inside],
@@ -254,22 +254,26 @@ def sensor_evidence(solution: Localised, inside: IntArray) -> SensorEvidence:
     return SensorEvidence(
         readings=readings,
         used=solution.used[inside],
-        place=sight.place.x[inside],
+        place=prediction.placed.x[inside],
         B_map=np.einsum("nij,nj->ni", R, b),
         b_lidar=b,
         residual=residual,
-        map_share=map_covariance(C, R, sight.map_variance[inside]),
-        pose_share=solution.way_share[inside],
+        map_share=map_covariance(C, R, prediction.map_variance[inside]),
+        pose_share=solution.interpolation_covariance[inside],
         white=np.einsum("nij,nj->ni", W, residual),
     )
 
 
-def _timeline(solution: Localised, own: IntArray) -> Timeline:
+def _timeline(solution: DriveSolution, own: IntArray) -> Timeline:
     """Return when readings of a sensor, by their rows, counted."""
-    drive, sight = solution.drive, solution.sight
+    drive, prediction = solution.drive, solution.prediction
     at = 1e-9 * (drive.stamp_ns - drive.stamp_ns[0])
     edges = np.linspace(0.0, at[-1], min(SPANS, max(len(drive) // POSES, 1)) + 1)
-    seconds, inside, used = at[drive.readings.key_pose[own]], sight.inside[own], solution.used[own]
+    seconds, inside, used = (
+        at[drive.readings.key_pose[own]],
+        prediction.inside[own],
+        solution.used[own],
+    )
 
     def count(which: FloatArray) -> tuple[int, ...]:
         return tuple(np.histogram(which, edges)[0].tolist())

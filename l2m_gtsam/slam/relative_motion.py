@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import CarriedReadings, StepError, Whitening, rotation_matrices
+from l2m_factors import KeyPoseReadings, StepError, Whitening, rotation_matrices
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drive import Drive
@@ -28,7 +28,7 @@ INSTANTS = 15  # within a step that are told from each other, evenly over it whe
 
 
 @dataclass(frozen=True)
-class Ways:
+class RelativeMotions:
     """The ways of a drive at an estimate of its key poses.
 
     Attributes
@@ -44,17 +44,17 @@ class Ways:
         fixed to it, shape (N, 6, 6).
     """
 
-    readings: CarriedReadings
+    readings: KeyPoseReadings
     steps: tuple[gtsam.Pose3, ...]
     covariance: FloatArray
     by_step: FloatArray
 
     @classmethod
-    def along(cls, drive: Drive, poses: Sequence[gtsam.Pose3]) -> "Ways":
+    def along(cls, drive: Drive, poses: Sequence[gtsam.Pose3]) -> "RelativeMotions":
         """Return those of a drive whose K key poses are taken for these."""
         steps = tuple(a.between(b) for a, b in pairwise(poses))
         rows, key = np.arange(len(drive.readings)), drive.readings.key_pose
-        shifted = hung_anew(drive, rows, [steps[k] for k in key.tolist()])
+        shifted = interpolated_readings(drive, rows, [steps[k] for k in key.tolist()])
         end = from_end(drive.readings, drive.steps.R[key], drive.steps.p[key])
         by_step = carried_back(end.R_key_lidar, end.p_key_lidar)
         return cls(shifted, steps, drive.steps.covariance, by_step)
@@ -93,7 +93,9 @@ class Ways:
         return StepError(key_pose, self.steps[key_pose], slope)
 
 
-def hung_anew(drive: Drive, rows: IntArray, steps: Sequence[gtsam.Pose3]) -> CarriedReadings:
+def interpolated_readings(
+    drive: Drive, rows: IntArray, steps: Sequence[gtsam.Pose3]
+) -> KeyPoseReadings:
     """Return n readings of a drive as they hang if the step of each is this and not odometry's."""
     if not len(rows):
         return drive.readings[rows]
@@ -105,7 +107,7 @@ def hung_anew(drive: Drive, rows: IntArray, steps: Sequence[gtsam.Pose3]) -> Car
     return shifted_readings(readings, R_odo, p_odo, turn, p - p_odo)
 
 
-def from_end(readings: CarriedReadings, R: FloatArray, p: FloatArray) -> CarriedReadings:
+def from_end(readings: KeyPoseReadings, R: FloatArray, p: FloatArray) -> KeyPoseReadings:
     """Return readings as they hang on the ends of their steps.
 
     Parameters
@@ -121,8 +123,8 @@ def from_end(readings: CarriedReadings, R: FloatArray, p: FloatArray) -> Carried
 
 
 def shifted_readings(
-    readings: CarriedReadings, R: FloatArray, p: FloatArray, turn: FloatArray, shift: FloatArray
-) -> CarriedReadings:
+    readings: KeyPoseReadings, R: FloatArray, p: FloatArray, turn: FloatArray, shift: FloatArray
+) -> KeyPoseReadings:
     """Return readings shifted by their shares of what changes a step.
 
     Parameters

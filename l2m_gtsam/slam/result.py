@@ -19,9 +19,9 @@ from l2m_gtsam.records.localisation import (
 )
 from l2m_gtsam.slam.disturbances import slip_notes
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.misfit import explains_no_more
+from l2m_gtsam.slam.misfit import fits_decoy_as_well
 from l2m_gtsam.slam.pose_graph import PoseGraph
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.rotation import polar_rotation
 
 # A drive of which less lies in the map is not localised by it.
@@ -36,10 +36,10 @@ LARGEST_CHI2 = 4.0
 
 def localisation_result(
     drive: Drive,
-    solution: Localised,
+    solution: DriveSolution,
     by_scans: PoseGraph,
     refine: CalibrationResult | None,
-    wrong: Sequence[Localised] = (),
+    wrong: Sequence[DriveSolution] = (),
 ) -> LocalisationResult:
     """Return what is told of a drive.
 
@@ -68,7 +68,7 @@ def localisation_result(
         drift=drift_figures(trajectory, odometry),
         sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
         calibration=None if refine is None else refined(refine, solution),
-        notes=slip_notes(drive, solution.poses, solution.longer),
+        notes=slip_notes(drive, solution.poses, solution.scale_error),
         bag=None,
         map=None,
         calibration_source=None,
@@ -78,7 +78,7 @@ def localisation_result(
     )
 
 
-def scan_use(solution: Localised, by_scans: PoseGraph) -> ScanUse | None:
+def scan_use(solution: DriveSolution, by_scans: PoseGraph) -> ScanUse | None:
     """Return what scans were worth; None where there were none."""
     if not len(by_scans.believed):
         return None
@@ -104,7 +104,7 @@ def drift_figures(localised: Trajectory, odometry: Trajectory) -> DriftFigures:
     )
 
 
-def refined(calibration: CalibrationResult, solution: Localised) -> CalibrationResult:
+def refined(calibration: CalibrationResult, solution: DriveSolution) -> CalibrationResult:
     """Return a calibration with the sensors that a drive refined; the others stay."""
     names = solution.drive.sensors.names
     sensors = [
@@ -114,7 +114,7 @@ def refined(calibration: CalibrationResult, solution: Localised) -> CalibrationR
     return replace(calibration, sensors=tuple(sensors), disagreements=())
 
 
-def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCalibration:
+def _refined(entry: SensorCalibration, solution: DriveSolution, i: int) -> SensorCalibration:
     sensors, covariance = solution.drive.sensors, solution.calibration_covariance[i]
     distortion = Distortion.from_vector(sensors.distortion[i])
     rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
@@ -134,8 +134,10 @@ def _refined(entry: SensorCalibration, solution: Localised, i: int) -> SensorCal
     )
 
 
-def _verdict(solution: Localised, wrong: Sequence[Localised]) -> tuple[LocalisationStatus, str]:
-    inside, used = solution.sight.inside, solution.used
+def _verdict(
+    solution: DriveSolution, wrong: Sequence[DriveSolution]
+) -> tuple[LocalisationStatus, str]:
+    inside, used = solution.prediction.inside, solution.used
     share = float(inside.mean())
     explained = float(used.sum() / max(inside.sum(), 1))
     # What was read near a change says nothing for or against the rest of the map.
@@ -155,7 +157,7 @@ def _verdict(solution: Localised, wrong: Sequence[Localised]) -> tuple[Localisat
             "start, or a wrong calibration"
         )
         return LocalisationStatus.NOT_HERE, message
-    if explains_no_more(solution, wrong):
+    if fits_decoy_as_well(solution, wrong):
         message = (
             f"{told}, hardly more than it does half turned, which is wrong for certain: another "
             "place, a wrong start, or a wrong calibration"
@@ -166,15 +168,15 @@ def _verdict(solution: Localised, wrong: Sequence[Localised]) -> tuple[Localisat
     return LocalisationStatus.LOCALISED, told
 
 
-def _use(solution: Localised, sensor: int) -> SensorUse:
+def _use(solution: DriveSolution, sensor: int) -> SensorUse:
     own = solution.drive.readings.sensor == sensor
     used = own & solution.used
-    residual = solution.sight.residual[used]
+    residual = solution.prediction.residual[used]
     return SensorUse(
         sensor=solution.drive.sensors.names[sensor],
         readings=int(own.sum()),
-        outside_map=int((own & ~solution.sight.inside).sum()),
-        rejected=int((own & solution.sight.inside & ~solution.used).sum()),
+        outside_map=int((own & ~solution.prediction.inside).sum()),
+        rejected=int((own & solution.prediction.inside & ~solution.used).sum()),
         rms=float(np.sqrt(np.mean(residual**2))) if used.any() else float("nan"),
         chi2_per_dof=float(solution.squared[used].mean() / 3) if used.any() else float("nan"),
     )

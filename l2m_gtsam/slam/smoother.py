@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import CarriedBatch, key_pose_factor
+from l2m_factors import MapBatch, key_pose_factor
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray
@@ -18,12 +18,12 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, Fit, changed
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import (
+    MapPrediction,
     SharedMapErrors,
-    Sight,
     errors_of,
-    look,
-    place,
+    place_readings,
     poses_in,
+    predict,
     sensors_in,
 )
 from l2m_gtsam.slam.online.follower import Follower, follow
@@ -35,12 +35,12 @@ from l2m_gtsam.slam.pose_graph import (
     odometry_graph,
     scale_values,
 )
-from l2m_gtsam.slam.relative_motion import Ways
-from l2m_gtsam.slam.solution import NOTHING, Localised
+from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.solution import NOTHING, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
+    colamd_ordering,
     descended,
-    least_fill,
     odometry_scale,
     pose_covariances,
     sensor_covariances,
@@ -49,7 +49,7 @@ from l2m_gtsam.solve.robust import WEIGHTS
 
 
 @dataclass(frozen=True)
-class Solved:
+class SmoothingRound:
     """A round: variables, how far each reading counted, and how the optimiser ended."""
 
     values: gtsam.Values
@@ -58,41 +58,43 @@ class Solved:
 
 
 @dataclass(frozen=True)
-class Seen:
+class DrivePrediction:
     """A drive's N readings at an estimate.
 
     Attributes
     ----------
     ways
         Between the key poses.
-    sight
+    prediction
         What the map says where they lead to.
     """
 
-    ways: Ways
-    sight: Sight
+    motions: RelativeMotions
+    prediction: MapPrediction
 
     @property
-    def way_share(self) -> FloatArray:
+    def interpolation_covariance(self) -> FloatArray:
         """What errors of the ways contribute to the covariance of residuals, (N, 3, 3)."""
-        return self.ways.share(np.arange(len(self.sight.inside)), self.sight.by_lidar)
+        return self.motions.share(np.arange(len(self.prediction.inside)), self.prediction.by_lidar)
 
     def squared(self, noise: FloatArray) -> FloatArray:
         """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
-        return self.sight.squared(self.sight.whitening(noise, more=self.way_share))
+        return self.prediction.squared(
+            self.prediction.whitening(noise, more=self.interpolation_covariance)
+        )
 
     def independent(self, noise: FloatArray, used: BoolArray) -> FloatArray:
         """Return squared lengths of residuals without what those of a step have in common, (N,).
 
         Zero for those that are not used or outside of the map.
         """
-        sight, squared = self.sight, np.zeros(len(used))
-        own = sight.whitening(noise)
-        rows = np.flatnonzero(used & sight.inside)
-        key = self.ways.readings.key_pose[rows]
+        prediction, squared = self.prediction, np.zeros(len(used))
+        own = prediction.whitening(noise)
+        rows = np.flatnonzero(used & prediction.inside)
+        key = self.motions.readings.key_pose[rows]
         for part in np.split(rows, np.flatnonzero(np.diff(key)) + 1) if len(rows) else ():
-            white = self.ways.whitening(part, own[part], sight.by_lidar[part])
-            e = white(sight.residual[part, :, None]).reshape(-1, 3)
+            white = self.motions.whitening(part, own[part], prediction.by_lidar[part])
+            e = white(prediction.residual[part, :, None]).reshape(-1, 3)
             squared[part] = np.einsum("ni,ni->n", e, e)
         return squared
 
@@ -123,18 +125,20 @@ class Problem:
         """Return the sensors as values have them."""
         return sensors_in(values, self._drive.sensors)
 
-    def look(self, values: gtsam.Values) -> Seen:
+    def predict(self, values: gtsam.Values) -> DrivePrediction:
         """Ask the map where values put the readings."""
         sensors, poses = self.sensors(values), poses_in(values, len(self._drive))
-        ways = Ways.along(self._drive, list(poses.values()))
-        return Seen(ways, look(self._map, place(ways.readings, poses, sensors), sensors))
+        motions = RelativeMotions.along(self._drive, list(poses.values()))
+        return DrivePrediction(
+            motions, predict(self._map, place_readings(motions.readings, poses, sensors), sensors)
+        )
 
-    def weights(self, seen: Seen, mu: float) -> FloatArray:
+    def weights(self, seen: DrivePrediction, mu: float) -> FloatArray:
         """Return how far each reading counts at a stage of the graduation, shape (N,)."""
         robust, r2 = self._options.robust, seen.squared(self._drive.sensors.noise)
-        return np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu) * seen.sight.inside)
+        return np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu) * seen.prediction.inside)
 
-    def solved(self, values: gtsam.Values, counts: BoolArray, mu: float) -> Solved:
+    def solved(self, values: gtsam.Values, counts: BoolArray, mu: float) -> SmoothingRound:
         """Solve for everything, with readings weighted as they fit now.
 
         Parameters
@@ -146,21 +150,21 @@ class Problem:
         mu
             Stage of the graduation.
         """
-        seen = self.look(values)
+        seen = self.predict(values)
         weights = self.weights(seen, mu) * counts
-        graph = self.graph(seen, weights, seen.sight.map_variance, None)
-        end = descended(graph, values, least_fill(graph), self._options.max_iterations)
-        return Solved(end.values, weights, end.ending)
+        graph = self.graph(seen, weights, seen.prediction.map_variance, None)
+        end = descended(graph, values, colamd_ordering(graph), self._options.max_iterations)
+        return SmoothingRound(end.values, weights, end.ending)
 
-    def fit(self, solved: Solved, counts: BoolArray) -> Fit:
+    def fit(self, solved: SmoothingRound, counts: BoolArray) -> Fit:
         """Return how the readings that may count fit."""
-        seen, readings = self.look(solved.values), self._drive.readings
+        seen, readings = self.predict(solved.values), self._drive.readings
         poses = poses_in(solved.values, len(self._drive)).values()
         used = solved.weights > NOTHING
         return Fit(
             readings.key_pose,
             readings.sensor,
-            seen.sight.inside & counts,
+            seen.prediction.inside & counts,
             used,
             seen.independent(self.sensors(solved.values).noise, used),
             np.stack([pose.translation() for pose in poses]),
@@ -168,7 +172,7 @@ class Problem:
 
     def graph(
         self,
-        seen: Seen,
+        seen: DrivePrediction,
         weights: FloatArray,
         map_variance: FloatArray,
         shared: SharedMapErrors | None,
@@ -194,38 +198,38 @@ class Problem:
         rows = np.flatnonzero(weights > NOTHING)
         if not len(rows):
             return graph
-        W = seen.sight.whitening(drive.sensors.noise, map_variance)
+        W = seen.prediction.whitening(drive.sensors.noise, map_variance)
         W = W * np.sqrt(weights)[:, None, None]
         fixed = None if self.free else drive.sensors.fixed()
-        batch = CarriedBatch(self._map, seen.ways.readings[rows], fixed)
+        batch = MapBatch(self._map, seen.motions.readings[rows], fixed)
         for k in batch.key_poses:
             own = rows[batch.rows_of(k)]
             errors = () if shared is None else shared.of(own)
-            by_lidar = seen.sight.by_lidar[own]
-            white = seen.ways.whitening(own, W[own], by_lidar)
-            step = seen.ways.step_error(own, by_lidar)
+            by_lidar = seen.prediction.by_lidar[own]
+            white = seen.motions.whitening(own, W[own], by_lidar)
+            step = seen.motions.step_error(own, by_lidar)
             graph.add(key_pose_factor(batch, k, white, errors, step))
         if shared is not None:
             graph.add(shared.prior())
         return graph
 
-    def finished(self, solved: Solved) -> Localised:
+    def finished(self, solved: SmoothingRound) -> DriveSolution:
         """Solve once more with the map's errors as variables, and take the covariances."""
         values, ending = solved.values, solved.ending
-        seen = self.look(values)
-        weights = solved.weights * seen.sight.inside
+        seen = self.predict(values)
+        weights = solved.weights * seen.prediction.inside
         shared = None
         if (weights > NOTHING).any():
-            shared = SharedMapErrors.over(errors_of(self._map), seen.sight)
+            shared = SharedMapErrors.over(errors_of(self._map), seen.prediction)
             values.insert(shared.values())
-        rest = seen.sight.map_variance if shared is None else shared.rest
+        rest = seen.prediction.map_variance if shared is None else shared.rest
         graph = self.graph(seen, weights, rest, shared)
-        order = least_fill(graph)
+        order = colamd_ordering(graph)
         optimised = descended(graph, values, order, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
         marginals = Marginals(graph.linearize(values), order)
-        seen = self.look(values)
-        return Localised(
+        seen = self.predict(values)
+        return DriveSolution(
             drive=replace(self._drive, sensors=sensors),
             poses=list(poses_in(values, len(self._drive)).values()),
             pose_covariance=pose_covariances(marginals, len(self._drive)),
@@ -234,10 +238,10 @@ class Problem:
                 if self.free
                 else sensors.covariance
             ),
-            sight=seen.sight,
-            way_share=seen.way_share,
+            prediction=seen.prediction,
+            interpolation_covariance=seen.interpolation_covariance,
             squared=seen.squared(sensors.noise),
-            weights=weights * seen.sight.inside,
+            weights=weights * seen.prediction.inside,
             near_changes=np.zeros(len(weights), dtype=np.bool_),
             bent=2 * self._odometry.error(values) / (6 * len(self._drive)),
             scale=odometry_scale(marginals, values),
@@ -252,10 +256,10 @@ GRADUATION = (1.0, 10.0, float("inf"), float("inf"))
 
 def localise_drive(
     drive: Drive, field_map: QueryableMap, options: SlamOptions, progress: Progress
-) -> Localised:
+) -> DriveSolution:
     """Find the poses of a drive, and its sensors' calibration if that is to be refined."""
     problem = Problem(drive, field_map, options)
-    followed = drive.with_scale_as_walk(options.drift.over_m)
+    followed = drive.with_scale_as_drift(options.drift.over_m)
     follower = Follower(followed, field_map, options.robust, free=problem.free)
     values = follow(follower, len(drive), progress)
     values.insert(scale_values(drive))

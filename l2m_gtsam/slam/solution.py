@@ -9,13 +9,13 @@ from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.map_prediction import Sight
+from l2m_gtsam.slam.map_prediction import MapPrediction
 
 NOTHING = 1e-6  # a weight that is as good as none
 
 
 @dataclass(frozen=True)
-class Localised:
+class DriveSolution:
     """A drive in the map.
 
     Attributes
@@ -28,9 +28,9 @@ class Localised:
         Of right perturbations of them, rotation (rad) before translation (m), shape (K, 6, 6).
     calibration_covariance
         Of (t, C row by row, H) in m and uT, shape (S, 15, 15); as given where it was fixed.
-    sight
+    prediction
         What the map says at the readings.
-    way_share
+    interpolation_covariance
         What odometry's errors on the ways between key poses contribute to the covariance of their
         residuals, uT^2, shape (N, 3, 3).
     squared
@@ -54,8 +54,8 @@ class Localised:
     poses: list[gtsam.Pose3]
     pose_covariance: FloatArray
     calibration_covariance: FloatArray
-    sight: Sight
-    way_share: FloatArray
+    prediction: MapPrediction
+    interpolation_covariance: FloatArray
     squared: FloatArray
     weights: FloatArray
     near_changes: BoolArray
@@ -65,8 +65,8 @@ class Localised:
     ending: Ending
 
     @property
-    def longer(self) -> float:
-        """Share by which ways are longer than odometry has them."""
+    def scale_error(self) -> float:
+        """Relative error of odometry's lengths: true ones are ``1 + scale_error`` times as long."""
         return 0.0 if self.scale is None else self.scale.longer
 
     @property

@@ -68,7 +68,7 @@ def descended(
     return Optimised(values, Ending.TOLERANCE if left > 0 else Ending.ITERATION_LIMIT)
 
 
-def least_fill(graph: gtsam.NonlinearFactorGraph) -> gtsam.Ordering:
+def colamd_ordering(graph: gtsam.NonlinearFactorGraph) -> gtsam.Ordering:
     """Return the order by minimum degree."""
     return gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
 
@@ -102,7 +102,7 @@ Found = TypeVar("Found")
 
 
 @contextmanager
-def well_scaled() -> Iterator[None]:
+def reported_ill_conditioning() -> Iterator[None]:
     """Say in one line why GTSAM cannot solve what is done inside.
 
     Raises
@@ -114,7 +114,7 @@ def well_scaled() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, np.linalg.LinAlgError) as error:
-        if isinstance(error, RuntimeError) and not is_refused(error):
+        if isinstance(error, RuntimeError) and not is_indeterminate_(error):
             raise
         raise CalibrationError(
             "the covariances of the poses cannot be computed: those of odometry, start and "
@@ -122,7 +122,7 @@ def well_scaled() -> Iterator[None]:
         ) from error
 
 
-def is_refused(error: RuntimeError) -> bool:
+def is_indeterminate_(error: RuntimeError) -> bool:
     """Return whether GTSAM could not factor a linear system: its exception has no Python type."""
     return "ndetermina" in str(error)
 
@@ -146,7 +146,7 @@ class Marginals:
     def of(self, key: int) -> FloatArray:
         """Return that of a variable by itself."""
         tree = self._cholesky
-        found = None if tree is None else unless_refused(lambda: tree.marginalCovariance(key))
+        found = None if tree is None else unless_indeterminate(lambda: tree.marginalCovariance(key))
         if found is None:
             found = covariance_of(self._qr.marginalFactor(key, gtsam.EliminateQR).jacobian()[0])
         return found
@@ -155,7 +155,7 @@ class Marginals:
         """Return that of some variables, in this order."""
         tree, own = self._cholesky, list(keys)
         if tree is not None:
-            found = unless_refused(lambda: tree.jointMarginalCovariance(own).fullMatrix())
+            found = unless_indeterminate(lambda: tree.jointMarginalCovariance(own).fullMatrix())
             if found is not None:
                 return np.asarray(found)
         left = self._qr.joint(own, gtsam.EliminateQR)
@@ -164,7 +164,7 @@ class Marginals:
 
     @cached_property
     def _cholesky(self) -> gtsam.GaussianBayesTree | None:
-        return unless_refused(lambda: self._linear.eliminateMultifrontal(self._ordering))
+        return unless_indeterminate(lambda: self._linear.eliminateMultifrontal(self._ordering))
 
     @cached_property
     def _qr(self) -> gtsam.GaussianBayesTree:
@@ -182,7 +182,7 @@ def joint_covariance(linear: gtsam.GaussianFactorGraph, keys: Sequence[int]) -> 
         tree = linear.marginal(own).eliminateMultifrontal(last)
         return np.asarray(tree.jointMarginalCovariance(own).fullMatrix())
 
-    found = unless_refused(by_cholesky)
+    found = unless_indeterminate(by_cholesky)
     if found is None:
         net = linear.marginalMultifrontalBayesNet(last, gtsam.EliminateQR)
         found = covariance_of(net.matrix()[0])
@@ -197,12 +197,12 @@ def ordered(keys: Sequence[int]) -> gtsam.Ordering:
     return ordering
 
 
-def unless_refused(work: Callable[[], Found]) -> Found | None:
+def unless_indeterminate(work: Callable[[], Found]) -> Found | None:
     """Return what GTSAM computes; none where it cannot factor a linear system."""
     try:
         return work()
     except RuntimeError as error:
-        if not is_refused(error):
+        if not is_indeterminate_(error):
             raise
         return None
 
@@ -221,7 +221,7 @@ def pose_covariances(marginals: Marginals, count: int) -> FloatArray:
 
     One by one, along the elimination tree, each at the same cost however long the drive is.
     """
-    with well_scaled():
+    with reported_ill_conditioning():
         return np.stack([marginals.of(X(k)) for k in range(count)])
 
 
@@ -234,7 +234,7 @@ def pose_covariances_together(marginals: Marginals, count: int) -> FloatArray:
     blocks: list[FloatArray] = []
     for first in range(0, count, TOGETHER):
         keys = [X(k) for k in range(first, min(first + TOGETHER, count))]
-        with well_scaled():
+        with reported_ill_conditioning():
             joint = marginals.joint(keys).reshape(len(keys), POSE, len(keys), POSE)
         blocks.extend(np.einsum("kikj->kij", joint))
     return np.stack(blocks)
@@ -244,12 +244,12 @@ def odometry_scale(marginals: Marginals, values: gtsam.Values) -> OdometryScale 
     """Return odometry's scale as it came out; None where it is no variable."""
     if not values.exists(G()):
         return None
-    with well_scaled():
+    with reported_ill_conditioning():
         variance = float(marginals.of(G())[0, 0])
     return OdometryScale(values.atDouble(G()), float(np.sqrt(variance)))
 
 
 def sensor_covariances(marginals: Marginals, count: int) -> FloatArray:
     """Return those of (t, C row by row, H) of so many sensors in m and uT, shape (S, 15, 15)."""
-    with well_scaled():
+    with reported_ill_conditioning():
         return np.stack([marginals.joint([T(i), D(i)]) for i in range(count)])

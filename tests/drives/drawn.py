@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import CarriedReadings
+from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform, Trajectory
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.odometry import odometry_steps
@@ -108,7 +108,7 @@ def drawn_readings(
     every: int,
     rng: np.random.Generator,
     noise: float,
-) -> CarriedReadings:
+) -> KeyPoseReadings:
     """Return a reading of each sensor at each pose, in order of poses.
 
     At a key pose it is the last one of the step that ends there.
@@ -123,7 +123,7 @@ def drawn_readings(
     C = calibration[sensor, 3:12].reshape(-1, 3, 3)
     field = moved(C @ R.transpose(0, 2, 1), B) + calibration[sensor, 12:]
     R_back = odometry.R[key].transpose(0, 2, 1)
-    return CarriedReadings(
+    return KeyPoseReadings(
         key_pose=key // every,
         sensor=sensor,
         R_key_lidar=R_back @ odometry.R[pose],

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import (
     BatchedReadings,
     Calibrations,
-    CarriedBatch,
-    CarriedReadings,
     D,
+    KeyPoseReadings,
     M,
     MagneticReadings,
+    MapBatch,
     PoseMotion,
     S,
     SharedError,
@@ -34,10 +34,10 @@ SENSORS = 2
 MODES = 4  # of a map's error
 
 
-def random_carried(seed: int, key_poses: int = 2, each: int = 4) -> CarriedReadings:
+def random_carried(seed: int, key_poses: int = 2, each: int = 4) -> KeyPoseReadings:
     """Return readings within half a metre of their key poses, the sensors in turn."""
     rng, n = np.random.default_rng(seed), key_poses * each
-    return CarriedReadings(
+    return KeyPoseReadings(
         key_pose=np.repeat(np.arange(key_poses), each),
         sensor=np.arange(n) % SENSORS,
         R_key_lidar=Rotation.from_rotvec(rng.normal(0, 0.3, (n, 3))).as_matrix(),
@@ -47,11 +47,11 @@ def random_carried(seed: int, key_poses: int = 2, each: int = 4) -> CarriedReadi
     )
 
 
-def on(readings: CarriedReadings, key_pose: int) -> CarriedReadings:
+def on(readings: KeyPoseReadings, key_pose: int) -> KeyPoseReadings:
     return readings[np.flatnonzero(readings.key_pose == key_pose)]
 
 
-def moving(readings: CarriedReadings, seed: int) -> CarriedReadings:
+def moving(readings: KeyPoseReadings, seed: int) -> KeyPoseReadings:
     rng, n = np.random.default_rng(seed), len(readings)
     twist = np.hstack([rng.uniform(-1, 1, (n, 3)), rng.uniform(-2, 2, (n, 3))])
     return replace(readings, motion=PoseMotion(twist, rng.uniform(-0.02, 0.02, n)))
@@ -103,10 +103,10 @@ def test_jacobians_match_central_differences(seed: int) -> None:
     W = whitenings(seed, 4)
     fixed = calibrations(values)
     for batch, errors, way in (
-        (CarriedBatch(world, readings), [], None),
-        (CarriedBatch(world, timed), shared, step),
-        (CarriedBatch(world, timed, fixed), shared, None),
-        (CarriedBatch(world, readings, fixed), [], step),
+        (MapBatch(world, readings), [], None),
+        (MapBatch(world, timed), shared, step),
+        (MapBatch(world, timed, fixed), shared, None),
+        (MapBatch(world, readings, fixed), [], step),
     ):
         factor = key_pose_factor(batch, 1, W, errors, way)
         # Steps of 2e-5 leave 1e-8 of third derivatives; rounding of 50 uT is smaller yet.
@@ -138,13 +138,13 @@ def test_what_is_known_of_a_step_shifts_the_readings() -> None:
     readings = replace(on(random_carried(7), 1), fraction=np.full(4, 0.5))
     off, step = np.array([0, 0, 0, 0.02, 0, 0]), gtsam.Pose3(gtsam.Rot3(), [0.2, 0, 0])
     ahead = replace(readings, p_key_lidar=readings.p_key_lidar + 0.5 * off[3:])
-    residuals = CarriedBatch(world, readings, fixed).residuals(values, 1)
+    residuals = MapBatch(world, readings, fixed).residuals(values, 1)
     values.update(X(2), values.atPose3(X(1)).compose(step).retract(off))
     W = Whitening.independent(np.tile(np.eye(3), (4, 1, 1)))
     slope = 0.5 * residuals.de_dX @ step.AdjointMap()
-    batch = CarriedBatch(world, readings, fixed)
+    batch = MapBatch(world, readings, fixed)
     found = key_pose_factor(batch, 1, W, step=StepError(1, step, slope)).unwhitenedError(values)
-    expected = CarriedBatch(world, ahead, fixed).residuals(values, 1).reading.residual
+    expected = MapBatch(world, ahead, fixed).residuals(values, 1).reading.residual
     # 1 cm in a field that bends over decimetres: the shift is linear to some per cent.
     change = np.linalg.norm(expected - residuals.reading.residual)
     assert np.linalg.norm(found - expected.ravel()) < 0.1 * change
@@ -167,13 +167,13 @@ def test_at_given_poses_it_is_the_factor_of_known_poses(seed: int) -> None:
         carried.field,
     )
     expected = BatchedReadings(world, known).residuals(values, 0)
-    found = CarriedBatch(world, carried).residuals(values, 0).reading
+    found = MapBatch(world, carried).residuals(values, 0).reading
     np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.de_dt, expected.de_dt, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found.de_dD, expected.de_dD, rtol=0, atol=1e-9)
 
 
-def graph_of(batch: CarriedBatch) -> gtsam.NonlinearFactorGraph:
+def graph_of(batch: MapBatch) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for k in batch.key_poses:
         W = np.broadcast_to(np.eye(3), (len(batch.rows_of(k)), 3, 3))
@@ -183,7 +183,7 @@ def graph_of(batch: CarriedBatch) -> gtsam.NonlinearFactorGraph:
 
 def test_one_map_query_when_all_poses_move() -> None:
     counting, values = CountingWorld(dipole_world(2)), values_for(2, key_poses=5)
-    graph = graph_of(CarriedBatch(counting, random_carried(2, key_poses=5)))
+    graph = graph_of(MapBatch(counting, random_carried(2, key_poses=5)))
     graph.error(values)
     graph.linearize(values)
     assert counting.calls == 1
@@ -204,7 +204,7 @@ def test_a_batch_for_each_key_pose_pays_for_what_moves() -> None:
     """What iSAM2 needs: of five key poses one is asked again, and its batch alone."""
     counting, values = CountingWorld(dipole_world(3)), values_for(3, key_poses=5)
     readings = random_carried(3, key_poses=5)
-    alone = [CarriedBatch(counting, on(readings, k)) for k in range(5)]
+    alone = [MapBatch(counting, on(readings, k)) for k in range(5)]
     factors = [graph_of(batch).at(0) for batch in alone]
     for factor in factors:
         factor.linearize(values)
@@ -220,10 +220,10 @@ def test_a_batch_for_each_key_pose_pays_for_what_moves() -> None:
 def test_batches_of_any_size_are_the_same_graph() -> None:
     world, values = dipole_world(4), values_for(4, key_poses=3)
     readings = random_carried(4, key_poses=3)
-    whole = graph_of(CarriedBatch(world, readings)).linearize(values).hessian()
+    whole = graph_of(MapBatch(world, readings)).linearize(values).hessian()
     parts = gtsam.NonlinearFactorGraph()
     for k in range(3):
-        parts.push_back(graph_of(CarriedBatch(world, on(readings, k))))
+        parts.push_back(graph_of(MapBatch(world, on(readings, k))))
     other = parts.linearize(values).hessian()
     for one, two in zip(whole, other, strict=True):
         np.testing.assert_allclose(one, two, rtol=0, atol=1e-12 * np.abs(one).max())
@@ -232,14 +232,14 @@ def test_batches_of_any_size_are_the_same_graph() -> None:
 def test_a_factor_alone_needs_only_its_own_variables() -> None:
     readings, everything = random_carried(5), values_for(5)
     mine = on(readings, 1)
-    batch = CarriedBatch(dipole_world(5), readings)
+    batch = MapBatch(dipole_world(5), readings)
     values = gtsam.Values()
     values.insert(X(1), everything.atPose3(X(1)))
     for i in range(SENSORS):
         values.insert(T(i), everything.atPoint3(T(i)))
         values.insert(D(i), everything.atVector(D(i)))
     W = whitenings(5, len(mine))
-    alone = key_pose_factor(CarriedBatch(dipole_world(5), mine), 1, W)
+    alone = key_pose_factor(MapBatch(dipole_world(5), mine), 1, W)
     assert key_pose_factor(batch, 1, W).error(values) == pytest.approx(alone.error(everything))
 
 
@@ -247,12 +247,12 @@ def test_a_reading_pulls_its_pose_back() -> None:
     """Exact readings of two sensors on one pose, calibration known: the pose comes back."""
     world, values = dipole_world(6), values_for(6, key_poses=1)
     readings, fixed = random_carried(6, key_poses=1, each=12), calibrations(values)
-    at = CarriedBatch(world, readings, fixed).residuals(values, 0).reading.residual
+    at = MapBatch(world, readings, fixed).residuals(values, 0).reading.residual
     exact = replace(readings, field=readings.field + at)
     start = gtsam.Values()
     off = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.05, 0.05, -0.04, 0.03]))
     start.insert(X(0), values.atPose3(X(0)).compose(off))
-    graph = graph_of(CarriedBatch(world, exact, fixed))
+    graph = graph_of(MapBatch(world, exact, fixed))
     found = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize().atPose3(X(0))
     # The optimiser ends when its error falls by less than 1e-5 uT^2: some micrometres.
     np.testing.assert_allclose(found.matrix(), values.atPose3(X(0)).matrix(), atol=1e-4)

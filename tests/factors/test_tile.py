@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_factors import (
-    CarriedBatch,
-    CarriedReadings,
     FieldDoubt,
+    KeyPoseReadings,
     M,
+    MapBatch,
     TileBatch,
     WeightedField,
     X,
@@ -49,7 +49,7 @@ def tile_values(seed: int, key_poses: int = 2) -> gtsam.Values:
     return values
 
 
-def batch_of(readings: CarriedReadings, anchor: int, values: gtsam.Values | None) -> TileBatch:
+def batch_of(readings: KeyPoseReadings, anchor: int, values: gtsam.Values | None) -> TileBatch:
     fixed = None if values is None else calibrations(values)
     return TileBatch(TILE, anchor, BASIS, readings, fixed)
 
@@ -85,7 +85,7 @@ def test_a_tile_whose_weights_are_known_is_a_map_in_the_frame_of_its_anchor() ->
     relative = gtsam.Values()
     relative.insert(X(1), values.atPose3(X(0)).between(values.atPose3(X(1))))
     field = WeightedField(BASIS, values.atVector(M(TILE)))
-    known = key_pose_factor(CarriedBatch(field, on(readings, 1), calibrations(values)), 1, W)
+    known = key_pose_factor(MapBatch(field, on(readings, 1), calibrations(values)), 1, W)
     ours, theirs = unknown.unwhitenedError(values), known.unwhitenedError(relative)
     np.testing.assert_allclose(ours, theirs, atol=1e-9)
 

@@ -21,7 +21,7 @@ class Course:
     seconds, way
         Since the first, in s and in m of the localised way, shape (K,).
     p, odometry
-        Localised places, and those of odometry alone, in the map in metres, shape (K, 3).
+        DriveSolution places, and those of odometry alone, in the map in metres, shape (K, 3).
     apart, turned
         Distance of both in m and angle of both in degrees, shape (K,).
     covariance

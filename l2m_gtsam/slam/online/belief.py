@@ -25,7 +25,7 @@ LINEAR = 12  # the first component of a sensor that readings are linear in
 
 
 @dataclass(frozen=True)
-class Evidence:
+class WhitenedMeasurement:
     """What is seen at an estimate.
 
     Attributes
@@ -45,7 +45,7 @@ class Evidence:
         return float(self.residual @ self.residual)
 
 
-class Distance:
+class MahalanobisDistance:
     """How far something is from its mean, in sigmas.
 
     Parameters
@@ -108,7 +108,7 @@ class Belief:
         at = POSE + SENSOR * np.arange(len(self.sensors.names))[:, None] + np.arange(SENSOR)
         return np.asarray(self.covariance[at[:, :, None], at[:, None, :]])
 
-    def departed(self, step: gtsam.Pose3, covariance: FloatArray) -> "Departed":
+    def predicted(self, step: gtsam.Pose3, covariance: FloatArray) -> "PredictedBelief":
         """Return what is known on the way to the next key pose.
 
         Parameters
@@ -119,34 +119,36 @@ class Belief:
             Of a right perturbation of it, shape (6, 6).
         """
         joint = block_diag(self.covariance, covariance)
-        return Departed(self.pose, self.sensors, joint, step)
+        return PredictedBelief(self.pose, self.sensors, joint, step)
 
-    def corrected(self, seen: Callable[[Self], Evidence]) -> Self:
+    def updated(self, measure: Callable[[Self], WhitenedMeasurement]) -> Self:
         """Return what is known once something was seen, by an iterated Kalman update.
 
         A step that makes the squared residuals and the distance from this belief larger together
         is halved: near a source a field bends so much that a whole one would lead away.
         """
-        P, delta, found = self.covariance, np.zeros(len(self.covariance)), seen(self)
-        component, distance = np.arange(len(P)) - POSE, Distance(P)
+        P, delta, measured = self.covariance, np.zeros(len(self.covariance)), measure(self)
+        component, distance = np.arange(len(P)) - POSE, MahalanobisDistance(P)
         bends = (component < 0) | (component % SENSOR < LINEAR)
         for _ in range(ITERATIONS):
-            gain = gain_of(P, found.jacobian)
-            step = gain @ (found.jacobian @ delta - found.residual) - delta
+            gain = kalman_gain(P, measured.jacobian)
+            step = gain @ (measured.jacobian @ delta - measured.residual) - delta
             if np.abs(step[bends]).max() < CLOSE:
-                return self._after(delta + step, gain, found)
-            before = distance.squared(delta) + found.squared
+                return self._posterior(delta + step, gain, measured)
+            before = distance.squared(delta) + measured.squared
             for shorter in step * 0.5 ** np.arange(HALVINGS)[:, None]:
-                there = seen(self.moved(delta + shorter))
+                there = measure(self.moved(delta + shorter))
                 if distance.squared(delta + shorter) + there.squared <= before:
                     break
             else:
                 break
-            delta, found = delta + shorter, there
-        return self._after(delta, gain_of(P, found.jacobian), found)
+            delta, measured = delta + shorter, there
+        return self._posterior(delta, kalman_gain(P, measured.jacobian), measured)
 
-    def _after(self, delta: FloatArray, gain: FloatArray, found: Evidence) -> Self:
-        left = self.covariance - gain @ (found.jacobian @ self.covariance)
+    def _posterior(
+        self, delta: FloatArray, gain: FloatArray, measured: WhitenedMeasurement
+    ) -> Self:
+        left = self.covariance - gain @ (measured.jacobian @ self.covariance)
         return replace(self.moved(delta), covariance=left)
 
     def is_near(self, other: "Belief", most: float) -> bool:
@@ -167,7 +169,7 @@ class Belief:
 
 
 @dataclass(frozen=True)
-class Departed(Belief):
+class PredictedBelief(Belief):
     """What is known between a key pose and the next.
 
     Attributes
@@ -191,14 +193,14 @@ class Departed(Belief):
         """Return the belief elsewhere, by components as those of the covariance."""
         return replace(super().moved(delta[:-POSE]), step=self.step.retract(delta[-POSE:]))
 
-    def arrived(self) -> Belief:
+    def marginalize_previous(self) -> Belief:
         """Return what is known of the next key pose."""
         J = np.eye(len(self.covariance) - POSE, len(self.covariance))
         J[:POSE, :POSE], J[:POSE, -POSE:] = self.step.inverse().AdjointMap(), np.eye(POSE)
         return Belief(self.pose.compose(self.step), self.sensors, J @ self.covariance @ J.T)
 
 
-def gain_of(P: FloatArray, J: FloatArray) -> FloatArray:
+def kalman_gain(P: FloatArray, J: FloatArray) -> FloatArray:
     """Return Kalman's gain for white evidence of unit variance, shape (P, m)."""
     crossed = P @ J.T
     return np.asarray(cho_solve(cho_factor(J @ crossed + np.eye(len(J))), crossed.T).T)

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from l2m_factors import (
-    CarriedBatch,
     D,
+    MapBatch,
     StepError,
     T,
     Whitening,
@@ -32,14 +32,14 @@ from l2m_gtsam.data import IntArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, as_pose
 from l2m_gtsam.slam.map_prediction import sensors_in
-from l2m_gtsam.slam.online.belief import POSE, Belief, Departed
+from l2m_gtsam.slam.online.belief import POSE, Belief, PredictedBelief
 from l2m_gtsam.slam.online.measurements import (
-    Leg,
-    LegView,
-    RememberedVariance,
-    fix_evidence,
-    passed,
-    take,
+    CachedVariance,
+    StepMeasurement,
+    StepReadings,
+    fix_measurement,
+    gate,
+    update,
 )
 from l2m_gtsam.slam.online.section import Section
 from l2m_gtsam.slam.pose_graph import (
@@ -50,8 +50,8 @@ from l2m_gtsam.slam.pose_graph import (
     start_factor,
     step_factor,
 )
-from l2m_gtsam.slam.relative_motion import hung_anew
-from l2m_gtsam.slam.solver import well_scaled
+from l2m_gtsam.slam.relative_motion import interpolated_readings
+from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.solve.robust import RobustOptions
 
 SECTION = 200  # key poses that are solved together
@@ -61,7 +61,7 @@ AGAIN = 2  # more steps with each group, so that the next one starts from where 
 
 
 @dataclass(frozen=True)
-class TakenLeg:
+class AcceptedReadings:
     """Readings between two key poses that the filter took.
 
     Attributes
@@ -80,7 +80,7 @@ class TakenLeg:
 
 
 @dataclass
-class Waiting:
+class PendingKeyPoses:
     """Key poses that the filter has taken and iSAM2 has not.
 
     Attributes
@@ -93,7 +93,7 @@ class Waiting:
 
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
-    legs: list[TakenLeg] = field(default_factory=list)
+    accepted: list[AcceptedReadings] = field(default_factory=list)
 
 
 class Follower:
@@ -123,7 +123,7 @@ class Follower:
         section: int = SECTION,
     ) -> None:
         self._drive, self._map, self._robust, self._free = drive, field_map, robust, free
-        self._variance = RememberedVariance(field_map)
+        self._variance = CachedVariance(field_map)
         self._ends = np.searchsorted(drive.readings.key_pose, np.arange(len(drive) + 1))
         fixes = np.flatnonzero(drive.links.in_map)
         self._fixes = fixes[np.argsort(drive.links.key_pose[fixes], kind="stable")]
@@ -134,7 +134,7 @@ class Follower:
         self._calibrations = [key for i in sensors for key in (T(i), D(i))]
         self._length, self._first, self._past = section, 0, gtsam.Values()
         self._section = Section(self._calibrations)
-        self._belief, self._waiting = self._at_start(), self._opening()
+        self._belief, self._pending = self._at_start(), self._opening()
 
     def step(self, number: int) -> Belief:
         """Add a key pose, and return what is known of it then; they come in order.
@@ -145,14 +145,14 @@ class Follower:
             What is known of poses and sensors is too many orders of magnitude apart.
         """
         if number > 0:
-            self._come_to(number)
+            self._advance(number)
         self._fix(number)
-        self._waiting.values.insert(X(number), self._belief.pose)
+        self._pending.values.insert(X(number), self._belief.pose)
         last = len(self._drive) - 1
         # Not before there was a reading: calibrations far off have to come from the filter.
         if 0 < number < EARLY or (number + 1) % GROUP == 0 or number == last:
-            with well_scaled():
-                self._settle(number)
+            with reported_ill_conditioning():
+                self._update_section(number)
         return self._belief
 
     def values(self) -> gtsam.Values:
@@ -161,13 +161,13 @@ class Follower:
         values.insert(self._section.values())
         return values
 
-    def _opening(self) -> Waiting:
+    def _opening(self) -> PendingKeyPoses:
         """Return what is known before the first key pose."""
-        waiting = Waiting()
-        waiting.graph.add(start_factor(self._drive.start))
+        pending = PendingKeyPoses()
+        pending.graph.add(start_factor(self._drive.start))
         if self._free:
-            waiting.graph.push_back(calibration_graph(self._drive.sensors))
-        return waiting
+            pending.graph.push_back(calibration_graph(self._drive.sensors))
+        return pending
 
     def _at_start(self) -> Belief:
         start, sensors = self._drive.start, self._drive.sensors
@@ -182,40 +182,40 @@ class Follower:
             covariance = self._belief.pose_covariance + links.covariance[row]
             off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
             if off @ np.linalg.solve(covariance, off) <= most:
-                seen = partial(fix_evidence, link_pose(links, row), links.covariance[row])
-                self._belief = self._belief.corrected(seen)
-                self._waiting.graph.add(link_factor(links, row))
+                seen = partial(fix_measurement, link_pose(links, row), links.covariance[row])
+                self._belief = self._belief.updated(seen)
+                self._pending.graph.add(link_factor(links, row))
 
-    def _come_to(self, number: int) -> None:
+    def _advance(self, number: int) -> None:
         """Go on to a key pose from the one before, and take what was read on the way."""
         before, steps = number - 1, self._drive.steps
-        belief = self._belief.departed(self._drive.step(before), steps.covariance[before])
-        self._belief = self._read(before, belief).arrived()
-        self._waiting.graph.add(step_factor(self._drive, before))
+        belief = self._belief.predicted(self._drive.step(before), steps.covariance[before])
+        self._belief = self._read(before, belief).marginalize_previous()
+        self._pending.graph.add(step_factor(self._drive, before))
 
-    def _read(self, number: int, belief: Departed) -> Departed:
+    def _read(self, number: int, belief: PredictedBelief) -> PredictedBelief:
         """Take the readings after a key pose as far as they pass for such."""
         rows = np.arange(self._ends[number], self._ends[number + 1])
         if not len(rows):
             return belief
-        view = LegView(Leg.of(self._drive, rows, number), self._map)
-        good = passed(view, self._variance, belief, self._robust)
-        if not len(good.rows):
+        view = StepMeasurement(StepReadings.of(self._drive, rows, number), self._map)
+        gated = gate(view, self._variance, belief, self._robust)
+        if not len(gated.rows):
             return belief
-        taken = take(view.of(good.rows), good.own, belief)
-        step = StepError(number, taken.belief.step, taken.by_step)
-        self._waiting.legs.append(TakenLeg(rows[good.rows], taken.whitening, step))
-        return taken.belief
+        updated = update(view.of(gated.rows), gated.own, belief)
+        step = StepError(number, updated.belief.step, updated.by_step)
+        self._pending.accepted.append(AcceptedReadings(rows[gated.rows], updated.whitening, step))
+        return updated.belief
 
-    def _settle(self, number: int) -> None:
+    def _update_section(self, number: int) -> None:
         """Give iSAM2 the key poses that wait, and take from it what is known of the last."""
-        waiting, self._waiting = self._waiting, Waiting()
-        for factor in self._reading_factors(waiting):
-            waiting.graph.add(factor)
-        if self._free and waiting.values.exists(X(0)):
+        pending, self._pending = self._pending, PendingKeyPoses()
+        for factor in self._reading_factors(pending):
+            pending.graph.add(factor)
+        if self._free and pending.values.exists(X(0)):
             # From the filter's estimate: linearised at values far off, readings would lead astray.
-            waiting.values.insert(calibration_values(self._belief.sensors))
-        self._section.add(waiting.graph, waiting.values, number, AGAIN)
+            pending.values.insert(calibration_values(self._belief.sensors))
+        self._section.add(pending.graph, pending.values, number, AGAIN)
         sensors, section = self._drive.sensors, self._section
         if self._free:
             sensors = sensors_in(section.calibration(), sensors)
@@ -223,16 +223,25 @@ class Follower:
         if number - self._first >= self._length:
             self._hand_over(number)
 
-    def _reading_factors(self, waiting: Waiting) -> Iterator[gtsam.NonlinearFactor]:
-        if not waiting.legs:
+    def _reading_factors(self, pending: PendingKeyPoses) -> Iterator[gtsam.NonlinearFactor]:
+        if not pending.accepted:
             return
-        rows = np.concatenate([leg.rows for leg in waiting.legs])
-        steps = [leg.step.step for leg in waiting.legs for _ in leg.rows]
-        readings = hung_anew(self._drive, rows, steps)
+        rows = np.concatenate([readings_of_step.rows for readings_of_step in pending.accepted])
+        steps = [
+            readings_of_step.step.step
+            for readings_of_step in pending.accepted
+            for _ in readings_of_step.rows
+        ]
+        readings = interpolated_readings(self._drive, rows, steps)
         fixed = None if self._free else self._drive.sensors.fixed()
-        batch = CarriedBatch(self._map, readings, fixed)
-        for leg in waiting.legs:
-            yield key_pose_factor(batch, leg.step.key_pose, leg.whitening, step=leg.step)
+        batch = MapBatch(self._map, readings, fixed)
+        for readings_of_step in pending.accepted:
+            yield key_pose_factor(
+                batch,
+                readings_of_step.step.key_pose,
+                readings_of_step.whitening,
+                step=readings_of_step.step,
+            )
 
     def _hand_over(self, last: int) -> None:
         """Begin a section with the last key pose of this one."""

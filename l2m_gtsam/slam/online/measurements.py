@@ -6,12 +6,12 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from l2m_factors import CarriedReadings, CarriedResiduals, Whitening, carried_residuals
+from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, key_pose_residuals
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.map_prediction import place
-from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, Departed, Evidence
+from l2m_gtsam.slam.map_prediction import place_readings
+from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, PredictedBelief, WhitenedMeasurement
 from l2m_gtsam.slam.pose_graph import root_information
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
@@ -21,7 +21,7 @@ from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 CELL_M = 0.25
 
 
-class RememberedVariance:
+class CachedVariance:
     """A map's variance, asked once in each cell that is come to.
 
     A harmonic map needs a hundred times as long for it as for the field.
@@ -55,7 +55,7 @@ class RememberedVariance:
 
 
 @dataclass(frozen=True)
-class Leg:
+class StepReadings:
     """Readings between two key poses.
 
     Attributes
@@ -68,22 +68,22 @@ class Leg:
         Of a right perturbation of it, shape (6, 6).
     """
 
-    readings: CarriedReadings
+    readings: KeyPoseReadings
     step: gtsam.Pose3
     covariance: FloatArray
 
     @classmethod
-    def of(cls, drive: Drive, rows: IntArray, number: int) -> "Leg":
+    def of(cls, drive: Drive, rows: IntArray, number: int) -> "StepReadings":
         """Return some of a drive's readings, all on a key pose of this number."""
         return cls(drive.readings[rows], drive.step(number), drive.steps.covariance[number])
 
-    def __getitem__(self, rows: IntArray) -> "Leg":
+    def __getitem__(self, rows: IntArray) -> "StepReadings":
         return replace(self, readings=self.readings[rows])
 
     def __len__(self) -> int:
         return len(self.readings)
 
-    def shifted(self, step: gtsam.Pose3) -> CarriedReadings:
+    def shifted(self, step: gtsam.Pose3) -> KeyPoseReadings:
         """Return the readings where they are if the step is this."""
         if step.equals(self.step, 0.0):
             return self.readings
@@ -93,7 +93,7 @@ class Leg:
 
 
 @dataclass(frozen=True)
-class Seen:
+class StepPrediction:
     """Readings of a leg beside what a map predicts.
 
     Attributes
@@ -107,8 +107,8 @@ class Seen:
         shape (n, 3, 6).
     """
 
-    readings: CarriedReadings
-    residuals: CarriedResiduals
+    readings: KeyPoseReadings
+    residuals: KeyPoseResiduals
     by_end: FloatArray
 
     @property
@@ -117,7 +117,7 @@ class Seen:
         return np.asarray(self.readings.fraction[:, None, None] * self.by_end)
 
 
-class LegView:
+class StepMeasurement:
     """A leg beside a map, which is asked once where a belief is looked at again.
 
     Parameters
@@ -128,34 +128,34 @@ class LegView:
         The map.
     """
 
-    def __init__(self, leg: Leg, field_map: QueryableMap) -> None:
+    def __init__(self, leg: StepReadings, field_map: QueryableMap) -> None:
         self.leg, self._map = leg, field_map
-        self._at: Departed | None = None
-        self._seen: Seen | None = None
+        self._at: PredictedBelief | None = None
+        self._seen: StepPrediction | None = None
 
-    def of(self, rows: IntArray) -> "LegView":
+    def of(self, rows: IntArray) -> "StepMeasurement":
         """Return the view of some readings: this one if they are all."""
-        return self if len(rows) == len(self.leg) else LegView(self.leg[rows], self._map)
+        return self if len(rows) == len(self.leg) else StepMeasurement(self.leg[rows], self._map)
 
-    def seen(self, belief: Departed) -> Seen:
+    def predicted(self, belief: PredictedBelief) -> StepPrediction:
         """Compare the readings with what the map predicts from a belief."""
         if self._seen is None or self._at is not belief:
             self._at, self._seen = belief, self._compared(belief)
         return self._seen
 
-    def _compared(self, belief: Departed) -> Seen:
+    def _compared(self, belief: PredictedBelief) -> StepPrediction:
         n, pose, readings = len(self.leg), belief.pose, self.leg.shifted(belief.step)
         R, p = np.tile(pose.rotation().matrix(), (n, 1, 1)), np.tile(pose.translation(), (n, 1))
-        seen = carried_residuals(readings, self._map, R, p, belief.sensors.fixed())
-        return Seen(readings, seen, seen.de_dX @ belief.step.AdjointMap())
+        predicted = key_pose_residuals(readings, self._map, R, p, belief.sensors.fixed())
+        return StepPrediction(readings, predicted, predicted.de_dX @ belief.step.AdjointMap())
 
 
-LOOKS = 3  # at what errors of the way do
+MAX_RELINEARISATIONS = 3  # at what errors of the way do
 NEAR = 0.03  # m, rad, or of an entry of C: there they do the same
 
 
 @dataclass(frozen=True)
-class Passed:
+class Gated:
     """Readings of a leg that pass for such.
 
     Attributes
@@ -171,7 +171,7 @@ class Passed:
 
 
 @dataclass(frozen=True)
-class Taken:
+class Updated:
     """What is known once the readings of a leg were taken.
 
     Attributes
@@ -184,33 +184,38 @@ class Taken:
         Their derivatives by a right perturbation of the step, shape (n, 3, 6).
     """
 
-    belief: Departed
+    belief: PredictedBelief
     whitening: Whitening
     by_step: FloatArray
 
 
-def passed(
-    view: LegView,
-    variance: RememberedVariance,
-    belief: Departed,
+def gate(
+    view: StepMeasurement,
+    variance: CachedVariance,
+    belief: PredictedBelief,
     robust: RobustOptions,
-) -> Passed:
+) -> Gated:
     """Return the readings of a leg that a belief explains, by what it and they may be off."""
-    leg, seen, sensors = view.leg, view.seen(belief), belief.sensors
-    where = place(seen.readings, {int(k): belief.pose for k in leg.readings.key_pose[:1]}, sensors)
+    leg, predicted, sensors = view.leg, view.predicted(belief), belief.sensors
+    where = place_readings(
+        predicted.readings, {int(k): belief.pose for k in leg.readings.key_pose[:1]}, sensors
+    )
     known = variance.at(where.x)
     rows = np.flatnonzero(np.isfinite(known[:, 0]))
     R, sensor = where.readings.R_map_lidar[rows], leg.readings.sensor[rows]
     noise = reading_covariance(sensors.noise[sensor], map_covariance(where.C[rows], R, known[rows]))
-    e, S = seen.residuals.reading.residual[rows], spread_of(leg, seen, belief)[rows] + noise
+    e, S = (
+        predicted.residuals.reading.residual[rows],
+        belief_covariance(leg, predicted, belief)[rows] + noise,
+    )
     r2 = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
     trust = WEIGHTS[robust.loss](r2, robust.largest, np.inf)
     good = np.flatnonzero(trust > 0)
     own = whitening(noise[good]) * np.sqrt(trust[good])[:, None, None]
-    return Passed(rows[good], own)
+    return Gated(rows[good], own)
 
 
-def take(view: LegView, own: FloatArray, belief: Departed) -> Taken:
+def update(view: StepMeasurement, own: FloatArray, belief: PredictedBelief) -> Updated:
     """Return what is known by the readings of a leg, too.
 
     What the errors of the way do to them goes with the field's gradient and the calibration: it is
@@ -224,52 +229,58 @@ def take(view: LegView, own: FloatArray, belief: Departed) -> Taken:
         What makes the noise of each reading white, 1/uT, shape (n, 3, 3).
     """
     at, leg = belief, view.leg
-    for _ in range(LOOKS):
-        seen = view.seen(at)
-        white = bridge_whitening(own, seen.by_end, leg.readings.fraction, leg.covariance)
-        found = belief.corrected(partial(evidence, view, white))
+    for _ in range(MAX_RELINEARISATIONS):
+        predicted = view.predicted(at)
+        white = bridge_whitening(own, predicted.by_end, leg.readings.fraction, leg.covariance)
+        found = belief.updated(partial(whitened_measurement, view, white))
         if found.is_near(at, NEAR):
             break
         at = found
-    return Taken(found, white, seen.by_step)
+    return Updated(found, white, predicted.by_step)
 
 
-def spread_of(leg: Leg, seen: Seen, belief: Departed) -> FloatArray:
+def belief_covariance(
+    leg: StepReadings, predicted: StepPrediction, belief: PredictedBelief
+) -> FloatArray:
     """Return what an uncertain belief adds to the covariance of residuals, uT^2, (n, 3, 3).
 
     That is, by the pose, by the calibrations, and by the way from there.
     """
-    P, sensor, residuals = belief.covariance, leg.readings.sensor, seen.residuals
-    parts = [residuals.de_dX, seen.by_step]
+    P, sensor, residuals = belief.covariance, leg.readings.sensor, predicted.residuals
+    parts = [residuals.de_dX, predicted.by_step]
     at = np.tile(np.append(np.arange(POSE), np.arange(len(P) - POSE, len(P))), (len(leg), 1))
     if belief.has_calibrations:
         parts += [residuals.reading.de_dt, residuals.reading.de_dD]
         at = np.hstack([at, columns_of(sensor)])
     J = np.concatenate(parts, axis=2)
     s = leg.readings.fraction[:, None, None]
-    bridge = s * (1 - s) * (seen.by_end @ leg.covariance @ seen.by_end.transpose(0, 2, 1))
+    bridge = s * (1 - s) * (predicted.by_end @ leg.covariance @ predicted.by_end.transpose(0, 2, 1))
     return np.asarray(J @ P[at[:, :, None], at[:, None, :]] @ J.transpose(0, 2, 1) + bridge)
 
 
-def evidence(view: LegView, white: Whitening, belief: Departed) -> Evidence:
+def whitened_measurement(
+    view: StepMeasurement, white: Whitening, belief: PredictedBelief
+) -> WhitenedMeasurement:
     """Return the n readings of a leg as evidence."""
-    leg, seen, n = view.leg, view.seen(belief), len(view.leg)
+    leg, predicted, n = view.leg, view.predicted(belief), len(view.leg)
     J = np.zeros((n, 3, len(belief.covariance)))
-    J[:, :, :POSE], J[:, :, -POSE:] = seen.residuals.de_dX, seen.by_step
-    reading = seen.residuals.reading
+    J[:, :, :POSE], J[:, :, -POSE:] = predicted.residuals.de_dX, predicted.by_step
+    reading = predicted.residuals.reading
     if belief.has_calibrations:
         by_sensor = np.concatenate([reading.de_dt, reading.de_dD], axis=2)
         at = np.arange(n)[:, None, None], np.arange(3)[:, None]
         J[(*at, columns_of(leg.readings.sensor)[:, None])] = by_sensor
-    return Evidence(white(reading.residual[:, :, None]).ravel(), white(J))
+    return WhitenedMeasurement(white(reading.residual[:, :, None]).ravel(), white(J))
 
 
-def fix_evidence(fix: gtsam.Pose3, covariance: FloatArray, belief: Belief) -> Evidence:
+def fix_measurement(
+    fix: gtsam.Pose3, covariance: FloatArray, belief: Belief
+) -> WhitenedMeasurement:
     """Return a key pose's place in the map, with its covariance (6, 6), as evidence."""
     W = root_information(covariance)
     J = np.zeros((POSE, len(belief.covariance)))
     J[:, :POSE] = W
-    return Evidence(W @ gtsam.Pose3.Logmap(fix.between(belief.pose)), J)
+    return WhitenedMeasurement(W @ gtsam.Pose3.Logmap(fix.between(belief.pose)), J)
 
 
 def columns_of(sensor: IntArray) -> IntArray:

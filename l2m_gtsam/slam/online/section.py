@@ -8,7 +8,7 @@ import numpy as np
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.belief import POSE
-from l2m_gtsam.slam.solver import covariance_of, ordered, unless_refused
+from l2m_gtsam.slam.solver import covariance_of, ordered, unless_indeterminate
 
 # Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
 # entries of C; never for H, in which readings are linear.
@@ -22,7 +22,7 @@ ANEW = 10  # steps of a section that is solved again from its beginning
 
 
 @dataclass
-class Added:
+class SectionContents:
     """All that came to a section: factors, and values to begin with."""
 
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
@@ -49,8 +49,8 @@ class Section:
 
     def __init__(self, calibrations: list[int], solver: str = CHOLESKY) -> None:
         self._engine, self._calibrations, self._solver = _engine(solver), calibrations, solver
-        self._added = Added()
-        self._told: set[int] = set()  # those of sensors that were heard
+        self._contents = SectionContents()
+        self._observed: set[int] = set()  # those of sensors that were heard
 
     def add(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
@@ -59,34 +59,34 @@ class Section:
         for n in range(graph.size()):
             keys = set(graph.at(n).keys())
             if not keys.issubset(self._calibrations):
-                self._told |= keys.intersection(self._calibrations)
-        self._added.graph.push_back(graph)
-        self._added.values.insert(values)
+                self._observed |= keys.intersection(self._calibrations)
+        self._contents.graph.push_back(graph)
+        self._contents.values.insert(values)
         if self._solver == QR:
-            self._take(graph, values, last, again)
-        elif unless_refused(lambda: self._take(graph, values, last, again)) is None:
+            self._update(graph, values, last, again)
+        elif unless_indeterminate(lambda: self._update(graph, values, last, again)) is None:
             self._solver, self._engine = QR, _engine(QR)
-            self._take(self._added.graph, self._added.values, last, ANEW)
+            self._update(self._contents.graph, self._contents.values, last, ANEW)
 
-    def _take(
+    def _update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
     ) -> gtsam.ISAM2Result:
-        order = self._last_ones(last)
+        order = self._last_group(last)
         result = self._engine.update(graph, values, constrainedKeys=order)
         for _ in range(again):
             result = self._engine.update(constrainedKeys=order)
         return result
 
-    def _last_ones(self, last: int) -> gtsam.KeyGroupMap:
+    def _last_group(self, last: int) -> gtsam.KeyGroupMap:
         """Return which variables are eliminated last.
 
         What is asked for at each key pose stands in the root of the tree then. The very last are
         poses: Cholesky takes a part of a calibration that only its prior holds for undetermined.
         """
         order = gtsam.KeyGroupMap()
-        for key in self._told:
+        for key in self._observed:
             order.insert2(key, 1)
-        order.insert2(X(last), 2 if self._told else 1)  # no group may be empty
+        order.insert2(X(last), 2 if self._observed else 1)  # no group may be empty
         return order
 
     def pose(self, number: int) -> gtsam.Pose3:
@@ -104,26 +104,28 @@ class Section:
     def covariance(self, last: int) -> FloatArray:
         """Return the joint covariance of the last key pose and the calibrations, in this order."""
         keys = [*self._calibrations, X(last)]
-        engine, found = self._engine, None
+        engine, covariance = self._engine, None
         if self._solver == CHOLESKY:
-            found = unless_refused(lambda: engine.jointMarginalCovariance(keys).fullMatrix())
-        if found is None:
+            covariance = unless_indeterminate(
+                lambda: engine.jointMarginalCovariance(keys).fullMatrix()
+            )
+        if covariance is None:
             left = engine.joint(keys, gtsam.EliminateQR)
             net = left.eliminateSequential(ordered(keys), gtsam.EliminateQR)
-            found = covariance_of(net.matrix()[0])
-        return np.roll(found, POSE, axis=(0, 1))
+            covariance = covariance_of(net.matrix()[0])
+        return np.roll(covariance, POSE, axis=(0, 1))
 
     def next(self, last: int) -> "Section":
         """Return a section that begins with what this one knows of key pose and calibrations."""
         keys = [*self._calibrations, X(last)]
         # As it was linearised; what has moved by more than a little was linearised anew.
         at = self._engine.getLinearizationPoint().extract(keys)
-        told = None
+        information = None
         if self._solver == CHOLESKY:
-            told = unless_refused(lambda: self._engine.joint(keys))
-        if told is None:
-            told = self._engine.joint(keys, gtsam.EliminateQR)
-        prior = gtsam.LinearContainerFactor.ConvertLinearGraph(told, at)
+            information = unless_indeterminate(lambda: self._engine.joint(keys))
+        if information is None:
+            information = self._engine.joint(keys, gtsam.EliminateQR)
+        prior = gtsam.LinearContainerFactor.ConvertLinearGraph(information, at)
         section = Section(self._calibrations, self._solver)
         section.add(prior, self._engine.calculateEstimate(keys), last, 0)
         return section

@@ -21,12 +21,18 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import carried_residuals, skew
+from l2m_factors import key_pose_residuals, skew
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, RigidTransform
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.records.localisation import StartCandidate
-from l2m_gtsam.slam.map_prediction import Place, SharedMapErrors, Sight, errors_of, look
+from l2m_gtsam.slam.map_prediction import (
+    MapPrediction,
+    PlacedReadings,
+    SharedMapErrors,
+    errors_of,
+    predict,
+)
 from l2m_gtsam.slam.start.window import Window
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance
 
@@ -34,7 +40,7 @@ UNKNOWN = np.repeat([10.0, 1e3], 3)  # rad and m: sigmas of what nothing is know
 
 
 @dataclass(frozen=True)
-class Beforehand:
+class StartPrior:
     """What is known before readings are looked at.
 
     Attributes
@@ -158,7 +164,7 @@ class WindowFit:
         What else is known.
     """
 
-    def __init__(self, window: Window, field_map: QueryableMap, beforehand: Beforehand) -> None:
+    def __init__(self, window: Window, field_map: QueryableMap, beforehand: StartPrior) -> None:
         self._window, self._map, self._known = window, field_map, beforehand
         self._back = carried_back(window.R, window.p)[window.readings.key_pose]
         self._steps = steps_root(window)
@@ -168,14 +174,14 @@ class WindowFit:
         pose = T_map_lidar
         trusted = self._plausible(pose)
         for round_ in range(ROUNDS):
-            seen, sight = self._linearised(pose), self._sight(pose)
-            S = self._covariance(seen, sight, shared=round_ == ROUNDS - 1)
-            trusted = sight.inside & self._predicted(seen.e, S, trusted)
+            seen, prediction = self._linearised(pose), self._prediction(pose)
+            S = self._covariance(seen, prediction, shared=round_ == ROUNDS - 1)
+            trusted = prediction.inside & self._predicted(seen.e, S, trusted)
             P = inverse(self._doubted(S, trusted))
             for _ in range(STEPS):
                 pose = self._stepped(pose, seen, P)
                 seen = self._linearised(pose)
-        return self._told(pose, seen, P, trusted, sight.inside)
+        return self._told(pose, seen, P, trusted, prediction.inside)
 
     def _told(
         self,
@@ -211,7 +217,7 @@ class WindowFit:
     def _linearised(self, pose: RigidTransform) -> Linearisation:
         window, sensors = self._window, self._window.sensors
         R, p = self._key_poses(pose)
-        seen = carried_residuals(window.readings, self._map, R, p, sensors.fixed())
+        seen = key_pose_residuals(window.readings, self._map, R, p, sensors.fixed())
         reading = seen.reading
         return Linearisation(
             reading.residual.ravel(),
@@ -224,23 +230,25 @@ class WindowFit:
         key = self._window.readings.key_pose
         return pose.R @ self._window.R[key], self._window.p[key] @ pose.R.T + pose.t
 
-    def _sight(self, pose: RigidTransform) -> Sight:
+    def _prediction(self, pose: RigidTransform) -> MapPrediction:
         """Ask the map where it has data, and how uncertain it is."""
         sensors = self._window.sensors
         at = self._window.readings.placed(*self._key_poses(pose))
         x = np.einsum("nij,nj->ni", at.R_map_lidar, sensors.t[at.sensor]) + at.p_map_lidar
         C = sensors.distortion[:, :9].reshape(-1, 3, 3)[at.sensor]
-        return look(self._map, Place(at, x, C), sensors)
+        return predict(self._map, PlacedReadings(at, x, C), sensors)
 
-    def _covariance(self, seen: Linearisation, sight: Sight, *, shared: bool) -> FloatArray:
+    def _covariance(
+        self, seen: Linearisation, prediction: MapPrediction, *, shared: bool
+    ) -> FloatArray:
         """Return S, shape (3N, 3N)."""
-        window, where = self._window, sight.place
-        variance, roots = sight.map_variance, [self._odometry_root(seen)]
+        window, where = self._window, prediction.placed
+        variance, roots = prediction.map_variance, [self._odometry_root(seen)]
         roots += [self._calibration_root(seen, i) for i in range(len(window.sensors.names))]
-        if shared and sight.inside.any():
-            errors = SharedMapErrors.over(errors_of(self._map), sight)
+        if shared and prediction.inside.any():
+            errors = SharedMapErrors.over(errors_of(self._map), prediction)
             variance, roots = errors.rest, [*roots, map_root(errors, where.C)]
-        variance = np.where(sight.inside[:, None], variance, 0.0)
+        variance = np.where(prediction.inside[:, None], variance, 0.0)
         share = map_covariance(where.C, where.readings.R_map_lidar, variance)
         noise = window.sensors.noise[where.readings.sensor]
         S = block_diagonal(reading_covariance(noise, share))
@@ -261,9 +269,9 @@ class WindowFit:
 
     def _plausible(self, pose: RigidTransform) -> BoolArray:
         """Return which readings are within their own covariances, shape (N,)."""
-        seen, sight = self._linearised(pose), self._sight(pose)
-        blocks = diagonal_blocks(self._covariance(seen, sight, shared=False))
-        return sight.inside & self._passes(seen.e.reshape(-1, 3), inverse(blocks))
+        seen, prediction = self._linearised(pose), self._prediction(pose)
+        blocks = diagonal_blocks(self._covariance(seen, prediction, shared=False))
+        return prediction.inside & self._passes(seen.e.reshape(-1, 3), inverse(blocks))
 
     def _predicted(self, e: FloatArray, S: FloatArray, trusted: BoolArray) -> BoolArray:
         """Return which readings those of the others that are trusted predict, shape (N,)."""

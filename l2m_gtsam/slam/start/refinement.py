@@ -22,7 +22,7 @@ UNKNOWNS = 6
 
 
 @dataclass(frozen=True)
-class Laid:
+class PatternPoses:
     """Poses in a map at which a pattern may lie, S of them.
 
     Attributes
@@ -40,23 +40,23 @@ class Laid:
     def __len__(self) -> int:
         return len(self.p)
 
-    def __getitem__(self, rows: IntArray) -> "Laid":
-        return Laid(self.R[rows], self.p[rows], self.cost[rows])
+    def __getitem__(self, rows: IntArray) -> "PatternPoses":
+        return PatternPoses(self.R[rows], self.p[rows], self.cost[rows])
 
     @classmethod
-    def upright(cls, places: Places) -> "Laid":
+    def upright(cls, places: Places) -> "PatternPoses":
         """Return places as poses."""
         R = np.array([about_z(yaw) for yaw in places.yaw.tolist()]).reshape(-1, 3, 3)
         return cls(R, places.p, places.score)
 
-    def moved(self, step: FloatArray) -> "Laid":
+    def moved(self, step: FloatArray) -> "PatternPoses":
         """Return them after turns about the map's axes (rad) and shifts (m), shape (S, 6)."""
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
         return replace(self, R=turn @ self.R, p=self.p + step[:, 3:])
 
-    def where(self, better: BoolArray, other: "Laid") -> "Laid":
+    def where(self, better: BoolArray, other: "PatternPoses") -> "PatternPoses":
         """Return those of ``other`` where it is better, shape (S,)."""
-        return Laid(
+        return PatternPoses(
             np.where(better[:, None, None], other.R, self.R),
             np.where(better[:, None], other.p, self.p),
             np.where(better, other.cost, self.cost),
@@ -91,8 +91,8 @@ class Slopes:
 
 
 def descended(
-    laid: Laid, pattern: Pattern, field_map: QueryableMap, longest_m: float, steps: int
-) -> Laid:
+    laid: PatternPoses, pattern: Pattern, field_map: QueryableMap, longest_m: float, steps: int
+) -> PatternPoses:
     """Return where poses lead to by damped Gauss-Newton steps, all of them abreast, the best first.
 
     Parameters
@@ -109,11 +109,11 @@ def descended(
         The most.
     """
     longest = np.repeat([longest_m / max(pattern.radius, longest_m), longest_m], 3)
-    laid, slopes = sloped(laid, pattern, field_map)
+    laid, slopes = linearised_cost(laid, pattern, field_map)
     damping = np.full(len(laid), LEAST)
     for _ in range(steps):
         step = slopes.step(damping, longest)
-        tried, there = sloped(laid.moved(step), pattern, field_map)
+        tried, there = linearised_cost(laid.moved(step), pattern, field_map)
         better = tried.cost < laid.cost
         laid, slopes = laid.where(better, tried), slopes.where(better, there)
         damping = np.maximum(np.where(better, LESS, MORE) * damping, LEAST)
@@ -122,7 +122,9 @@ def descended(
     return laid[np.argsort(laid.cost, kind="stable")]
 
 
-def sloped(laid: Laid, pattern: Pattern, field_map: QueryableMap) -> tuple[Laid, Slopes]:
+def linearised_cost(
+    laid: PatternPoses, pattern: Pattern, field_map: QueryableMap
+) -> tuple[PatternPoses, Slopes]:
     """Return poses with Cauchy's cost, to which what is far off adds little, and its slopes."""
     S, N = len(laid), len(pattern.x)
     x, read = (v @ laid.R.transpose(0, 2, 1) for v in (pattern.x, pattern.field))
@@ -143,7 +145,7 @@ def sloped(laid: Laid, pattern: Pattern, field_map: QueryableMap) -> tuple[Laid,
     return replace(laid, cost=cost), Slopes(gradient, curvature)
 
 
-def leaning(laid: Laid, tilt: float) -> tuple[FloatArray, FloatArray]:
+def leaning(laid: PatternPoses, tilt: float) -> tuple[FloatArray, FloatArray]:
     """Return how far poses lean, in sigmas, (S, 3), and the derivative by turns, (S, 3, 3)."""
     up = laid.R[:, :, 2]
     return (up - [0.0, 0.0, 1.0]) / tilt, -skew(up) / tilt

@@ -304,7 +304,7 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Screened:
+class ScreeningResult:
     """The places that readings do not rule out, the best first, and how many were looked at."""
 
     places: Places
@@ -313,7 +313,7 @@ class Screened:
 
 def screen(
     pattern: Pattern, lattice: FieldLattice, nodes: IntArray, options: StartSearchOptions
-) -> Screened:
+) -> ScreeningResult:
     """Return the places that readings do not rule out, at most ``MOST_KEPT``.
 
     Parameters
@@ -338,7 +338,7 @@ def screen(
         kept = np.flatnonzero(np.isfinite(score))
         return Places(lattice.places(nodes[kept]), np.full(len(kept), yaw), score[kept])
 
-    return Screened(best_of(in_threads(look, headings)), len(headings) * len(nodes))
+    return ScreeningResult(best_of(in_threads(look, headings)), len(headings) * len(nodes))
 
 
 def heading_step(radius: float, step: float) -> float:

@@ -19,8 +19,8 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.localisation import StartCandidate, StartSearch, StartVerdict
 from l2m_gtsam.slam.drive import Drive, StartPose
 from l2m_gtsam.slam.options import SlamOptions, StartPoseOptions, StartSearchOptions
-from l2m_gtsam.slam.start.likelihood import Beforehand, WindowFit
-from l2m_gtsam.slam.start.refinement import Laid, descended
+from l2m_gtsam.slam.start.likelihood import StartPrior, WindowFit
+from l2m_gtsam.slam.start.refinement import PatternPoses, descended
 from l2m_gtsam.slam.start.screening import FieldLattice, Places, lattice_over, screen
 from l2m_gtsam.slam.start.window import Pattern, Window, window_of
 
@@ -211,12 +211,12 @@ def search_window(
     return judged(distinct(fits, search), window, screened.looked_at, search)
 
 
-def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> Beforehand:
+def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> StartPrior:
     """Return what is known of the start without readings."""
     start, height = options.start, options.start.search.height_m
     z = lattice.places(np.arange(len(lattice)))[:, 2]
     anywhere = float(np.ptp(z)) + 2.0 * lattice.step
-    return Beforehand(
+    return StartPrior(
         up=window.R_odom_lidar[2],
         tilt=float(np.deg2rad(start.rotation_deg)),
         height=float(z.mean()) if height is None else height,
@@ -228,9 +228,9 @@ def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> B
 
 def followed(
     places: Places, pattern: Pattern, field_map: QueryableMap, options: StartSearchOptions
-) -> Laid:
+) -> PatternPoses:
     """Return the best minima that places lead to."""
-    seeds, step = Laid.upright(places), options.step_m
+    seeds, step = PatternPoses.upright(places), options.step_m
     if not len(seeds):
         return seeds
     seeds = apart(seeds, pattern, STRIDE * step, options.seeds)
@@ -241,17 +241,17 @@ def followed(
     return apart(ends, pattern, options.apart_m, options.candidates)
 
 
-def apart(laid: Laid, pattern: Pattern, metres: float, most: int) -> Laid:
+def apart(laid: PatternPoses, pattern: Pattern, metres: float, most: int) -> PatternPoses:
     """Return the first poses that keep a distance from those before."""
     return laid[np.array(spread_out(drawn(laid, pattern), metres, most), dtype=np.int64)]
 
 
-def drawn(laid: Laid, pattern: Pattern) -> FloatArray:
+def drawn(laid: PatternPoses, pattern: Pattern) -> FloatArray:
     """Return poses as points in metres, shape (S, 5): headings lie on a circle of the pattern."""
     return np.hstack([laid.p, max(pattern.radius, SMALLEST) * laid.R[:, :2, 0]])
 
 
-def poses_of(laid: Laid, pattern: Pattern, window: Window) -> list[RigidTransform]:
+def poses_of(laid: PatternPoses, pattern: Pattern, window: Window) -> list[RigidTransform]:
     """Return where the first key pose is if the pattern lies at these poses."""
     lever = window.p_odom_lidar - pattern.origin
     R, p = laid.R @ window.R_odom_lidar, laid.R @ lever + laid.p

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_factors import CarriedReadings
+from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.slam.drive import Drive, KnownSensors, spread
+from l2m_gtsam.slam.drive import Drive, KnownSensors, evenly_spread
 
 AXES = 3
 
@@ -79,7 +79,7 @@ class Window:
     R: FloatArray
     p: FloatArray
     covariance: FloatArray
-    readings: CarriedReadings
+    readings: KeyPoseReadings
     sensors: KnownSensors
     R_odom_lidar: FloatArray
     p_odom_lidar: FloatArray
@@ -160,7 +160,7 @@ def window_of(drive: Drive, way_m: float, most: int) -> Window:
         way_m=float(way[count - 1]),
         R=R[0].T @ R[:count],
         p=(p[:count] - p[0]) @ R[0],
-        covariance=drive.steps.with_scale_as_walk(way_m).covariance[: count - 1],
+        covariance=drive.steps.with_scale_as_drift(way_m).covariance[: count - 1],
         readings=own[thinned(own, most)],
         sensors=drive.sensors,
         R_odom_lidar=R[0],
@@ -168,7 +168,7 @@ def window_of(drive: Drive, way_m: float, most: int) -> Window:
     )
 
 
-def thinned(readings: CarriedReadings, most: int) -> IntArray:
+def thinned(readings: KeyPoseReadings, most: int) -> IntArray:
     """Return rows of one reading of each sensor on each key pose, at most so many in all."""
-    rows = spread(np.column_stack([readings.key_pose, readings.sensor]), 1)
+    rows = evenly_spread(np.column_stack([readings.key_pose, readings.sensor]), 1)
     return np.asarray(rows[np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64)])

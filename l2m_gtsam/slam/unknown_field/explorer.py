@@ -20,7 +20,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.slam.drive import Drive, as_pose
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.solver import well_scaled
+from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory
 from l2m_gtsam.slam.unknown_field.open_section import OpenSection
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior
@@ -40,7 +40,7 @@ class ExploringOptions(Options):
 
 
 @dataclass(frozen=True)
-class LetGo:
+class MarginalizedPose:
     """A key pose that is no variable any more: where it was in the frame of its tile's anchor."""
 
     anchor: int
@@ -83,13 +83,13 @@ class Explorer:
                 "`slam.calibration: refined` works off line where there is no map; on line give "
                 "`fixed`"
             )
-        drive = drive.with_scale_as_walk(options.drift.over_m)
+        drive = drive.with_scale_as_drift(options.drift.over_m)
         self._drive, self._options = drive, options
         self._pace = ExploringOptions() if pace is None else pace
         self._memory = FieldMemory.at_start(drive)
         self._way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
         self._first = self._solved = 0
-        self._past: list[LetGo] = []
+        self._past: list[MarginalizedPose] = []
         self._belief = self._at_start()
         self._section = None if prior is None else self._opened(prior)
 
@@ -117,7 +117,7 @@ class Explorer:
         for k in pending:
             self._carry(k)
             if self._section is not None and self._is_due(k):
-                with well_scaled():
+                with reported_ill_conditioning():
                     self._settle(self._section, k)
         return self._belief
 
@@ -149,8 +149,8 @@ class Explorer:
         """Carry on by odometry what is known."""
         if number > 0:
             drift = self._drive.steps.covariance[number - 1]
-            departed = self._belief.departed(self._drive.step(number - 1), drift)
-            self._belief = departed.arrived()
+            predicted = self._belief.predicted(self._drive.step(number - 1), drift)
+            self._belief = predicted.marginalize_previous()
 
     def _settle(self, section: OpenSection, number: int) -> None:
         """Solve the last stretch up to a key pose, and begin another one if it is long."""
@@ -162,6 +162,8 @@ class Explorer:
     def _hand_over(self, section: OpenSection, last: int) -> None:
         for k in range(len(self._past), last + 1):
             anchor = section.tile(k).anchor
-            self._past.append(LetGo(anchor, section.pose(anchor).between(section.pose(k))))
+            self._past.append(
+                MarginalizedPose(anchor, section.pose(anchor).between(section.pose(k)))
+            )
         self._memory, self._first = section.closed(), last
         self._section = section.next(self._memory, last)

@@ -263,7 +263,7 @@ def whitened_difference(known: JointGaussian, W: FloatArray) -> gtsam.CustomFact
 
 
 @dataclass(frozen=True)
-class ExploredTile:
+class RememberedTile:
     """A tile of the field as it is remembered.
 
     Attributes
@@ -282,7 +282,7 @@ class ExploredTile:
     taught: FloatArray
 
     @classmethod
-    def new(cls, number: int, anchor: int, field: WaveTile) -> "ExploredTile":
+    def new(cls, number: int, anchor: int, field: WaveTile) -> "RememberedTile":
         """Return a tile that nothing is known of."""
         return cls(number, anchor, field, np.zeros((len(field), len(field))))
 
@@ -300,7 +300,7 @@ class FieldMemory:
     """
 
     known: JointGaussian
-    tiles: tuple[ExploredTile, ...] = field(default=())
+    tiles: tuple[RememberedTile, ...] = field(default=())
 
     @classmethod
     def at_start(cls, drive: Drive) -> "FieldMemory":

@@ -9,21 +9,21 @@ import numpy as np
 from l2m_factors import M, TileBatch, Whitening, X, doubt_factor, tile_factor
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.map_prediction import Place, Sight, place
+from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import step_factor
 from l2m_gtsam.slam.solution import NOTHING
-from l2m_gtsam.slam.solver import descended, joint_covariance, least_fill
+from l2m_gtsam.slam.solver import colamd_ordering, descended, joint_covariance
 from l2m_gtsam.slam.unknown_field.field_memory import (
-    ExploredTile,
     FieldMemory,
     JointGaussian,
+    RememberedTile,
     part_of,
     prior_factors,
     tile_of,
 )
-from l2m_gtsam.slam.unknown_field.tiled_drive import LaidTile
+from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
@@ -44,7 +44,7 @@ class TileReadings:
         Of their noise per axis with what the tile leaves out, over their weights, uT^2, (c, 3).
     """
 
-    laid: LaidTile
+    laid: OccupiedTile
     chosen: IntArray
     whitening: FloatArray
     variance: FloatArray
@@ -52,8 +52,8 @@ class TileReadings:
     @classmethod
     def weighed(
         cls,
-        laid: LaidTile,
-        sight: Sight,
+        laid: OccupiedTile,
+        prediction: MapPrediction,
         noise: FloatArray,
         mu: FloatArray,
         robust: RobustOptions,
@@ -62,7 +62,7 @@ class TileReadings:
 
         Parameters
         ----------
-        laid, sight
+        laid, prediction
             The tile and what it says.
         noise
             Of each reading in uT, shape (n,).
@@ -71,14 +71,14 @@ class TileReadings:
         robust
             How readings are treated that nothing explains.
         """
-        W = sight.whitening_of(noise)
-        r2, weights = sight.squared(W), np.empty(len(mu))
+        W = prediction.whitening_of(noise)
+        r2, weights = prediction.squared(W), np.empty(len(mu))
         for stage in np.unique(mu):
             own = mu == stage
             weights[own] = WEIGHTS[robust.loss](r2[own], robust.largest, stage)
         chosen = np.flatnonzero(weights > NOTHING)
         W = W[chosen] * np.sqrt(weights[chosen])[:, None, None]
-        variance = noise[:, None] ** 2 + laid.field.unresolved(laid.place.x)
+        variance = noise[:, None] ** 2 + laid.field.unresolved(laid.placed.x)
         return cls(laid, chosen, W, variance[chosen] / weights[chosen, None])
 
     def factors(self, drive: Drive) -> Iterator[gtsam.NonlinearFactor]:
@@ -88,11 +88,11 @@ class TileReadings:
             white = Whitening.independent(self.whitening[batch.rows_of(k)])
             yield tile_factor(batch, k, white)
 
-    def doubts(self, drive: Drive, tile: ExploredTile) -> Iterator[gtsam.NonlinearFactor]:
+    def doubts(self, drive: Drive, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
         """Yield what keeps poses from where the tile would take up more noise."""
         if not len(self.chosen):
             return
-        batch, x = self._batch(drive), self.laid.place.x[self.chosen]
+        batch, x = self._batch(drive), self.laid.placed.x[self.chosen]
         doubt = self.laid.field.doubt(x, self.variance, tile.taught)
         for k in batch.key_poses:
             factor = doubt_factor(batch, k, doubt[batch.rows_of(k)])
@@ -101,7 +101,7 @@ class TileReadings:
 
     def information(self) -> FloatArray:
         """Return what they tell of the tile's m weights, shape (m, m)."""
-        return self.laid.field.information(self.laid.place.x[self.chosen], self.variance)
+        return self.laid.field.information(self.laid.placed.x[self.chosen], self.variance)
 
     def _batch(self, drive: Drive) -> TileBatch:
         readings = drive.readings[self.laid.rows[self.chosen]]
@@ -182,7 +182,7 @@ class OpenSection:
         known = self._memory.known.values
         return (self._values if self._values.exists(X(number)) else known).atPose3(X(number))
 
-    def tile(self, number: int) -> ExploredTile:
+    def tile(self, number: int) -> RememberedTile:
         """Return the tile that a key pose of the section lies in."""
         return self._tiles[self._tile_of[number]]
 
@@ -206,7 +206,7 @@ class OpenSection:
         self._tile_of[k] = number
         if number == len(self._tiles):
             field = self._waves(k)
-            self._tiles.append(ExploredTile.new(number, k, field))
+            self._tiles.append(RememberedTile.new(number, k, field))
             self._values.insert(M(number), np.zeros(len(field)))
             return False
         if self._values.exists(M(number)):
@@ -228,10 +228,10 @@ class OpenSection:
         near = np.abs(x @ level[:, :2]).max(axis=1) <= options.edge / 2
         return WaveTile.about(self._field_prior, level, x[near] if near.any() else x)
 
-    def _place(self, rows: IntArray, anchor: int) -> Place:
+    def _place(self, rows: IntArray, anchor: int) -> PlacedReadings:
         readings, origin = self._drive.readings[rows], self.pose(anchor)
         own = {int(k): origin.between(self.pose(int(k))) for k in np.unique(readings.key_pose)}
-        return place(readings, own, self._drive.sensors)
+        return place_readings(readings, own, self._drive.sensors)
 
     def _factors(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
         """Return odometry, the prior of new tiles, and readings, those from ``new`` on scaled."""
@@ -252,18 +252,22 @@ class OpenSection:
                 graph.add(factor)
         return graph
 
-    def _weighed(self, tile: ExploredTile, rows: IntArray, new: int, scale: float) -> TileReadings:
+    def _weighed(
+        self, tile: RememberedTile, rows: IntArray, new: int, scale: float
+    ) -> TileReadings:
         """Return the readings of a tile with their weights, by what it says of them by now."""
         sensors, readings = self._drive.sensors, self._drive.readings
-        laid = LaidTile(tile.number, tile.anchor, rows, tile.field, self._place(rows, tile.anchor))
+        laid = OccupiedTile(
+            tile.number, tile.anchor, rows, tile.field, self._place(rows, tile.anchor)
+        )
         recent = readings.key_pose[rows] >= new
         if not self._values.atVector(M(tile.number)).any():
             likely = laid.likely_weights(sensors, scale * sensors.noise)
             self._values.update(M(tile.number), likely)
-        sight = laid.sight(self._values.atVector(M(tile.number)), sensors)
+        prediction = laid.prediction(self._values.atVector(M(tile.number)), sensors)
         noise = sensors.noise[readings.sensor[rows]] * np.where(recent, scale, 1.0)
         mu = np.where(recent, SOFT, np.inf)
-        return TileReadings.weighed(laid, sight, noise, mu, self._options.robust)
+        return TileReadings.weighed(laid, prediction, noise, mu, self._options.robust)
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, most: int) -> None:
         """Solve for all variables of the section, in so many steps at most."""
@@ -273,7 +277,7 @@ class OpenSection:
                 self._prior.add(factor)
         graph.push_back(self._prior)
         self._graph = graph
-        found = descended(graph, self._values, least_fill(graph), most, CLOSE)
+        found = descended(graph, self._values, colamd_ordering(graph), most, CLOSE)
         self._values = found.values
 
     def _kept(self) -> list[int]:

@@ -7,8 +7,8 @@ import numpy as np
 
 from l2m_factors import (
     Calibrations,
-    CarriedReadings,
     FieldDoubt,
+    KeyPoseReadings,
     M,
     TileBatch,
     doubt_factor,
@@ -16,8 +16,8 @@ from l2m_factors import (
 )
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.map_prediction import Place, Sight, look, place
-from l2m_gtsam.slam.relative_motion import Ways
+from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings, predict
+from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solution import NOTHING
 from l2m_gtsam.slam.unknown_field.tiles import (
     AXES,
@@ -30,7 +30,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
 
 
 @dataclass(frozen=True)
-class LaidTile:
+class OccupiedTile:
     """A tile and the readings in it.
 
     Attributes
@@ -41,7 +41,7 @@ class LaidTile:
         Readings of the drive that lie in it, shape (n,).
     field
         What its weights mean.
-    place
+    placed
         Where the readings are in the anchor's frame.
     """
 
@@ -49,25 +49,25 @@ class LaidTile:
     anchor: int
     rows: IntArray
     field: WaveTile
-    place: Place
+    placed: PlacedReadings
 
     def likely_weights(self, sensors: KnownSensors, noise: FloatArray) -> FloatArray:
         """Return the weights that the readings make most likely where they are taken to be."""
-        own = noise[self.place.readings.sensor, None] ** 2
-        variance = own + self.field.unresolved(self.place.x)
-        b = self.place.field(sensors)
-        return self.field.likely_weights(self.place.x, b, variance)
+        own = noise[self.placed.readings.sensor, None] ** 2
+        variance = own + self.field.unresolved(self.placed.x)
+        b = self.placed.field(sensors)
+        return self.field.likely_weights(self.placed.x, b, variance)
 
     def doubt(self, rows: IntArray, noise: FloatArray) -> FieldDoubt:
         """Return what these of the tile's readings, which teach it, count for; see there."""
         own = np.searchsorted(self.rows, rows)
-        x = self.place.x[own]
-        variance = noise[self.place.readings.sensor[own], None] ** 2 + self.field.unresolved(x)
+        x = self.placed.x[own]
+        variance = noise[self.placed.readings.sensor[own], None] ** 2 + self.field.unresolved(x)
         return self.field.doubt(x, variance)
 
-    def sight(self, weights: FloatArray, sensors: KnownSensors) -> Sight:
+    def prediction(self, weights: FloatArray, sensors: KnownSensors) -> MapPrediction:
         """Return what the tile says of its readings, in the anchor's frame."""
-        return look(_TileMap(self.field, weights), self.place, sensors)
+        return predict(_TileMap(self.field, weights), self.placed, sensors)
 
 
 class _TileMap:
@@ -98,32 +98,38 @@ class TiledDrive:
     """
 
     anchoring: Anchoring
-    tiles: tuple[LaidTile, ...]
+    tiles: tuple[OccupiedTile, ...]
 
     @classmethod
     def lay(
-        cls, ways: Ways, poses: list[gtsam.Pose3], sensors: KnownSensors, prior: FieldPrior
+        cls,
+        motions: RelativeMotions,
+        poses: list[gtsam.Pose3],
+        sensors: KnownSensors,
+        prior: FieldPrior,
     ) -> "TiledDrive":
         """Lay a drive out on tiles, with ways, key poses and sensors taken for these."""
         R = np.stack([pose.rotation().matrix() for pose in poses])
         p = np.stack([pose.translation() for pose in poses])
         anchoring = anchored(R, p, prior.options.core)
         axes = level_axes(R)
-        owner = anchoring.tile[ways.readings.key_pose]
+        owner = anchoring.tile[motions.readings.key_pose]
         tiles = []
         for number, anchor in enumerate(anchoring.anchor.tolist()):
             rows = np.flatnonzero(owner == number)
             if len(rows):
-                where = _relative_place(ways.readings[rows], poses, anchor, sensors)
+                where = _relative_place(motions.readings[rows], poses, anchor, sensors)
                 field = WaveTile.about(prior, R[anchor].T @ axes[anchor], where.x)
-                tiles.append(LaidTile(number, anchor, rows, field, where))
+                tiles.append(OccupiedTile(number, anchor, rows, field, where))
         return cls(anchoring, tuple(tiles))
 
-    def moved(self, ways: Ways, poses: list[gtsam.Pose3], sensors: KnownSensors) -> "TiledDrive":
+    def moved(
+        self, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors
+    ) -> "TiledDrive":
         """Return the same tiles with their readings where these poses and sensors put them."""
-        own = ways.readings
+        own = motions.readings
         tiles = (
-            replace(tile, place=_relative_place(own[tile.rows], poses, tile.anchor, sensors))
+            replace(tile, placed=_relative_place(own[tile.rows], poses, tile.anchor, sensors))
             for tile in self.tiles
         )
         return TiledDrive(self.anchoring, tuple(tiles))
@@ -135,9 +141,9 @@ class TiledDrive:
             values.insert(M(tile.number), tile.likely_weights(sensors, noise))
         return values
 
-    def sights(self, values: gtsam.Values, sensors: KnownSensors) -> list[Sight]:
+    def predictions(self, values: gtsam.Values, sensors: KnownSensors) -> list[MapPrediction]:
         """Return what each tile says of its readings."""
-        return [tile.sight(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
+        return [tile.prediction(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
 
     def doubts(
         self, noise: FloatArray, weights: FloatArray, squared: FloatArray
@@ -163,7 +169,7 @@ class TiledDrive:
 
     def graph(
         self,
-        ways: Ways,
+        motions: RelativeMotions,
         doubts: tuple[FieldDoubt, ...],
         whitening: FloatArray,
         by_lidar: FloatArray,
@@ -193,12 +199,12 @@ class TiledDrive:
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
             graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
             if len(rows):
-                readings = ways.readings[rows]
+                readings = motions.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
                 for k in batch.key_poses:
                     own = rows[batch.rows_of(k)]
-                    white = ways.whitening(own, whitening[own], by_lidar[own])
-                    graph.add(tile_factor(batch, k, white, ways.step_error(own, by_lidar[own])))
+                    white = motions.whitening(own, whitening[own], by_lidar[own])
+                    graph.add(tile_factor(batch, k, white, motions.step_error(own, by_lidar[own])))
                     factor = doubt_factor(batch, k, doubt[batch.rows_of(k)])
                     if factor is not None:
                         graph.add(factor)
@@ -206,8 +212,8 @@ class TiledDrive:
 
 
 def _relative_place(
-    readings: CarriedReadings, poses: list[gtsam.Pose3], anchor: int, sensors: KnownSensors
-) -> Place:
+    readings: KeyPoseReadings, poses: list[gtsam.Pose3], anchor: int, sensors: KnownSensors
+) -> PlacedReadings:
     origin = poses[anchor]
     own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
-    return place(readings, own, sensors)
+    return place_readings(readings, own, sensors)

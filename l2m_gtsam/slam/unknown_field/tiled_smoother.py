@@ -20,7 +20,7 @@ from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors
-from l2m_gtsam.slam.map_prediction import Sight, place, poses_in, sensors_in
+from l2m_gtsam.slam.map_prediction import MapPrediction, place_readings, poses_in, sensors_in
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
@@ -30,8 +30,8 @@ from l2m_gtsam.slam.pose_graph import (
     odometry_graph,
     scale_values,
 )
-from l2m_gtsam.slam.relative_motion import Ways
-from l2m_gtsam.slam.solution import NOTHING, Localised
+from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.solution import NOTHING, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
     descended,
@@ -52,7 +52,7 @@ AWAY_M = 5.0  # of way after which a tile that is entered again closes a loop
 
 
 @dataclass(frozen=True)
-class Mapped:
+class FieldSolution:
     """A drive and the field along it.
 
     Attributes
@@ -65,7 +65,7 @@ class Mapped:
         Key poses in tiles that had been left before.
     """
 
-    solution: Localised
+    solution: DriveSolution
     tiles: int
     returns: IntArray
 
@@ -76,7 +76,7 @@ def map_drive(
     prior: FieldPrior,
     options: SlamOptions,
     progress: Progress,
-) -> Mapped:
+) -> FieldSolution:
     """Find the poses of a drive and the field along it.
 
     Parameters
@@ -92,7 +92,7 @@ def map_drive(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    poses, sensors = grown(drive, begin, prior, options, progress), drive.sensors
+    poses, sensors = incremental_poses(drive, begin, prior, options, progress), drive.sensors
     problem = TiledProblem(drive, prior, options)
     for stage, (scale, mu) in enumerate(STAGES[:-1]):
         progress("solving poses and field", stage / len(STAGES))
@@ -104,7 +104,7 @@ def map_drive(
     return found
 
 
-def grown(
+def incremental_poses(
     drive: Drive,
     begin: list[gtsam.Pose3],
     prior: FieldPrior,
@@ -128,7 +128,7 @@ def grown(
 
 
 @dataclass(frozen=True)
-class Solved:
+class TiledRound:
     """A stage: tiles as they were laid, the graph and where it led."""
 
     tiled: TiledDrive
@@ -160,7 +160,7 @@ class TiledProblem:
 
     def solved(
         self, poses: list[gtsam.Pose3], sensors: KnownSensors, scale: float, mu: float
-    ) -> Solved:
+    ) -> TiledRound:
         """Lay tiles at these poses and solve for poses and weights.
 
         Parameters
@@ -172,25 +172,25 @@ class TiledProblem:
         mu
             Stage of the graduation of the readings' weights.
         """
-        ways = Ways.along(self._drive, poses)
-        tiled = TiledDrive.lay(ways, poses, sensors, self._prior)
+        motions = RelativeMotions.along(self._drive, poses)
+        tiled = TiledDrive.lay(motions, poses, sensors, self._prior)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
         values.insert(scale_values(self._drive))
         for k, pose in enumerate(poses):
             values.insert(X(k), pose)
-        sights = tiled.sights(values, sensors)
-        whitenings = [sight.whitening(noise) for sight in sights]
+        predictions = tiled.predictions(values, sensors)
+        whitenings = [prediction.whitening(noise) for prediction in predictions]
         W = self._gathered(tiled, whitenings)
-        r2 = self._squared(tiled, ways, sights, noise)
+        r2 = self._squared(tiled, motions, predictions, noise)
         robust = self._options.robust
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
-        doubts = tiled.doubts(noise, weights, self._own_squared(tiled, sights, whitenings))
+        doubts = tiled.doubts(noise, weights, self._own_squared(tiled, predictions, whitenings))
         chosen = np.flatnonzero(weights > NOTHING)
         fixed = None if self._free else self._drive.sensors.fixed()
         W = W * np.sqrt(weights)[:, None, None]
-        by_lidar = self._gathered(tiled, [sight.by_lidar for sight in sights])
-        graph = tiled.graph(ways, doubts, W, by_lidar, chosen, fixed)
+        by_lidar = self._gathered(tiled, [prediction.by_lidar for prediction in predictions])
+        graph = tiled.graph(motions, doubts, W, by_lidar, chosen, fixed)
         graph.push_back(self._odometry)
         graph.push_back(self._links)
         if self._free:
@@ -200,17 +200,17 @@ class TiledProblem:
         end = descended(graph, values, order, self._options.max_iterations)
         found = list(poses_in(end.values, len(poses)).values())
         after = sensors_in(end.values, sensors)
-        return Solved(tiled, graph, weights, end.values, found, after, end.ending)
+        return TiledRound(tiled, graph, weights, end.values, found, after, end.ending)
 
-    def finished(self, solved: Solved) -> Mapped:
+    def finished(self, solved: TiledRound) -> FieldSolution:
         """Return a solved stage with its covariances and residuals."""
         drive, sensors = self._drive, solved.sensors
         order = weights_first(solved.graph, solved.values)
         marginals = Marginals(solved.graph.linearize(solved.values), order)
-        ways = Ways.along(drive, solved.poses)
-        tiled = solved.tiled.moved(ways, solved.poses, sensors)
-        sights = tiled.sights(solved.values, sensors)
-        solution = Localised(
+        motions = RelativeMotions.along(drive, solved.poses)
+        tiled = solved.tiled.moved(motions, solved.poses, sensors)
+        predictions = tiled.predictions(solved.values, sensors)
+        solution = DriveSolution(
             drive=replace(drive, sensors=sensors),
             poses=solved.poses,
             pose_covariance=pose_covariances_together(marginals, len(drive)),
@@ -219,9 +219,11 @@ class TiledProblem:
                 if self._free
                 else sensors.covariance
             ),
-            sight=self._sight(solved, ways, tiled, sights),
-            way_share=self._gathered(tiled, way_shares(tiled, ways, sights)),
-            squared=self._squared(tiled, ways, sights, sensors.noise),
+            prediction=self._prediction(solved, motions, tiled, predictions),
+            interpolation_covariance=self._gathered(
+                tiled, interpolation_covariances(tiled, motions, predictions)
+            ),
+            squared=self._squared(tiled, motions, predictions, sensors.noise),
             weights=solved.weights,
             near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
@@ -231,7 +233,7 @@ class TiledProblem:
         )
         way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
         returns = tiled.anchoring.returns(way, AWAY_M)
-        return Mapped(solution, len(tiled.tiles), returns)
+        return FieldSolution(solution, len(tiled.tiles), returns)
 
     def _gathered(self, tiled: TiledDrive, parts: list[FloatArray]) -> FloatArray:
         """Return what tiles say of their readings in the order of the drive's."""
@@ -241,32 +243,49 @@ class TiledProblem:
         return whole
 
     def _squared(
-        self, tiled: TiledDrive, ways: Ways, sights: list[Sight], noise: FloatArray
+        self,
+        tiled: TiledDrive,
+        motions: RelativeMotions,
+        predictions: list[MapPrediction],
+        noise: FloatArray,
     ) -> FloatArray:
         """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
-        pairs = zip(sights, way_shares(tiled, ways, sights), strict=True)
-        parts = [sight.squared(sight.whitening(noise, more=share)) for sight, share in pairs]
+        pairs = zip(
+            predictions, interpolation_covariances(tiled, motions, predictions), strict=True
+        )
+        parts = [
+            prediction.squared(prediction.whitening(noise, more=share))
+            for prediction, share in pairs
+        ]
         return self._gathered(tiled, parts)
 
     def _own_squared(
-        self, tiled: TiledDrive, sights: list[Sight], whitenings: list[FloatArray]
+        self, tiled: TiledDrive, predictions: list[MapPrediction], whitenings: list[FloatArray]
     ) -> FloatArray:
         """Return squared lengths of residuals as these make them white, without the ways, (N,)."""
-        pairs = zip(sights, whitenings, strict=True)
-        return self._gathered(tiled, [sight.squared(white) for sight, white in pairs])
+        pairs = zip(predictions, whitenings, strict=True)
+        return self._gathered(tiled, [prediction.squared(white) for prediction, white in pairs])
 
-    def _sight(self, solved: Solved, ways: Ways, tiled: TiledDrive, sights: list[Sight]) -> Sight:
+    def _prediction(
+        self,
+        solved: TiledRound,
+        motions: RelativeMotions,
+        tiled: TiledDrive,
+        predictions: list[MapPrediction],
+    ) -> MapPrediction:
         """Return what the tiles say, with places and axes of the map."""
-        where = place(ways.readings, dict(enumerate(solved.poses)), solved.sensors)
+        where = place_readings(motions.readings, dict(enumerate(solved.poses)), solved.sensors)
         anchors = [solved.poses[tile.anchor].rotation().matrix() for tile in tiled.tiles]
-        pairs = zip(sights, anchors, strict=True)
+        pairs = zip(predictions, anchors, strict=True)
         variance = self._gathered(tiled, [each.map_variance @ (R**2).T for each, R in pairs])
-        residual = self._gathered(tiled, [sight.residual for sight in sights])
-        by_lidar = self._gathered(tiled, [sight.by_lidar for sight in sights])
-        return Sight(where, np.ones(len(residual), bool), variance, residual, by_lidar)
+        residual = self._gathered(tiled, [prediction.residual for prediction in predictions])
+        by_lidar = self._gathered(tiled, [prediction.by_lidar for prediction in predictions])
+        return MapPrediction(where, np.ones(len(residual), bool), variance, residual, by_lidar)
 
 
-def way_shares(tiled: TiledDrive, ways: Ways, sights: list[Sight]) -> list[FloatArray]:
+def interpolation_covariances(
+    tiled: TiledDrive, motions: RelativeMotions, predictions: list[MapPrediction]
+) -> list[FloatArray]:
     """Return of each tile what errors of the ways contribute to its residuals, (n, 3, 3)."""
-    pairs = zip(tiled.tiles, sights, strict=True)
-    return [ways.share(tile.rows, sight.by_lidar) for tile, sight in pairs]
+    pairs = zip(tiled.tiles, predictions, strict=True)
+    return [motions.share(tile.rows, prediction.by_lidar) for tile, prediction in pairs]

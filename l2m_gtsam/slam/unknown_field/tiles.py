@@ -21,7 +21,7 @@ from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_a
 from l2m_gtsam.maps.harmonic.uniform import UniformField
 from l2m_gtsam.maps.training import merged, training_set
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.map_prediction import place
+from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.options import TileOptions
 
 
@@ -82,7 +82,7 @@ def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) ->
     way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
     early = np.flatnonzero(way[drive.readings.key_pose] <= options.learn_over_m)
     readings = drive.readings[early]
-    where = place(
+    where = place_readings(
         readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
     )
     return field_prior(where.x, where.field(drive.sensors), options)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import LidarMap, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.geometry import between, difference, perturbed
-from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loops
+from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loop_closures
 from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, follow
 from l2m_gtsam.lidar.registration import PoseEstimate, Refusal, unseen_covariance
 from l2m_gtsam.lidar.scan_localisation import (
@@ -161,7 +161,7 @@ def test_another_building_is_told(cloud: Surface) -> None:
 
 
 def test_loops_are_closed(steps: list[ScanStep]) -> None:
-    found = find_loops(steps, LoopOptions(least_way_m=8.0))
+    found = find_loop_closures(steps, LoopOptions(least_way_m=8.0))
     assert len(found.loops) >= 1
     row = {int(stamp): k for k, stamp in enumerate(DRIVE.stamp_ns)}
     for loop in found.loops:
@@ -177,7 +177,9 @@ def test_wrong_loops_are_refused(steps: list[ScanStep]) -> None:
     odd = follow(scans(OTHER, DRIVE, np.random.default_rng(3)), OdometryOptions())
     later = 60_000_000_000
     moved = [replace(each, stamp_ns=each.stamp_ns + later) for each in odd]
-    found = find_loops(chain(steps[:20], moved[:8]), LoopOptions(least_way_m=4.0, search_m=4.0))
+    found = find_loop_closures(
+        chain(steps[:20], moved[:8]), LoopOptions(least_way_m=4.0, search_m=4.0)
+    )
     wrong = [each for each in found.loops if each.to_ns - each.from_ns > later / 2]
     assert wrong == []
     assert found.refused[Refusal.ELSEWHERE] >= 2

@@ -15,7 +15,7 @@ from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.pose_graph import write_g2o
 from l2m_gtsam.slam.record import odometry_covariance
 from l2m_gtsam.slam.smoother import localise_drive
-from l2m_gtsam.slam.solution import Localised
+from l2m_gtsam.slam.solution import DriveSolution
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds
 from tests.integration.slam.test_slam import quiet
@@ -50,7 +50,7 @@ def scaled(seed: int) -> Scaled:
 
 
 @cache
-def localised(seed: int) -> Localised:
+def localised(seed: int) -> DriveSolution:
     options = SlamOptions(drift=DRIFT)
     return localise_drive(scaled(seed).drawn.drive, dipole_world(seed), options, quiet)
 
@@ -61,7 +61,7 @@ def off(drawn: DrawnDrive, poses: list[gtsam.Pose3]) -> FloatArray:
     return np.stack([gtsam.Pose3.Logmap(a.between(b)) for a, b in zip(poses, truth, strict=True)])
 
 
-def nees(drawn: DrawnDrive, solution: Localised) -> float:
+def nees(drawn: DrawnDrive, solution: DriveSolution) -> float:
     error = off(drawn, solution.poses)
     white = np.linalg.solve(solution.pose_covariance, error[:, :, None])[:, :, 0]
     return float(np.einsum("ni,ni->n", error, white).mean())
@@ -111,7 +111,7 @@ def test_for_who_does_not_ask_the_scale_is_a_walk() -> None:
     """It comes to the same after the way that was said, and adds nothing across steps."""
     steps = scaled(0).drawn.drive.steps
     way = float(np.linalg.norm(steps.p, axis=1).sum())
-    walked = steps.with_scale_as_walk(way)
+    walked = steps.with_scale_as_drift(way)
     assert walked.scale == 0
     more = (walked.covariance - steps.covariance)[:, 3:, 3:]
     assert np.trace(more, axis1=1, axis2=2).sum() == pytest.approx((SIGMA * way) ** 2)
@@ -125,8 +125,8 @@ def test_a_scale_is_no_slip() -> None:
     drive = scaled(0).drawn.drive
     poses = [gtsam.Pose3()]
     for k in range(len(drive.steps)):
-        poses.append(poses[-1].compose(drive.step(k, longer=0.33)))
-    assert not list(slips(drive, poses, longer=0.33))
+        poses.append(poses[-1].compose(drive.step(k, scale_error=0.33)))
+    assert not list(slips(drive, poses, scale_error=0.33))
     assert list(slips(drive, poses))
 
 
@@ -136,5 +136,5 @@ def test_edges_are_as_long_as_ways_came_out(tmp_path: Path) -> None:
     lines = (tmp_path / "graph.g2o").read_text().splitlines()
     edges = np.array([line.split()[3:6] for line in lines if line.startswith("EDGE")], float)
     # Six digits of some 0.1 m.
-    expected = (1 + solution.longer) * solution.drive.steps.p
+    expected = (1 + solution.scale_error) * solution.drive.steps.p
     np.testing.assert_allclose(edges, expected, atol=1e-6)

@@ -265,7 +265,7 @@ def test_a_door_that_opens_is_told_and_does_not_pull(three: tuple[KnownSensor, .
     # Nearly all that was left out is of the last lap, and near.
     solution = done.solution
     lost = ~solution.used
-    away = np.linalg.norm(solution.sight.place.x[lost] - beside, axis=1)
+    away = np.linalg.norm(solution.prediction.placed.x[lost] - beside, axis=1)
     assert np.quantile(away, 0.9) < 4.0
     late = solution.drive.stamp_ns[solution.drive.readings.key_pose[lost]]
     assert np.mean(late - truth.stamp_ns[0] > 20e9) > 0.95

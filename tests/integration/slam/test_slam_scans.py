@@ -7,16 +7,16 @@ import pytest
 
 from l2m_gtsam.data import KnownSensor, RigidTransform, Trajectory
 from l2m_gtsam.geometry import compose
-from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loops
+from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loop_closures
 from l2m_gtsam.lidar.registration import PoseEstimate, RegistrationOptions
 from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.surface import Surface, smoothed
-from l2m_gtsam.recording.odometry_jumps import Mended, without_jumps
+from l2m_gtsam.recording.odometry_jumps import RepairedOdometry, without_jumps
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
-from l2m_gtsam.slam.odometry import carried_scans
+from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.options import SlamOptions, TileOptions
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.drives.slam import SlamDrive, calibrated, laps, rounds, slam_drive
@@ -33,7 +33,7 @@ REGISTRATION = RegistrationOptions(unseen_m=100.0, unseen_deg=100.0)
 EVERY = 15  # poses: a scan each 0.75 s
 
 
-def mended(drive: SlamDrive) -> Mended:
+def mended(drive: SlamDrive) -> RepairedOdometry:
     """Return a drive's odometry, which does not jump."""
     return without_jumps(drive.recording.trajectory, OPTIONS.jumps)
 
@@ -54,7 +54,7 @@ def fixes(room: Room, drive: SlamDrive, seed: int = 5) -> ScanEvidence:
         for k, scan in enumerate(scans(room, mapping, rng))
     ]
     cloud = Surface(smoothed(thinned_cloud(np.concatenate(points), 0.1)))
-    steps = carried_scans(scans(room, seen, rng), mended(drive), 0.25, OPTIONS)
+    steps = scan_odometry(scans(room, seen, rng), mended(drive), 0.25, OPTIONS)
     options = ScanLocalisationOptions(registration=REGISTRATION)
     start = PoseEstimate(RigidTransform(seen.R[0], seen.p[0]), 1e-2 * np.eye(6))
     found = localise_scans(steps, cloud, start, options)
@@ -129,8 +129,8 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     known, drive = drive_of(23, laps(75), sensors=2)
     rng, truth = np.random.default_rng(6), drive.truth
     seen = rows(truth, range(1, len(truth), EVERY))
-    steps = carried_scans(scans(ROOM, seen, rng), mended(drive), 0.25, OPTIONS)
-    loops = ScanEvidence(loops=find_loops(steps, LoopOptions()).loops)
+    steps = scan_odometry(scans(ROOM, seen, rng), mended(drive), 0.25, OPTIONS)
+    loops = ScanEvidence(loops=find_loop_closures(steps, LoopOptions()).loops)
     assert len(loops) > 10
     # Tiles that are a little larger than by default: fewer, in less than half the time.
     options = OPTIONS.model_copy(update={"tiles": TileOptions(core=4.0)})
@@ -148,5 +148,5 @@ def test_a_corridor_closes_no_loop() -> None:
     _, drive = drive_of(24, rounds(40))
     seen = rows(drive.truth, range(1, len(drive.truth), EVERY))
     found = scans(CORRIDOR, replace(seen, p=seen.p * [1.0, 0.3, 1.0]), np.random.default_rng(7))
-    steps = carried_scans(found, mended(drive), 0.25, OPTIONS)
-    assert find_loops(steps, LoopOptions()).loops == ()
+    steps = scan_odometry(found, mended(drive), 0.25, OPTIONS)
+    assert find_loop_closures(steps, LoopOptions()).loops == ()

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, difference, moved
-from l2m_gtsam.recording.odometry_jumps import JumpOptions, Mended, without_jumps
+from l2m_gtsam.recording.odometry_jumps import JumpOptions, RepairedOdometry, without_jumps
 from l2m_gtsam.slam.odometry import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 from tests.drives.faults import jumped, shift
@@ -25,7 +25,7 @@ def pose(trajectory: Trajectory, k: int) -> RigidTransform:
     return RigidTransform(trajectory.R[k], trajectory.p[k])
 
 
-def step_nees(true: Trajectory, mended: Mended) -> float:
+def step_nees(true: Trajectory, mended: RepairedOdometry) -> float:
     """Return the squared errors of the motions put in place of jumps, in sigmas of the graph's."""
     total, least = 0.0, drift_covariance(np.eye(3)[None], np.zeros((1, 3)), DriftOptions())[0]
     for each in mended.jumps:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_gtsam.slam.disturbances import Fit, changed
-from l2m_gtsam.slam.misfit import HalfTurned
+from l2m_gtsam.slam.misfit import DecoyMap
 from tests.worlds.exact import dipole_world
 
 KEY_POSES, SENSORS, READINGS = 200, 3, 3
@@ -64,7 +64,7 @@ def test_a_map_that_is_half_turned_has_the_field_of_the_other_side(seed: int) ->
     """And its gradient is that of its field."""
     world, rng = dipole_world(seed), np.random.default_rng(seed)
     middle = np.array([0.5, -0.3, 0.4])
-    turned, x = HalfTurned(world, middle), rng.uniform([-3, -3, 0.3], [3, 3, 0.7], (20, 3))
+    turned, x = DecoyMap(world, middle), rng.uniform([-3, -3, 0.3], [3, 3, 0.7], (20, 3))
     other = x * [-1, -1, 1] + [2 * 0.5, -2 * 0.3, 0]
     np.testing.assert_allclose(turned.query(x).field, world.query(other).field, atol=1e-12)
     h, (_, gradient) = 1e-5, turned.field_and_gradient(x)

@@ -13,7 +13,7 @@ from l2m_gtsam.data import FieldSample, FloatArray, Trajectory
 from l2m_gtsam.slam.drive import MAP, Drive, Links
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.follower import Follower
-from l2m_gtsam.slam.online.measurements import CELL_M, RememberedVariance
+from l2m_gtsam.slam.online.measurements import CELL_M, CachedVariance
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import calibration_values, odometry_graph
 from l2m_gtsam.slam.smoother import Problem
@@ -89,8 +89,8 @@ def solved_at_once(drive: Drive) -> Belief:
     for k, pose in enumerate(drive.dead_reckoning()):
         values.insert(X(k), pose)
     for _ in range(2):  # readings hang on their ways as these came out the first time
-        seen = problem.look(values)
-        graph = problem.graph(seen, all_of_them, seen.sight.map_variance, None)
+        seen = problem.predict(values)
+        graph = problem.graph(seen, all_of_them, seen.prediction.map_variance, None)
         values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     last = len(drive) - 1
     order = [key for i in range(len(drive.sensors.names)) for key in (T(i), D(i))]
@@ -183,7 +183,7 @@ def test_a_belief_is_carried_as_gtsam_carries_it() -> None:
     step, covariance = drive.step(0), drive.steps.covariance[0]
     pose = gtsam.Pose3(gtsam.Rot3(start.T_map_lidar.R), start.T_map_lidar.t)
     behind = Belief(pose, drive.sensors, start.covariance)
-    ahead = behind.departed(step, covariance).arrived()
+    ahead = behind.predicted(step, covariance).marginalize_previous()
     graph, values = odometry_graph(drive), gtsam.Values()
     for k, each in enumerate(drive.dead_reckoning()):
         values.insert(X(k), each)
@@ -193,7 +193,7 @@ def test_a_belief_is_carried_as_gtsam_carries_it() -> None:
 
 def test_variance_is_remembered_by_place() -> None:
     field_map = HalfMap()
-    known = RememberedVariance(field_map)
+    known = CachedVariance(field_map)
     points = np.array([[1.0, 0.0, 0.5], [1.02, 0.02, 0.52], [2.0, 1.0, 0.5], [-1.0, 0.0, 0.5]])
     told = known.at(points)
     assert field_map.asked == 3

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_factors import CarriedReadings
+from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, compose, difference, perturbed
 from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, spaced
 from l2m_gtsam.recording.sync import interpolated
-from l2m_gtsam.records.scans import Loop, PoseFix, ScanEvidence
-from l2m_gtsam.slam.drive import MAP, Drive, KnownSensors, StartPose, link_stamps, linked
+from l2m_gtsam.records.scans import LoopClosure, PoseFix, ScanEvidence
+from l2m_gtsam.slam.drive import MAP, Drive, KnownSensors, StartPose, key_pose_links, link_stamps
 from l2m_gtsam.slam.odometry import drift_covariance, key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
@@ -36,9 +36,9 @@ def a_fix(truth: Trajectory, stamp: int, rng: np.random.Generator) -> PoseFix:
     return PoseFix(stamp, noisy(pose(truth, stamp), rng), np.diag(SIGMA**2))
 
 
-def a_loop(truth: Trajectory, start: int, end: int, rng: np.random.Generator) -> Loop:
+def a_loop(truth: Trajectory, start: int, end: int, rng: np.random.Generator) -> LoopClosure:
     T = between(pose(truth, start), pose(truth, end))
-    return Loop(start, end, noisy(T, rng), np.diag(SIGMA**2))
+    return LoopClosure(start, end, noisy(T, rng), np.diag(SIGMA**2))
 
 
 def scanned(truth: Trajectory, odometry: Trajectory, seen: ScanEvidence) -> tuple[Drive, IntArray]:
@@ -47,11 +47,11 @@ def scanned(truth: Trajectory, odometry: Trajectory, seen: ScanEvidence) -> tupl
     rows = with_rows_at(rows, odometry, link_stamps(seen))
     no = np.empty(0, dtype=np.int64)
     none, rows_of_3 = np.empty(0), np.empty((0, 3))
-    empty = CarriedReadings(no, no, np.empty((0, 3, 3)), rows_of_3, none, rows_of_3)
+    empty = KeyPoseReadings(no, no, np.empty((0, 3, 3)), rows_of_3, none, rows_of_3)
     sensors = KnownSensors((), np.empty((0, 3)), np.empty((0, 12)), none, none, np.empty((0, 15)))
     begin = StartPose(RigidTransform(truth.R[0], truth.p[0]), 1e-6 * np.eye(6))
     steps = odometry_steps(odometry, rows, DriftOptions())
-    links = linked(seen, odometry, rows, DriftOptions())
+    links = key_pose_links(seen, odometry, rows, DriftOptions())
     return Drive(odometry.stamp_ns[rows], steps, empty, begin, sensors, links), rows
 
 
@@ -69,8 +69,8 @@ def test_links_say_of_key_poses_what_scans_say_of_theirs(seed: int) -> None:
     stamps = rng.integers(truth.stamp_ns[0], truth.stamp_ns[-1], 3)
     first, second = sorted(stamps[:2].tolist())
     fix = PoseFix(int(stamps[2]), pose(truth, int(stamps[2])), np.eye(6))
-    loop = Loop(first, second, between(pose(truth, first), pose(truth, second)), np.eye(6))
-    links = linked(ScanEvidence((fix,), (loop,)), truth, rows, DriftOptions())
+    loop = LoopClosure(first, second, between(pose(truth, first), pose(truth, second)), np.eye(6))
+    links = key_pose_links(ScanEvidence((fix,), (loop,)), truth, rows, DriftOptions())
     for origin, k, R, p in zip(links.origin, links.key_pose, links.R, links.p, strict=True):
         here = RigidTransform(truth.R[rows[k]], truth.p[rows[k]])
         there = RigidTransform(truth.R[rows[origin]], truth.p[rows[origin]])
@@ -86,8 +86,8 @@ def test_covariances_go_with_the_errors_that_they_are_of() -> None:
     rows = key_pose_rows(truth, KeyPoseOptions(distance_m=1.5))
     first, second = (int(truth.stamp_ns[row] + 7_000_000) for row in (40, 340))
     T = between(pose(truth, first), pose(truth, second))
-    link = linked(
-        ScanEvidence(loops=(Loop(first, second, T, np.diag(SIGMA**2)),)), truth, rows, drift
+    link = key_pose_links(
+        ScanEvidence(loops=(LoopClosure(first, second, T, np.diag(SIGMA**2)),)), truth, rows, drift
     )
     exact = RigidTransform(link.R[0], link.p[0])
     origin, key = (

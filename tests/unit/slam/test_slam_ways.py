@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import CarriedReadings, CarriedResiduals, Whitening, X, carried_residuals
+from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, X, key_pose_residuals
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.online.follower import Follower
@@ -40,9 +40,9 @@ def drive(every: int, seconds: float = 4.0) -> DrawnDrive:
     return drawn_drive(WORLD, random_sensors(3, 4), truth, rng, EXACT, NOISE, every, WALKING)
 
 
-def hung(R: FloatArray, p: FloatArray, fraction: FloatArray) -> CarriedReadings:
+def hung(R: FloatArray, p: FloatArray, fraction: FloatArray) -> KeyPoseReadings:
     n = len(p)
-    return CarriedReadings(np.zeros(n, np.int64), np.zeros(n, np.int64), R, p, fraction, p)
+    return KeyPoseReadings(np.zeros(n, np.int64), np.zeros(n, np.int64), R, p, fraction, p)
 
 
 @given(st.integers(0, 10_000))
@@ -69,7 +69,7 @@ class Walks:
     R: FloatArray
     p: FloatArray
 
-    def readings(self, instant: IntArray, sensor: IntArray) -> CarriedReadings:
+    def readings(self, instant: IntArray, sensor: IntArray) -> KeyPoseReadings:
         """Return readings at instants, of one walk after the other."""
         R, p, n = (
             self.R[:, instant].reshape(-1, 3, 3),
@@ -77,7 +77,7 @@ class Walks:
             len(self.p),
         )
         s = np.tile(instant / PARTS, n)
-        return CarriedReadings(0 * np.tile(sensor, n), np.tile(sensor, n), R, p, s, 0 * p)
+        return KeyPoseReadings(0 * np.tile(sensor, n), np.tile(sensor, n), R, p, s, 0 * p)
 
 
 def walks(truth: Trajectory, Q: FloatArray, draws: int, rng: np.random.Generator) -> Walks:
@@ -104,9 +104,9 @@ def test_whitened_residuals_of_walks_between_known_key_poses_are_white() -> None
     instant, sensor = np.repeat([4, 8, 13], 2), np.tile([0, 1], 3)
     n, known = len(instant), drive(1).drive.sensors.fixed()
 
-    def residuals(readings: CarriedReadings) -> CarriedResiduals:
+    def residuals(readings: KeyPoseReadings) -> KeyPoseResiduals:
         R, p = (np.repeat(each, len(readings), 0) for each in (truth.R[:1], truth.p[:1]))
-        return carried_residuals(readings, WORLD, R, p, known)
+        return key_pose_residuals(readings, WORLD, R, p, known)
 
     ideal = residuals(true.readings(instant, sensor))
     step = gtsam.Pose3(gtsam.Rot3(true.R[0, -1]), true.p[0, -1])
@@ -171,22 +171,22 @@ def test_what_a_way_contributes_is_what_whitening_knows() -> None:
     values = gtsam.Values()
     for k, pose in enumerate(given_drive.dead_reckoning()):
         values.insert(X(k), pose)
-    seen = problem.look(values)
-    ways, by_lidar = seen.ways, seen.sight.by_lidar
-    rows = np.flatnonzero(ways.readings.key_pose == 2)
-    n, Q, s = len(rows), ways.covariance[2], ways.readings.fraction[rows]
-    F = by_lidar[rows] @ ways.by_step[rows]
+    seen = problem.predict(values)
+    motions, by_lidar = seen.motions, seen.prediction.by_lidar
+    rows = np.flatnonzero(motions.readings.key_pose == 2)
+    n, Q, s = len(rows), motions.covariance[2], motions.readings.fraction[rows]
+    F = by_lidar[rows] @ motions.by_step[rows]
     S = NOISE**2 * np.eye(3 * n)
     for i in range(n):
         for j in range(n):
             common = min(s[i], s[j]) - s[i] * s[j]
             S[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] += common * F[i] @ Q @ F[j].T
     own = np.tile(np.eye(3) / NOISE, (n, 1, 1))
-    white = ways.whitening(rows, own, by_lidar[rows])
+    white = motions.whitening(rows, own, by_lidar[rows])
     half = white(S.reshape(n, 3, 3 * n))
     # Errors of less than a thousandth of the noise's variance are left out.
     np.testing.assert_allclose(white(half.T.reshape(n, 3, 3 * n)), np.eye(3 * n), atol=2e-3)
-    share = ways.share(rows, by_lidar[rows])
+    share = motions.share(rows, by_lidar[rows])
     for i in range(n):
         block = S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] - NOISE**2 * np.eye(3)
         np.testing.assert_allclose(share[i], block, atol=1e-12)

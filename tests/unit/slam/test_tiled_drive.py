@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.slam.options import DriftOptions, TileOptions
-from l2m_gtsam.slam.relative_motion import Ways
+from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from tests.drives.drawn import DrawnDrive, drawn_drive
@@ -42,12 +42,12 @@ def counted(drawn: DrawnDrive, stated: float, spoilt: FloatArray, weights: Float
     """
     drive = drawn.drive
     poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    tiled = TiledDrive.lay(Ways.along(drive, poses), poses, drive.sensors, PRIOR)
+    tiled = TiledDrive.lay(RelativeMotions.along(drive, poses), poses, drive.sensors, PRIOR)
     noise = np.full(len(drive.sensors.names), stated)
-    sights = tiled.sights(tiled.weights(drive.sensors, noise), drive.sensors)
+    predictions = tiled.predictions(tiled.weights(drive.sensors, noise), drive.sensors)
     squared = spoilt.copy()
-    for tile, sight in zip(tiled.tiles, sights, strict=True):
-        squared[tile.rows] += sight.squared(sight.whitening(noise))
+    for tile, prediction in zip(tiled.tiles, predictions, strict=True):
+        squared[tile.rows] += prediction.squared(prediction.whitening(noise))
     of_noise = sum(each.parameters for each in tiled.doubts(noise, weights, squared))
     chosen = np.flatnonzero(weights)
     as_stated = (
@@ -81,12 +81,12 @@ def test_a_tile_without_readings_is_not_laid(drawn: DrawnDrive) -> None:
     """Its readings gone, the others keep their numbers and all of theirs."""
     drive = drawn.drive
     poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    ways = Ways.along(drive, poses)
-    whole = TiledDrive.lay(ways, poses, drive.sensors, PRIOR)
+    motions = RelativeMotions.along(drive, poses)
+    whole = TiledDrive.lay(motions, poses, drive.sensors, PRIOR)
     assert len(whole.tiles) > 1
     gone = whole.tiles[0]
     kept = np.setdiff1d(np.arange(len(drive.readings)), gone.rows)
-    left = replace(ways, readings=ways.readings[kept])
+    left = replace(motions, readings=motions.readings[kept])
     fewer = TiledDrive.lay(left, poses, drive.sensors, PRIOR)
     assert [each.number for each in fewer.tiles] == [each.number for each in whole.tiles[1:]]
     for after, before in zip(fewer.tiles, whole.tiles[1:], strict=True):

@@ -28,7 +28,7 @@ from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_res
 
 
 @dataclass(frozen=True)
-class CarriedReadings:
+class KeyPoseReadings:
     """Readings of one or several magnetometers and how each hangs on a key pose.
 
     Attributes
@@ -61,11 +61,11 @@ class CarriedReadings:
     def __len__(self) -> int:
         return len(self.key_pose)
 
-    def __getitem__(self, rows: npt.NDArray[np.int64]) -> "CarriedReadings":
+    def __getitem__(self, rows: npt.NDArray[np.int64]) -> "KeyPoseReadings":
         motion = self.motion
         if motion is not None:
             motion = PoseMotion(motion.twist_lidar[rows], motion.offset[rows])
-        return CarriedReadings(
+        return KeyPoseReadings(
             self.key_pose[rows],
             self.sensor[rows],
             self.R_key_lidar[rows],
@@ -101,7 +101,7 @@ class CarriedReadings:
 
 
 @dataclass(frozen=True)
-class CarriedResiduals:
+class KeyPoseResiduals:
     """Residuals of N readings on key poses and their derivatives.
 
     Attributes
@@ -141,13 +141,13 @@ class Calibrations:
         return cls(np.zeros((sensors, 3)), np.zeros((sensors, 12)), np.zeros(sensors))
 
 
-def carried_residuals(
-    readings: CarriedReadings,
+def key_pose_residuals(
+    readings: KeyPoseReadings,
     field_map: FieldMap,
     R_map_key: FloatArray,
     p_map_key: FloatArray,
     sensors: Calibrations,
-) -> CarriedResiduals:
+) -> KeyPoseResiduals:
     """Compare readings with what a map predicts from their key poses, in one batched query.
 
     Parameters
@@ -169,4 +169,4 @@ def carried_residuals(
     t_key_mag = np.einsum("nij,nj->ni", R, t) + p
     by_shift = seen.de_dt @ R_lidar_key
     by_turn = C @ skew(seen.b_lidar) @ R_lidar_key - by_shift @ skew(t_key_mag)
-    return CarriedResiduals(seen, np.concatenate([by_turn, by_shift], axis=2))
+    return KeyPoseResiduals(seen, np.concatenate([by_turn, by_shift], axis=2))
