@@ -19,9 +19,9 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.plan import DrivePlan
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
 from l2m_gtsam.storage.calibration_file import write_calibration
-from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
-from l2m_gtsam.storage.metrics_file import write_metrics
+from l2m_gtsam.storage.record_files import write_metrics
 from l2m_gtsam.storage.rerun_file import require_rerun, write_scene
 
 CALIBRATION_FILE = "calibration.yaml"

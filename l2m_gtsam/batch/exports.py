@@ -6,11 +6,11 @@ from pathlib import Path
 
 from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.errors import ConfigError, OutputError
-from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.exports.export import Export, export_of, left_out_notes
 from l2m_gtsam.storage.exports.formats import FORMATS
-from l2m_gtsam.storage.exports.urdf_edit import edited_urdf
+from l2m_gtsam.storage.exports.urdf import edited_urdf
+from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.yaml_file import MAX_BYTES
 
 

@@ -33,11 +33,9 @@ from l2m_gtsam.qa.fleet.options import FleetOptions
 from l2m_gtsam.qa.fleet.outliers import with_outliers
 from l2m_gtsam.qa.fleet.page import fleet_page
 from l2m_gtsam.records.fleet import DriveOutcome, FleetRow
-from l2m_gtsam.storage.atomic import atomic_path
-from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.files import atomic_path, printable, source_file
 from l2m_gtsam.storage.fleet_table import write_csv, write_parquet
-from l2m_gtsam.storage.folder_names import printable
-from l2m_gtsam.storage.outcome_file import read_outcome
+from l2m_gtsam.storage.record_files import read_outcome
 
 COUNTS = {"bag", "calibration", "qa"}  # parts of a configuration that a drive's results depend on
 WORK = Work(map_of, open_map, calibrated_drive, lost_drive)

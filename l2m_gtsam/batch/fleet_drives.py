@@ -7,9 +7,15 @@ from pathlib import Path
 
 from l2m_gtsam.errors import BagError, ConfigError
 from l2m_gtsam.records.fleet import DATE
-from l2m_gtsam.storage.find_bags import FILES, find_bags, is_bag, is_folder
-from l2m_gtsam.storage.folder_names import folder_names
-from l2m_gtsam.storage.manifest import ManifestEntry, read_manifest
+from l2m_gtsam.storage.drive_lists import (
+    FILES,
+    ManifestEntry,
+    find_bags,
+    is_bag,
+    is_folder,
+    read_manifest,
+)
+from l2m_gtsam.storage.files import folder_names
 
 PAGE_FILE, CSV_FILE, PARQUET_FILE = "index.html", "fleet.csv", "fleet.parquet"
 

@@ -22,9 +22,8 @@ from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import L2MError, OutputError
 from l2m_gtsam.qa.fleet.rows import sensor_rows
 from l2m_gtsam.records.fleet import DATE, DriveOutcome, Made, RowKey
-from l2m_gtsam.storage.digest import source_file
-from l2m_gtsam.storage.folder_names import printable
-from l2m_gtsam.storage.outcome_file import write_outcome
+from l2m_gtsam.storage.files import printable, source_file
+from l2m_gtsam.storage.record_files import write_outcome
 
 OUTCOME_FILE = "outcome.json"
 RESULTS = (CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, REPORT_FILE)

@@ -18,7 +18,7 @@ from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.figures import map_figure, save_figure
-from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import save_map
 
 

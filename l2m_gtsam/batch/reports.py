@@ -16,10 +16,10 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.page import STAGE, report_page
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.metrics import Metrics
-from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration
-from l2m_gtsam.storage.metrics_file import read_metrics
+from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.pdf import print_page
+from l2m_gtsam.storage.record_files import read_metrics
 
 REPORT_FILE = "report.html"
 PDF_FILE = "report.pdf"

@@ -20,7 +20,7 @@ from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.localisation import NO_SCANS, start_pose
 from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.options import Usage
-from l2m_gtsam.storage.scan_topic import has_clouds
+from l2m_gtsam.storage.point_cloud2 import has_clouds
 
 # Along what a scan does not show a fix says nothing, nor do some hundreds of them; more than this
 # beside the millimetres of what it shows would drown in rounding.

@@ -23,8 +23,8 @@ from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.storage.bag import has_poses, read_fields
 from l2m_gtsam.storage.clocks import check_clocks
-from l2m_gtsam.storage.digest import source_file
-from l2m_gtsam.storage.scan_topic import ScanTopic, has_clouds
+from l2m_gtsam.storage.files import source_file
+from l2m_gtsam.storage.point_cloud2 import ScanTopic, has_clouds
 
 
 def read_drives_on(

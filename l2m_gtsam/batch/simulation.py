@@ -9,7 +9,7 @@ from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, Beside, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.cloud import write_cloud
 from l2m_gtsam.storage.known_sensors import write_known_sensors
-from l2m_gtsam.storage.tum import write_tum
+from l2m_gtsam.storage.trajectory_files import write_tum
 
 SUITE_FILE, TRUTH_FILE, STRUCTURE_FILE = "suite.yaml", "truth.yaml", "structure.ply"
 GROUND_TRUTH_FILE = "ground_truth.tum"

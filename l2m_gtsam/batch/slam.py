@@ -31,12 +31,15 @@ from l2m_gtsam.slam.localisation import Sources, localise
 from l2m_gtsam.slam.pose_graph import write_g2o
 from l2m_gtsam.slam.record import Told, localisation_record
 from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from l2m_gtsam.storage.digest import source_file
-from l2m_gtsam.storage.slam_file import write_slam
-from l2m_gtsam.storage.trajectory_bag import LocalisedMotion, write_trajectory_bag
-from l2m_gtsam.storage.tum import read_tum, write_tum
+from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.record_files import write_slam
+from l2m_gtsam.storage.trajectory_files import (
+    LocalisedMotion,
+    read_tum,
+    write_trajectory_bag,
+    write_tum,
+)
 
 TRAJECTORY_FILE = "trajectory.tum"
 BAG_FILE = "trajectory.mcap"

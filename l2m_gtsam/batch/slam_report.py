@@ -9,8 +9,8 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.slam_page import slam_page
 from l2m_gtsam.qa.slam.judge import judge_localisation
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.storage.atomic import atomic_path
-from l2m_gtsam.storage.slam_file import read_slam
+from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.record_files import read_slam
 
 SLAM_FILE = "slam.json"
 

@@ -22,9 +22,9 @@ from l2m_gtsam.lidar.surface import smoothed
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
-from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.known_sensors import read_known_sensors
-from l2m_gtsam.storage.scan_topic import cloud_topic
+from l2m_gtsam.storage.point_cloud2 import cloud_topic
 
 # What a map file takes: 120 MB.
 MAX_LIDAR_POINTS = 5_000_000

@@ -27,11 +27,10 @@ from l2m_gtsam.records.validation import (
     NamedSource,
     Validation,
 )
-from l2m_gtsam.storage.atomic import atomic_path
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibration_file import read_calibration
-from l2m_gtsam.storage.digest import source_file
-from l2m_gtsam.storage.validation_file import write_validation
+from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.record_files import write_validation
 from l2m_gtsam.validation.validate import validate
 
 VALIDATION_FILE = "validation.json"

@@ -243,7 +243,7 @@ def plan(
             plan_table,
         )
         from l2m_gtsam.config import load_config
-        from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
+        from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
         chosen, places = load_config(config), [_place(text) for text in at or []]
         found = plan_bag(bag, map_path, chosen, places, progress)
@@ -413,7 +413,7 @@ def _print_calibration(result: "CalibrationResult", models: bool) -> None:
         held_clocks_note,
         missing_note,
     )
-    from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
+    from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
     print_table(calibration_table(result))
     for note in result.notes:

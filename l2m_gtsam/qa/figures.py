@@ -15,7 +15,7 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import MapPicture, Row
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.files import atomic_path
 
 # Cells along the longer side of a map picture.
 CELLS = 240

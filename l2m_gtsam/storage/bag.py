@@ -10,9 +10,17 @@ from rosbags.interfaces import Connection
 from l2m_gtsam.data import FieldSeries, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.geometry import moved
-from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
+from l2m_gtsam.storage.bag_options import (
+    MICROTESLA_PER,
+    BagOptions,
+    Stamps,
+    TfChain,
+    fault,
+    is_turning,
+    strength,
+)
 from l2m_gtsam.storage.clocks import check_clocks, check_stamps, clock_notes
-from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.messages import (
     FIELD_TYPE,
     POSE_TYPES,
@@ -30,7 +38,6 @@ from l2m_gtsam.storage.selection import (
     several_frames,
 )
 from l2m_gtsam.storage.tf import Link, ancestors, compose
-from l2m_gtsam.storage.units import MICROTESLA_PER, fault, is_turning, strength
 
 
 @dataclass

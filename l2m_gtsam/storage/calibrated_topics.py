@@ -11,11 +11,17 @@ from rosbags.interfaces import Connection
 from l2m_gtsam.data import CorrectedField, FloatArray, IntArray
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.storage.bag_copy import BagCopy
-from l2m_gtsam.storage.bag_options import BagOptions, Stamps
+from l2m_gtsam.storage.bag_options import (
+    MICROTESLA_PER,
+    BagOptions,
+    Stamps,
+    fault,
+    is_turning,
+    strength,
+)
 from l2m_gtsam.storage.messages import FIELD_TYPE, FieldBuffer, header_ns
 from l2m_gtsam.storage.open_bag import Bag, Codec, Progress, RawMessage
 from l2m_gtsam.storage.selection import select_fields, sensor_names, several_frames
-from l2m_gtsam.storage.units import MICROTESLA_PER, fault, is_turning, strength
 
 Correct = Callable[[FloatArray, IntArray], CorrectedField]
 """What corrects readings in microtesla, shape (N, 3), of times in nanoseconds, shape (N,)."""

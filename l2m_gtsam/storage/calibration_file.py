@@ -1,12 +1,14 @@
 """``calibration.yaml``: everything about each sensor, with formulas and units inside."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, RigidTransform, SourceFile, SyncCounts
+from l2m_gtsam.data import Distortion, FloatArray, RigidTransform, SourceFile, SyncCounts
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     Disagreement,
@@ -18,18 +20,188 @@ from l2m_gtsam.records.calibration import (
     TimeOffset,
     Uncertainty,
 )
-from l2m_gtsam.storage.calibration_legend import MODEL, UNCERTAINTY
-from l2m_gtsam.storage.file_model import Lenient, Matrix, Vector, read_model
-from l2m_gtsam.storage.model_entry import (
-    ModelsEntry,
-    MovingEntry,
-    models_entry,
-    models_of,
-    moving_entry,
-    moving_of,
+from l2m_gtsam.records.sensor_models import (
+    Coefficients,
+    Model,
+    ModelComparison,
+    ModelFigures,
+    MovingField,
 )
-from l2m_gtsam.storage.transform_entry import transform_entry
-from l2m_gtsam.storage.yaml_file import write_yaml
+from l2m_gtsam.storage.yaml_file import Lenient, Matrix, Vector, read_model, write_yaml
+
+UNCERTAINTY = {
+    Uncertainty.FULL: (
+        "sigmas carry the map's errors as they are: shared by readings near each other and by all "
+        "sensors; they hold as far as the map explains its own field (`l2m map info`)"
+    ),
+    Uncertainty.INDEPENDENT: (
+        "sigmas count the map's errors as independent from reading to reading; where the map is "
+        "less sure than the sensor they are too small"
+    ),
+}
+
+MODEL = {
+    "measurement": "B_meas = C @ B_lidar + H",
+    "correction": "B_lidar = inv(C) @ (B_meas - H)",
+    "units": {"B": "uT", "H": "uT", "C": "1", "t": "m", "rotation": "rad", "noise": "uT"},
+    "frames": "lidar: frame of the poses' child after the fixed transform; mag: the sensor's axes",
+    "t_lidar_mag": "position of the sensor in the lidar frame",
+    "rotation": (
+        "C = R_mag_lidar @ P with P symmetric positive (proper polar factor); "
+        "R_lidar_mag is its transpose; quaternions are x, y, z, w"
+    ),
+    "rotation_covariance": "of the error e in the mag frame: true = exp(e) @ R_mag_lidar",
+    "covariance_order": "t_x t_y t_z C_xx C_xy C_xz C_yx C_yy C_yz C_zx C_zy C_zz H_x H_y H_z",
+    "time_offset": (
+        "a reading's pose is that at stamp + seconds; cross_covariance with the parameters in "
+        "covariance_order; held says why it is not estimated but taken as 0"
+    ),
+    "moving": (
+        "B_meas = C @ B_lidar + H + sum of number * h (uT per unit of the recorded number); H is "
+        "the offset where all numbers are 0; empty where the readings do not ask for it"
+    ),
+    "models": (
+        "models of the readings, z = C b + H + sum of number * h + E db/dt and parts of it; score: "
+        "mean log density of held-out readings (1/uT^3), behind: the best of them; coefficients "
+        "are those of the recommended model at t_lidar_mag, b counted as exact"
+    ),
+    "disagreements": (
+        "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
+        "ns, the lidar's way from p_from to p_to in m in the map, median residual (size) in uT"
+    ),
+    "from_priors": (
+        "what the readings leave open and only `calibration.priors` determine, or mostly (sigmas "
+        "without them would be more than twice as large): parameters, and what was known of them"
+    ),
+    "infinite": "a variance of .inf marks what this drive and map do not determine",
+}
+
+
+def transform_entry(T_lidar_mag: RigidTransform) -> dict[str, Any]:
+    """Return both directions and a point in both frames, so that no convention is left to guess."""
+    p_mag = np.array([0.1, 0.2, 0.3])
+    p_lidar = T_lidar_mag.R @ p_mag + T_lidar_mag.t
+    return {
+        "T_lidar_mag": _direction(T_lidar_mag),
+        "T_mag_lidar": _direction(T_lidar_mag.inverse()),
+        "example": {
+            "meaning": "one point in both frames: p_lidar = R_lidar_mag @ p_mag + t_lidar_mag",
+            "p_mag": p_mag.tolist(),
+            "p_lidar": p_lidar.tolist(),
+        },
+    }
+
+
+def _direction(transform: RigidTransform) -> dict[str, list[float]]:
+    return {
+        "translation": transform.t.tolist(),
+        "quaternion_xyzw": _quaternion(transform.R),
+    }
+
+
+def _quaternion(R: FloatArray) -> list[float]:
+    if not np.isfinite(R).all():
+        return [float("nan")] * 4
+    return [float(q) for q in Rotation.from_matrix(R).as_quat(canonical=True)]
+
+
+class MovingEntry(Lenient):
+    """What a recorded number adds to the readings."""
+
+    h: Vector
+    sigma: Vector
+
+
+class CoefficientsEntry(Lenient):
+    """Coefficients of a model, or their sigmas; h by the names of the numbers."""
+
+    C: Matrix
+    H: Vector
+    h: dict[str, Vector]
+    E: Matrix
+
+
+class FiguresEntry(Lenient):
+    """How one model does."""
+
+    model: Model
+    parameters: int
+    rms: float
+    held_out_rms: float
+    held_out_score: float
+    score_error: float
+    behind: float
+    behind_error: float
+    bic: float
+    bic_above: float
+
+
+class ModelsEntry(Lenient):
+    """All models side by side."""
+
+    recommended: Model
+    reason: str
+    readings: int
+    independent: float
+    segments: int
+    regressors: tuple[str, ...]
+    fits: tuple[FiguresEntry, ...]
+    coefficients: CoefficientsEntry
+    sigma: CoefficientsEntry
+
+
+def moving_entry(moving: tuple[MovingField, ...]) -> dict[str, Any]:
+    """Return what recorded numbers add as plain values, by their names."""
+    return {each.name: {"h": each.h.tolist(), "sigma": each.sigma.tolist()} for each in moving}
+
+
+def moving_of(entries: Mapping[str, MovingEntry]) -> tuple[MovingField, ...]:
+    """Return what recorded numbers add from its entry."""
+    return tuple(
+        MovingField(name, np.array(each.h), np.array(each.sigma)) for name, each in entries.items()
+    )
+
+
+def models_entry(comparison: ModelComparison) -> dict[str, Any]:
+    """Return a comparison as plain values."""
+    names = comparison.regressors
+    return {
+        "recommended": comparison.recommended.value,
+        "reason": comparison.reason,
+        "readings": comparison.readings,
+        "independent": comparison.independent,
+        "segments": comparison.segments,
+        "regressors": list(names),
+        "fits": [{**vars(each), "model": each.model.value} for each in comparison.fits],
+        "coefficients": _coefficients_entry(comparison.coefficients, names),
+        "sigma": _coefficients_entry(comparison.sigma, names),
+    }
+
+
+def models_of(entry: ModelsEntry) -> ModelComparison:
+    """Return a comparison from its entry."""
+    return ModelComparison(
+        fits=tuple(ModelFigures(**dict(each)) for each in entry.fits),
+        regressors=entry.regressors,
+        readings=entry.readings,
+        independent=entry.independent,
+        segments=entry.segments,
+        recommended=entry.recommended,
+        reason=entry.reason,
+        coefficients=_coefficients(entry.coefficients),
+        sigma=_coefficients(entry.sigma),
+    )
+
+
+def _coefficients_entry(found: Coefficients, names: tuple[str, ...]) -> dict[str, Any]:
+    h = {name: each.tolist() for name, each in zip(names, found.h, strict=True)}
+    return {"C": found.C.tolist(), "H": found.H.tolist(), "h": h, "E": found.E.tolist()}
+
+
+def _coefficients(entry: CoefficientsEntry) -> Coefficients:
+    h = np.array(list(entry.h.values())).reshape(-1, 3)
+    return Coefficients(np.array(entry.C), np.array(entry.H), h, np.array(entry.E))
+
 
 FORMAT = "l2m-calibration"
 VERSION = 1

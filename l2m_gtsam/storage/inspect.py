@@ -9,12 +9,20 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import L2MError
-from l2m_gtsam.storage.bag_options import BagOptions, Stamps
-from l2m_gtsam.storage.covariances import CovarianceBuffer
+from l2m_gtsam.storage.bag_options import (
+    MICROTESLA_PER,
+    BagOptions,
+    Stamps,
+    Strength,
+    fault,
+    is_turning,
+    strength,
+)
 from l2m_gtsam.storage.messages import (
     FIELD_TYPE,
     POSE_TYPES,
     TF_TYPES,
+    CovarianceBuffer,
     FieldBuffer,
     StampBuffer,
     header_ns,
@@ -22,7 +30,6 @@ from l2m_gtsam.storage.messages import (
 from l2m_gtsam.storage.open_bag import Bag, Progress, open_bag
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
-from l2m_gtsam.storage.units import MICROTESLA_PER, Strength, fault, is_turning, strength
 
 BY_CLOUDS = "a map made with `l2m map build --lidar` gives poses to its point clouds"
 

@@ -8,8 +8,7 @@ from pydantic import ConfigDict, Field, field_validator
 
 from l2m_gtsam.data import Distortion, KnownSensor
 from l2m_gtsam.records.calibration import SensorStatus
-from l2m_gtsam.storage.file_model import Lenient, Matrix, Vector, read_model
-from l2m_gtsam.storage.yaml_file import write_yaml
+from l2m_gtsam.storage.yaml_file import Lenient, Matrix, Vector, read_model, write_yaml
 
 
 class _Clock(Lenient):

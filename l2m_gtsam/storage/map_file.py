@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from l2m_gtsam.data import LidarMap, MapState
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.files import atomic_path
 
 FORMAT = "l2m-map"
 VERSION = 2

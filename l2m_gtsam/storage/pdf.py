@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from l2m_gtsam.errors import OutputError
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.files import atomic_path
 
 BROWSERS = (
     "chromium",

@@ -1,14 +1,17 @@
-"""Tables of points in files, as headers declare them, and their bodies as text and as bytes.
+"""Tables of points in files, as headers declare them, and their bodies: PLY and PCD.
 
-Files are untrusted: what a header declares is compared with what the file holds before memory is
-reserved for it, only x, y and z are taken out, and bodies are read in pieces of bounded size.
-A `ValueError` says what is wrong with a file; `cloud.py` turns it into one line.
+PLY is the polygon file format 1.0; of PCD versions .5 to .7 are read, ascii, binary or
+binary_compressed. Files are untrusted: what a header declares is compared with what the file holds
+before memory is reserved for it, only x, y and z are taken out, and bodies are read in pieces of
+bounded size. A `ValueError` says what is wrong with a file; `cloud.py` turns it into one line.
 """
 
+import math
 import os
-from collections.abc import Iterator
+import struct
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import IO, Any
 
@@ -171,3 +174,175 @@ def refuse_many(path: Path, count: int) -> None:
             f"{path}: declares {count} points, at most {MAX_POINTS} are accepted; thin the cloud "
             "with a voxel filter"
         )
+
+
+CLASSIC = ["char", "uchar", "short", "ushort", "int", "uint", "float", "double"]
+SIZED = ["int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
+NUMPY = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"]
+PLY_TYPES = dict(zip(CLASSIC + SIZED, NUMPY * 2, strict=True))
+PLY_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def ply_pieces(path: Path) -> Iterator[FloatArray]:
+    """Yield the points of a PLY file, piece by piece, shape (N, 3).
+
+    Raises
+    ------
+    MapError
+        It declares too many points.
+    ValueError
+        It is damaged or another kind of file. So are KeyError (a type of number or order of
+        bytes that is not known), IndexError (what ends too early) and OverflowError.
+    """
+    with path.open("rb") as file:
+        words = _ply_header(file)
+        if words[0] != ["ply"] or words[1][0] != "format":
+            raise ValueError("its first lines are not those of a PLY file")
+        body = words[1][1]
+        *before, table = _ply_tables(words[2:], PLY_ORDERS[body])
+        refuse_many(path, table.count)
+        if body == "ascii":
+            yield from text_pieces(file, table, skip=sum(each.count for each in before))
+        else:
+            file.seek(sum(each.count * each.size for each in before), os.SEEK_CUR)
+            yield from binary_pieces(file, table)
+
+
+def _ply_header(file: IO[bytes]) -> list[list[str]]:
+    header: list[list[str]] = []
+    for words in header_words(file):
+        if words[0] == "end_header":
+            break
+        if words[0] not in ("comment", "obj_info"):
+            header.append(words)
+    return header
+
+
+def _ply_tables(header: list[list[str]], order: str) -> list[Table]:
+    """Return the tables up to that of the vertices, which is the last; others do not matter."""
+    starts = [line for line, words in enumerate(header) if words[0] == "element"]
+    tables: list[Table] = []
+    for low, high in pairwise([*starts, len(header)]):
+        _, name, count = _three(header[low])
+        properties = tuple(_ply_property(words, order) for words in header[low + 1 : high])
+        tables.append(Table(int(count), properties))
+        if name == "vertex":
+            return tables
+    raise ValueError("it has no element `vertex`")
+
+
+def _ply_property(words: list[str], order: str) -> Property:
+    if "list" in words[:2]:
+        raise ValueError("its vertices have a list, or stand behind an element that has one")
+    _, kind, name = _three(words)
+    return Property(name, np.dtype(order + PLY_TYPES[kind]))
+
+
+def _three(words: list[str]) -> list[str]:
+    if len(words) != 3:
+        raise ValueError(f"its header has a line {' '.join(words)!r}")
+    return words
+
+
+def write_ply(path: Path, points: FloatArray) -> None:
+    """Write points, shape (N, 3), as binary float64."""
+    axes = "".join(f"property double {axis}\n" for axis in "xyz")
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{axes}"
+    with path.open("wb") as file:
+        file.write(f"{header}end_header\n".encode("ascii"))
+        file.write(np.ascontiguousarray(points, dtype="<f8").data)
+
+
+PCD_TYPES = {"F4": "<f4", "F8": "<f8"} | {
+    f"{sign}{size}": f"<{sign.lower()}{size}" for sign in "IU" for size in (1, 2, 4, 8)
+}
+MAX_UNPACKED_BYTES = 2 << 30
+
+
+def pcd_pieces(path: Path) -> Iterator[FloatArray]:
+    """Yield the points of a PCD file, piece by piece, shape (N, 3).
+
+    Raises
+    ------
+    MapError
+        It declares too many points.
+    ValueError
+        It is damaged or another kind of file. So are KeyError (what the header lacks),
+        IndexError and struct.error (what ends too early).
+    """
+    with path.open("rb") as file:
+        header = _pcd_header(file)
+        table = _pcd_table(header)
+        refuse_many(path, table.count)
+        body = header["DATA"][0].lower()
+        if body not in PCD_BODIES:
+            raise ValueError(f"its DATA is {body!r}, known are {', '.join(PCD_BODIES)}")
+        yield from PCD_BODIES[body](file, table)
+
+
+def _pcd_header(file: IO[bytes]) -> dict[str, list[str]]:
+    header: dict[str, list[str]] = {}
+    for words in header_words(file):
+        header[words[0].upper()] = words[1:]
+        if "DATA" in header:
+            break
+    return header
+
+
+def _pcd_table(header: dict[str, list[str]]) -> Table:
+    names, sizes, kinds = header["FIELDS"], header["SIZE"], header["TYPE"]
+    repeats = header.get("COUNT", ["1"] * len(names))
+    if not len(names) == len(sizes) == len(kinds) == len(repeats):
+        raise ValueError("its FIELDS, SIZE, TYPE and COUNT are not of one length")
+    properties = tuple(
+        Property(name, np.dtype(PCD_TYPES[kind + size]), int(repeat))
+        for name, size, kind, repeat in zip(names, sizes, kinds, repeats, strict=True)
+    )
+    extents = [header["POINTS"]] if "POINTS" in header else [header["WIDTH"], header["HEIGHT"]]
+    return Table(math.prod(int(words[0]) for words in extents), properties)
+
+
+def _packed_pieces(file: IO[bytes], table: Table) -> Iterator[FloatArray]:
+    """Read what is packed property by property."""
+    packed, size = struct.unpack("<II", file.read(8))
+    require_bytes(remaining(file), packed, 1)
+    if size > MAX_UNPACKED_BYTES:
+        raise ValueError(f"it unpacks to {size} bytes, at most {MAX_UNPACKED_BYTES} are accepted")
+    require_bytes(size, table.count, table.size)
+    columns = table.view_by_property(_unpacked(file.read(packed), size))
+    for low in range(0, table.count, PIECE_POINTS):
+        yield stacked([column[low : low + PIECE_POINTS] for column in columns])
+
+
+def _unpacked(packed: bytes, size: int) -> bytearray:
+    """Undo LZF compression (liblzf): runs of literal bytes, and copies of what came before."""
+    out, at = bytearray(), 0
+    while at < len(packed) and len(out) <= size:
+        control = packed[at]
+        at += 1
+        if control < 32:
+            out += packed[at : at + control + 1]
+            at += control + 1
+            continue
+        length = control >> 5
+        if length == 7:
+            length += packed[at]
+            at += 1
+        distance = ((control & 31) << 8) + packed[at] + 1
+        at += 1
+        start = len(out) - distance
+        if start < 0:
+            raise ValueError("its packed data refers to what is not there")
+        # A copy may reach into itself: what it repeats has the length of the distance.
+        repeats = (length + 2) // distance + 1
+        out += (out[start : start + length + 2] * repeats)[: length + 2]
+    if len(out) != size:
+        raise ValueError(f"its packed data does not hold the {size} bytes declared")
+    return out
+
+
+PCD_BODIES: dict[str, Callable[[IO[bytes], Table], Iterator[FloatArray]]] = {
+    "ascii": text_pieces,
+    "binary": binary_pieces,
+    "binary_compressed": _packed_pieces,
+}

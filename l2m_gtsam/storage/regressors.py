@@ -11,10 +11,9 @@ import numpy as np
 
 from l2m_gtsam.data import ScalarSeries
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.storage.bag_options import Stamps
+from l2m_gtsam.storage.bag_options import RegressorTopic, Stamps
 from l2m_gtsam.storage.messages import header_ns
 from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
-from l2m_gtsam.storage.regressor_options import RegressorTopic
 from l2m_gtsam.storage.selection import listed
 
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?", re.ASCII)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.records.scene import DriveView, MapView, Scene, SensorView
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.files import atomic_path
 
 if TYPE_CHECKING:
     from rerun import RecordingStream

@@ -1,14 +1,15 @@
-"""YAML in and out, with plain values only."""
+"""YAML in and out, with plain values only, and checked against a model."""
 
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import BaseModel, ConfigDict, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from l2m_gtsam.errors import L2MError
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.errors import CalibrationError, L2MError
+from l2m_gtsam.storage.files import atomic_path
 
 # A calibration of a hundred sensors is under 1 MB; more than this is not ours.
 MAX_BYTES = 50_000_000
@@ -61,3 +62,34 @@ def yaml_text(content: dict[str, Any], header: str) -> str:
     stream.write("".join(f"# {line}\n" for line in header.splitlines()))
     yaml.dump(content, stream)
     return stream.getvalue()
+
+
+Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+
+
+class Lenient(BaseModel):
+    """A part of a file; what is derived from the rest is ignored when read."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+FileModel = TypeVar("FileModel", bound=BaseModel)
+
+
+def read_model(path: Path, model: type[FileModel]) -> FileModel:
+    """Return the content of a YAML file as its model.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing, is not YAML or is not of this form; the line names the first fault.
+    """
+    content = read_yaml(path, CalibrationError)
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        key = ".".join(str(part) for part in fault["loc"]) or "the file"
+        msg = f"{path}: not a calibration file of this program: {key}: {fault['msg']}"
+        raise CalibrationError(msg) from error

@@ -9,7 +9,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.options import Options
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.studies.study import Study
 
 Cell = TypeVar("Cell")

@@ -14,7 +14,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.figures import save_figure
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.studies.cell_files import CellFolder, Made
 from l2m_gtsam.studies.provenance import Provenance, code_version, machine_class
 from l2m_gtsam.studies.study import Study

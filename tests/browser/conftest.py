@@ -13,7 +13,7 @@ from l2m_gtsam.data import SourceFile
 from l2m_gtsam.qa.evaluate import appraise
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.storage.calibration_file import write_calibration
-from l2m_gtsam.storage.metrics_file import write_metrics
+from l2m_gtsam.storage.record_files import write_metrics
 from tests.drives.verdict import NOMINAL, loose
 from tests.support.browsing import Looked, look
 

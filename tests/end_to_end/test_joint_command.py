@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from l2m_gtsam.storage.calibration_file import read_calibration
-from l2m_gtsam.storage.metrics_file import read_metrics
+from l2m_gtsam.storage.record_files import read_metrics
 from tests.end_to_end.conftest import complaint_here, l2m
 
 

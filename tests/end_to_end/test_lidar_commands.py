@@ -16,7 +16,7 @@ from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.map_file import load_map, save_map
-from l2m_gtsam.storage.slam_file import read_slam
+from l2m_gtsam.storage.record_files import read_slam
 from tests.drives.calibrations import calibration, sensor
 from tests.end_to_end.conftest import complaint_here, l2m
 from tests.worlds.halls import SMALL_HALL

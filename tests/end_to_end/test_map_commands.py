@@ -9,7 +9,7 @@ import pytest
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic import compiled, tiles
-from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import load_map
 from tests.end_to_end.conftest import complaint_here, l2m, l2m_process
 from tests.worlds.quick_maps import QUICK_HARMONIC

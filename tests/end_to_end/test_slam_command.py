@@ -16,7 +16,7 @@ from l2m_gtsam.qa.reasons.reason import Level
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from l2m_gtsam.storage.tum import write_tum
+from l2m_gtsam.storage.trajectory_files import write_tum
 from tests.drives.calibrations import calibration, sensor
 from tests.drives.yard import calibrated_yard
 from tests.end_to_end.conftest import complaint_here, l2m

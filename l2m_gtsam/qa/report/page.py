@@ -18,7 +18,7 @@ from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.solve.rank import PARAMETERS
-from l2m_gtsam.storage.calibration_legend import MODEL, UNCERTAINTY
+from l2m_gtsam.storage.calibration_file import MODEL, UNCERTAINTY
 
 STAGE = "report"
 

@@ -7,7 +7,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.report.figures.correlations import NAMES, correlations
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
 from l2m_gtsam.records.metrics import Repeatability, SensorMetrics
-from l2m_gtsam.storage.calibration_legend import UNCERTAINTY
+from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
 
 def with_sigma(value: float, sigma: float, digits: int) -> str:

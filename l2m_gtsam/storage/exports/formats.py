@@ -1,14 +1,150 @@
-"""The formats, by name."""
+"""The formats by name: JSON, Kalibr, a ROS 2 launch file, and those of modules of their own."""
 
+import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import RigidTransform
+from l2m_gtsam.storage.calibration_file import (
+    MODEL,
+    UNCERTAINTY,
+    bag_entries,
+    sensor_entry,
+    source_entry,
+)
 from l2m_gtsam.storage.exports.bias_scale import bias_scale_notes, bias_scale_text, not_reducible
-from l2m_gtsam.storage.exports.export import Export, Fault, not_mounted
-from l2m_gtsam.storage.exports.json_file import json_text
-from l2m_gtsam.storage.exports.kalibr import kalibr_text
-from l2m_gtsam.storage.exports.ros2_launch import launch_text
+from l2m_gtsam.storage.exports.export import Export, ExportedSensor, Fault, not_mounted
 from l2m_gtsam.storage.exports.urdf import urdf_text
+from l2m_gtsam.storage.yaml_file import yaml_text
+
+UNKNOWN = "null: not determined by the drive and the map (an infinite variance), or not known"
+
+
+def json_text(export: Export) -> str:
+    """Return the sensors with formulas, units, frames, covariances and where they come from.
+
+    Numbers that are not finite, which JSON does not have, are null.
+    """
+    result = export.result
+    content = {
+        "format": "l2m-export",
+        "version": 1,
+        "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL, "infinite": UNKNOWN},
+        "lidar_frame": export.lidar_frame,
+        **bag_entries(result),
+        "map": source_entry(result.map),
+        "versions": result.versions,
+        "doubts": list(result.doubts),
+        "left_out": dict(export.left_out),
+        "sensors": {
+            each.calibration.sensor: {"frame": each.frame, **sensor_entry(each.calibration)}
+            for each in export.sensors
+        },
+    }
+    return json.dumps(_finite(content), indent=2, allow_nan=False) + "\n"
+
+
+def _finite(value: Any) -> Any:
+    """Return plain values with None for numbers that are not finite."""
+    if isinstance(value, dict):
+        return {key: _finite(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+CONVENTION = (
+    "T_mag_lidar takes points from the lidar frame to the sensor's: p_mag = T_mag_lidar @ p_lidar,",
+    "in metres, as Kalibr's T_cam_imu takes them from the imu to the camera.",
+    "timeshift_mag_lidar: t_lidar = t_mag + shift in seconds; absent where it is not estimated.",
+)
+
+
+def kalibr_text(export: Export) -> str:
+    """Return a chain of sensors ``mag0``, ``mag1`` ... in Kalibr's manner."""
+    content = {f"mag{k}": _entry(sensor, export) for k, sensor in enumerate(export.sensors)}
+    return yaml_text(content, "\n".join((*export.origin, *CONVENTION)))
+
+
+def _entry(sensor: ExportedSensor, export: Export) -> dict[str, Any]:
+    entry: dict[str, Any] = {"sensor": sensor.calibration.sensor, "frame": sensor.frame}
+    entry["T_mag_lidar"] = _homogeneous(sensor.T_lidar_mag.inverse())
+    offset = sensor.calibration.time_offset
+    if offset is not None and offset.estimated:
+        entry["timeshift_mag_lidar"] = offset.seconds
+    if not _split_by_frame(export):
+        entry["rostopic"] = f"/{sensor.calibration.sensor}"
+    return entry
+
+
+def _split_by_frame(export: Export) -> bool:
+    """Return whether sensors are named after frames, which says nothing of their topics."""
+    bag = export.result.options.get("bag")
+    return isinstance(bag, dict) and bool(bag.get("split_by_frame"))
+
+
+def _homogeneous(transform: RigidTransform) -> list[list[float]]:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = transform.R, transform.t
+    return [[float(value) for value in row] for row in T]
+
+
+HEAD = '''
+
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    """Publish where every calibrated magnetometer sits in the frame of the LiDAR."""
+    return LaunchDescription(
+        [
+'''
+TAIL = """        ]
+    )
+"""
+
+
+def launch_text(export: Export) -> str:
+    """Return a Python launch file with a static transform publisher for each sensor.
+
+    Metres and quaternions x, y, z, w of ``T_lidar_mag``, which turns a point given in the sensor's
+    frame into the lidar's: parent is the lidar, child the sensor.
+    """
+    comments = (*export.origin, "The parent of every transform is the LiDAR, the child a sensor.")
+    top = "\n".join(f"# {line}" for line in comments)
+    nodes = "".join(_node(sensor, export.lidar_frame) for sensor in export.sensors)
+    return top + HEAD + nodes + TAIL
+
+
+def _node(sensor: ExportedSensor, lidar_frame: str) -> str:
+    """Return the node of one sensor; the program itself gives it a name that is not taken."""
+    arguments = "".join(
+        f"                    {name!r}, {value!r},\n"
+        for name, value in _arguments(sensor, lidar_frame).items()
+    )
+    return f"""            Node(
+                package='tf2_ros',
+                executable='static_transform_publisher',
+                arguments=[
+{arguments}                ],
+            ),
+"""
+
+
+def _arguments(sensor: ExportedSensor, lidar_frame: str) -> dict[str, str]:
+    transform = sensor.T_lidar_mag
+    numbers = [*transform.t, *Rotation.from_matrix(transform.R).as_quat(canonical=True)]
+    names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+    values = {name: repr(float(number)) for name, number in zip(names, numbers, strict=True)}
+    return {**values, "--frame-id": lidar_frame, "--child-frame-id": sensor.frame}
 
 
 def _no_notes(_export: Export) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from l2m_gtsam.storage.metrics_file import read_metrics, write_metrics
+from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.degenerate import STRONG, at_height, poses
 from tests.drives.moving import moving_drive, surveyed
 from tests.drives.moving import options as moving_options

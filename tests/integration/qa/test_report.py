@@ -20,7 +20,7 @@ from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.reasons.reason import Level
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
-from l2m_gtsam.storage.metrics_file import read_metrics, write_metrics
+from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.verdict import EIGHT, changed_place, drive, with_series
 from tests.end_to_end.conftest import complaint_here
 

@@ -18,7 +18,7 @@ from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.pose_graph import odometry_graph, scale_values
 from l2m_gtsam.slam.record import odometry_covariance, sensor_evidence
-from l2m_gtsam.storage.slam_file import read_slam, write_slam
+from l2m_gtsam.storage.record_files import read_slam, write_slam
 from tests.drives.localised import WORLD, driven, localised, record
 from tests.integration.slam.test_slam import pose_nees, position_error
 

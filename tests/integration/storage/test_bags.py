@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import BagError, L2MError, UnitsError
 from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
-from l2m_gtsam.storage.bag_options import BagOptions, FixedTransform, Stamps, TfChain
+from l2m_gtsam.storage.bag_options import BagOptions, FixedTransform, Stamps, TfChain, Unit
 from l2m_gtsam.storage.inspect import inspect_bag
-from l2m_gtsam.storage.units import Unit
 from tests.drives.bags import KINDS, Entry, ros, write
 
 START = 1_700_000_000_000_000_000

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import BagError, MapError
-from l2m_gtsam.storage import voxels
+from l2m_gtsam.storage import cloud
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
@@ -171,7 +171,7 @@ def test_scans_are_merged_as_one_cloud_would_be(
     for each in seen:
         each[:4] = [[np.nan, 1, 1], [np.inf, 0, 0], [np.nan] * 3, [0, -np.inf, 2]]
     content = [scan("ros1", stamp, each) for stamp, each in zip(stamps, seen, strict=True)]
-    monkeypatch.setattr(voxels, "BATCH_POINTS", 1000)
+    monkeypatch.setattr(cloud, "BATCH_POINTS", 1000)
     options = CloudTopicOptions(edge=0.7, min_range=0)
     found = read(write(tmp_path, "ros1", entries(content)), options)
     placed = [
@@ -190,7 +190,7 @@ def test_memory_follows_the_cells_and_not_the_scans(
     stamps = [START + k * SECOND // 20 for k in range(60)]
     content = [scan("mcap", stamp, rng.uniform(-5, 5, (20_000, 3))) for stamp in stamps]
     path = write(tmp_path, "mcap", entries(content))
-    monkeypatch.setattr(voxels, "BATCH_POINTS", 20_000)
+    monkeypatch.setattr(cloud, "BATCH_POINTS", 20_000)
     all_points = len(stamps) * 20_000 * 3 * 8
     read(path)  # imports and caches
     tracemalloc.start()

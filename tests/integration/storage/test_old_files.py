@@ -14,8 +14,7 @@ from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.map_file import load_map, save_map
-from l2m_gtsam.storage.metrics_file import read_metrics, write_metrics
-from l2m_gtsam.storage.slam_file import read_slam, write_slam
+from l2m_gtsam.storage.record_files import read_metrics, read_slam, write_metrics, write_slam
 
 FILES = Path(__file__).parents[2] / "files"
 

@@ -13,8 +13,7 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import get_types_from_msg
 
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.storage.bag_options import Stamps
-from l2m_gtsam.storage.regressor_options import RegressorTopic
+from l2m_gtsam.storage.bag_options import RegressorTopic, Stamps
 from l2m_gtsam.storage.regressors import read_scalars
 from tests.drives.bags import KINDS, Entry, Ros, ros, write
 

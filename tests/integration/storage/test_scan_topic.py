@@ -15,7 +15,7 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.records.scans import Scan, ScanOptions
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
-from l2m_gtsam.storage.scan_topic import ScanTopic, cloud_topic, has_clouds
+from l2m_gtsam.storage.point_cloud2 import ScanTopic, cloud_topic, has_clouds
 from tests.drives.bags import KINDS, Entry, ros, write
 from tests.integration.storage.test_cloud_topic import SECOND, START, TYPE, entries, field, scan
 

@@ -17,7 +17,7 @@ from l2m_gtsam.recording.sync import twists
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
-from l2m_gtsam.storage.trajectory_bag import TOPIC, LocalisedMotion, write_trajectory_bag
+from l2m_gtsam.storage.trajectory_files import TOPIC, LocalisedMotion, write_trajectory_bag
 from tests.drives.slam import drifted, rounds
 
 EVERY = 7  # a key pose

@@ -32,7 +32,7 @@ from l2m_gtsam.records.validation import (
     Validation,
     ValidationVerdict,
 )
-from l2m_gtsam.storage.validation_file import read_validation, write_validation
+from l2m_gtsam.storage.record_files import read_validation, write_validation
 from l2m_gtsam.validation.validate import joint_covariance, validate
 from tests.drives.calibrations import unsolved
 from tests.drives.degenerate import STRONG

@@ -14,8 +14,8 @@ from pydantic import ValidationError
 from l2m_gtsam.batch.fleet_drives import FleetDrive, FleetOrder, fleet_drives
 from l2m_gtsam.errors import BagError, ConfigError
 from l2m_gtsam.records.fleet import DATE
-from l2m_gtsam.storage.folder_names import folder_names, printable
-from l2m_gtsam.storage.manifest import ManifestEntry
+from l2m_gtsam.storage.drive_lists import ManifestEntry
+from l2m_gtsam.storage.files import folder_names, printable
 
 HOSTILE = ("../../etc", "/root", "..", ".", "", "a/b", "con\n", "\\x", "-rf", "fleet.csv", "\udcff")
 NAMES = st.lists(st.text(max_size=80) | st.sampled_from(HOSTILE), max_size=12, unique=True)

@@ -16,7 +16,7 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import solved_tile
-from l2m_gtsam.storage import tile_file
+from l2m_gtsam.storage import tile_folder
 from l2m_gtsam.storage.tile_folder import TileFolder
 from tests.worlds.harmonic import OPTIONS, POST, fitted_map, queries, readings
 
@@ -138,7 +138,7 @@ def flipped(path: Path) -> None:
 
 def of_another_version(path: Path) -> None:
     content = bytearray(path.read_bytes())
-    content[len(tile_file.MAGIC)] += 1
+    content[len(tile_folder.MAGIC)] += 1
     path.write_bytes(content)
 
 
@@ -191,7 +191,7 @@ def test_a_folder_that_can_only_be_read_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     filled(tmp_path)
-    monkeypatch.setattr(tile_file, "renamed_path", None)
+    monkeypatch.setattr(tile_folder, "renamed_path", None)
     assert_right(beside(tmp_path))
 
 

@@ -18,7 +18,7 @@ from l2m_gtsam.qa.metrics.mounting import axis_order, gains, skews_deg
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.records.metrics import Halves
-from l2m_gtsam.storage.metrics_file import read_metrics
+from l2m_gtsam.storage.record_files import read_metrics
 
 SEEDS = st.integers(0, 10_000)
 

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.errors import L2MError, OutputError
-from l2m_gtsam.storage.atomic import atomic_path
-from l2m_gtsam.storage.digest import source_file
+from l2m_gtsam.storage.files import atomic_path, source_file
 
 
 def test_the_name_appears_at_the_end(tmp_path: Path) -> None:

@@ -14,9 +14,8 @@ from pypcd4.pypcd4 import Encoding, PointCloud
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError, OutputError
-from l2m_gtsam.storage import cloud, pcd, point_table, voxels
-from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud, write_cloud
-from l2m_gtsam.storage.voxels import VoxelMeans
+from l2m_gtsam.storage import cloud, point_table
+from l2m_gtsam.storage.cloud import VoxelMeans, read_cloud, thinned_cloud, write_cloud
 
 POINTS = np.array([[1.0, 2.0, 3.0], [-4.5, 0.25, 8.0], [0.0, 1e5, -2.5]])
 METRES = st.floats(-cloud.MAX_COORDINATE_M, cloud.MAX_COORDINATE_M)
@@ -153,10 +152,10 @@ def test_long_files_are_read_in_pieces(tmp_path: Path, monkeypatch: pytest.Monke
     written(tmp_path / "a.pcd", pcd_header("ascii", 1003) + text)
     for name in ("a.ply", "a.npz"):
         write_cloud(tmp_path / name, points)
-    for module in (cloud, pcd, point_table):
+    for module in (cloud, point_table):
         monkeypatch.setattr(module, "PIECE_POINTS", 100)
     monkeypatch.setattr(point_table, "PIECE_BYTES", 2400)
-    monkeypatch.setattr(voxels, "BATCH_POINTS", 50)
+    monkeypatch.setattr(cloud, "BATCH_POINTS", 50)
     for name in ("a.pcd", "a.ply", "a.npz"):
         np.testing.assert_array_equal(read_cloud(tmp_path / name), points)
         # Sums in another order: rounding only.

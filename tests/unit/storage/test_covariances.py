@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.storage.covariances import CovarianceBuffer, usable
+from l2m_gtsam.storage.messages import CovarianceBuffer, usable
 
 GOOD = np.diag([1e-4, 2e-4, 3e-4, 1e-6, 2e-6, 3e-6])
 

@@ -28,9 +28,7 @@ from l2m_gtsam.storage.exports.bias_scale import (
     reduced,
 )
 from l2m_gtsam.storage.exports.export import export_of, not_correctable, not_mounted
-from l2m_gtsam.storage.exports.json_file import json_text
-from l2m_gtsam.storage.exports.kalibr import kalibr_text
-from l2m_gtsam.storage.exports.ros2_launch import launch_text
+from l2m_gtsam.storage.exports.formats import json_text, kalibr_text, launch_text
 from tests.drives.calibrations import (
     SIGMA,
     calibration,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from l2m_gtsam.data import FloatArray, LidarMap, MapState
 from l2m_gtsam.errors import MapError, OutputError
 from l2m_gtsam.storage import map_file
-from l2m_gtsam.storage.atomic import atomic_path
+from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.map_file import load_map, save_map
 
 

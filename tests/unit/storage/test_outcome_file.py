@@ -16,7 +16,7 @@ from l2m_gtsam.qa.fleet.rows import DIGITS
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.qa.reasons.reason import Level
 from l2m_gtsam.records.fleet import VERDICTS, DriveOutcome, Made, RowKey
-from l2m_gtsam.storage.outcome_file import read_outcome, write_outcome
+from l2m_gtsam.storage.record_files import read_outcome, write_outcome
 from tests.drives.fleet_rows import sensor_row
 
 KEY = RowKey("0" * 64, "1" * 64, "2" * 64, "1.0")

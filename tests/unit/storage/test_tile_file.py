@@ -15,9 +15,15 @@ from hypothesis.extra import numpy as hnp
 from l2m_gtsam.errors import ConfigError, MapError, Notice
 from l2m_gtsam.maps.harmonic.compiled_arrays import near_from_arrays
 from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, Entry
-from l2m_gtsam.storage import tile_file
-from l2m_gtsam.storage.tile_file import fingerprint_of, read_tile, write_tile
-from l2m_gtsam.storage.tile_folder import LIMIT, TileFolder, tiles_beside
+from l2m_gtsam.storage import tile_folder
+from l2m_gtsam.storage.tile_folder import (
+    LIMIT,
+    TileFolder,
+    fingerprint_of,
+    read_tile,
+    tiles_beside,
+    write_tile,
+)
 
 ENTRY = Entry("3_-1.solved", "ab" * 32)
 ARRAYS: Arrays = {"mean": np.linspace(0, 1, 5), "starts": np.arange(6).reshape(2, 3)}
@@ -96,7 +102,7 @@ def test_it_is_noticed_when_the_end_is_missing(tmp_path: Path, data: st.DataObje
 )
 def test_a_header_that_makes_no_sense_is_refused(tmp_path: Path, arrays: object) -> None:
     header = json.dumps({"fingerprint": ENTRY.fingerprint, "arrays": arrays}).encode()
-    start = tile_file.MAGIC + (1).to_bytes(8, "little") + len(header).to_bytes(8, "little")
+    start = tile_folder.MAGIC + (1).to_bytes(8, "little") + len(header).to_bytes(8, "little")
     (tmp_path / "a.tile").write_bytes(start + bytes(32) + header + bytes(8))
     with pytest.raises(MapError):
         read_tile(tmp_path / "a.tile", ENTRY)
@@ -104,7 +110,7 @@ def test_a_header_that_makes_no_sense_is_refused(tmp_path: Path, arrays: object)
 
 @pytest.mark.parametrize("header", [b"[" * 60_000, b"[]", b"{}", b"\xff"])
 def test_a_header_that_is_none_is_refused(tmp_path: Path, header: bytes) -> None:
-    start = tile_file.MAGIC + (1).to_bytes(8, "little") + len(header).to_bytes(8, "little")
+    start = tile_folder.MAGIC + (1).to_bytes(8, "little") + len(header).to_bytes(8, "little")
     (tmp_path / "a.tile").write_bytes(start + bytes(32) + header)
     with pytest.raises(MapError):
         read_tile(tmp_path / "a.tile", ENTRY)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.storage.units import MICROTESLA_PER, Unit, fault, is_turning, strength
+from l2m_gtsam.storage.bag_options import MICROTESLA_PER, Unit, fault, is_turning, strength
 
 
 def turning_field(strength_ut: float, noise: float, count: int = 200) -> FloatArray:

@@ -12,8 +12,7 @@ from urdf_parser_py.urdf import URDF
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.records.calibration import SensorStatus
-from l2m_gtsam.storage.exports.urdf import comment_text, roll_pitch_yaw, urdf_text
-from l2m_gtsam.storage.exports.urdf_edit import edited_urdf
+from l2m_gtsam.storage.exports.urdf import comment_text, edited_urdf, roll_pitch_yaw, urdf_text
 from tests.drives.calibrations import mounted, rotations, sensor, unsolved
 
 ROBOT = """<?xml version="1.0" encoding="utf-8"?>

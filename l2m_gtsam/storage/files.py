@@ -1,0 +1,177 @@
+"""Files of any kind: written whole or not at all, their digests, and safe names for folders."""
+
+import hashlib
+import os
+import secrets
+import unicodedata
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Protocol
+
+from l2m_gtsam.data import SourceFile
+from l2m_gtsam.errors import L2MError, OutputError
+
+
+@contextmanager
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Give a temporary file to write, and rename it to ``path`` when the block ends well.
+
+    The temporary file stands in the same folder, so that the rename is one step of the file
+    system. When the block fails it is removed, and what was under ``path`` before stays.
+
+    Parameters
+    ----------
+    path
+        Name that the complete file gets.
+
+    Yields
+    ------
+    Path
+        An empty file to write to.
+
+    Raises
+    ------
+    OutputError
+        The folder is missing or the file cannot be written.
+    """
+    with renamed_path(path) as temporary:
+        yield temporary
+        _flush(temporary)
+
+
+@contextmanager
+def renamed_path(path: Path) -> Iterator[Path]:
+    """Give a temporary file as ``atomic_path`` does, for what may be lost with the power.
+
+    Half of it may then be under the name; whoever reads it has to notice.
+    """
+    if path.exists() and not path.is_file():
+        msg = f"{path}: cannot be written: it exists and is not a regular file"
+        raise OutputError(msg)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        temporary.touch(exist_ok=False)
+        yield temporary
+        temporary.replace(path)
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    """Have the content on the disk before the name points to it."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+CHUNK_BYTES = 1 << 20
+
+
+class Hasher(Protocol):
+    """What takes in bytes."""
+
+    def update(self, data: bytes, /) -> None:
+        """Take in bytes."""
+
+
+def source_file(path: Path) -> SourceFile:
+    """Return the SHA-256 of a file, or of all files in a folder.
+
+    A file's digest is that of ``sha256sum``. A folder's is taken over its files in order of their
+    names relative to it: the name, a zero byte, the size as text, a zero byte, the content.
+
+    Parameters
+    ----------
+    path
+        File, or folder (a ROS2 bag).
+
+    Raises
+    ------
+    L2MError
+        The path does not exist or cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        if path.is_dir():
+            _take_folder(digest, path)
+        else:
+            _take_file(digest, path)
+    except OSError as error:
+        msg = f"{path}: cannot be read: {error.strerror or error}"
+        raise L2MError(msg) from error
+    return SourceFile(str(path), digest.hexdigest())
+
+
+def _take_folder(digest: Hasher, folder: Path) -> None:
+    files = {file.relative_to(folder).as_posix(): file for file in folder.rglob("*")}
+    for name, file in sorted(files.items()):
+        if file.is_file():
+            digest.update(f"{name}\0{file.stat().st_size}\0".encode())
+            _take_file(digest, file)
+
+
+def _take_file(digest: Hasher, path: Path) -> None:
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK_BYTES):
+            digest.update(chunk)
+
+
+LONGEST = 60  # letters: four bytes each and a digest are still a name for every file system
+DIGITS = 8  # of the digest that tells names apart
+PLAIN = "._-+ "  # beside letters and digits
+
+
+def folder_names(
+    names: Sequence[str], identities: Sequence[str], reserved: Sequence[str] = ()
+) -> list[str]:
+    """Return a folder's name for each of these names, no two alike on any file system.
+
+    A name that is one already stays as it is. Any other, and all of those that are alike but for
+    upper and lower case, get a few digits of a digest. So the name of one does not depend on the
+    order in which they stand, and on others only when they are like it: one that had no digits gets
+    them when another like it is added.
+
+    Parameters
+    ----------
+    names
+        Any text.
+    identities
+        What stands behind each, unique.
+    reserved
+        Names that are taken.
+    """
+    safe = [_safe(name) for name in names]
+    taken = Counter(map(_alike, safe)) + Counter({_alike(name): 1 for name in reserved})
+    return [
+        made if made == name and taken[_alike(made)] == 1 else f"{made}-{_digits(identity)}"
+        for name, made, identity in zip(names, safe, identities, strict=True)
+    ]
+
+
+def printable(text: str) -> str:
+    """Return text that can be written and shown anywhere: without control characters."""
+    told = text.encode("utf-8", "replace").decode("utf-8")
+    return "".join("\N{REPLACEMENT CHARACTER}" if _controls(each) else each for each in told)
+
+
+def _safe(name: str) -> str:
+    letters = (each if each.isalnum() or each in PLAIN else "_" for each in name)
+    return "".join(letters)[:LONGEST].lstrip(". -").rstrip(". ") or "_"
+
+
+def _alike(name: str) -> str:
+    return unicodedata.normalize("NFKC", name).casefold()
+
+
+def _digits(identity: str) -> str:
+    return hashlib.sha256(identity.encode(errors="surrogatepass")).hexdigest()[:DIGITS]
+
+
+def _controls(letter: str) -> bool:
+    """Return whether a letter is a control character, or changes the direction of others."""
+    return unicodedata.category(letter) in ("Cc", "Cf", "Zl", "Zp")

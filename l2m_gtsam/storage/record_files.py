@@ -1,0 +1,225 @@
+"""Records as JSON: ``metrics.json``, ``validation.json``, ``slam.json`` and ``outcome.json``.
+
+Each file is a head with format and version, then the record. Files are read without trust.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.records.fleet import DATE, VERDICTS, DriveOutcome, SensorRow
+from l2m_gtsam.records.localisation_file import LocalisationRecord
+from l2m_gtsam.records.metrics import Metrics, Record
+from l2m_gtsam.records.validation import Validation
+from l2m_gtsam.storage.files import atomic_path
+
+MAX_BYTES = 100_000_000  # figures of a hundred sensors are some megabytes
+MAX_OUTCOME_BYTES = 10_000_000  # a hundred sensors are some 100 kB
+UNIT = 1e-6  # by which a quaternion's length may differ from 1: it is written with nine digits
+LEGEND = {
+    "poses": "T_map_lidar at key poses: stamp_ns, p in metres, quaternion_xyzw",
+    "covariance": "of a right perturbation, T_true = T_map_lidar Exp(error): rotation (rad), then "
+    "translation (m), along the axes of the lidar",
+    "odometry": "alone, from where the drive is said to begin; sigma along x, y, z of the map (m), "
+    "and about them (deg)",
+    "drift": "odometry alone less the localised poses, in m and deg",
+    "chi2_per_dof": "mean square of whitened residuals; 1 is consistent",
+    "scale": "longer: share by which all distances are longer than odometry has them, with its "
+    "sigma; null where odometry's scale counts as right",
+    "steps": "mean square of the whitened differences between steps of the poses and odometry's",
+    "truth": "errors against a trajectory that was given, nothing aligned; expected nees: 6",
+    "start": "candidates for the start of the drive over the whole map, the likeliest first; "
+    "margin: log likelihood ratio of the first and the second, null without a second",
+}
+
+Content = TypeVar("Content")
+
+
+@dataclass(frozen=True)
+class _MetricsFile(Record):
+    format: Literal["l2m-metrics"]
+    version: Literal[1]
+    metrics: Metrics
+
+
+@dataclass(frozen=True)
+class _ValidationFile(Record):
+    format: Literal["l2m-validation"]
+    version: Literal[1]
+    validation: Validation
+
+
+@dataclass(frozen=True)
+class _SlamHead(Record):
+    format: Literal["l2m-slam"]
+    version: Literal[4]
+    legend: dict[str, str]
+
+
+@dataclass(frozen=True)
+class _SlamFile(LocalisationRecord, _SlamHead):
+    """The head, and the fields of the record beside it."""
+
+
+@dataclass(frozen=True)
+class _OutcomeFile(Record):
+    format: Literal["l2m-fleet-outcome"]
+    version: Literal[1]
+    outcome: DriveOutcome
+
+
+_METRICS = TypeAdapter(_MetricsFile)
+_VALIDATION = TypeAdapter(_ValidationFile)
+_SLAM = TypeAdapter(_SlamFile)
+_OUTCOME = TypeAdapter(_OutcomeFile)
+
+
+def write_metrics(path: Path, metrics: Metrics) -> None:
+    """Write ``metrics.json``, which a report is drawn from; `read_metrics` gives it back equal."""
+    # What only several drives have is left out of files of one.
+    _write(path, _METRICS.dump_json(_MetricsFile("l2m-metrics", 1, metrics), exclude_none=True))
+
+
+def read_metrics(path: Path) -> Metrics:
+    """Return the metrics in a file.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing, damaged or something else.
+    """
+    writer = "`l2m calibrate` writes it beside calibration.yaml"
+    return _read(path, _METRICS, "metrics", writer).metrics
+
+
+def write_validation(path: Path, validation: Validation) -> None:
+    """Write ``validation.json``; `read_validation` gives it back equal."""
+    _write(path, _VALIDATION.dump_json(_ValidationFile("l2m-validation", 1, validation)))
+
+
+def read_validation(path: Path) -> Validation:
+    """Return the validation in a file.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing, damaged or something else.
+    """
+    writer = "`l2m validate --out` writes it"
+    return _read(path, _VALIDATION, "validation", writer).validation
+
+
+def write_slam(path: Path, record: LocalisationRecord) -> None:
+    """Write ``slam.json``; `read_slam` gives it back equal.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    _write(path, _SLAM.dump_json(_SlamFile("l2m-slam", 4, LEGEND, **_parts(record))))
+
+
+def read_slam(path: Path) -> LocalisationRecord:
+    """Return the localisation in a file.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing, damaged or something else.
+    """
+    return LocalisationRecord(**_parts(_read(path, _SLAM, "localisation", "`l2m slam` writes it")))
+
+
+def _parts(record: LocalisationRecord) -> dict[str, Any]:
+    return {each.name: getattr(record, each.name) for each in fields(LocalisationRecord)}
+
+
+def write_outcome(path: Path, outcome: DriveOutcome) -> None:
+    """Write ``outcome.json`` of a drive of a fleet; `read_outcome` gives it back equal."""
+    _write(path, _OUTCOME.dump_json(_OutcomeFile("l2m-fleet-outcome", 1, outcome), indent=1))
+
+
+def read_outcome(path: Path) -> DriveOutcome | None:
+    """Return an outcome; None where there is none, or none that can be gone on from.
+
+    One that was damaged or edited counts as none: its drive is computed again, which is safer than
+    a table of what was never found.
+    """
+    try:
+        if path.stat().st_size > MAX_OUTCOME_BYTES:
+            return None
+        found = _OUTCOME.validate_json(path.read_bytes()).outcome
+    except (OSError, ValidationError):
+        return None
+    return found if _sound(found) else None
+
+
+def _sound(outcome: DriveOutcome) -> bool:
+    """Return whether an outcome can be what `write_outcome` was given."""
+    return (
+        bool(outcome.sensors) != bool(outcome.error)
+        and _is_date(outcome.start)
+        and 0 <= outcome.duration < math.inf
+        and all(map(_sound_row, outcome.sensors))
+    )
+
+
+def _sound_row(sensor: SensorRow) -> bool:
+    """Return whether a row has a known verdict, and a rotation or none."""
+    q = sensor.quaternion_xyzw
+    none = all(map(math.isnan, q))
+    return sensor.verdict in VERDICTS and (none or abs(math.hypot(*q) - 1) < UNIT)
+
+
+def _is_date(text: str) -> bool:
+    """Return whether text is a date, or empty: that of a drive which was not read."""
+    try:
+        return not text or bool(datetime.strptime(text, DATE).replace(tzinfo=UTC))
+    except ValueError:
+        return False
+
+
+def _write(path: Path, content: bytes) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content + b"\n")
+
+
+def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> Content:
+    """Return what a file holds.
+
+    Parameters
+    ----------
+    path
+        The file.
+    adapter
+        Of its content.
+    kind
+        What it is called in messages, "metrics".
+    writer
+        Which command writes it, for the message about a missing file.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing, damaged or something else.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            msg = f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
+            raise CalibrationError(msg)
+        return adapter.validate_json(path.read_bytes())
+    except FileNotFoundError as error:
+        raise CalibrationError(f"{path}: no such file; {writer}") from error
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        fault = error.errors()[0]
+        key = ".".join(str(part) for part in fault["loc"]) or "the file"
+        msg = f"{path}: not a {kind} file of this program: {key}: {fault['msg']}"
+        raise CalibrationError(msg) from error
