@@ -7,12 +7,11 @@ import pytest
 from hypothesis import settings
 
 from tests.support.browsing import find_tools
+from tests.support.repository import REPOSITORY
 
 # Machines are as fast as they are, and the first call of a compiled function compiles it.
 settings.register_profile("l2m", deadline=None)
 settings.load_profile("l2m")
-
-REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")

@@ -15,14 +15,7 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.record_files import write_metrics
 from tests.drives.verdict import NOMINAL, loose
-from tests.support.browsing import Looked, look
-
-HOSTILE = {
-    "mag_0": "<script>alert(1)</script>",
-    "mag_1": '"><img src=x onerror=alert(2)>$\\frac{',
-    "mag_2": "</style></svg><svg onload=alert(3)>{{ 7 * 7 }}",
-}
-BAG = "<b onmouseover=alert(4)>drive</b>.bag"
+from tests.support.browsing import BAG, HOSTILE, Looked, look
 
 
 @pytest.fixture(scope="session")

@@ -6,8 +6,9 @@ import numpy as np
 from PIL import Image
 
 from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
-from tests.browser.conftest import BAG, HOSTILE
 from tests.support.browsing import (
+    BAG,
+    HOSTILE,
     Looked,
     check_accessibility,
     check_figures,

@@ -9,9 +9,10 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.slam_page import slam_page
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.validation import NamedSource
-from tests.browser.conftest import BAG, HOSTILE
 from tests.drives.localised import record
 from tests.support.browsing import (
+    BAG,
+    HOSTILE,
     Looked,
     check_accessibility,
     check_figures,

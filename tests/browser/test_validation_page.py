@@ -13,10 +13,11 @@ from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.validation import NamedSource, Validation
 from l2m_gtsam.validation.validate import validate
-from tests.browser.conftest import BAG, HOSTILE
 from tests.drives.degenerate import STRONG
 from tests.drives.validation import OPTIONS, calibrated, changed, other_drive
 from tests.support.browsing import (
+    BAG,
+    HOSTILE,
     Looked,
     check_accessibility,
     check_figures,

@@ -16,10 +16,14 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.slam.options import KeyPoseOptions
 from tests.drives.calibrations import calibration, sensor
+from tests.worlds.exact import dipole_world, random_sensors
 
 RATE_HZ = 20
 SPEED = 0.6  # m/s
+WIDE = np.concatenate([np.full(3, 0.05), np.full(9, 0.05), np.full(3, 10.0)])
+COARSE = KeyPoseOptions(readings=3)  # enough, and quick
 
 
 class Field(Protocol):
@@ -135,3 +139,15 @@ def calibrated(
             )
         )
     return calibration(*entries)
+
+
+def quiet(_stage: str, _fraction: float) -> None:
+    """Tell nobody."""
+
+
+def small_hall(
+    seed: int, seconds: float, sensors: int = 2
+) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
+    known = random_sensors(seed, sensors)
+    rng = np.random.default_rng(seed)
+    return known, slam_drive(dipole_world(1), known, rounds(seconds), rng)

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import KnownSensor, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
@@ -55,3 +56,36 @@ def turning_drive(count: int = 150) -> Readings:
     field = np.concatenate(measured) + rng.normal(0, NOISE, (N, 3))
     stamps = np.tile(np.arange(count) * 50_000_000, len(SENSORS))
     return Readings(tuple(s.sensor for s in SENSORS), sensor, stamps, R, p, field)
+
+
+def dense_rows(
+    readings: Readings, field_map: HarmonicMap, theta: FloatArray, A: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return residuals (N, 3) and their derivatives (N, 3, n) by all unknowns."""
+    S, beta = len(SENSORS), theta[15 * len(SENSORS) :]
+    parts = theta[: 15 * S].reshape(S, 15)[readings.sensor]
+    t, C, H = parts[:, :3], parts[:, 3:12].reshape(-1, 3, 3), parts[:, 12:]
+    R = readings.R_map_lidar
+    B, G = field_map.field_and_gradient(np.einsum("nij,nj->ni", R, t) + readings.p_map_lidar)
+    b = np.einsum("nji,nj->ni", R, B + A @ beta)
+    e = np.einsum("nij,nj->ni", C, b) + H - readings.field
+    CR = C @ R.transpose(0, 2, 1)
+    J = np.zeros((len(readings), 3, len(theta)))
+    for n, sensor in enumerate(readings.sensor):
+        own = J[n, :, 15 * sensor : 15 * sensor + 15]
+        own[:, :3] = CR[n] @ G[n] @ R[n]
+        own[:, 3:12] = np.kron(np.eye(3), b[n])
+        own[:, 12:] = np.eye(3)
+    J[:, :, 15 * S :] = CR @ A
+    return e, J
+
+
+def all_features(errors: ErrorModes, points: FloatArray) -> FloatArray:
+    """Return A over all beta, shape (N, 3, K)."""
+    A = np.zeros((len(points), 3, len(errors.covariance)))
+    owner, start = errors.owner(points), 0
+    for tile, size in errors.sizes().items():
+        rows = np.flatnonzero(owner == tile)
+        A[rows, :, start : start + size] = errors.features(points[rows], tile)
+        start += size
+    return A

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from tests.drives.bags import Entry, ros, write
-from tests.end_to_end.conftest import l2m
+from tests.support.command_line import l2m
 from tests.support.made_once import made_once
 from tests.worlds.yard import NOISE, START, STEP, Yard, make_yard, route, world
 

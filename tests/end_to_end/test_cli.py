@@ -12,7 +12,6 @@ from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from tests.drives.bags import Entry, ros, write
-from tests.end_to_end.conftest import Demo, complaint_here, l2m, l2m_process, one_line
 from tests.support.browsing import (
     check_accessibility,
     check_figures,
@@ -20,6 +19,7 @@ from tests.support.browsing import (
     check_silence,
     look,
 )
+from tests.support.command_line import Demo, complaint_here, l2m, l2m_process, one_line
 
 
 def test_help_loads_nothing_heavy() -> None:

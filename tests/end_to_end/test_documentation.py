@@ -11,8 +11,8 @@ from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import load_options
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from tests.conftest import REPOSITORY
-from tests.end_to_end.pages import blocks, run_page, words
+from tests.support.pages import blocks, run_page, words
+from tests.support.repository import REPOSITORY
 
 DOCS = REPOSITORY / "docs"
 PAGES = [REPOSITORY / "README.md", *sorted(DOCS.rglob("*.md"))]

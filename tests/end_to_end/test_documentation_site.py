@@ -9,7 +9,7 @@ from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 from l2m_gtsam.config import Config
-from tests.conftest import REPOSITORY
+from tests.support.repository import REPOSITORY
 
 
 class Page(HTMLParser):

@@ -11,7 +11,7 @@ import pytest
 from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.drives.yard import T_LIDAR_MAG, C, CalibratedYard, calibrated, calibrated_yard, written
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.fleet import DriveOutcome
 from tests.drives.fleets import Place, make_place, not_a_bag, truncated, vehicle
-from tests.end_to_end.conftest import Finished, complaint_here, l2m
+from tests.support.command_line import Finished, complaint_here, l2m
 
 HOSTILE = "<img src=x onerror=alert(1)>.bag"
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_metrics
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 
 
 def test_bags_that_are_missing_or_given_twice(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from l2m_gtsam.storage.calibration_file import read_calibration, write_calibrati
 from l2m_gtsam.storage.map_file import load_map, save_map
 from l2m_gtsam.storage.record_files import read_slam
 from tests.drives.calibrations import calibration, sensor
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 from tests.worlds.halls import SMALL_HALL
 from tests.worlds.quick_maps import QUICK_HARMONIC
 

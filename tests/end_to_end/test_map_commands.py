@@ -11,7 +11,7 @@ from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic import compiled, tiles
 from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import load_map
-from tests.end_to_end.conftest import complaint_here, l2m, l2m_process
+from tests.support.command_line import complaint_here, l2m, l2m_process
 from tests.worlds.quick_maps import QUICK_HARMONIC
 from tests.worlds.yard import POST, Yard, make_yard, world
 

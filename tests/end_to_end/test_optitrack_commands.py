@@ -6,7 +6,6 @@ import pytest
 
 from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
-from tests.end_to_end.conftest import l2m
 from tests.support.browsing import (
     check_accessibility,
     check_figures,
@@ -14,6 +13,7 @@ from tests.support.browsing import (
     check_silence,
     look,
 )
+from tests.support.command_line import l2m
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from tests.drives.bags import Entry, ros, write
 from tests.drives.yard import calibrated_yard
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 from tests.worlds.yard import START, STEP, Yard, route
 
 

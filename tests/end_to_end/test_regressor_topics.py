@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.drives.bags import Entry, ros, write
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 from tests.worlds.yard import NOISE, START, STEP, Yard, make_yard, route, world
 
 H = np.array([0.8, -0.5, 0.6])  # uT/A

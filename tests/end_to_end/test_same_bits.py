@@ -7,7 +7,7 @@ import numpy as np
 
 from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
-from tests.end_to_end.conftest import l2m, l2m_process
+from tests.support.command_line import l2m, l2m_process
 from tests.worlds.halls import SMALL_HALL
 from tests.worlds.quick_maps import QUICK_HARMONIC
 

@@ -20,7 +20,7 @@ from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.yaml_file import read_yaml
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 
 CORRIDOR = {
     "corridor": {"length": 12.0},

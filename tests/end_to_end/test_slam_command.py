@@ -19,7 +19,7 @@ from l2m_gtsam.storage.calibration_file import read_calibration, write_calibrati
 from l2m_gtsam.storage.trajectory_files import write_tum
 from tests.drives.calibrations import calibration, sensor
 from tests.drives.yard import calibrated_yard
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 from tests.worlds.yard import NOISE, Yard, route
 
 SIGMA = np.concatenate([np.full(3, 0.01), np.full(9, 0.01), np.full(3, 1.0)])

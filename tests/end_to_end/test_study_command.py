@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.storage.yaml_file import write_yaml
-from tests.end_to_end.conftest import complaint_here, l2m
-from tests.statistical.test_basin import TINY
+from tests.support.command_line import complaint_here, l2m
+from tests.worlds.study_sites import TINY_BASIN as TINY
 
 
 def test_a_study_from_options_to_page_and_again(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 
 QUICK = {"sync": {"thin_distance_m": 0.05}, "windows": 1, "readings": 800, "modes": 120}
 

@@ -15,7 +15,7 @@ from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
 from tests.drives.yard import CalibratedYard, H, calibrated_yard, written
-from tests.end_to_end.conftest import complaint_here, l2m
+from tests.support.command_line import complaint_here, l2m
 from tests.worlds.yard import NOISE
 
 

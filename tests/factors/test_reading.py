@@ -1,7 +1,5 @@
 """The magnetic reading factors: derivatives, batching, and the two forms of one mathematics."""
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import (
     BatchedReadings,
     D,
-    MagneticReadings,
     PoseMotion,
     S,
     T,
@@ -23,32 +20,9 @@ from l2m_factors import (
     moved,
     reading_factor,
 )
-from l2m_gtsam.data import FloatArray, Readings
-from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
-
-
-def as_magnetic(readings: Readings) -> MagneticReadings:
-    return MagneticReadings(
-        readings.sensor, readings.R_map_lidar, readings.p_map_lidar, readings.field
-    )
-
-
-def with_motion(readings: MagneticReadings, seed: int) -> MagneticReadings:
-    """Return readings of a lidar that turns by up to 1 rad/s and moves by up to 2 m/s."""
-    rng, n = np.random.default_rng(seed), len(readings)
-    twist = np.hstack([rng.uniform(-1, 1, (n, 3)), rng.uniform(-2, 2, (n, 3))])
-    return replace(readings, motion=PoseMotion(twist, rng.uniform(-0.02, 0.02, n)))
-
-
-def random_values(seed: int, sensors: int) -> gtsam.Values:
-    rng = np.random.default_rng(seed)
-    values = gtsam.Values()
-    for i in range(sensors):
-        values.insert(T(i), rng.uniform(-0.5, 0.5, 3))
-        C = Rotation.random(rng=rng).as_matrix() + rng.normal(0, 0.2, (3, 3))
-        values.insert(D(i), np.concatenate([C.ravel(), rng.normal(0, 20, 3)]))
-        values.insert(S(i), float(rng.uniform(-0.05, 0.05)))
-    return values
+from l2m_gtsam.data import FloatArray
+from tests.support.factor_inputs import CountingWorld, as_magnetic, random_values, with_motion
+from tests.worlds.exact import dipole_world, drive, random_sensors
 
 
 def fixed_distortion(values: gtsam.Values, sensors: int) -> FloatArray:
@@ -106,17 +80,6 @@ def test_check_catches_a_wrong_jacobian() -> None:
     factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), [T(0)], papers)
     with pytest.raises(AssertionError, match="Jacobian by T0"):
         assert_jacobians_match(factor, values)
-
-
-class CountingWorld:
-    """A map that counts how often it is asked."""
-
-    def __init__(self, world: DipoleWorld) -> None:
-        self.world, self.calls = world, 0
-
-    def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        self.calls += 1
-        return self.world.field_and_gradient(points)
 
 
 def test_one_map_query_per_linearisation() -> None:

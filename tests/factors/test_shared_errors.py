@@ -25,7 +25,7 @@ from l2m_factors import (
     uncertain_reading_factor,
 )
 from l2m_gtsam.data import FloatArray, IntArray
-from tests.factors.test_reading import as_magnetic, random_values, with_motion
+from tests.support.factor_inputs import as_magnetic, random_values, with_motion
 from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
 
 TILES = {7: 4, 2: 6}  # weights of each; keys are no positions

@@ -22,7 +22,7 @@ from l2m_factors import (
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
-from tests.factors.test_pose import (
+from tests.support.factor_inputs import (
     calibrations,
     moving,
     on,

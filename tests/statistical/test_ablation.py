@@ -12,11 +12,6 @@ from pydantic import TypeAdapter
 
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.mapping.map_building import MappingOptions
-from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
-from l2m_gtsam.simulate.route import CalibrationRouteOptions
-from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
 from l2m_gtsam.studies.ablation.cells import (
     AblationCell,
     AblationOptions,
@@ -30,25 +25,16 @@ from l2m_gtsam.studies.ablation.page import ablation_page
 from l2m_gtsam.studies.ablation.study import ABLATION
 from l2m_gtsam.studies.ablation.table import AblationTable, ablation_table, gain
 from l2m_gtsam.studies.fingerprints import LAYER, thinned_rows
-from l2m_gtsam.studies.site import SiteOptions
 from tests.support.inline_study import run_inline
-from tests.worlds.quick_maps import quick
+from tests.worlds.study_sites import one_row_site
 
-HALL = ScenarioOptions(
-    floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
-    suite=SuiteOptions(lateral=(0.0,)),
-    array=ArrayOptions(count=1),
-    noise=NoiseOptions(field=0.1),
-    calibration_route=CalibrationRouteOptions(turns=1),
-    calibration_sampling=SamplingOptions(field_rate=3.0),
-)
 TINY = AblationOptions(
     batches=2,
     batch=1,
     kinds=("bilinear", "sliding_gp"),
     spacings=(0.0, 1.5),
     window=WindowOptions(width=4.0, height=3.0, step=0.5),
-    site=SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("harmonic"))),
+    site=one_row_site(0.1),
     search=StartOptions(search_radius=1.0, poses=40),
 )
 

@@ -11,12 +11,7 @@ from scipy.stats import binomtest
 
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.start.global_start import find_starts
-from l2m_gtsam.mapping.map_building import MappingOptions
 from l2m_gtsam.parallel.cluster import ClusterOptions
-from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
-from l2m_gtsam.simulate.route import CalibrationRouteOptions
-from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
 from l2m_gtsam.studies.basin.cells import (
     DRIVE,
     BasinOptions,
@@ -29,24 +24,13 @@ from l2m_gtsam.studies.basin.report import basin_figure, basin_markdown
 from l2m_gtsam.studies.basin.study import BASIN
 from l2m_gtsam.studies.run import run_study
 from l2m_gtsam.studies.share import Share
-from l2m_gtsam.studies.site import SiteOptions, mapped_site, random_drive
-from tests.worlds.quick_maps import quick
-
-HALL = ScenarioOptions(
-    floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
-    suite=SuiteOptions(lateral=(0.0,)),
-    array=ArrayOptions(count=1),
-    noise=NoiseOptions(field=0.2),
-    calibration_route=CalibrationRouteOptions(turns=1),
-    calibration_sampling=SamplingOptions(field_rate=3.0),
-)
-SITE = SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("harmonic")))
-TINY = BasinOptions(distortions=1, starts=3, few_starts=2, rings=2, width=1.5, site=SITE)
+from l2m_gtsam.studies.site import mapped_site, random_drive
+from tests.worlds.study_sites import TINY_BASIN as TINY
 
 
 @lru_cache
 def tiny_cells() -> tuple[Cell, ...]:
-    return cells_of(TINY, mapped_site(SITE), 0).rings
+    return cells_of(TINY, mapped_site(TINY.site), 0).rings
 
 
 def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
@@ -84,16 +68,16 @@ def test_starts_lie_in_their_ring() -> None:
 
 def test_a_ring_repeats_itself_also_without_the_others() -> None:
     alone = TINY.model_copy(update={"rings": 1})
-    (again,) = cells_of(alone, mapped_site(SITE), 0).rings
+    (again,) = cells_of(alone, mapped_site(TINY.site), 0).rings
     for name, value in vars(tiny_cells()[0]).items():
         # Descents go in step with those of other starts: sums over other batches round otherwise.
         np.testing.assert_allclose(getattr(again, name), value, rtol=1e-9, atol=1e-9)
 
 
 def test_a_start_is_solved_as_the_product_does() -> None:
-    site = mapped_site(SITE)
+    site = mapped_site(TINY.site)
     rng = np.random.default_rng([TINY.seed, 0, 0, DRIVE])
-    readings = random_drive(site, SITE, rng).readings
+    readings = random_drive(site, TINY.site, rng).readings
     for each in tiny_cells():
         found = find_starts(readings, site.field_map, each.t_start[2], TINY.search)[0]
         assert found is not None

@@ -11,9 +11,8 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
 from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
-from tests.drives.slam import calibrated, laps
-from tests.integration.slam.test_exploring import OnLine, prepared_drive, rms
-from tests.integration.slam.test_slam import quiet
+from tests.drives.exploring import OnLine, prepared_drive, rms
+from tests.drives.slam import calibrated, laps, quiet
 from tests.worlds.exact import random_sensors
 
 SEEDS, SENSORS = range(1, 7), 6

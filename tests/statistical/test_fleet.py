@@ -13,7 +13,7 @@ import pytest
 
 from l2m_gtsam.batch.fleet_task import OUTCOME_FILE
 from tests.drives.fleets import BROKEN, Place, make_place, vehicle
-from tests.end_to_end.conftest import l2m_process
+from tests.support.command_line import l2m_process
 
 pytestmark = pytest.mark.study
 

@@ -4,28 +4,15 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.build import build_map
-from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.slam import calibrated, rounds, slam_drive
-from tests.integration.slam.test_slam import pose_nees, position_error, quiet
-from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
-from tests.worlds.quick_maps import quick
+from tests.drives.slam import calibrated, quiet, rounds, slam_drive
+from tests.support.pose_errors import pose_nees, position_error
+from tests.worlds.exact import dipole_world, random_sensors
+from tests.worlds.surveyed import NOISE, survey
 
 DRIVES = 12
-NOISE = 0.2  # uT
-
-
-def survey(world: DipoleWorld, rng: np.random.Generator) -> FieldMap:
-    """Return a map from readings at three heights over the middle of the hall."""
-    lines = np.arange(-4.4, 4.5, 0.3)
-    x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
-    points = np.column_stack([x, y, rng.choice([0.2, 0.5, 0.9], len(x))])
-    points += rng.normal(0, 0.03, points.shape)
-    field, _ = world.field_and_gradient(points)
-    return build_map(points, field + NOISE * rng.normal(size=field.shape), quick("harmonic"))
 
 
 def one_drive(seed: int) -> FloatArray:

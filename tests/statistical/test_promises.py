@@ -20,7 +20,7 @@ from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
 from l2m_gtsam.studies.honesty.study import HONESTY
 from l2m_gtsam.studies.honesty.summary import TARGET, Verdict
 from l2m_gtsam.studies.run import run_study
-from tests.statistical.study_calibration import (
+from tests.drives.studied_calibrations import (
     CalibrationCase,
     CalibrationConditions,
     Solved,
@@ -28,7 +28,7 @@ from tests.statistical.study_calibration import (
     independent,
     solved_by,
 )
-from tests.statistical.study_maps import (
+from tests.worlds.studied_maps import (
     Build,
     MapCase,
     MapConditions,

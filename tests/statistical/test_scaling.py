@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_gtsam.calibration.start.global_start import StartOptions
-from l2m_gtsam.mapping.map_building import MappingOptions
 from l2m_gtsam.maps.training import training_set
 from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
 from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
@@ -20,17 +19,15 @@ from l2m_gtsam.studies.scaling.study import SCALING
 from l2m_gtsam.studies.scaling.table import ScalingTable, exponent, scaling_table
 from l2m_gtsam.studies.scaling.tasks import middle
 from l2m_gtsam.studies.scaling.workers import Stint, rate
-from l2m_gtsam.studies.site import SiteOptions
-from tests.statistical.test_ablation import HALL
 from tests.support.inline_study import run_inline
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.exact import drive as simulated
-from tests.worlds.quick_maps import quick
+from tests.worlds.study_sites import one_row_site
 
 MIB = 2**20
 FRESH = 64 * MIB
 # Calibrations on a harmonic map take longer; others test them.
-SITE = SiteOptions(scenario=HALL, mapping=MappingOptions(model=quick("bilinear")))
+SITE = one_row_site(0.1, "bilinear")
 TINY = ScalingOptions(
     readings=(60, 120),
     numeric_readings=60,

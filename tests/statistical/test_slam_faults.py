@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.records.localisation import LocalisationStatus
+from tests.drives.exploring import explored
 from tests.drives.faults import jumped, shift
 from tests.drives.slam import laps, slam_drive
-from tests.integration.slam.test_explore import explored
-from tests.integration.slam.test_slam import position_error
+from tests.support.pose_errors import position_error
 from tests.worlds.exact import dipole_world, random_sensors
 
 

@@ -8,11 +8,9 @@ from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
-from tests.drives.slam import calibrated, slam_drive
-from tests.integration.slam.test_slam import quiet
-from tests.statistical.test_localisation import survey
+from tests.drives.slam import calibrated, quiet, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
-from tests.worlds.surveyed import in_odometry, wandering
+from tests.worlds.surveyed import in_odometry, survey, wandering
 
 HALLS, DRIVES = 5, 20
 NEAR = 0.5  # metres

@@ -11,15 +11,16 @@ from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
 from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, steel_hall
 from l2m_gtsam.simulate.world import SteelWorld
-from tests.statistical import study_calibration
-from tests.statistical.study_calibration import (
+from tests.drives import studied_calibrations
+from tests.drives.studied_calibrations import (
     CalibrationCase,
     CalibrationConditions,
     Solved,
     calibration_study,
     independent,
 )
-from tests.statistical.study_maps import (
+from tests.worlds.exact import DipoleWorld, dipole_world
+from tests.worlds.studied_maps import (
     NOISE_FACT,
     MapCase,
     MapConditions,
@@ -27,7 +28,6 @@ from tests.statistical.study_maps import (
     StudiedMap,
     map_study,
 )
-from tests.worlds.exact import DipoleWorld, dipole_world
 
 Exact = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
@@ -138,7 +138,7 @@ def test_the_calibration_study_finds_an_exact_map_honest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Exact fields and white noise: the covariances are true, and with half the sigmas not."""
-    monkeypatch.setattr(study_calibration, "steel_hall", dipole_hall)
+    monkeypatch.setattr(studied_calibrations, "steel_hall", dipole_hall)
     conditions = CalibrationConditions(
         surveys=4, drives=2, sensors=3, readings=100, noises=(0.2,), survey_readings=50
     )

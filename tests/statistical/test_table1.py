@@ -9,7 +9,6 @@ from pydantic import TypeAdapter
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.route import RouteShape
-from l2m_gtsam.simulate.sensors import NoiseOptions
 from l2m_gtsam.studies.site import random_drive
 from l2m_gtsam.studies.table1 import report
 from l2m_gtsam.studies.table1.cells import (
@@ -31,7 +30,7 @@ from l2m_gtsam.studies.table1.methods import (
 from l2m_gtsam.studies.table1.paper import NOISES, Printed, printed
 from l2m_gtsam.studies.table1.study import TABLE1, keys
 from l2m_gtsam.studies.table1.summary import Table1Summary, summarise
-from tests.statistical.test_basin import SITE
+from tests.worlds.study_sites import one_row_site
 
 NOISE = 0.2
 TINY = Table1Options(
@@ -41,9 +40,7 @@ TINY = Table1Options(
     starts=3,
     others=1,
     bounds=1,
-    site=SITE.model_copy(
-        update={"scenario": SITE.scenario.model_copy(update={"noise": NoiseOptions(field=0.1)})}
-    ),
+    site=one_row_site(0.1),
 )
 
 

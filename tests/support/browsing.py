@@ -99,3 +99,13 @@ def check_accessibility(looked: Looked) -> None:
     """Axe-core has no serious finding."""
     for each in looked.looks:
         assert [fault for fault in each["accessibility"] if fault["impact"] in GRAVE] == []
+
+
+HOSTILE = {
+    "mag_0": "<script>alert(1)</script>",
+    "mag_1": '"><img src=x onerror=alert(2)>$\\frac{',
+    "mag_2": "</style></svg><svg onload=alert(3)>{{ 7 * 7 }}",
+}
+
+
+BAG = "<b onmouseover=alert(4)>drive</b>.bag"

@@ -6,15 +6,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FieldSample, FloatArray, Recording, Trajectory
-from l2m_gtsam.maps.field_map import masked
+from l2m_gtsam.maps.build import build_map
+from l2m_gtsam.maps.field_map import FieldMap, masked
 from l2m_gtsam.maps.training import TrainingSet
 from tests.drives.slam import RATE_HZ, SPEED
 from tests.worlds.exact import DipoleWorld
+from tests.worlds.quick_maps import quick
 
 REACH = 0.4  # metres
 SIGMA = 0.05  # uT, what the map says of itself
 HEIGHTS = (0.1, 0.5, 0.9)  # metres
 ROOM = 4.5  # metres to each side of its middle
+NOISE = 0.2  # uT
 
 
 @dataclass(frozen=True)
@@ -80,3 +83,13 @@ def in_odometry(recording: Recording, rng: np.random.Generator) -> Recording:
     poses, away = recording.trajectory, rng.uniform(-20, 20, 3)
     poses = replace(poses, R=R @ poses.R, p=poses.p @ R.T + away, frame="odom")
     return replace(recording, trajectory=poses)
+
+
+def survey(world: DipoleWorld, rng: np.random.Generator) -> FieldMap:
+    """Return a map from readings at three heights over the middle of the hall."""
+    lines = np.arange(-4.4, 4.5, 0.3)
+    x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
+    points = np.column_stack([x, y, rng.choice([0.2, 0.5, 0.9], len(x))])
+    points += rng.normal(0, 0.03, points.shape)
+    field, _ = world.field_and_gradient(points)
+    return build_map(points, field + NOISE * rng.normal(size=field.shape), quick("harmonic"))

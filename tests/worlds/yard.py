@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.storage.cloud import write_cloud
 from tests.drives.bags import Entry, ros, write
-from tests.integration.storage.test_cloud_topic import scan
+from tests.drives.clouds import scan
 from tests.worlds.exact import DipoleWorld
 from tests.worlds.quick_maps import QUICK_HARMONIC
 

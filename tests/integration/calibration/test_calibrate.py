@@ -14,43 +14,22 @@ from l2m_gtsam.cli.tables.tables import disagreement_note
 from l2m_gtsam.data import (
     Distortion,
     FieldSample,
-    FieldSeries,
     FloatArray,
     KnownSensor,
     Recording,
     SourceFile,
-    Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors, write_known_sensors
 from l2m_gtsam.storage.yaml_file import read_yaml
+from tests.drives.figure_of_eight import recorded_drive
+from tests.support.records import assert_equal
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
 
-STEP_NS = 50_000_000
 # The sensors sit within a metre of the lidar; the exact field of many dipoles is slow.
 OPTIONS = CalibrationOptions(search=StartOptions(search_radius=1.0))
-
-
-def recorded_drive(
-    world: DipoleWorld, sensors: tuple[KnownSensor, ...], seconds: float = 30.0
-) -> Recording:
-    """A smooth noiseless drive: figure of eight with pitching and rolling, poses at 20 Hz."""
-    s = np.arange(0, seconds, STEP_NS * 1e-9)
-    angles = np.column_stack([0.5 * s, 0.2 * np.sin(1.1 * s), 0.2 * np.cos(1.7 * s)])
-    R = Rotation.from_euler("ZYX", angles).as_matrix()
-    p = np.column_stack([3 * np.sin(0.3 * s), 2 * np.sin(0.6 * s), 0.5 + 0.1 * np.sin(0.9 * s)])
-    stamps = 1_700_000_000_000_000_000 + np.arange(len(s)) * STEP_NS
-    rng = np.random.default_rng(0)
-    series = []
-    for sensor in sensors:
-        B, _ = world.field_and_gradient(np.einsum("nij,j->ni", R, sensor.t_lidar_mag) + p)
-        field = sensor.distortion.apply(np.einsum("nji,nj->ni", R, B))
-        field += 0.1 * rng.normal(size=field.shape)
-        series.append(FieldSeries(sensor.sensor, "/" + sensor.sensor, "mag", stamps, field))
-    trajectory = Trajectory(stamps, R, p, "map", "lidar")
-    return Recording(trajectory, tuple(series), SourceFile("drive.bag", "ab12"))
 
 
 @pytest.fixture(scope="module")
@@ -157,24 +136,6 @@ def test_the_file_reads_back_equal(mixed: CalibrationResult, tmp_path: Path) -> 
     assert_equal(back, doubted)
     write_calibration(tmp_path / "again.yaml", back)
     assert (tmp_path / "again.yaml").read_bytes() == path.read_bytes()
-
-
-def assert_equal(a: object, b: object) -> None:
-    """Compare records field by field, arrays bit by bit, NaN equal to NaN."""
-    assert type(a) is type(b)
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        np.testing.assert_array_equal(a, b)
-    elif isinstance(a, tuple) and isinstance(b, tuple):
-        assert len(a) == len(b)
-        for x, y in zip(a, b, strict=True):
-            assert_equal(x, y)
-    elif hasattr(a, "__dataclass_fields__"):
-        for name in a.__dataclass_fields__:
-            assert_equal(getattr(a, name), getattr(b, name))
-    elif isinstance(a, float) and isinstance(b, float) and np.isnan(a):
-        assert np.isnan(b)
-    else:
-        assert a == b
 
 
 def test_the_file_explains_itself(mixed: CalibrationResult, tmp_path: Path) -> None:

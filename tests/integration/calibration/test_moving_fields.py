@@ -23,7 +23,7 @@ from l2m_gtsam.records.calibration import (
 from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from tests.drives.moving import STEP_NS, WORLD, MovingDrive, moving_drive, options, surveyed
-from tests.integration.calibration.test_calibrate import assert_equal
+from tests.support.records import assert_equal
 
 SEEDS = (1, 2)
 MORE_SEEDS = range(1, 5)

@@ -18,7 +18,7 @@ from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from tests.drives.degenerate import POSTS, STRONG, at_height, mounted, poses, recorded, straight
-from tests.integration.calibration.test_calibrate import recorded_drive
+from tests.drives.figure_of_eight import recorded_drive
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
 
 WORLD = dipole_world(11)

@@ -14,7 +14,6 @@ from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.priors import Difference, Priors
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.records.calibration import Uncertainty
 from tests.drives.uncertain import (
@@ -25,6 +24,8 @@ from tests.drives.uncertain import (
     SENSORS,
     STARTS,
     WORLD,
+    all_features,
+    dense_rows,
     surveyed_map,
     turning_drive,
 )
@@ -70,39 +71,6 @@ class Dense:
 
     theta: FloatArray
     covariance: FloatArray
-
-
-def dense_rows(
-    readings: Readings, field_map: HarmonicMap, theta: FloatArray, A: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return residuals (N, 3) and their derivatives (N, 3, n) by all unknowns."""
-    S, beta = len(SENSORS), theta[15 * len(SENSORS) :]
-    parts = theta[: 15 * S].reshape(S, 15)[readings.sensor]
-    t, C, H = parts[:, :3], parts[:, 3:12].reshape(-1, 3, 3), parts[:, 12:]
-    R = readings.R_map_lidar
-    B, G = field_map.field_and_gradient(np.einsum("nij,nj->ni", R, t) + readings.p_map_lidar)
-    b = np.einsum("nji,nj->ni", R, B + A @ beta)
-    e = np.einsum("nij,nj->ni", C, b) + H - readings.field
-    CR = C @ R.transpose(0, 2, 1)
-    J = np.zeros((len(readings), 3, len(theta)))
-    for n, sensor in enumerate(readings.sensor):
-        own = J[n, :, 15 * sensor : 15 * sensor + 15]
-        own[:, :3] = CR[n] @ G[n] @ R[n]
-        own[:, 3:12] = np.kron(np.eye(3), b[n])
-        own[:, 12:] = np.eye(3)
-    J[:, :, 15 * S :] = CR @ A
-    return e, J
-
-
-def all_features(errors: ErrorModes, points: FloatArray) -> FloatArray:
-    """Return A over all beta, shape (N, 3, K)."""
-    A = np.zeros((len(points), 3, len(errors.covariance)))
-    owner, start = errors.owner(points), 0
-    for tile, size in errors.sizes().items():
-        rows = np.flatnonzero(owner == tile)
-        A[rows, :, start : start + size] = errors.features(points[rows], tile)
-        start += size
-    return A
 
 
 def dense_solution(readings: Readings, field_map: HarmonicMap, near: Estimate) -> Dense:

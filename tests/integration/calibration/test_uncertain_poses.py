@@ -14,15 +14,15 @@ from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.solve.robust import Loss, RobustOptions
-from tests.drives.uncertain import NOISE, SENSORS, STARTS
-from tests.integration.calibration.test_uncertain_calibration import (
+from tests.drives.uncertain import (
+    NOISE,
+    SENSORS,
+    STARTS,
     all_features,
     dense_rows,
-    field_map,
-    readings,
+    surveyed_map,
+    turning_drive,
 )
-
-__all__ = ["field_map", "readings"]  # fixtures
 
 LASTS_S = 0.7
 OPTIONS = OneKeyOptions(
@@ -30,6 +30,16 @@ OPTIONS = OneKeyOptions(
     pose_noise=PoseNoiseOptions(correlation_s=LASTS_S),
     robust=RobustOptions(loss=Loss.SQUARED),
 )
+
+
+@pytest.fixture(scope="module")
+def field_map() -> HarmonicMap:
+    return surveyed_map()
+
+
+@pytest.fixture(scope="module")
+def readings() -> Readings:
+    return turning_drive()
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
-from tests.drives.slam import SlamDrive, slam_drive
-from tests.integration.slam.test_slam import quiet
+from tests.drives.slam import SlamDrive, quiet, slam_drive
 from tests.worlds.exact import DipoleWorld
 from tests.worlds.surveyed import strange_hall, wandering
 

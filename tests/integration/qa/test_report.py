@@ -22,7 +22,7 @@ from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.verdict import EIGHT, changed_place, drive, with_series
-from tests.end_to_end.conftest import complaint_here
+from tests.support.command_line import complaint_here
 
 
 @dataclass(frozen=True)

@@ -9,22 +9,17 @@ from l2m_gtsam.data import KnownSensor, Trajectory
 from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.slam.exploration import Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
-from tests.integration.slam.test_slam import pose_nees, position_error, quiet
+from tests.drives.exploring import COARSE, explored
+from tests.drives.slam import SlamDrive, calibrated, laps, quiet, slam_drive
+from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 
 SENSORS = 4
-COARSE = {"distance_m": 0.3, "readings": 2}  # enough, and quick
 
 
 def drive_in(seed: int, truth: Trajectory) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
     known = random_sensors(seed, SENSORS)
     return known, slam_drive(dipole_world(seed), known, truth, np.random.default_rng(seed))
-
-
-def explored(drive: SlamDrive, sensors: tuple[KnownSensor, ...], **options: object) -> Exploration:
-    chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
-    return explore(drive.recording, calibrated(sensors), chosen, quiet)
 
 
 @pytest.fixture(scope="module")

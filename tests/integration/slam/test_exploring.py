@@ -1,87 +1,24 @@
 """Drives through places without a map, key pose by key pose."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
+from l2m_gtsam.data import Trajectory
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.exploration import HERE
-from l2m_gtsam.slam.localisation import prepared
-from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
 from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
-from tests.drives.slam import calibrated, laps, slam_drive
-from tests.integration.slam.test_slam import quiet
-from tests.worlds.exact import dipole_world, random_sensors
+from tests.drives.exploring import OnLine, prepared_drive, rms
+from tests.drives.slam import calibrated, laps, quiet
+from tests.worlds.exact import random_sensors
 
 SMALL = (1.9, 1.4)  # radii of laps of 10 m
 TILES = {"modes": 100, "learn_over_m": 9.0}
 QUICK = {"key_poses": {"distance_m": 0.3, "readings": 2}, "tiles": TILES}
-
-
-@dataclass(frozen=True)
-class OnLine:
-    """What was known of each key pose when it came, and where it truly was."""
-
-    explorer: Explorer
-    drive: Drive
-    beliefs: list[Belief]
-    truth: list[gtsam.Pose3]
-    sizes: list[int]
-
-    @classmethod
-    def over(
-        cls,
-        drive: Drive,
-        truth: list[gtsam.Pose3],
-        options: SlamOptions,
-        pace: ExploringOptions,
-    ) -> "OnLine":
-        """Follow a drive."""
-        explorer, beliefs, sizes = Explorer(drive, options, pace=pace), [], []
-        for number in range(len(drive)):
-            beliefs.append(explorer.step(number))
-            sizes.append(len(explorer.memory.known.covariance))
-        return cls(explorer, drive, beliefs, truth, sizes)
-
-    def off(self, poses: list[gtsam.Pose3]) -> FloatArray:
-        """Return how far poses are off, in metres."""
-        pairs = zip(poses, self.truth, strict=True)
-        return np.array([np.linalg.norm(a.translation() - b.translation()) for a, b in pairs])
-
-    def nees(self) -> FloatArray:
-        errors = [
-            gtsam.Pose3.Logmap(belief.pose.between(true))
-            for belief, true in zip(self.beliefs, self.truth, strict=True)
-        ]
-        pairs = zip(errors, self.beliefs, strict=True)
-        return np.array([e @ np.linalg.solve(known.pose_covariance, e) for e, known in pairs])
-
-
-def rms(off: FloatArray) -> float:
-    return float(np.sqrt(np.mean(off**2)))
-
-
-def prepared_drive(
-    seed: int,
-    truth: Trajectory,
-    sensors: tuple[KnownSensor, ...],
-    known: CalibrationResult,
-    options: SlamOptions,
-) -> tuple[Drive, list[gtsam.Pose3]]:
-    """Return a drive through a hall, from its first pose on, and its true key poses."""
-    recorded = slam_drive(dipole_world(seed), sensors, truth, np.random.default_rng(seed))
-    drive, _ = prepared(recorded.recording, known, options)
-    rows = np.searchsorted(truth.stamp_ns, drive.stamp_ns)
-    true = [gtsam.Pose3(gtsam.Rot3(truth.R[row]), truth.p[row]) for row in rows]
-    return replace(drive, start=replace(drive.start, covariance=HERE)), true
 
 
 def on_line(seed: int, truth: Trajectory, sensors: int, section_m: float) -> OnLine:

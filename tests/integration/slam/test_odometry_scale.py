@@ -17,8 +17,7 @@ from l2m_gtsam.slam.record import odometry_covariance
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.slam.solution import DriveSolution
 from tests.drives.drawn import DrawnDrive, drawn_drive
-from tests.drives.slam import rounds
-from tests.integration.slam.test_slam import quiet
+from tests.drives.slam import quiet, rounds
 from tests.worlds.exact import dipole_world, random_sensors
 
 SEEDS, SIGMA = tuple(range(8)), 0.02

@@ -10,29 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2m_gtsam.config import Config
-from l2m_gtsam.data import KnownSensor, Recording, Trajectory
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.data import Recording, Trajectory
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
-from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.storage.bag import read_recording
-from tests.drives.slam import drifted
-from tests.integration.slam.test_slam import pose_nees, position_error, quiet
+from tests.drives.motion_capture import QUICK, mapped, read
+from tests.drives.slam import drifted, quiet
+from tests.support.pose_errors import pose_nees, position_error
 
-BAG = {"fields": ["/imu/mag"], "poses": "/optitrack/pose"}
 # Residuals of readings less than some 0.3 s apart are alike: one reading on a key pose.
 POSES = {"distance_m": 0.1, "readings": 1}
-QUICK = {"sync": {"thin_distance_m": 0.05}, "windows": 2, "readings": 700, "modes": 150}
-
-
-def read(folder: Path, run: int) -> Recording:
-    config = Config.model_validate({"bag": BAG})
-    return read_recording(folder / "bags" / f"optitrack_run{run}_ros1.bag", config.bag)
 
 
 def with_drift(
@@ -47,15 +36,6 @@ def with_drift(
     )
     odometry = drifted(truth, np.random.default_rng(seed))
     return replace(recording, trajectory=odometry), truth
-
-
-def mapped(recording: Recording, suite: CalibrationResult) -> FieldMap:
-    (sensor,) = suite.sensors
-    assert sensor.time_offset is not None
-    known = KnownSensor(
-        sensor.sensor, sensor.t_lidar_mag, sensor.distortion, sensor.time_offset.seconds
-    )
-    return map_recordings([recording], {known.sensor: known}, MappingOptions())
 
 
 def test_a_run_is_localised_in_the_map_of_another(shared_data: Path) -> None:

@@ -15,9 +15,8 @@ from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
-from tests.drives.slam import drifted
-from tests.integration.slam.test_recorded_slam import QUICK, mapped, read
-from tests.integration.slam.test_slam import quiet
+from tests.drives.motion_capture import QUICK, mapped, read
+from tests.drives.slam import drifted, quiet
 from tests.worlds.surveyed import in_odometry
 
 # An area of 2.4 x 2.3 m: fine, and over few metres.

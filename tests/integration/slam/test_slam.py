@@ -4,51 +4,24 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evo.core import metrics
-from evo.core.trajectory import PoseTrajectory3D
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Trajectory
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.slam.localisation import localise
-from l2m_gtsam.slam.options import CalibrationUse, KeyPoseOptions, SlamOptions, StartPoseOptions
-from tests.drives.slam import SlamDrive, calibrated, rounds, slam_drive
-from tests.worlds.exact import dipole_world, random_sensors
-
-WIDE = np.concatenate([np.full(3, 0.05), np.full(9, 0.05), np.full(3, 10.0)])
-COARSE = KeyPoseOptions(readings=3)  # enough, and quick
-
-
-def quiet(_stage: str, _fraction: float) -> None:
-    """Tell nobody."""
-
-
-def at(trajectory: Trajectory, stamps: IntArray) -> PoseTrajectory3D:
-    """Return poses at stamps that they have, as evo takes them."""
-    rows = np.searchsorted(trajectory.stamp_ns, stamps)
-    quaternions = Rotation.from_matrix(trajectory.R[rows]).as_quat(scalar_first=True)
-    return PoseTrajectory3D(trajectory.p[rows], quaternions, 1e-9 * trajectory.stamp_ns[rows])
-
-
-def position_error(truth: Trajectory, found: Trajectory) -> float:
-    """Return evo's absolute pose error in metres, rms, without any alignment."""
-    ape = metrics.APE(metrics.PoseRelation.translation_part)
-    ape.process_data((at(truth, found.stamp_ns), at(found, found.stamp_ns)))
-    return float(ape.get_statistic(metrics.StatisticsType.rmse))
-
-
-def pose_nees(truth: Trajectory, found: Trajectory) -> FloatArray:
-    """Return the squared pose errors in sigmas; each is 6 in the mean if sigmas are honest."""
-    assert found.covariance is not None
-    rows = np.searchsorted(truth.stamp_ns, found.stamp_ns)
-    R_back = found.R.transpose(0, 2, 1)
-    turn = Rotation.from_matrix(R_back @ truth.R[rows]).as_rotvec()
-    shift = np.einsum("nij,nj->ni", R_back, truth.p[rows] - found.p)
-    error = np.hstack([turn, shift])[:, :, None]
-    return np.asarray((error * np.linalg.solve(found.covariance, error)).sum(axis=(1, 2)))
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
+from tests.drives.slam import (
+    COARSE,
+    WIDE,
+    SlamDrive,
+    calibrated,
+    quiet,
+    small_hall,
+)
+from tests.support.pose_errors import position_error
+from tests.worlds.exact import dipole_world
 
 
 def located(
@@ -59,14 +32,6 @@ def located(
 ) -> LocalisationResult:
     chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
     return localise(drive.recording, field_map, known, chosen, quiet).result
-
-
-def small_hall(
-    seed: int, seconds: float, sensors: int = 2
-) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
-    known = random_sensors(seed, sensors)
-    rng = np.random.default_rng(seed)
-    return known, slam_drive(dipole_world(1), known, rounds(seconds), rng)
 
 
 def test_a_known_map_takes_the_drift_out() -> None:

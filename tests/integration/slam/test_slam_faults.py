@@ -16,8 +16,8 @@ from l2m_gtsam.slam.localisation import Localisation, localise
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.record import Told, localisation_record
 from tests.drives.faults import jumped, opened, shift, with_steel
-from tests.drives.slam import SlamDrive, calibrated, rounds, slam_drive
-from tests.integration.slam.test_slam import COARSE, WIDE, pose_nees, position_error, quiet
+from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, quiet, rounds, slam_drive
+from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 
 WORLD = dipole_world(1)

@@ -11,8 +11,7 @@ from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
-from tests.drives.slam import calibrated
-from tests.integration.slam.test_slam import COARSE, quiet, small_hall
+from tests.drives.slam import COARSE, calibrated, quiet, small_hall
 from tests.worlds.exact import dipole_world
 
 LATE = 8  # key poses

@@ -20,7 +20,7 @@ from l2m_gtsam.slam.pose_graph import odometry_graph, scale_values
 from l2m_gtsam.slam.record import odometry_covariance, sensor_evidence
 from l2m_gtsam.storage.record_files import read_slam, write_slam
 from tests.drives.localised import WORLD, driven, localised, record
-from tests.integration.slam.test_slam import pose_nees, position_error
+from tests.support.pose_errors import pose_nees, position_error
 
 
 def test_odometry_with_a_scale_is_as_sure_as_its_graph() -> None:

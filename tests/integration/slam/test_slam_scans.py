@@ -19,8 +19,8 @@ from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.options import SlamOptions, TileOptions
 from l2m_gtsam.storage.cloud import thinned_cloud
-from tests.drives.slam import SlamDrive, calibrated, laps, rounds, slam_drive
-from tests.integration.slam.test_slam import COARSE, pose_nees, position_error, quiet
+from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, quiet, rounds, slam_drive
+from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.lidar_rooms import CORRIDOR, Room, rows, scans
 

@@ -12,8 +12,8 @@ from l2m_gtsam.records.localisation import LocalisationStatus, StartSearch, Star
 from l2m_gtsam.slam.localisation import localise, prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
-from tests.drives.slam import SlamDrive, calibrated, slam_drive
-from tests.integration.slam.test_slam import position_error, quiet
+from tests.drives.slam import SlamDrive, calibrated, quiet, slam_drive
+from tests.support.pose_errors import position_error
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
 from tests.worlds.surveyed import SurveyedWorld, in_odometry, strange_hall, surveyed, wandering
 

@@ -17,7 +17,7 @@ from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, read_cloud_topic
 from l2m_gtsam.storage.point_cloud2 import ScanTopic, cloud_topic, has_clouds
 from tests.drives.bags import KINDS, Entry, ros, write
-from tests.integration.storage.test_cloud_topic import SECOND, START, TYPE, entries, field, scan
+from tests.drives.clouds import SECOND, START, TYPE, entries, field, scan
 
 NEAR = ScanOptions(min_range=0.0, max_range=50.0)
 POINTS: FloatArray = np.random.default_rng(0).uniform(-5, 5, (40, 3))

@@ -19,35 +19,8 @@ from l2m_gtsam.calibration.start.global_start import (
 from l2m_gtsam.data import FieldSample, FloatArray, Readings
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.records.calibration import FoundStart
-from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
-
-# The exact field of these worlds is slow to compute: fewer poses, fewer dipoles.
-OPTIONS = StartOptions(poses=60)
-# What sixty noisy readings know of the place, in metres; from there the solve goes on with all.
-NEAR = 0.1
-SENSORS = random_sensors(4, 3)
-WORLD = dipole_world(4, count=12)
-
-
-def together(seed: int = 4, noise: float = 0.2, world: DipoleWorld = WORLD) -> Readings:
-    """Return what three sensors of one vehicle read, each at poses that all of them share."""
-    one = drive(seed, SENSORS[:1], world, count=400)
-    rng = np.random.default_rng(seed)
-    parts = []
-    for sensor in SENSORS:
-        places = one.R_map_lidar @ sensor.t_lidar_mag + one.p_map_lidar
-        b_map, _ = world.field_and_gradient(places)
-        b = np.einsum("kji,kj->ki", one.R_map_lidar, b_map)
-        parts.append(sensor.distortion.apply(b) + rng.normal(0, noise, b.shape))
-    n, count = len(one), len(SENSORS)
-    return Readings(
-        tuple(sensor.sensor for sensor in SENSORS),
-        np.repeat(np.arange(count), n),
-        np.tile(one.stamp_ns, count),
-        np.tile(one.R_map_lidar, (count, 1, 1)),
-        np.tile(one.p_map_lidar, (count, 1)),
-        np.concatenate(parts),
-    )
+from tests.drives.start_search import NEAR, OPTIONS, PERIOD, SENSORS, WORLD, corridor, together
+from tests.worlds.exact import drive
 
 
 def errors(found: list[FoundStart | None]) -> FloatArray:
@@ -153,19 +126,6 @@ def test_places_are_spread_out_one_after_the_other(count: int, apart: float, mos
         if len(picked) < most and all(np.linalg.norm(place - places[p]) >= apart for p in picked):
             picked.append(row)
     assert spread_out(places, apart, most) == picked
-
-
-PERIOD = 2.0  # metres
-
-
-def corridor() -> DipoleWorld:
-    """Return a field that comes again every two metres of the drive's only direction."""
-    rng = np.random.default_rng(3)
-    cell = rng.uniform([0, -0.8, -0.8], [PERIOD, 0.8, -0.4], (5, 3))
-    moments = rng.normal(0, 10, (5, 3))
-    shifts = PERIOD * np.arange(-3, 10)[:, None, None] * np.array([1.0, 0.0, 0.0])
-    positions = (cell + shifts).reshape(-1, 3)
-    return DipoleWorld(np.array([20.0, 0.0, -40.0]), positions, np.tile(moments, (13, 1)))
 
 
 def test_a_field_that_repeats_itself_is_ambiguous() -> None:

@@ -18,15 +18,7 @@ from l2m_gtsam.calibration.start.rigid_groups import (
     rigid_groups,
 )
 from l2m_gtsam.data import FloatArray, Readings
-from tests.unit.calibration.test_global_start import (
-    NEAR,
-    OPTIONS,
-    PERIOD,
-    SENSORS,
-    WORLD,
-    corridor,
-    together,
-)
+from tests.drives.start_search import NEAR, OPTIONS, PERIOD, SENSORS, WORLD, corridor, together
 
 ALONG = st.tuples(*[st.integers(-4, 4)] * 3)
 

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from l2m_factors import T, X
-from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.slam.solver import (
     TOGETHER,
@@ -17,6 +16,7 @@ from l2m_gtsam.slam.solver import (
     pose_covariances_together,
     reported_ill_conditioning,
 )
+from tests.drives.pose_chain import FAR_APART, chain, off
 
 COUNT = TOGETHER + 30  # poses: more than are eliminated for at once
 
@@ -42,39 +42,6 @@ def test_poses_together_are_as_sure_as_one_by_one() -> None:
     alone = pose_covariances(marginals, COUNT)
     together = pose_covariances_together(marginals, COUNT)
     np.testing.assert_allclose(together, alone, rtol=1e-7, atol=1e-9 * alone.max())
-
-
-# Of a start and of steps, rotation (rad) before translation (m).
-FAR_APART = [
-    ([1e-9, 1e-9, 1e-9, 1e3, 1e3, 1e3], [1e-2] * 6),
-    ([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1e4], [1e-3] * 6),
-    ([1e-2, 1e-2, 1e-2, 1.0, 1.0, 1.0], [1e-2] * 5 + [1e5]),
-]
-
-
-def chain(
-    start: list[float], step: list[float]
-) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[FloatArray]]:
-    """Return poses with these sigmas, and their covariances."""
-    rng, graph, values = np.random.default_rng(1), gtsam.NonlinearFactorGraph(), gtsam.Values()
-    sigmas, pose = gtsam.noiseModel.Diagonal.Sigmas, gtsam.Pose3()
-    graph.add(gtsam.PriorFactorPose3(X(0), pose, sigmas(np.array(start))))
-    values.insert(X(0), pose)
-    P = [np.diag(np.square(start))]
-    for k in range(8):
-        move = gtsam.Pose3.Expmap(rng.normal(0, 0.2, 6))
-        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), move, sigmas(np.array(step))))
-        pose = pose.compose(move)
-        values.insert(X(k + 1), pose)
-        Ad = move.inverse().AdjointMap()
-        P.append(Ad @ P[-1] @ Ad.T + np.diag(np.square(step)))
-    return graph, values, P
-
-
-def off(found: FloatArray, P: FloatArray) -> float:
-    """Return how far a covariance is off, in units of the sigmas."""
-    sigma = np.sqrt(np.diag(P))
-    return float(np.abs((found - P) / np.outer(sigma, sigma)).max())
 
 
 @pytest.mark.parametrize(("start", "step"), FAR_APART)

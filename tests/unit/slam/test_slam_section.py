@@ -6,7 +6,7 @@ import pytest
 
 from l2m_factors import X
 from l2m_gtsam.slam.online.section import Section
-from tests.unit.slam.test_slam_covariances import FAR_APART, chain, off
+from tests.drives.pose_chain import FAR_APART, chain, off
 
 
 @pytest.mark.parametrize(("start", "step"), FAR_APART)

@@ -13,7 +13,7 @@ from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, 
 from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, hall_cloud, steel_hall
 from l2m_gtsam.studies.honesty.outcomes import Honesty, Outcomes, honesty
 from l2m_gtsam.studies.honesty.place import drive_seed, start_near
-from tests.statistical.study_maps import Build, Scene, StudiedMap
+from tests.worlds.studied_maps import Build, Scene, StudiedMap
 
 START_M = 0.05  # each axis of a start is at most this far from the truth
 

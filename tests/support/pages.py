@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 from l2m_gtsam.config import Config
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from tests.end_to_end.conftest import l2m
+from tests.support.command_line import l2m
 
 LANGUAGES = ("sh", "bash", "python", "yaml", "text")
 FENCE = re.compile(r"^( *)```(\w*)(.*)$")

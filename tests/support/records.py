@@ -1,0 +1,21 @@
+"""Comparison of records."""
+
+import numpy as np
+
+
+def assert_equal(a: object, b: object) -> None:
+    """Compare records field by field, arrays bit by bit, NaN equal to NaN."""
+    assert type(a) is type(b)
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        np.testing.assert_array_equal(a, b)
+    elif isinstance(a, tuple) and isinstance(b, tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_equal(x, y)
+    elif hasattr(a, "__dataclass_fields__"):
+        for name in a.__dataclass_fields__:
+            assert_equal(getattr(a, name), getattr(b, name))
+    elif isinstance(a, float) and isinstance(b, float) and np.isnan(a):
+        assert np.isnan(b)
+    else:
+        assert a == b

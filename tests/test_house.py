@@ -1,0 +1,50 @@
+"""The order of the tests themselves: what they import, and where they stand."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SHARED = ("worlds", "drives", "support", "reference")
+"""Folders of ``tests`` that tests and benchmarks may import from."""
+
+
+def imported(file: Path) -> Iterator[str]:
+    """Yield the modules that a file imports, and what it imports from them as if modules."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.module is not None, f"{file}:{node.lineno}: a relative import"
+            yield node.module
+            yield from (f"{node.module}.{name.name}" for name in node.names)
+
+
+@pytest.mark.parametrize("folder", ["tests", "benchmarks"])
+def test_no_test_imports_another(repository: Path, folder: str) -> None:
+    """What several tests need stands in a shared folder; conftest.py is for pytest alone."""
+    wrong = [
+        f"{file.relative_to(repository)} imports {module}"
+        for file in sorted((repository / folder).rglob("*.py"))
+        if "node_modules" not in file.parts
+        for module in imported(file)
+        if module.startswith("tests.") and module.split(".")[1] not in SHARED
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_shared_folders_hold_no_tests(repository: Path) -> None:
+    found = [file for each in SHARED for file in (repository / "tests" / each).rglob("test_*.py")]
+    assert not found
+
+
+@pytest.mark.parametrize("kind", ["unit", "integration"])
+def test_folders_of_tests_are_packages_of_the_library(repository: Path, kind: str) -> None:
+    """And a file beside them tests the module of its name."""
+    library = repository / "l2m_gtsam"
+    for entry in (repository / "tests" / kind).iterdir():
+        if entry.is_dir() and entry.name != "__pycache__":
+            assert (library / entry.name / "__init__.py").is_file(), entry
+        elif entry.name.startswith("test_"):
+            assert (library / entry.name.removeprefix("test_")).is_file(), entry
