@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import l2m_factors
 from tests.support.repository import REPOSITORY
 
 DOCS = REPOSITORY / "docs"
@@ -18,6 +19,7 @@ LEAST = {"architecture.md": 100, "glossary.md": 50}
 """Names on the pages on the code: fewer would test nothing."""
 CODE = re.compile(r"`([^`\n]+)`")
 DOTTED = re.compile(r"(l2m_gtsam|l2m_factors)(\.\w+)+")
+FACTOR = re.compile(r"[A-Z][a-z]+[A-Z]\w+|[a-z_]+_(factor|prior|information)")
 FOLDERS = ("l2m_gtsam/", "factors/", "tests/", "docs/")
 LOOP = 14  # files from `calibrate` to the marginals, at most
 
@@ -68,6 +70,13 @@ def test_names_exist(page: Path) -> None:
     names = named(page)
     assert len(names) >= LEAST.get(page.name, 0)
     assert [each for each in names if not exists(each)] == []
+
+
+def test_the_factors_page_names_what_is_there() -> None:
+    codes = CODE.findall((REPOSITORY / "factors" / "README.md").read_text(encoding="utf-8"))
+    names = [each for each in codes if FACTOR.fullmatch(each)]
+    assert len(names) >= 15
+    assert [each for each in names if not hasattr(l2m_factors, each)] == []
 
 
 def test_files_are_named_by_their_whole_path() -> None:
