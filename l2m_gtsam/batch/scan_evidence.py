@@ -31,7 +31,7 @@ UNSEEN = {"unseen_m": 100.0, "unseen_deg": 100.0}
 class Scanned:
     """What scans say, and what is worth a warning."""
 
-    seen: ScanEvidence = NO_SCANS
+    evidence: ScanEvidence = NO_SCANS
     notes: tuple[str, ...] = ()
 
 

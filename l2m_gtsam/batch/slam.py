@@ -136,9 +136,11 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
         check_truth(truth, recording.trajectory, gap, str(given.truth))
     source = source_file(given.calibration)
     if saved is None:
-        found = _explored(recording, calibration, source, scanned.seen, config, progress)
+        found = _explored(recording, calibration, source, scanned.evidence, config, progress)
     else:
-        found = _localised(recording, calibration, source, saved, scanned.seen, config, progress)
+        found = _localised(
+            recording, calibration, source, saved, scanned.evidence, config, progress
+        )
     notes = (*scanned.notes, *found.result.notes)
     found = replace(found, result=replace(found.result, notes=notes))
     options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})
@@ -158,7 +160,7 @@ def _localised(
     calibration: CalibrationResult,
     source: SourceFile,
     saved: SavedMap,
-    seen: ScanEvidence,
+    evidence: ScanEvidence,
     config: Config,
     progress: Progress,
 ) -> _Found:
@@ -167,7 +169,7 @@ def _localised(
     is_given = start.position is not None and start.quaternion_xyzw is not None
     field_map = saved.open(progress, [] if start.anywhere or is_given else [recording])
     sources = Sources(source_file(saved.path), source)
-    found = localise(recording, field_map, calibration, config.slam, progress, sources, seen)
+    found = localise(recording, field_map, calibration, config.slam, progress, sources, evidence)
     if found.result.status in NOWHERE:
         told = "; ".join((found.result.message, *found.result.notes))
         raise MapError(f"{recording.source.path} in {saved.path}: {told}")
@@ -178,11 +180,11 @@ def _explored(
     recording: Recording,
     calibration: CalibrationResult,
     source: SourceFile,
-    seen: ScanEvidence,
+    evidence: ScanEvidence,
     config: Config,
     progress: Progress,
 ) -> _Found:
-    found = explore(recording, calibration, config.slam, progress, source, seen)
+    found = explore(recording, calibration, config.slam, progress, source, evidence)
     progress("building the map", 0.0)
     field_map = build_map(found.points, found.field, config.mapping.model)
     progress("building the map", 1.0)

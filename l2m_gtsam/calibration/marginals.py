@@ -85,10 +85,3 @@ def sensors_in(linear: gtsam.GaussianFactorGraph) -> list[int]:
     keys = {key for index in range(linear.size()) for key in list(linear.at(index).keys())}
     symbols = (gtsam.Symbol(key) for key in keys)
     return sorted(int(each.index()) for each in symbols if each.key() == T(each.index()))
-
-
-def root_of(covariance: FloatArray) -> FloatArray:
-    """Return G with ``G G^T`` the covariance, both of shape (n, n)."""
-    sigma = np.sqrt(np.diag(covariance))
-    values, axes = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    return np.asarray(sigma[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))

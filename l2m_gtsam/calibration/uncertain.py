@@ -38,13 +38,14 @@ from l2m_gtsam.calibration.joint_information import (
     joint_information,
     rows_of_factors,
 )
-from l2m_gtsam.calibration.marginals import joint_covariance, root_of
+from l2m_gtsam.calibration.marginals import joint_covariance
 from l2m_gtsam.calibration.moving_fields import Correction, moving_fields
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised, optimise, polish
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_of, keys_of
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.solve.figures import residual_figures
+from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import HALF, estimate_noise
 from l2m_gtsam.solve.rank import Determinacy
 
@@ -373,7 +374,7 @@ class UncertainProblem:
         among = joint_covariance(linear, values, joint.among)
         missed = contradictions(self._known, values, among)
         every = among(sensors)
-        root = root_of(every)
+        root = covariance_root(every, np.sqrt(np.diag(every)))
         solutions = []
         for row, s in enumerate(sensors):
             rows, own = self._batch.rows_of(s), slice(SENSOR * row, SENSOR * (row + 1))

@@ -19,7 +19,7 @@ MAP = -1  # in place of a key pose: the frame of the map
 
 @dataclass(frozen=True)
 class Links:
-    """L poses of key poses, each in the map or in the frame of an earlier key pose.
+    """L scan registrations: poses of key poses in the map, or relative to an earlier key pose.
 
     Attributes
     ----------
@@ -53,45 +53,45 @@ class Links:
 
     @classmethod
     def none(cls) -> "Links":
-        """Return those of a drive without scans."""
+        """Return the links of a drive without scans."""
         no = np.empty(0, dtype=np.int64)
         return cls(no, no, np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 6, 6)))
 
     @property
     def in_map(self) -> BoolArray:
-        """Which tell a place in the map, shape (L,); the others close loops."""
+        """Which fix a key pose in the map, shape (L,); the others are loop closures."""
         return np.asarray(self.origin == MAP)
 
 
-def link_stamps(seen: ScanEvidence) -> IntArray:
-    """Return the times of the scans that links are between, in nanoseconds."""
-    loops = [stamp for each in seen.loops for stamp in (each.from_ns, each.to_ns)]
-    return np.array([*(each.stamp_ns for each in seen.fixes), *loops], dtype=np.int64)
+def link_stamps(evidence: ScanEvidence) -> IntArray:
+    """Return the times of the scans of all links, in nanoseconds."""
+    loops = [stamp for each in evidence.loops for stamp in (each.from_ns, each.to_ns)]
+    return np.array([*(each.stamp_ns for each in evidence.fixes), *loops], dtype=np.int64)
 
 
 def key_pose_links(
-    seen: ScanEvidence, trajectory: Trajectory, rows: IntArray, options: DriftOptions
+    evidence: ScanEvidence, trajectory: Trajectory, rows: IntArray, options: DriftOptions
 ) -> Links:
-    """Hang what scans say on the key poses next to them.
+    """Return scan registrations as links of the key poses nearest in time.
 
-    From a scan to its key pose odometry leads, whose error over that way is added.
+    Odometry connects a scan with its key pose; its drift between the two is added.
 
     Parameters
     ----------
-    seen
-        Fixes and loops, at times of the trajectory.
+    evidence
+        Fixes and loop closures, at times of the trajectory.
     trajectory
-        Odometry.
+        Odometry, M poses.
     rows
-        Which of its poses are key poses, shape (K,).
+        Rows of the key poses in it, shape (K,).
     options
-        How wrong odometry becomes.
+        Drift of odometry.
     """
-    if not len(seen):
+    if not len(evidence):
         return Links.none()
-    carrier = _Carrier(link_stamps(seen), trajectory, rows, options)
-    fixes = [carrier.fix(each) for each in seen.fixes]
-    loops = [carrier.loop(each) for each in seen.loops]
+    carrier = _Carrier(link_stamps(evidence), trajectory, rows, options)
+    fixes = [carrier.fix(each) for each in evidence.fixes]
+    loops = [carrier.loop(each) for each in evidence.loops]
     links = [each for each in (*fixes, *loops) if each.origin != each.key_pose]
     return Links(
         origin=np.array([each.origin for each in links], dtype=np.int64),
@@ -111,7 +111,7 @@ class _Link:
 
 
 class _Carrier:
-    """Moves what holds at a scan to the key pose that is nearest in time."""
+    """Transfers poses and covariances from scans to the key poses nearest in time."""
 
     def __init__(
         self,
@@ -124,21 +124,21 @@ class _Carrier:
         at, keys = interpolated(trajectory, stamps), trajectory.stamp_ns[rows]
         after = np.clip(np.searchsorted(keys, stamps), 1, len(keys) - 1)
         nearest = after - (stamps - keys[after - 1] < keys[after] - stamps)
-        self._hung = {
+        self._nearest = {
             int(stamp): (int(k), _between(at, i, trajectory, int(rows[k])))
             for i, (stamp, k) in enumerate(zip(stamps, nearest, strict=True))
         }
 
     def fix(self, fix: PoseFix) -> _Link:
         """Return a key pose in the map."""
-        k, T_scan_key = self._hung[fix.stamp_ns]
+        k, T_scan_key = self._nearest[fix.stamp_ns]
         covariance = moved(fix.covariance[None], T_scan_key)[0] + self._drift(T_scan_key)
         return _Link(MAP, k, compose(fix.T_map_lidar, T_scan_key), covariance)
 
     def loop(self, loop: LoopClosure) -> _Link:
         """Return a key pose in the frame of an earlier one."""
-        origin, T_first_origin = self._hung[loop.from_ns]
-        k, T_second_key = self._hung[loop.to_ns]
+        origin, T_first_origin = self._nearest[loop.from_ns]
+        k, T_second_key = self._nearest[loop.to_ns]
         T_origin_first = T_first_origin.inverse()
         T_first_key = compose(loop.T_from_to, T_second_key)
         covariance = moved(loop.covariance[None], T_second_key)[0] + self._drift(T_second_key)
@@ -155,8 +155,8 @@ def _between(one: Trajectory, i: int, other: Trajectory, k: int) -> RigidTransfo
     return between(first, second)
 
 
-ARM_M = 1.0  # a turn counts as much as the way at the end of such an arm,
-CREEP_M_S = 1e-6  # and time as much as a motion that is none, where there is no other
+ARM_M = 1.0  # lever arm that converts a rotation into a distance
+CREEP_M_S = 1e-6  # makes the progress of a parked vehicle increase with time
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class StartPose:
     Attributes
     ----------
     T_map_lidar
-        Pose.
+        Pose of the lidar at the first key pose.
     covariance
         Of a right perturbation, rotation (rad) before translation (m), shape (6, 6).
     """
@@ -210,17 +210,17 @@ class Drive:
     Attributes
     ----------
     stamp_ns
-        When the K key poses were, shape (K,).
+        Times of the K key poses, shape (K,).
     steps
-        What odometry says between them.
+        Odometry between them, K - 1 steps.
     readings
-        N in number, in order of key poses: each hangs on one, and lies between it and the next.
+        N readings in order of key poses, each taken between its key pose and the next.
     start
-        Of the first.
+        Prior of the first key pose.
     sensors
-        That read.
+        Calibrations of the S sensors.
     links
-        What scans say of key poses.
+        L scan registrations of key poses.
     """
 
     stamp_ns: IntArray
@@ -245,20 +245,20 @@ class Drive:
         )
 
     def dead_reckoning(self) -> list[gtsam.Pose3]:
-        """Return the key poses that odometry alone leads to from the start."""
+        """Return the key poses by odometry alone, from the start on."""
         poses = [as_pose(self.start.T_map_lidar)]
         for step in range(len(self.steps)):
             poses.append(poses[-1].compose(self.step(step)))
         return poses
 
     def step(self, number: int, scale_error: float = 0.0) -> gtsam.Pose3:
-        """Return the way from a key pose to the next, if ways are longer by so large a share."""
+        """Return odometry's step from a key pose to the next, its length corrected for an error."""
         return gtsam.Pose3(
             gtsam.Rot3(self.steps.R[number]), (1 + scale_error) * self.steps.p[number]
         )
 
     def with_scale_as_drift(self, over_m: float) -> "Drive":
-        """Return the drive for those who do not estimate odometry's scale; see the steps."""
+        """Return the drive for solvers without a scale variable; see ``OdometrySteps``."""
         return replace(self, steps=self.steps.with_scale_as_drift(over_m))
 
 
@@ -270,20 +270,20 @@ def as_pose(transform: RigidTransform) -> gtsam.Pose3:
 def key_pose_readings(
     readings: Readings, trajectory: Trajectory, rows: IntArray, most: int
 ) -> KeyPoseReadings:
-    """Hang readings on the key pose before each, and keep not too many.
+    """Express readings relative to the key pose before each, and thin them.
 
-    One that is as late as a key pose hangs on the one before it: it is the end of that step.
+    A reading at the time of a key pose belongs to the one before it, as the end of that step.
 
     Parameters
     ----------
     readings
-        With poses of odometry.
+        N readings with poses of odometry.
     trajectory
-        Odometry.
+        Odometry, M poses.
     rows
-        Which of its poses are key poses, shape (K,).
+        Rows of the key poses in it, shape (K,).
     most
-        Readings of a sensor on a key pose.
+        Limit of readings per sensor and key pose.
     """
     key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns) - 1
     key = np.clip(key, 0, len(rows) - 2)
@@ -303,11 +303,11 @@ def key_pose_readings(
 def _fractions(
     trajectory: Trajectory, first: IntArray, last: IntArray, stamp_ns: IntArray
 ) -> FloatArray:
-    """Return how much of the motion from a first pose to a last is done at a time, shape (N,)."""
+    """Return the fraction of the motion from a first pose to a last that is done, shape (N,)."""
     turn = Rotation.from_matrix(trajectory.R[:-1].transpose(0, 2, 1) @ trajectory.R[1:]).magnitude()
     seconds = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
-    way = np.linalg.norm(np.diff(trajectory.p, axis=0), axis=1)
-    done = np.append(0.0, np.cumsum(way + ARM_M * turn + CREEP_M_S * np.diff(seconds)))
+    distance = np.linalg.norm(np.diff(trajectory.p, axis=0), axis=1)
+    done = np.append(0.0, np.cumsum(distance + ARM_M * turn + CREEP_M_S * np.diff(seconds)))
     at = np.interp(1e-9 * (stamp_ns - trajectory.stamp_ns[0]), seconds, done)
     return np.asarray(np.clip((at - done[first]) / (done[last] - done[first]), 0.0, 1.0))
 

@@ -57,7 +57,7 @@ def explore(
     options: SlamOptions,
     progress: Progress,
     calibration_source: SourceFile | None = None,
-    seen: ScanEvidence = NO_SCANS,
+    evidence: ScanEvidence = NO_SCANS,
 ) -> Exploration:
     """Find where a vehicle was and what the field is there, from where its odometry begins.
 
@@ -90,7 +90,7 @@ def explore(
     """
     if options.start.anywhere:
         raise ConfigError("`slam.start.anywhere` looks for the start in a map: give one with --map")
-    drive, notes = prepared(recording, calibration, options, seen)
+    drive, notes = prepared(recording, calibration, options, evidence)
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=HERE))
     progress("learning the field's prior", 0.0)

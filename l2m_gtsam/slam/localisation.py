@@ -77,7 +77,7 @@ def localise(
     options: SlamOptions,
     progress: Progress,
     sources: Sources | None = None,
-    seen: ScanEvidence = NO_SCANS,
+    evidence: ScanEvidence = NO_SCANS,
 ) -> Localisation:
     """Find where a vehicle was in a magnetic map.
 
@@ -107,7 +107,7 @@ def localise(
     MapError
         The start was looked for, and is not the only one that fits, or none does.
     """
-    drive, notes = prepared(recording, calibration, options, seen)
+    drive, notes = prepared(recording, calibration, options, evidence)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     search = None
     if options.start.anywhere:
@@ -138,7 +138,7 @@ def prepared(
     recording: Recording,
     calibration: CalibrationResult,
     options: SlamOptions,
-    seen: ScanEvidence = NO_SCANS,
+    evidence: ScanEvidence = NO_SCANS,
 ) -> tuple[Drive, tuple[str, ...]]:
     """Return a recording as a drive of its calibrated sensors, and what is worth a warning.
 
@@ -162,15 +162,15 @@ def prepared(
     calibrated, left_out = usable_sensors(alive.recording, calibration)
     readings = drive_readings(alive.recording, calibrated, options)
     rows = np.union1d(key_pose_rows(odometry, options.key_poses), mended.rows)
-    if len(seen):
-        rows = with_rows_at(rows, odometry, link_stamps(seen))
+    if len(evidence):
+        rows = with_rows_at(rows, odometry, link_stamps(evidence))
     drive = Drive(
         stamp_ns=odometry.stamp_ns[rows],
         steps=odometry_steps(odometry, rows, options.drift, mended.jumps),
         readings=key_pose_readings(readings, odometry, rows, options.key_poses.readings),
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
-        links=key_pose_links(seen, odometry, rows, options.drift),
+        links=key_pose_links(evidence, odometry, rows, options.drift),
     )
     recorded = (note for part in recording.parts for note in part.notes)
     return drive, (*recorded, *mended.notes(), *left_out, *alive.notes)

@@ -1,7 +1,7 @@
-r"""Key poses of a drive, and what odometry says between them.
+r"""Key poses of a drive, odometry between them, and scans at the poses of odometry.
 
-Where a recording states covariances of its poses that grow as odometry's do,
-``P' = Ad P Ad^T + Q``, the step's covariance is Q. Otherwise it follows from way and turning.
+Where a recording states covariances of its poses that accumulate as odometry's do,
+``P' = Ad P Ad^T + Q``, the step's covariance is Q. Otherwise it follows from distance and rotation.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,13 +19,13 @@ from l2m_gtsam.recording.sync import has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, SlamOptions, Usage
 
-# Rounding and interpolation may make a step's covariance a little less than nothing.
+# Rounding and interpolation may make eigenvalues of a step's covariance slightly negative.
 ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
 class OdometrySteps:
-    """From each key pose to the next.
+    """Odometry from each key pose to the next.
 
     Attributes
     ----------
@@ -35,10 +35,9 @@ class OdometrySteps:
     covariance
         Of a right perturbation of the step, rotation (rad) before translation (m), (K - 1, 6, 6).
     stated
-        Whether the recording says so.
+        Whether the recording states these covariances.
     scale
-        Standard deviation of a share by which all ways are too long or too short alike, beside
-        that; 0 where there is none.
+        Standard deviation of a relative error that all lengths share; 0 for none.
     """
 
     R: FloatArray
@@ -55,30 +54,32 @@ class OdometrySteps:
         return replace(self, R=self.R[:count], p=self.p[:count], covariance=self.covariance[:count])
 
     def with_scale_as_drift(self, over_m: float) -> "OdometrySteps":
-        """Return steps for those who do not estimate the scale.
+        """Return steps for solvers without a scale variable.
 
-        Its errors count as independent, and come to what they are after so many metres.
+        The scale error becomes independent noise of each step along its direction, a random walk
+        that has the same variance after ``over_m`` metres.
         """
-        way = np.linalg.norm(self.p, axis=1)[:, None]
-        along = np.einsum("nji,nj->ni", self.R, self.p) / np.maximum(way, np.finfo(float).tiny)
+        length = np.linalg.norm(self.p, axis=1)[:, None]
+        along = np.einsum("nji,nj->ni", self.R, self.p) / np.maximum(length, np.finfo(float).tiny)
         covariance = self.covariance.copy()
-        walk = self.scale * np.sqrt(over_m * way) * along
-        covariance[:, 3:, 3:] += walk[:, :, None] * walk[:, None]
+        # n steps of length l: n s^2 L l = (s L)^2 where n l = L, the variance of the scale error.
+        sigma = self.scale * np.sqrt(over_m * length) * along
+        covariance[:, 3:, 3:] += sigma[:, :, None] * sigma[:, None]
         return replace(self, covariance=covariance, scale=0.0)
 
 
 def key_pose_rows(trajectory: Trajectory, options: KeyPoseOptions) -> IntArray:
-    """Return which poses of a trajectory are key poses, shape (K,), the first and last among them.
+    """Return the rows of a trajectory's key poses, shape (K,), the first and last among them.
 
-    Way and turning count from the last key pose straight, so that the noise of poses at rest makes
-    no key poses.
+    Distance and rotation are those from the last key pose, not summed over the poses between: the
+    noise of a parked vehicle makes no key poses.
     """
     rows, least = [0], np.cos(np.deg2rad(options.angle_deg))
     for row in range(1, len(trajectory)):
         last = rows[-1]
-        way = np.linalg.norm(trajectory.p[row] - trajectory.p[last])
+        distance = np.linalg.norm(trajectory.p[row] - trajectory.p[last])
         turned = (np.sum(trajectory.R[row] * trajectory.R[last]) - 1) / 2 <= least
-        if way >= options.distance_m or turned:
+        if distance >= options.distance_m or turned:
             rows.append(row)
     if rows[-1] != len(trajectory) - 1:
         rows.append(len(trajectory) - 1)
@@ -86,7 +87,7 @@ def key_pose_rows(trajectory: Trajectory, options: KeyPoseOptions) -> IntArray:
 
 
 def with_rows_at(rows: IntArray, trajectory: Trajectory, stamp_ns: IntArray) -> IntArray:
-    """Return key poses, and beside them the poses that are nearest to these times."""
+    """Return rows of key poses, with those of the poses nearest to some times."""
     after = np.clip(np.searchsorted(trajectory.stamp_ns, stamp_ns), 1, len(trajectory) - 1)
     early, late = trajectory.stamp_ns[after - 1], trajectory.stamp_ns[after]
     return np.union1d(rows, after - (stamp_ns - early < late - stamp_ns))
@@ -95,25 +96,25 @@ def with_rows_at(rows: IntArray, trajectory: Trajectory, stamp_ns: IntArray) -> 
 def odometry_steps(
     trajectory: Trajectory, rows: IntArray, options: DriftOptions, jumps: Sequence[Jump] = ()
 ) -> OdometrySteps:
-    """Return what odometry says between key poses.
+    """Return odometry's steps between key poses.
 
     Parameters
     ----------
     trajectory
-        Poses of odometry.
+        Odometry, M poses.
     rows
-        Which are key poses, shape (K,).
+        Rows of the key poses in it, shape (K,).
     options
-        How wrong odometry becomes.
+        Drift of odometry.
     jumps
-        That were taken out of the trajectory; key poses are next to them.
+        Those removed from the trajectory; the poses before and after each are key poses.
     """
     R_back = trajectory.R[rows[:-1]].transpose(0, 2, 1)
     R = R_back @ trajectory.R[rows[1:]]
     p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
     stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
-    if stated is not None:  # with what is said of jumps
-        return OdometrySteps(R, p, stated + _least(options), stated=True, scale=options.scale)
+    if stated is not None:  # the repair of jumps has put their covariance into the poses'
+        return OdometrySteps(R, p, stated + _minimum(options), stated=True, scale=options.scale)
     covariance = drift_covariance(R, p, options)
     for jump in jumps:
         covariance[np.searchsorted(rows, jump.row)] += jump.covariance
@@ -137,54 +138,55 @@ def _stated(
 
 
 def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> FloatArray:
-    """Return covariances of N steps that grow with their way and turning, shape (N, 6, 6).
+    """Return covariances of N steps that grow with their length and rotation, shape (N, 6, 6).
 
     Parameters
     ----------
     R, p
         The steps, shapes (N, 3, 3) and (N, 3), metres.
     options
-        How wrong odometry becomes.
+        Drift of odometry.
     """
-    way, turn = np.linalg.norm(p, axis=1), Rotation.from_matrix(R).magnitude()
-    over = options.over_m * way
+    length, turn = np.linalg.norm(p, axis=1), Rotation.from_matrix(R).magnitude()
+    # Steps err independently: variances add up to (share * over_m)^2 after over_m metres.
+    over = options.over_m * length
     position = options.position_share**2 * over
     rotation = np.deg2rad(options.rotation_deg_per_m) ** 2 * over
     rotation += (options.rotation_share * turn) ** 2
     variance = np.repeat(np.column_stack([rotation, position]), 3, axis=1)
-    return np.asarray(variance[:, :, None] * np.eye(6) + _least(options))
+    return np.asarray(variance[:, :, None] * np.eye(6) + _minimum(options))
 
 
-def _least(options: DriftOptions) -> FloatArray:
-    """Return the least covariance of a step, shape (6, 6)."""
+def _minimum(options: DriftOptions) -> FloatArray:
+    """Return what is added to every step's covariance, shape (6, 6)."""
     sigma = np.repeat([np.deg2rad(options.least_deg), options.least_m], 3)
     return np.diag(sigma**2)
 
 
-NEIGHBOURHOOD_NS = 1_000_000_000  # of odometry about a scan, in which its motion is looked up
+NEIGHBOURHOOD_NS = 1_000_000_000  # of odometry before and after a scan, for its motion
 
 
 def scan_odometry(
-    scans: Iterable[Scan], mended: RepairedOdometry, edge: float, options: SlamOptions
+    scans: Iterable[Scan], repaired: RepairedOdometry, edge: float, options: SlamOptions
 ) -> Iterator[ScanStep]:
-    """Yield the scans that have points enough and a pose, each with that pose.
+    """Yield the scans with enough points and a pose of odometry, each with that pose.
 
     Parameters
     ----------
     scans
         In order of time.
-    mended
+    repaired
         Poses of the vehicle by odometry, in the same clock, without its jumps.
     edge
-        Scans are thinned to a point per cell of this size in metres.
+        Cell size in metres; scans are thinned to one point per cell.
     options
-        Which gaps of odometry are bridged, and how far it is trusted.
+        Longest gap of odometry that is interpolated, and its drift.
     """
     last: RigidTransform | None = None
     last_ns = 0
     for scan in scans:
         at = np.array([scan.stamp_ns], dtype=np.int64)
-        near = _around(mended.trajectory, scan.stamp_ns)
+        near = _around(repaired.trajectory, scan.stamp_ns)
         if len(scan) < LEAST_POINTS or not has_pose(near, at, options.max_pose_gap_s)[0]:
             continue
         pose = interpolated(near, at)
@@ -192,19 +194,19 @@ def scan_odometry(
         step = IDENTITY if last is None else between(last, here)
         covariance = drift_covariance(step.R[None], step.t[None], options.drift)[0]
         if last is not None:
-            covariance += _jumps_between(mended, last_ns, scan.stamp_ns)
+            covariance += _jumps_between(repaired, last_ns, scan.stamp_ns)
         surface = Surface(taken_at_once(scan, twists(near, at)[0]), edge)
         yield ScanStep(scan.stamp_ns, here, step, covariance, surface, believed=True)
         last, last_ns = here, scan.stamp_ns
 
 
-def _jumps_between(mended: RepairedOdometry, first_ns: int, last_ns: int) -> FloatArray:
-    """Return what jumps in some time add to the covariance of a step over it, shape (6, 6)."""
-    stamps = mended.trajectory.stamp_ns
+def _jumps_between(repaired: RepairedOdometry, first_ns: int, last_ns: int) -> FloatArray:
+    """Return what jumps between two times add to a step's covariance, shape (6, 6)."""
+    stamps = repaired.trajectory.stamp_ns
     return sum(
         (
             each.covariance
-            for each in mended.jumps
+            for each in repaired.jumps
             if stamps[each.row] < last_ns and stamps[each.row + 1] > first_ns
         ),
         start=np.zeros((6, 6)),

@@ -16,6 +16,7 @@ from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.slam.drive import MAP, Drive, KnownSensors, Links, StartPose, as_pose
 from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.solution import DriveSolution
+from l2m_gtsam.solve.linear_algebra import information_root
 
 EXACT = 1e-9  # m, uT, or of an entry of C: what no reading can tell from nothing
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
@@ -74,15 +75,14 @@ def calibration_graph(sensors: KnownSensors) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for i, covariance in enumerate(sensors.covariance):
         at = np.concatenate([sensors.t[i], sensors.distortion[i]])
-        graph.add(held_directions(i, root_information(covariance), at))
+        graph.add(held_directions(i, stated_information_root(covariance), at))
     return graph
 
 
-def root_information(covariance: FloatArray) -> FloatArray:
-    """Return W with ``W S W^T = I``; what a file says is exact, or a little less, is nearly so."""
+def stated_information_root(covariance: FloatArray) -> FloatArray:
+    """Return W with ``W S W^T = I`` of an S that a file may state as exact, or slightly negative."""
     sigma = np.maximum(np.sqrt(np.maximum(np.diag(covariance), 0.0)), EXACT)
-    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    return np.asarray((vectors / np.sqrt(np.maximum(values, ROUNDING))).T / sigma)
+    return information_root(covariance, sigma, ROUNDING)
 
 
 def calibration_values(sensors: KnownSensors) -> gtsam.Values:

@@ -34,7 +34,7 @@ from l2m_gtsam.records.localisation_file import (
 )
 from l2m_gtsam.records.validation import ChiSquare, NamedSource
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.pose_graph import root_information
+from l2m_gtsam.slam.pose_graph import stated_information_root
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.chi_square import quantile
 from l2m_gtsam.solve.noise import map_covariance
@@ -201,7 +201,7 @@ def _refined(before: CalibrationResult, result: LocalisationResult) -> tuple[Ref
 
 def _change(before: SensorCalibration, after: SensorCalibration) -> RefinedSensor:
     old, new = (np.append(each.t_lidar_mag, each.distortion.vector()) for each in (before, after))
-    whitened = root_information(before.covariance) @ (new - old)
+    whitened = stated_information_root(before.covariance) @ (new - old)
     low, high = quantile(BAND, len(PARAMETERS))
     return RefinedSensor(
         sensor=before.sensor,

@@ -22,6 +22,7 @@ from l2m_factors import KeyPoseReadings, StepError, Whitening, rotation_matrices
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import whitening
 
 INSTANTS = 15  # within a step that are told from each other, evenly over it where there are more
@@ -160,7 +161,7 @@ def bridge_whitening(own: FloatArray, F: FloatArray, s: FloatArray, Q: FloatArra
     at, F = _instants(s), F @ np.linalg.cholesky(Q)
     slot = np.abs(np.subtract.outer(s, at)).argmin(axis=1)
     bridge = np.minimum.outer(at, at) - np.outer(at, at)
-    errors = np.einsum("nij,nm->nimj", F, _root(bridge)[slot])
+    errors = np.einsum("nij,nm->nimj", F, covariance_root(bridge)[slot])
     # From the instant to the reading it is a way of its own, as far as others know.
     rest = own @ F * np.sqrt(np.abs(s - at[slot]))[:, None, None]
     own = whitening(np.eye(3) + rest @ rest.transpose(0, 2, 1)) @ own
@@ -171,9 +172,3 @@ def _instants(s: FloatArray) -> FloatArray:
     """Return shares of a step that stand for these, n of them, ascending."""
     at = np.unique(s)
     return at if len(at) <= INSTANTS else np.unique(np.round((INSTANTS + 1) * s)) / (INSTANTS + 1)
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """Return L with ``L L^T`` the covariance, which may be singular."""
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -28,7 +28,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from l2m_factors import D, G, T, X
-from l2m_gtsam.calibration.optimise import TOLERANCE, Ending, LinearSolver, Optimised
+from l2m_gtsam.calibration.optimise import TOLERANCE, Ending, LinearSolver, Optimised, refused
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale
@@ -114,17 +114,12 @@ def reported_ill_conditioning() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, np.linalg.LinAlgError) as error:
-        if isinstance(error, RuntimeError) and not is_indeterminate_(error):
+        if isinstance(error, RuntimeError) and not refused(error):
             raise
         raise CalibrationError(
             "the covariances of the poses cannot be computed: those of odometry, start and "
             "calibration are too many orders of magnitude apart"
         ) from error
-
-
-def is_indeterminate_(error: RuntimeError) -> bool:
-    """Return whether GTSAM could not factor a linear system: its exception has no Python type."""
-    return "ndetermina" in str(error)
 
 
 class Marginals:
@@ -202,7 +197,7 @@ def unless_indeterminate(work: Callable[[], Found]) -> Found | None:
     try:
         return work()
     except RuntimeError as error:
-        if not is_indeterminate_(error):
+        if not refused(error):
             raise
         return None
 

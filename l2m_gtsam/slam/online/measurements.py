@@ -12,7 +12,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, PredictedBelief, WhitenedMeasurement
-from l2m_gtsam.slam.pose_graph import root_information
+from l2m_gtsam.slam.pose_graph import stated_information_root
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
@@ -277,7 +277,7 @@ def fix_measurement(
     fix: gtsam.Pose3, covariance: FloatArray, belief: Belief
 ) -> WhitenedMeasurement:
     """Return a key pose's place in the map, with its covariance (6, 6), as evidence."""
-    W = root_information(covariance)
+    W = stated_information_root(covariance)
     J = np.zeros((POSE, len(belief.covariance)))
     J[:, :POSE] = W
     return WhitenedMeasurement(W @ gtsam.Pose3.Logmap(fix.between(belief.pose)), J)

@@ -34,6 +34,7 @@ from l2m_gtsam.slam.map_prediction import (
     predict,
 )
 from l2m_gtsam.slam.start.window import Window
+from l2m_gtsam.solve.linear_algebra import covariance_root, inverse
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance
 
 UNKNOWN = np.repeat([10.0, 1e3], 3)  # rad and m: sigmas of what nothing is known of
@@ -89,13 +90,6 @@ def steps_root(window: Window) -> FloatArray:
     return np.asarray(np.linalg.solve(back, np.linalg.cholesky(window.covariance)))
 
 
-def root_of(covariance: FloatArray) -> FloatArray:
-    """Return L with ``L L^T`` a covariance that may be singular."""
-    sigma = np.sqrt(np.maximum(np.diag(covariance), ROUNDING))
-    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
-    return np.asarray(sigma[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
-
-
 def map_root(errors: SharedMapErrors, C: FloatArray) -> FloatArray:
     """Return a root of what the map's errors add to S, shape (3N, K)."""
     columns = []
@@ -122,11 +116,6 @@ def diagonal_blocks(S: FloatArray) -> FloatArray:
     """Return the blocks of three rows on the diagonal, shape (N, 3, 3)."""
     N = len(S) // 3
     return np.asarray(S.reshape(N, 3, N, 3)[np.arange(N), :, np.arange(N)])
-
-
-def inverse(matrices: FloatArray) -> FloatArray:
-    """Return the inverses of matrices, shape (..., n, n)."""
-    return np.asarray(np.linalg.inv(matrices))
 
 
 ROUNDS = 3  # with covariances of their own
@@ -265,7 +254,9 @@ class WindowFit:
         """Return a root of what a sensor's calibration adds to S."""
         own = (self._window.readings.sensor == sensor)[:, None, None]
         K = np.where(own, seen.by_calibration, 0.0)
-        return np.asarray((K @ root_of(self._window.sensors.covariance[sensor])).reshape(-1, 15))
+        P = self._window.sensors.covariance[sensor]
+        sigma = np.sqrt(np.maximum(np.diag(P), ROUNDING))
+        return np.asarray((K @ covariance_root(P, sigma)).reshape(-1, 15))
 
     def _plausible(self, pose: RigidTransform) -> BoolArray:
         """Return which readings are within their own covariances, shape (N,)."""

@@ -15,13 +15,14 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import solve_triangular
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive, as_pose
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.unknown_field.tiles import WaveTile, level_axes, tile_about
+from l2m_gtsam.solve.linear_algebra import correlation_factor, triangular_information_root
 
 ROUNDING = 1e-12  # of a correlation
 
@@ -67,8 +68,7 @@ def conditioned(
     """
     r = np.setdiff1d(np.arange(len(P)), s)
     sigma = np.sqrt(np.diag(P)[s])
-    correlation = P[np.ix_(s, s)] / np.outer(sigma, sigma) + ROUNDING * np.eye(len(s))
-    lower = cholesky(correlation, lower=True, check_finite=False)
+    lower = correlation_factor(P[np.ix_(s, s)], ROUNDING)
 
     def whitened(rows: FloatArray) -> FloatArray:
         scaled = rows / sigma[:, None]
@@ -208,21 +208,13 @@ def prior_factors(known: JointGaussian) -> Iterator[gtsam.NonlinearFactor]:
     weights = [key for key in known.sizes if not is_pose(key)]
     poses = [key for key in known.sizes if is_pose(key)]
     ordered = known.marginal([*weights, *poses])
-    W = root_information(ordered.covariance)
+    W = triangular_information_root(ordered.covariance, ROUNDING)
     count = sum(known.sizes[key] for key in weights)
     if weights:
         own = {key: known.sizes[key] for key in weights}
         yield of_vectors(known.values, own, W[:count, :count].T @ W[:count, :count])
     if poses:
         yield whitened_difference(ordered, W[count:])
-
-
-def root_information(covariance: FloatArray) -> FloatArray:
-    """Return the lower triangle W with ``W^T W`` the inverse."""
-    sigma = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(sigma, sigma) + ROUNDING * np.eye(len(sigma))
-    lower = cholesky(correlation, lower=True, check_finite=False)
-    return np.asarray(solve_triangular(lower, np.diag(1 / sigma), lower=True, check_finite=False))
 
 
 def of_vectors(

@@ -11,7 +11,7 @@ from l2m_gtsam.calibration import uncertain
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import FactorForm
 from l2m_gtsam.calibration.forecast import stated_at
-from l2m_gtsam.calibration.marginals import joint_covariance, root_of
+from l2m_gtsam.calibration.marginals import joint_covariance
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised, Optimizer, polish
 from l2m_gtsam.calibration.uncertain import UncertainDrive, UncertainProblem, starting_values
@@ -215,17 +215,6 @@ def test_marginals_that_gtsam_refuses_come_from_elsewhere() -> None:
     among = joint_covariance(graph, values, instead)
     np.testing.assert_array_equal(among((0,)), np.eye(16))
     assert asked == [(0,)]
-
-
-def test_a_root_has_the_covariance() -> None:
-    rng = np.random.default_rng(0)
-    half = rng.normal(size=(8, 5)) * 10.0 ** rng.uniform(-4, 2, (8, 1))
-    covariance = half @ half.T
-    root = root_of(covariance)
-    sigma = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(
-        root @ root.T / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-12
-    )
 
 
 def test_a_forecast_stands_on_the_same_graph(last: LastGraph, field_map: HarmonicMap) -> None:

@@ -192,7 +192,7 @@ def test_fixes_that_stop_are_bridged_by_odometry_and_readings(
     known, scanned = calibrated(sensors), [*range(8), *range(23, 30)]
     seen = fixes(drive, range(30))
     some = replace(seen, fixes=tuple(seen.fixes[k] for k in scanned))
-    result = localise(drive.recording, WORLD, known, options, quiet, seen=some).result
+    result = localise(drive.recording, WORLD, known, options, quiet, evidence=some).result
     assert result.scans is not None
     assert result.scans.rejected == 0
     assert error(drive, result) < 0.03
@@ -204,7 +204,7 @@ def test_fixes_that_stop_are_bridged_by_odometry_and_readings(
     assert sigma[(seconds > 9) & (seconds < 21)].max() > 1.2 * seen_then
     # Half of the drive without any.
     early = replace(seen, fixes=seen.fixes[:15])
-    result = localise(drive.recording, WORLD, known, options, quiet, seen=early).result
+    result = localise(drive.recording, WORLD, known, options, quiet, evidence=early).result
     assert error(drive, result) < 0.05
     assert pose_nees(drive.truth, result.trajectory).mean() < 12
     assert position_sigmas(result)[-1] > 1.5 * seen_then
@@ -235,7 +235,9 @@ def test_another_field_where_scans_fit_is_not_here(
     """A cloud of this place beside the field of another one: readings say so."""
     options = SlamOptions.model_validate({"key_poses": COARSE})
     world, seen = dipole_world(99), fixes(drive, range(30))
-    result = localise(drive.recording, world, calibrated(sensors), options, quiet, seen=seen).result
+    result = localise(
+        drive.recording, world, calibrated(sensors), options, quiet, evidence=seen
+    ).result
     assert result.status is LocalisationStatus.NOT_HERE
     # Poses are held by the scans: what is refused is not nonsense.
     assert error(drive, result) < 0.1

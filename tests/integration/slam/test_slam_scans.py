@@ -65,7 +65,7 @@ def found_by(
     drive: SlamDrive, known: tuple[KnownSensor, ...], seen: ScanEvidence
 ) -> LocalisationResult:
     world = dipole_world(1)
-    return localise(drive.recording, world, calibrated(known), OPTIONS, quiet, seen=seen).result
+    return localise(drive.recording, world, calibrated(known), OPTIONS, quiet, evidence=seen).result
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +134,7 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     assert len(loops) > 10
     # Tiles that are a little larger than by default: fewer, in less than half the time.
     options = OPTIONS.model_copy(update={"tiles": TileOptions(core=4.0)})
-    found = explore(drive.recording, calibrated(known), options, quiet, seen=loops).result
+    found = explore(drive.recording, calibrated(known), options, quiet, evidence=loops).result
     assert found.scans is not None
     assert found.by_scans is not None
     assert (found.scans.loops, found.scans.rejected) == (len(loops), 0)

@@ -13,7 +13,7 @@ from l2m_gtsam.geometry import moved
 from l2m_gtsam.slam.drive import evenly_spread, key_pose_readings
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
-from l2m_gtsam.slam.pose_graph import root_information
+from l2m_gtsam.slam.pose_graph import stated_information_root
 from tests.drives.slam import rounds
 
 
@@ -161,7 +161,7 @@ def test_prior_of_a_calibration_is_its_covariance(seed: int) -> None:
     mixing = np.eye(15) + 0.2 * rng.normal(size=(15, 15))
     sigma = 10.0 ** rng.uniform(-4, 1, 15)
     covariance = mixing @ mixing.T * np.outer(sigma, sigma)
-    W = root_information(covariance)
+    W = stated_information_root(covariance)
     np.testing.assert_allclose(W @ covariance @ W.T, np.eye(15), atol=1e-6)
-    exact = root_information(np.zeros((15, 15)))
+    exact = stated_information_root(np.zeros((15, 15)))
     assert np.isfinite(exact).all()

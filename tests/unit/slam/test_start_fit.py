@@ -9,7 +9,7 @@ from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.start.likelihood import StartPrior, WindowFit, root_of, steps_root
+from l2m_gtsam.slam.start.likelihood import StartPrior, WindowFit, steps_root
 from l2m_gtsam.slam.start.window import Window, window_of
 from tests.drives.slam import SlamDrive, calibrated, slam_drive
 from tests.worlds.exact import random_sensors
@@ -97,10 +97,3 @@ def test_a_frame_carries_its_poses() -> None:
     carried = carried_back(R[None], p[None])[0] @ d
     here, there = RigidTransform(R, p), RigidTransform(moved_R, moved_p)
     np.testing.assert_allclose(off(there, here), carried, atol=1e-11)
-
-
-def test_a_root_of_a_singular_covariance() -> None:
-    rng = np.random.default_rng(4)
-    A = rng.normal(size=(15, 6)) * np.logspace(-3, 1, 15)[:, None]
-    L = root_of(A @ A.T)
-    np.testing.assert_allclose(L @ L.T, A @ A.T, atol=1e-9)

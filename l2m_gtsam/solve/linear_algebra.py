@@ -1,0 +1,72 @@
+"""Roots and inverses of covariances that may be badly scaled or singular."""
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from l2m_gtsam.data import FloatArray
+
+
+def covariance_root(covariance: FloatArray, sigma: FloatArray | float = 1.0) -> FloatArray:
+    """Return G with ``G G^T`` the covariance, both of shape (n, n); it may be singular.
+
+    A Cholesky factor does not exist there; eigenvalues below zero by rounding count as zero.
+
+    Parameters
+    ----------
+    covariance
+        Shape (n, n).
+    sigma
+        Scale of each component, shape (n,), by which rows and columns are divided before the
+        decomposition: rad beside uT would lose the smaller ones' digits.
+    """
+    scale = np.broadcast_to(sigma, len(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def information_root(covariance: FloatArray, sigma: FloatArray, least: float) -> FloatArray:
+    """Return W with ``W S W^T = I``, where a nearly singular S is kept invertible.
+
+    Parameters
+    ----------
+    covariance
+        S, shape (n, n).
+    sigma
+        Scale of each component, above zero, shape (n,).
+    least
+        Smallest eigenvalue of the scaled covariance; smaller ones are raised to it.
+    """
+    values, vectors = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    return np.asarray((vectors / np.sqrt(np.maximum(values, least))).T / sigma)
+
+
+def triangular_information_root(covariance: FloatArray, ridge: float) -> FloatArray:
+    """Return the lower triangle W with ``W^T W`` the inverse of a covariance.
+
+    Parameters
+    ----------
+    covariance
+        Positive definite but for rounding, shape (n, n).
+    ridge
+        Added to each variance as a share of it.
+
+    Raises
+    ------
+    LinAlgError
+        The covariance is not positive definite.
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    lower = correlation_factor(covariance, ridge)
+    return np.asarray(solve_triangular(lower, np.diag(1 / sigma), lower=True, check_finite=False))
+
+
+def correlation_factor(covariance: FloatArray, ridge: float) -> FloatArray:
+    """Return the lower Cholesky factor of a covariance's correlations; as above."""
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sigma, sigma) + ridge * np.eye(len(sigma))
+    return np.asarray(cholesky(correlation, lower=True, check_finite=False))
+
+
+def inverse(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of matrices, shape (..., n, n)."""
+    return np.asarray(np.linalg.inv(matrices), dtype=np.float64)

@@ -1,0 +1,53 @@
+"""Roots of covariances: they multiply to the matrix they were taken of, singular ones too."""
+
+import numpy as np
+
+from l2m_gtsam.solve.linear_algebra import (
+    correlation_factor,
+    covariance_root,
+    information_root,
+    triangular_information_root,
+)
+
+
+def test_a_root_has_the_covariance() -> None:
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(8, 5)) * 10.0 ** rng.uniform(-4, 2, (8, 1))
+    covariance = half @ half.T
+    sigma = np.sqrt(np.diag(covariance))
+    root = covariance_root(covariance, sigma)
+    np.testing.assert_allclose(
+        root @ root.T / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-12
+    )
+
+
+def test_a_root_of_a_singular_covariance() -> None:
+    rng = np.random.default_rng(4)
+    A = rng.normal(size=(15, 6)) * np.logspace(-3, 1, 15)[:, None]
+    P = A @ A.T
+    L = covariance_root(P, np.sqrt(np.maximum(np.diag(P), 1e-12)))
+    np.testing.assert_allclose(L @ L.T, P, atol=1e-9)
+
+
+def test_roots_of_an_information_whiten() -> None:
+    """Both kinds, of sigmas from 1e-4 to 10; the ridge is what the second is off by."""
+    rng = np.random.default_rng(1)
+    mixing, sigma = np.eye(6) + 0.2 * rng.normal(size=(6, 6)), 10.0 ** rng.uniform(-4, 1, 6)
+    P = mixing @ mixing.T * np.outer(sigma, sigma)
+    W = information_root(P, np.sqrt(np.diag(P)), 1e-9)
+    np.testing.assert_allclose(W @ P @ W.T, np.eye(6), atol=1e-9)
+    T = triangular_information_root(P, 1e-12)
+    np.testing.assert_array_equal(T, np.tril(T))
+    np.testing.assert_allclose(T @ P @ T.T, np.eye(6), atol=1e-9)
+
+
+def test_a_direction_that_is_exact_keeps_the_least_variance() -> None:
+    P = np.diag([4.0, 0.0])
+    W = information_root(P, np.array([2.0, 1e-3]), 1e-4)
+    np.testing.assert_allclose(W.T @ W, np.diag([0.25, 1e10]), rtol=1e-12)
+
+
+def test_correlations_are_factored() -> None:
+    P = np.array([[4.0, 1.0], [1.0, 9.0]])
+    L = correlation_factor(P, 0.0)
+    np.testing.assert_allclose(L @ L.T, [[1.0, 1 / 6], [1 / 6, 1.0]], rtol=1e-12)
