@@ -80,7 +80,7 @@ def calibration_graph(sensors: KnownSensors) -> gtsam.NonlinearFactorGraph:
 
 
 def stated_information_root(covariance: FloatArray) -> FloatArray:
-    """Return W with ``W S W^T = I`` of an S that a file may state as exact, or slightly negative."""
+    """Return W with ``W S W^T = I``; a file may state S as exact, or as slightly negative."""
     sigma = np.maximum(np.sqrt(np.maximum(np.diag(covariance), 0.0)), EXACT)
     return information_root(covariance, sigma, ROUNDING)
 
