@@ -4,8 +4,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from l2m_gtsam.batch.opening import OpenMap, SavedMap, check_bags, read_drive
-from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.batch.files import (
+    OpenMap,
+    SavedMap,
+    check_bags,
+    check_outputs,
+    ensure_folder,
+    read_drive,
+)
 from l2m_gtsam.batch.scan_poses import read_drives_on
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.config import Config

@@ -1,16 +1,44 @@
 """Calibrations for other programs: written in their formats, and applied to bags."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
-from l2m_gtsam.errors import ConfigError, OutputError
+import numpy as np
+
+from l2m_gtsam.batch.files import check_outputs, ensure_folder, saved_options
+from l2m_gtsam.config import load_config
+from l2m_gtsam.data import CorrectedField, FloatArray, IntArray, ScalarSeries
+from l2m_gtsam.errors import BagError, ConfigError, OutputError
+from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.recording.regressors import ResampleOptions, resampled
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.solve.correction import corrected, moving_variance, without_moving
+from l2m_gtsam.storage.bag_copy import bag_copy, check_copy
+from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.calibrated_topics import (
+    CalibratedTopic,
+    Calibrator,
+    Correct,
+    Key,
+    SensorTopic,
+    check_units,
+    sensor_topics,
+)
 from l2m_gtsam.storage.calibration_file import read_calibration
-from l2m_gtsam.storage.exports.export import Export, export_of, left_out_notes
+from l2m_gtsam.storage.exports.export import (
+    Export,
+    check_lidar_frame,
+    export_of,
+    left_out_notes,
+    not_correctable,
+    usable_sensors,
+)
 from l2m_gtsam.storage.exports.formats import FORMATS
 from l2m_gtsam.storage.exports.urdf import edited_urdf
 from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.open_bag import Bag, open_bag
+from l2m_gtsam.storage.regressors import read_scalars
 from l2m_gtsam.storage.yaml_file import MAX_BYTES
 
 
@@ -86,3 +114,217 @@ def _edited(export: Export, urdf: Path) -> bytes:
         return edited_urdf(export, str(urdf), urdf.read_bytes())
     except OSError as error:
         raise ConfigError(f"{urdf}: cannot be read: {error.strerror or error}") from error
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How readings, and numbers that they follow, get out of a bag."""
+
+    bag: BagOptions
+    resampling: ResampleOptions
+
+    @classmethod
+    def from_config(cls, path: Path) -> "Reading":
+        """Return what a configuration says."""
+        config = load_config(path)
+        return cls(config.bag, config.calibration.regressors)
+
+    @classmethod
+    def of(cls, result: CalibrationResult, path: Path) -> "Reading":
+        """Return how the drive of a calibration was read.
+
+        Parameters
+        ----------
+        result
+            The calibration.
+        path
+            Its file, for messages.
+
+        Raises
+        ------
+        CalibrationError
+            It does not say it in a way that is understood.
+        """
+        return cls(
+            saved_options(path, result.options, BagOptions, "bag"),
+            saved_options(path, result.options, ResampleOptions, "calibration", "regressors"),
+        )
+
+
+def not_applicable(sensor: SensorCalibration) -> str | None:
+    """Return why the readings of a sensor cannot be corrected."""
+    if (reason := not_correctable(sensor)) is not None:
+        return reason
+    unknown = [m.name for m in sensor.moving if not np.isfinite([m.h, m.sigma]).all()]
+    return f"what follows {unknown[0]} is not determined" if unknown else None
+
+
+def corrections_of(
+    bag: Path, sensors: Sequence[SensorCalibration], reading: Reading, progress: Progress
+) -> dict[str, Correct]:
+    """Return what corrects sensors of a bag, by their names.
+
+    Parameters
+    ----------
+    bag
+        The bag; numbers that readings follow are read out of it.
+    sensors
+        Sensors whose readings can be corrected.
+    reading
+        How the bag is read.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    ConfigError
+        A number that readings follow is not named.
+    BagError
+        It is not in the bag.
+    """
+    names = sorted({moving.name for sensor in sensors for moving in sensor.moving})
+    if missing := [name for name in names if name not in reading.bag.regressors]:
+        raise ConfigError(
+            f"a part of the readings follows {missing[0]!r}, which `bag.regressors` does not name; "
+            "say in --config where it is recorded"
+        )
+    topics = {name: reading.bag.regressors[name] for name in names}
+    told = counter(f"reading numbers of {bag.name}", progress)
+    scalars = read_scalars(bag, topics, reading.bag.stamps, told)
+    series = {each.name: each for each in scalars}
+    return {
+        sensor.sensor: _correction(sensor, [series[m.name] for m in sensor.moving], reading)
+        for sensor in sensors
+    }
+
+
+def _correction(
+    sensor: SensorCalibration, numbers: Sequence[ScalarSeries], reading: Reading
+) -> Correct:
+    """Return what takes a sensor's moving fields out of its readings, and then C and H."""
+    covariance = np.array(sensor.covariance[3:, 3:])
+    h = np.array([moving.h for moving in sensor.moving]).reshape(-1, 3)
+    h_sigma = np.array([moving.sigma for moving in sensor.moving]).reshape(-1, 3)
+
+    def correct(readings: FloatArray, stamp_ns: IntArray) -> CorrectedField:
+        at = resampled(numbers, stamp_ns, reading.resampling)
+        still = without_moving(readings, at.values, h)
+        still[~at.known] = np.nan
+        variance = sensor.noise**2 + moving_variance(at.values, h_sigma)
+        return corrected(still, sensor.distortion, covariance, variance)
+
+    return correct
+
+
+@dataclass(frozen=True)
+class Application:
+    """What is asked for.
+
+    Attributes
+    ----------
+    bag
+        Bag with the readings.
+    calibration
+        A `calibration.yaml`.
+    out
+        Bag to write, of the same kind.
+    config
+        Configuration whose `bag` says how readings are read; that of the calibration if absent.
+    lidar_frame
+        Name of the frame that the corrected readings are in.
+    replace
+        Whether the topics that are corrected are left out.
+    """
+
+    bag: Path
+    calibration: Path
+    out: Path
+    config: Path | None = None
+    lidar_frame: str = "lidar"
+    replace: bool = False
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What was done.
+
+    Attributes
+    ----------
+    topics
+        Topics of the corrected readings by the names of the sensors.
+    notes
+        What is worth a warning, a sentence each.
+    """
+
+    topics: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+def apply_calibration(wanted: Application, progress: Progress) -> Applied:
+    """Write a copy of a bag with corrected readings, along the axes of the lidar.
+
+    Parameters
+    ----------
+    wanted
+        What to write, and from what.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line; nothing is written then.
+    """
+    result = read_calibration(wanted.calibration)
+    if wanted.config is None:
+        reading = Reading.of(result, wanted.calibration)
+    else:
+        reading = Reading.from_config(wanted.config)
+    usable = usable_sensors(result, not_applicable)
+    check_lidar_frame(wanted.lidar_frame)
+    with open_bag(wanted.bag) as bag:
+        check_copy(bag, wanted.out)
+        name = wanted.bag.name
+        found = sensor_topics(bag, reading.bag, counter(f"reading {name}", progress))
+        names = {each.sensor for each in found.values()}
+        here = [sensor for sensor in usable.sensors if sensor.sensor in names]
+        corrections = corrections_of(wanted.bag, here, reading, progress)
+        topics = _calibrated_topics(bag, found, corrections, reading.bag)
+        left_out = frozenset(topic for topic, _ in topics) if wanted.replace else frozenset()
+        calibrator = Calibrator(bag, topics, reading.bag, wanted.lidar_frame, left_out)
+        with bag_copy(bag, wanted.out) as copy:
+            calibrator.copy(copy, counter(f"copying {name}", progress))
+    added = {found[key].sensor: new.topic for key, new in topics.items()}
+    return Applied(added, (*usable.notes, *_unmatched(result, found)))
+
+
+def _calibrated_topics(
+    bag: Bag,
+    found: Mapping[Key, SensorTopic],
+    corrections: Mapping[str, Correct],
+    options: BagOptions,
+) -> dict[Key, CalibratedTopic]:
+    """Return what is added for each sensor of the bag that is calibrated."""
+    keys = [key for key in found if found[key].sensor in corrections]
+    if not keys:
+        there = ", ".join(sorted(each.sensor for each in found.values()))
+        raise BagError(
+            f"{bag.path}: the calibration can correct none of its sensors "
+            f"({there or 'no readings'})"
+        )
+    taken = {connection.topic for connection in bag.connections}
+    for key in keys:
+        if found[key].topic in taken:
+            raise BagError(f"{bag.path}: has a topic {found[key].topic} already")
+        check_units(bag, key, found[key], options)
+    return {key: CalibratedTopic(found[key].topic, corrections[found[key].sensor]) for key in keys}
+
+
+def _unmatched(result: CalibrationResult, found: Mapping[Key, SensorTopic]) -> tuple[str, ...]:
+    """Return which sensors stand in the calibration alone or in the bag alone, a sentence each."""
+    calibrated = [sensor.sensor for sensor in result.sensors]
+    there = [each.sensor for each in found.values()]
+    return (
+        *(f"{name} is not in the bag" for name in calibrated if name not in there),
+        *(f"{name} is not in the calibration" for name in sorted(there) if name not in calibrated),
+    )

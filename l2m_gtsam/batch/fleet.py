@@ -6,25 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from l2m_gtsam.batch.fleet_drives import (
+from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder
+from l2m_gtsam.batch.fleet_task import (
     CSV_FILE,
+    OUTCOME_FILE,
     PAGE_FILE,
     PARQUET_FILE,
+    RESULTS,
     FleetDrive,
     FleetOrder,
-    fleet_drives,
-)
-from l2m_gtsam.batch.fleet_task import (
-    OUTCOME_FILE,
-    RESULTS,
     FleetTask,
     calibrated_drive,
+    fleet_drives,
     lost_drive,
     map_of,
     open_map,
 )
-from l2m_gtsam.batch.opening import SavedMap
-from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed

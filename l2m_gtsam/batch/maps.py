@@ -6,8 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.batch.opening import SavedMap
-from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder
 from l2m_gtsam.batch.survey import read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording

@@ -1,12 +1,15 @@
-"""Reports: rendered from what a calibration or a localisation left behind."""
+"""Reports on calibrations and localisations, as pages and, by a browser, as PDF."""
 
+import os
+import shutil
+import subprocess
+import tempfile
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE
-from l2m_gtsam.batch.outputs import check_outputs
-from l2m_gtsam.batch.slam_report import SLAM_FILE, report_localisation
+from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
 from l2m_gtsam.progress import Progress
@@ -14,12 +17,106 @@ from l2m_gtsam.qa.judge import Verdict, judge
 from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.page import STAGE, report_page
+from l2m_gtsam.qa.report.slam_page import slam_page
+from l2m_gtsam.qa.slam.judge import judge_localisation
 from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import atomic_path
-from l2m_gtsam.storage.pdf import print_page
-from l2m_gtsam.storage.record_files import read_metrics
+from l2m_gtsam.storage.record_files import read_metrics, read_slam
+
+SLAM_FILE = "slam.json"
+
+
+def report_localisation(folder: Path, config: Path | None, page: Path) -> Verdict:
+    """Write the report on the localisation in a folder.
+
+    Parameters
+    ----------
+    folder
+        Where it was written to.
+    config
+        Configuration with thresholds; those of the localisation if there is none.
+    page
+        File of the report.
+
+    Raises
+    ------
+    L2MError
+        The record is missing or damaged; one line.
+    """
+    source = folder / SLAM_FILE
+    record = read_slam(source)
+    if config is None:
+        options = saved_options(source, record.options, QaOptions, "qa")
+    else:
+        options = load_config(config).qa
+    return write_slam_report(page, record, options)
+
+
+def write_slam_report(page: Path, record: LocalisationRecord, options: QaOptions) -> Verdict:
+    """Write the report on a localisation and return its verdict."""
+    text = slam_page(record, options)
+    with atomic_path(page) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="replace")
+    return judge_localisation(record, options)
+
+
+BROWSERS = (
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "microsoft-edge",
+)
+NAMED = "L2M_BROWSER"  # environment variable with another one
+TIMEOUT_S = 120
+
+
+def find_browser() -> str | None:
+    """Return the path of a browser that can print, if there is one."""
+    names = [os.environ.get(NAMED, ""), *BROWSERS]
+    return next((path for name in names if name and (path := shutil.which(name))), None)
+
+
+def print_page(page: Path, pdf: Path) -> None:
+    """Print a page to a PDF.
+
+    Raises
+    ------
+    OutputError
+        There is no browser, or it fails; the line says what to do.
+    """
+    browser = find_browser()
+    if browser is None:
+        msg = (
+            f"{pdf}: a PDF is printed by Chromium, Chrome or Edge, and none was found: install "
+            f"chromium, name one in {NAMED}, or print {page.name} from any browser"
+        )
+        raise OutputError(msg)
+    with tempfile.TemporaryDirectory() as profile, atomic_path(pdf) as temporary:
+        run = _run(browser, profile, page, temporary)
+        if run or not temporary.stat().st_size:
+            msg = f"{pdf}: {browser} could not print {page.name}{run}; print it from any browser"
+            raise OutputError(msg)
+
+
+def _run(browser: str, profile: str, page: Path, pdf: Path) -> str:
+    """Return what went wrong, as the end of a sentence."""
+    # As root, as in a container, there is no sandbox; the page is ours and has no script.
+    command = [
+        *(browser, "--headless", "--disable-gpu", "--no-sandbox", f"--user-data-dir={profile}"),
+        *("--no-pdf-header-footer", f"--print-to-pdf={pdf}", page.resolve().as_uri()),
+    ]
+    try:
+        run = subprocess.run(command, capture_output=True, check=False, timeout=TIMEOUT_S)  # noqa: S603
+    except subprocess.TimeoutExpired:
+        return f" within {TIMEOUT_S} s"
+    except OSError as error:
+        return f": {error.strerror}"
+    return f" (exit code {run.returncode})" if run.returncode else ""
+
 
 REPORT_FILE = "report.html"
 PDF_FILE = "report.pdf"

@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from l2m_gtsam.batch.opening import (
+from l2m_gtsam.batch.files import (
     SavedMap,
     read_drive,
     read_drive_and_numbers,

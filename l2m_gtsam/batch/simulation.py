@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from l2m_gtsam.batch.outputs import ensure_folder
+from l2m_gtsam.batch.files import ensure_folder
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.simulate.bag_writer import BagKind, BagOptions, Beside, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate

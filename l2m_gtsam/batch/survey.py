@@ -1,12 +1,13 @@
-"""What a map is made of: mapping bags, the suite's calibrations, what a LiDAR saw."""
+"""Mapping bags: what a map is made of, and the calibration of the mapping suite itself."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from l2m_gtsam.batch.files import check_bags, check_outputs, ensure_folder, read_drive
 from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import (
@@ -19,7 +20,10 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.lidar.surface import smoothed
+from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
 from l2m_gtsam.storage.files import source_file
@@ -186,3 +190,41 @@ def _spaced(p: FloatArray) -> IntArray:
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
     _, rows = np.unique(np.floor(way / PLACES_M), return_index=True)
     return np.asarray(rows)
+
+
+def calibrate_suite_file(
+    bags: Sequence[Path],
+    out: Path,
+    config: Config,
+    known: Path | None,
+    progress: Progress,
+) -> CalibrationResult:
+    """Calibrate the sensors of mapping bags and write the calibration.
+
+    Parameters
+    ----------
+    bags
+        One or several mapping bags of one suite.
+    out
+        Calibration to write (`.yaml`).
+    config
+        Configuration.
+    known
+        File with what is known of the sensors, if there is one.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line; nothing is written then.
+    """
+    check_bags(bags)
+    check_outputs(out, suffix=".yaml")
+    assumed = None if known is None else read_known_sensors(known)
+    recordings = [read_drive(bag, config, progress) for bag in bags]
+    found = calibrate_suite(recordings, assumed, config.mapping.suite, progress)
+    result = replace(found, options=config.model_dump(mode="json", include={"bag", "mapping"}))
+    ensure_folder(out.parent)
+    write_calibration(out, result)
+    return result

@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from l2m_gtsam.batch.corrections import saved_options
-from l2m_gtsam.batch.opening import SavedMap
-from l2m_gtsam.batch.outputs import check_outputs, ensure_folder
+from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, saved_options
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.calibration.calibrate import VERSIONED
 from l2m_gtsam.calibration.options import CalibrationOptions

@@ -293,8 +293,8 @@ def map_build(
 ) -> None:
     """Build a map from one or several bags of a calibrated mapping suite."""
     with shown_progress() as progress:
+        from l2m_gtsam.batch.files import make_tiles
         from l2m_gtsam.batch.maps import build_map_file
-        from l2m_gtsam.batch.tiles import make_tiles
         from l2m_gtsam.cli.tables.tables import map_table
         from l2m_gtsam.config import load_config
 
@@ -320,8 +320,8 @@ def map_update(
     Where there are new readings, the scales of a harmonic map's tiles follow them.
     """
     with shown_progress() as progress:
+        from l2m_gtsam.batch.files import make_tiles
         from l2m_gtsam.batch.maps import update_map_file
-        from l2m_gtsam.batch.tiles import make_tiles
         from l2m_gtsam.cli.tables.tables import map_table
         from l2m_gtsam.config import load_config
 

@@ -68,7 +68,7 @@ def apply(
 ) -> None:
     """Copy a bag and add the corrected readings, in the axes of the LiDAR, as TOPIC/calibrated."""
     with shown_progress() as progress:
-        from l2m_gtsam.batch.corrected_bag import Application, apply_calibration
+        from l2m_gtsam.batch.exports import Application, apply_calibration
 
         wanted = Application(bag, calibration, out, config, lidar_frame, replace)
         applied = apply_calibration(wanted, progress)

@@ -43,7 +43,7 @@ def batch(
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.fleet import run_fleet
-        from l2m_gtsam.batch.fleet_drives import CSV_FILE, PAGE_FILE, PARQUET_FILE, FleetOrder
+        from l2m_gtsam.batch.fleet_task import CSV_FILE, PAGE_FILE, PARQUET_FILE, FleetOrder
         from l2m_gtsam.parallel.cluster import ClusterOptions
 
         order = FleetOrder(source, map_path, config, out)

@@ -32,7 +32,7 @@ def suite(
     that sit or read otherwise.
     """
     with shown_progress() as progress:
-        from l2m_gtsam.batch.suite import calibrate_suite_file
+        from l2m_gtsam.batch.survey import calibrate_suite_file
         from l2m_gtsam.cli.tables.tables import calibration_table
         from l2m_gtsam.config import load_config
 

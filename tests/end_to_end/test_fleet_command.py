@@ -16,17 +16,18 @@ import pyarrow.parquet as pq
 import pytest
 
 from l2m_gtsam.batch import fleet as batch_fleet
+from l2m_gtsam.batch.files import SavedMap
 from l2m_gtsam.batch.fleet import fleet_tasks, run_fleet
-from l2m_gtsam.batch.fleet_drives import FleetOrder, fleet_drives
 from l2m_gtsam.batch.fleet_task import (
     OUTCOME_FILE,
     RESULTS,
+    FleetOrder,
     FleetTask,
     calibrated_drive,
+    fleet_drives,
     lost_drive,
     open_map,
 )
-from l2m_gtsam.batch.opening import SavedMap
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.fleet import DriveOutcome

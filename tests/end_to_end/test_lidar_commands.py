@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader, Writer
 
-from l2m_gtsam.batch.opening import SavedMap
+from l2m_gtsam.batch.files import SavedMap
 from l2m_gtsam.batch.scan_poses import read_drive_on, read_drive_or_follow
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import Config, load_config

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from l2m_gtsam.storage.pdf import find_browser
+from l2m_gtsam.batch.reports import find_browser
 
 PROGRAMS = Path(__file__).parents[1] / "browser"
 TIMEOUT_S = 280

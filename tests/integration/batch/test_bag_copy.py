@@ -24,7 +24,7 @@ from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.typesys import get_types_from_msg
 
-from l2m_gtsam.batch.corrected_bag import Application, Applied, apply_calibration
+from l2m_gtsam.batch.exports import Application, Applied, apply_calibration
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import BagError, CalibrationError, ConfigError, L2MError, OutputError
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus

@@ -1,20 +1,79 @@
-"""Drives and maps from their files, in one frame."""
+"""Drives and maps opened from their files, tiles kept beside maps, folders for results."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
-from l2m_gtsam.batch.tiles import with_tiles
+from pydantic import ValidationError
+
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import MapState, Recording, ScalarSeries, SourceFile
-from l2m_gtsam.errors import BagError, MapError
+from l2m_gtsam.errors import BagError, CalibrationError, MapError, OutputError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.tile_store import TileStore
+from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.map_file import load_map
 from l2m_gtsam.storage.regressors import read_scalars
+from l2m_gtsam.storage.tile_folder import tiles_beside
+
+SavedOptions = TypeVar("SavedOptions", bound=Options)
+
+
+def check_outputs(*files: Path, suffix: str | None = None) -> None:
+    """Raise an OutputError, before any work is done, for files that cannot be written."""
+    for file in files:
+        if suffix is not None and file.suffix != suffix:
+            raise OutputError(f"{file}: the name must end in {suffix}")
+        if file.exists() and not file.is_file():
+            raise OutputError(f"{file}: exists and is not a regular file; choose another --out")
+        if file.parent.exists() and not file.parent.is_dir():
+            raise OutputError(f"{file.parent}: is a file, --out needs a folder; choose another")
+
+
+def ensure_folder(folder: Path) -> None:
+    """Make a folder for results, and those above it, unless it is there; an OutputError if not."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{folder}: cannot be made as a folder for results: {error.strerror}"
+        raise OutputError(msg) from error
+
+
+@runtime_checkable
+class Tiled(Protocol):
+    """A map whose tiles are worth keeping."""
+
+    def with_store(self, store: TileStore) -> "FieldMap":
+        """Return the map that keeps its tiles in a store."""
+        ...
+
+    def make_tiles(self, told: Callable[[int, int], None]) -> int:
+        """Have all tiles in the store, and return how many there are."""
+        ...
+
+
+def with_tiles(field_map: FieldMap, path: Path) -> FieldMap:
+    """Return a map that keeps its tiles, if it has any, beside its file."""
+    return field_map.with_store(tiles_beside(path)) if isinstance(field_map, Tiled) else field_map
+
+
+def make_tiles(field_map: FieldMap, path: Path, progress: Progress) -> None:
+    """Make all tiles of a map, if it has any, and keep them beside its file.
+
+    Parameters
+    ----------
+    field_map, path
+        The map and its file.
+    progress
+        Called with a stage and the fraction of it that is done.
+    """
+    kept = with_tiles(field_map, path)
+    if isinstance(kept, Tiled):
+        kept.make_tiles(counter("making tiles", progress))
 
 
 def read_drive(bag: Path, config: Config, progress: Progress) -> Recording:
@@ -120,3 +179,15 @@ class SavedMap:
     def _list_of(self, name: str) -> list[Any]:
         entries = self.state.provenance.get(name)
         return entries if isinstance(entries, list) else []
+
+
+def saved_options(path: Path, options: Any, model: type[SavedOptions], *names: str) -> SavedOptions:
+    """Return the options under some names of those that a calibration was made with."""
+    for name in names:
+        options = options.get(name, {}) if isinstance(options, dict) else options
+    try:
+        return model.model_validate(options)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        key = ".".join(str(part) for part in ("options", *names, *fault["loc"]))
+        raise CalibrationError(f"{path}: {key}: {fault['msg']}") from error
