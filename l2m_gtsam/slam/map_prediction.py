@@ -32,12 +32,12 @@ from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 
 @dataclass(frozen=True)
 class PlacedReadings:
-    """Where N readings were taken.
+    """N readings at an estimate of poses and sensors.
 
     Attributes
     ----------
     readings
-        With the lidar's poses in the map.
+        The lidar's poses in the map.
     x
         Positions of the sensors in the map in metres, shape (N, 3).
     C
@@ -49,7 +49,7 @@ class PlacedReadings:
     C: FloatArray
 
     def field(self, sensors: KnownSensors) -> FloatArray:
-        """Return the field that was measured there, in the map's frame in uT, shape (N, 3)."""
+        """Return the measured field in the map's frame, distortion undone, uT, shape (N, 3)."""
         at = self.readings
         H = sensors.distortion[at.sensor, 9:]
         b_lidar = np.linalg.solve(self.C, (at.field - H)[:, :, None])
@@ -58,12 +58,12 @@ class PlacedReadings:
 
 @dataclass(frozen=True)
 class MapPrediction:
-    """What the map says there.
+    """What the map predicts at N readings.
 
     Attributes
     ----------
     placed
-        Where.
+        The readings and the sensors' positions.
     inside
         Whether the map has data there, shape (N,).
     map_variance
@@ -85,36 +85,36 @@ class MapPrediction:
         self,
         noise: FloatArray,
         map_variance: FloatArray | None = None,
-        more: FloatArray | None = None,
+        extra: FloatArray | None = None,
     ) -> FloatArray:
-        """Return matrices that make residuals white, 1/uT, (N, 3, 3); zero outside of the map.
+        """Return each residual's whitening matrix, 1/uT, shape (N, 3, 3); zero outside of the map.
 
         Parameters
         ----------
         noise
             Standard deviations of the sensors' noise in uT, shape (S,).
         map_variance
-            In place of the map's own, shape (N, 3).
-        more
-            Covariance that residuals have beside, uT^2, shape (N, 3, 3).
+            Instead of the map's own, per axis in uT^2, shape (N, 3).
+        extra
+            Covariance that residuals have in addition, uT^2, shape (N, 3, 3).
         """
         of_reading = noise[self.placed.readings.sensor]
-        return self.whitening_of(of_reading, map_variance, more)
+        return self.whitening_of(of_reading, map_variance, extra)
 
     def whitening_of(
         self,
         noise: FloatArray,
         map_variance: FloatArray | None = None,
-        more: FloatArray | None = None,
+        extra: FloatArray | None = None,
     ) -> FloatArray:
-        """Return the same where each reading has a noise of its own, shape (N,)."""
+        """Return the same for a standard deviation of each reading's noise in uT, shape (N,)."""
         variance = self.map_variance if map_variance is None else map_variance
         W = np.zeros((len(self.inside), 3, 3))
         rows = np.flatnonzero(self.inside)
         at = self.placed.readings
         share = map_covariance(self.placed.C[rows], at.R_map_lidar[rows], variance[rows])
-        if more is not None:
-            share = share + more[rows]
+        if extra is not None:
+            share = share + extra[rows]
         W[rows] = whitening(reading_covariance(noise[rows], share))
         return W
 
@@ -127,16 +127,16 @@ class MapPrediction:
 def place_readings(
     readings: KeyPoseReadings, poses: Mapping[int, gtsam.Pose3], sensors: KnownSensors
 ) -> PlacedReadings:
-    """Put readings into the map.
+    """Return readings at poses in the map.
 
     Parameters
     ----------
     readings
-        N readings.
+        N readings relative to key poses.
     poses
-        At least of their key poses, by number.
+        Estimates of their key poses at least, by number.
     sensors
-        As they are taken for.
+        Estimates of the S sensors.
     """
     numbers, slot = np.unique(readings.key_pose, return_inverse=True)
     own = [poses[int(k)] for k in numbers]
@@ -149,7 +149,7 @@ def place_readings(
 
 
 def predict(field_map: QueryableMap, where: PlacedReadings, sensors: KnownSensors) -> MapPrediction:
-    """Ask the map, once for all readings."""
+    """Query the map once for all readings, and compare with what was measured."""
     sample, at = field_map.query(where.x), where.readings
     R_back = at.R_map_lidar.transpose(0, 2, 1)
     b = np.einsum("nij,nj->ni", R_back, sample.field)
@@ -167,7 +167,7 @@ def poses_in(values: gtsam.Values, count: int) -> dict[int, gtsam.Pose3]:
 
 
 def sensors_in(values: gtsam.Values, known: KnownSensors) -> KnownSensors:
-    """Return sensors with the calibration that values hold, if they hold one."""
+    """Return sensors with the calibrations in values; the known ones if there are none."""
     count = range(len(known.names))
     if not values.exists(T(0)):
         return known
@@ -207,25 +207,25 @@ class SharedMapErrors:
 
     @classmethod
     def over(cls, errors: UncertainMap, prediction: MapPrediction) -> "SharedMapErrors":
-        """Ask a map for its errors where readings were taken."""
+        """Return a map's errors at readings."""
         rows = np.flatnonzero(prediction.inside)
         x, R = prediction.placed.x[rows], prediction.placed.readings.R_map_lidar[rows]
-        told = errors.errors_over(x)
+        found = errors.errors_over(x)
         owner, rest = np.full(len(prediction.inside), -1), prediction.map_variance.copy()
-        owner[rows] = told.owner(x)
+        owner[rows] = found.owner(x)
         features: dict[int, FloatArray] = {}
-        for tile in told.sizes():
+        for tile in found.sizes():
             own = np.flatnonzero(owner[rows] == tile)
-            A = told.features(x[own], tile)
+            A = found.features(x[own], tile)
             held = np.einsum("nir,nir->ni", A, A)
             rest[rows[own]] = np.maximum(rest[rows[own]] - held, 0.0)
             features[tile] = R[own].transpose(0, 2, 1) @ A
-        lower = np.linalg.cholesky(told.covariance)
+        lower = np.linalg.cholesky(found.covariance)
         root = solve_triangular(lower, np.eye(len(lower)), lower=True)
-        return cls(owner, features, rest, told.sizes(), root)
+        return cls(owner, features, rest, found.sizes(), root)
 
     def of(self, rows: IntArray) -> tuple[SharedError, ...]:
-        """Return what some readings share: zero for those of other tiles."""
+        """Return the shared errors of some readings: zero for readings of other tiles."""
         errors = []
         for tile in np.unique(self.owner[rows]).tolist():
             F = np.zeros((len(rows), 3, self.sizes[tile]))
@@ -236,11 +236,11 @@ class SharedMapErrors:
         return tuple(errors)
 
     def prior(self) -> gtsam.NonlinearFactor:
-        """Return the prior of the weights."""
+        """Return the joint prior of all weights."""
         return map_weights_prior(self.sizes, self.root_information)
 
     def values(self) -> gtsam.Values:
-        """Return weights of a map without errors."""
+        """Return zero weights: a map without errors."""
         values = gtsam.Values()
         for tile, size in self.sizes.items():
             values.insert(M(tile), np.zeros(size))
@@ -248,5 +248,5 @@ class SharedMapErrors:
 
 
 def errors_of(field_map: object) -> UncertainMap:
-    """Return what a map knows of its errors: nothing shared if it does not know."""
+    """Return a map's model of its errors; without one no error is shared."""
     return field_map if isinstance(field_map, UncertainMap) else NothingShared()

@@ -242,7 +242,7 @@ def sensor_evidence(solution: DriveSolution, inside: IntArray) -> SensorEvidence
     R, field, residual = at.R_map_lidar[inside], at.field[inside], prediction.residual[inside]
     H = drive.sensors.distortion[at.sensor[inside], 9:]
     b = np.asarray(np.linalg.solve(C, (residual + field - H)[:, :, None])[:, :, 0], dtype=float)
-    W = prediction.whitening(drive.sensors.noise, more=solution.interpolation_covariance)[inside]
+    W = prediction.whitening(drive.sensors.noise, extra=solution.interpolation_covariance)[inside]
     readings = Readings(
         sensors=drive.sensors.names,
         sensor=at.sensor[inside],

@@ -1,13 +1,14 @@
-"""The ways between key poses: where readings on them stand, and what odometry's errors do to them.
+"""Relative motions between key poses: interpolated readings, and what odometry's errors do to them.
 
-Odometry errs as a random walk does: after a share s of a step by ``s Q`` of its covariance Q, in
-new directions all the time. Where both ends of the step are estimated, a reading between them is
-shifted by s of what was found for the whole step, and what is left is a Brownian bridge: the ways
-to two readings after shares s <= s' err together by ``s (1 - s') Q``. Both hold to first order in
-the error, with Q along the axes of the step's end.
+Odometry's error is a random walk: after a share s of a step it has the covariance ``s Q``, with
+independent increments. Where both ends of the step are estimated, a reading between them is shifted
+by s of the correction of the whole step, and what remains is a Brownian bridge: the errors at two
+readings after shares s <= s' have the covariance ``s (1 - s') Q``. Both hold to first order in the
+error, with Q along the axes of the step's end (T. Barfoot, C. Tong, S. Sarkka, RSS 2014, has the
+general case).
 
-A step in which odometry jumped is one between two of its poses, with a Q of its own (see
-``jumps``): nothing tells when within it, and the bridge is widest in its middle.
+A step in which odometry jumped has a Q of its own (see ``recording.odometry_jumps``): the time of
+the jump within it is unknown, and the bridge is widest in its middle.
 """
 
 from collections.abc import Sequence
@@ -25,24 +26,24 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import whitening
 
-INSTANTS = 15  # within a step that are told from each other, evenly over it where there are more
+INSTANTS = 15  # limit of distinct times within a step; more are rounded to so many
 
 
 @dataclass(frozen=True)
 class RelativeMotions:
-    """The ways of a drive at an estimate of its key poses.
+    """The relative motions of a drive at an estimate of its key poses.
 
     Attributes
     ----------
     readings
-        N readings, shifted on their ways as the estimate asks for.
+        N readings relative to their key poses, corrected by the estimated steps.
     steps
-        From each key pose to the next, as estimated.
+        From each key pose to the next by the estimate, K - 1.
     covariance
-        Of the errors of odometry's steps, shape (K - 1, 6, 6).
+        Of odometry's steps, shape (K - 1, 6, 6).
     by_step
-        What a perturbation of the end of its step does to the lidar at a reading that were rigidly
-        fixed to it, shape (N, 6, 6).
+        Adjoints that take a perturbation of the end of a step to the lidar at a reading, as if it
+        were rigidly fixed to that end, shape (N, 6, 6).
     """
 
     readings: KeyPoseReadings
@@ -52,7 +53,7 @@ class RelativeMotions:
 
     @classmethod
     def along(cls, drive: Drive, poses: Sequence[gtsam.Pose3]) -> "RelativeMotions":
-        """Return those of a drive whose K key poses are taken for these."""
+        """Return the motions of a drive at an estimate of its K key poses."""
         steps = tuple(a.between(b) for a, b in pairwise(poses))
         rows, key = np.arange(len(drive.readings)), drive.readings.key_pose
         shifted = interpolated_readings(drive, rows, [steps[k] for k in key.tolist()])
@@ -60,13 +61,13 @@ class RelativeMotions:
         by_step = carried_back(end.R_key_lidar, end.p_key_lidar)
         return cls(shifted, steps, drive.steps.covariance, by_step)
 
-    def share(self, rows: IntArray, by_lidar: FloatArray) -> FloatArray:
-        """Return what is left of odometry's errors in n residuals, uT^2, shape (n, 3, 3).
+    def interpolation_covariance(self, rows: IntArray, by_lidar: FloatArray) -> FloatArray:
+        """Return the bridge's covariance of n residuals, each alone, uT^2, shape (n, 3, 3).
 
         Parameters
         ----------
         rows
-            Of the readings.
+            Of n readings.
         by_lidar
             Derivatives of their residuals by a right perturbation of the lidar's pose, (n, 3, 6).
         """
@@ -75,20 +76,20 @@ class RelativeMotions:
         return np.asarray((s * (1 - s))[:, None, None] * (F @ Q @ F.transpose(0, 2, 1)))
 
     def whitening(self, rows: IntArray, own: FloatArray, by_lidar: FloatArray) -> Whitening:
-        """Return what makes the residuals of n readings on one key pose white.
+        """Return the joint whitening of the residuals of n readings on one key pose.
 
         Parameters
         ----------
         rows, by_lidar
-            As of ``share``.
+            As of ``interpolation_covariance``.
         own
-            For the noise of each reading alone, 1/uT, shape (n, 3, 3).
+            Whitening of each reading's own noise, 1/uT, shape (n, 3, 3).
         """
         F, Q = by_lidar @ self.by_step[rows], self.covariance[self.readings.key_pose[rows[0]]]
         return bridge_whitening(own, F, self.readings.fraction[rows], Q)
 
     def step_error(self, rows: IntArray, by_lidar: FloatArray) -> StepError:
-        """Return what n readings on one key pose feel of the step; parameters as of ``share``."""
+        """Return the derivatives of n readings on one key pose by the step; parameters as above."""
         key_pose = int(self.readings.key_pose[rows[0]])
         slope = self.readings.fraction[rows, None, None] * (by_lidar @ self.by_step[rows])
         return StepError(key_pose, self.steps[key_pose], slope)
@@ -97,7 +98,7 @@ class RelativeMotions:
 def interpolated_readings(
     drive: Drive, rows: IntArray, steps: Sequence[gtsam.Pose3]
 ) -> KeyPoseReadings:
-    """Return n readings of a drive as they hang if the step of each is this and not odometry's."""
+    """Return n readings of a drive relative to their key poses, at estimates of their steps."""
     if not len(rows):
         return drive.readings[rows]
     R = np.stack([each.rotation().matrix() for each in steps])
@@ -109,12 +110,12 @@ def interpolated_readings(
 
 
 def from_end(readings: KeyPoseReadings, R: FloatArray, p: FloatArray) -> KeyPoseReadings:
-    """Return readings as they hang on the ends of their steps.
+    """Return readings relative to the ends of their steps.
 
     Parameters
     ----------
     readings
-        As odometry hangs them on the key poses before them, n in number.
+        n readings relative to the key poses before them, by odometry.
     R, p
         The step by odometry of each, or one for all, shapes (..., 3, 3) and (..., 3), metres.
     """
@@ -126,35 +127,35 @@ def from_end(readings: KeyPoseReadings, R: FloatArray, p: FloatArray) -> KeyPose
 def shifted_readings(
     readings: KeyPoseReadings, R: FloatArray, p: FloatArray, turn: FloatArray, shift: FloatArray
 ) -> KeyPoseReadings:
-    """Return readings shifted by their shares of what changes a step.
+    """Return readings corrected by their shares of a step's correction.
 
     Parameters
     ----------
     readings, R, p
         As of ``from_end``.
     turn
-        By what vector the end of the step is turned, about its axes, rad, shape (..., 3).
+        Rotation vector of the correction, about the axes of the step's end, rad, shape (..., 3).
     shift
-        By what it is shifted, along the axes of the key pose, metres, shape (..., 3).
+        Translation of the correction, along the axes of the key pose, metres, shape (..., 3).
     """
     s, end = readings.fraction[:, None], from_end(readings, R, p)
-    # The end of the step with a share of the change, and from there on as odometry has it.
+    # The end of the step with a share of the correction, and from there to the lidar by odometry.
     R_end, p_end = R @ rotation_matrices(s * turn), p + s * shift
-    way = (R_end @ end.p_key_lidar[:, :, None])[:, :, 0]
-    return replace(readings, R_key_lidar=R_end @ end.R_key_lidar, p_key_lidar=way + p_end)
+    lever = (R_end @ end.p_key_lidar[:, :, None])[:, :, 0]
+    return replace(readings, R_key_lidar=R_end @ end.R_key_lidar, p_key_lidar=lever + p_end)
 
 
 def bridge_whitening(own: FloatArray, F: FloatArray, s: FloatArray, Q: FloatArray) -> Whitening:
-    """Return what makes the residuals of n readings within one step white.
+    """Return the joint whitening of the residuals of n readings within one step.
 
     Parameters
     ----------
     own
-        For the noise of each reading alone, 1/uT, shape (n, 3, 3).
+        Whitening of each reading's own noise, 1/uT, shape (n, 3, 3).
     F
         Derivatives of residuals by a perturbation of the end of the step, shape (n, 3, 6).
     s
-        Shares of the step that lie behind them, shape (n,).
+        Share of the step that is done at each, shape (n,).
     Q
         Covariance of the step, shape (6, 6).
     """
@@ -162,13 +163,13 @@ def bridge_whitening(own: FloatArray, F: FloatArray, s: FloatArray, Q: FloatArra
     slot = np.abs(np.subtract.outer(s, at)).argmin(axis=1)
     bridge = np.minimum.outer(at, at) - np.outer(at, at)
     errors = np.einsum("nij,nm->nimj", F, covariance_root(bridge)[slot])
-    # From the instant to the reading it is a way of its own, as far as others know.
+    # From the instant to the reading the walk counts as independent of other readings.
     rest = own @ F * np.sqrt(np.abs(s - at[slot]))[:, None, None]
     own = whitening(np.eye(3) + rest @ rest.transpose(0, 2, 1)) @ own
     return Whitening.with_errors(own, errors.reshape(*own.shape[:2], -1))
 
 
 def _instants(s: FloatArray) -> FloatArray:
-    """Return shares of a step that stand for these, n of them, ascending."""
+    """Return the shares of a step that n shares are rounded to, ascending."""
     at = np.unique(s)
     return at if len(at) <= INSTANTS else np.unique(np.round((INSTANTS + 1) * s)) / (INSTANTS + 1)

@@ -75,12 +75,14 @@ class DrivePrediction:
     @property
     def interpolation_covariance(self) -> FloatArray:
         """What errors of the ways contribute to the covariance of residuals, (N, 3, 3)."""
-        return self.motions.share(np.arange(len(self.prediction.inside)), self.prediction.by_lidar)
+        return self.motions.interpolation_covariance(
+            np.arange(len(self.prediction.inside)), self.prediction.by_lidar
+        )
 
     def squared(self, noise: FloatArray) -> FloatArray:
         """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
         return self.prediction.squared(
-            self.prediction.whitening(noise, more=self.interpolation_covariance)
+            self.prediction.whitening(noise, extra=self.interpolation_covariance)
         )
 
     def independent(self, noise: FloatArray, used: BoolArray) -> FloatArray:

@@ -1,7 +1,7 @@
-"""What is known of the vehicle at one key pose: where it is, and how its sensors read.
+"""The filter's belief at one key pose: the vehicle's pose and its sensors' calibrations.
 
-The update is Kalman's and not GTSAM's: of 192 components it takes 0.6 ms, elimination 5.2 ms. It
-asks for no inverse of the covariance, which may be singular by rounding.
+The update is a Kalman update and not GTSAM's: of 192 components it takes 0.6 ms, elimination
+5.2 ms. It needs no inverse of the covariance, which may be singular by rounding.
 """
 
 from collections.abc import Callable
@@ -17,21 +17,21 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drive import KnownSensors
 
 POSE, SENSOR = 6, 15  # components of a pose and of a sensor's calibration
-HALVINGS = 8  # of a step
-ITERATIONS = 20  # the most linearisations of what is seen
-CLOSE = 0.01  # rad, m, or of an entry of C: what moved by less need not be linearised anew
+HALVINGS = 8  # of a step in the line search
+ITERATIONS = 20  # limit of linearisations in an update
+CLOSE = 0.01  # rad, m, or of an entry of C: smaller steps end an update
 ROUNDING = 1e-10  # of a correlation
-LINEAR = 12  # the first component of a sensor that readings are linear in
+LINEAR = 12  # from this component of a sensor on (H) readings are linear
 
 
 @dataclass(frozen=True)
 class WhitenedMeasurement:
-    """What is seen at an estimate.
+    """A measurement at an estimate, white with unit variance.
 
     Attributes
     ----------
     residual
-        Whitened, shape (m,).
+        Shape (m,).
     jacobian
         Its derivative by the components of the belief, shape (m, P).
     """
@@ -46,7 +46,7 @@ class WhitenedMeasurement:
 
 
 class MahalanobisDistance:
-    """How far something is from its mean, in sigmas.
+    """Distance from the mean of a Gaussian, in standard deviations.
 
     Parameters
     ----------
@@ -59,13 +59,13 @@ class MahalanobisDistance:
 
     @cached_property
     def _factor(self) -> tuple[FloatArray, bool]:
-        """Of the correlations: needed only where a step is long."""
+        """Cholesky factor of the correlations: needed only where a step is long."""
         correlation = self._covariance / np.outer(self._sigma, self._sigma)
         factor, lower = cho_factor(correlation + ROUNDING * np.eye(len(correlation)))
         return np.asarray(factor), bool(lower)
 
     def squared(self, delta: FloatArray) -> float:
-        """Return the squared distance of a difference, shape (P,)."""
+        """Return the squared distance of a difference from the mean, shape (P,)."""
         u = delta / self._sigma
         return float(u @ cho_solve(self._factor, u))
 
@@ -77,9 +77,9 @@ class Belief:
     Attributes
     ----------
     pose
-        Of the lidar in the map.
+        Pose of the lidar in the map.
     sensors
-        Calibrations as they are known by then.
+        Estimates of the S calibrations.
     covariance
         Of a right perturbation of the pose, rotation (rad) before translation (m), and, where they
         are variables, of (t, C row by row, H) of one sensor after the other, in m and uT; shape
@@ -92,7 +92,7 @@ class Belief:
 
     @property
     def pose_covariance(self) -> FloatArray:
-        """That of the pose, shape (6, 6)."""
+        """Covariance of the pose, shape (6, 6)."""
         return self.covariance[:POSE, :POSE]
 
     @property
@@ -102,19 +102,19 @@ class Belief:
 
     @property
     def calibration_covariance(self) -> FloatArray:
-        """Those of the sensors, shape (S, 15, 15); as they were given where they are constants."""
+        """Covariances of the sensors, shape (S, 15, 15); as given where they are constants."""
         if not self.has_calibrations:
             return self.sensors.covariance
         at = POSE + SENSOR * np.arange(len(self.sensors.names))[:, None] + np.arange(SENSOR)
         return np.asarray(self.covariance[at[:, :, None], at[:, None, :]])
 
     def predicted(self, step: gtsam.Pose3, covariance: FloatArray) -> "PredictedBelief":
-        """Return what is known on the way to the next key pose.
+        """Return the joint belief of this key pose and the step to the next.
 
         Parameters
         ----------
         step
-            The way to it by odometry.
+            The next key pose in the frame of this one, by odometry.
         covariance
             Of a right perturbation of it, shape (6, 6).
         """
@@ -122,15 +122,22 @@ class Belief:
         return PredictedBelief(self.pose, self.sensors, joint, step)
 
     def updated(self, measure: Callable[[Self], WhitenedMeasurement]) -> Self:
-        """Return what is known once something was seen, by an iterated Kalman update.
+        """Return the posterior of a measurement, by an iterated Kalman update.
 
-        A step that makes the squared residuals and the distance from this belief larger together
-        is halved: near a source a field bends so much that a whole one would lead away.
+        Each iteration is a Gauss-Newton step of the maximum a posteriori problem (B. Bell,
+        F. Cathey, IEEE Trans. Automatic Control 38, 1993, 294-297). A step that increases the
+        cost is halved: near a source a field is so curved that the full step diverges.
+
+        Parameters
+        ----------
+        measure
+            Linearises the measurement at a belief.
         """
         P, delta, measured = self.covariance, np.zeros(len(self.covariance)), measure(self)
         component, distance = np.arange(len(P)) - POSE, MahalanobisDistance(P)
         bends = (component < 0) | (component % SENSOR < LINEAR)
         for _ in range(ITERATIONS):
+            # Linearised at delta: the innovation from the prior mean is the residual less J delta.
             gain = kalman_gain(P, measured.jacobian)
             step = gain @ (measured.jacobian @ delta - measured.residual) - delta
             if np.abs(step[bends]).max() < CLOSE:
@@ -152,13 +159,13 @@ class Belief:
         return replace(self.moved(delta), covariance=left)
 
     def is_near(self, other: "Belief", most: float) -> bool:
-        """Return whether poses (rad, m), positions of sensors (m) and C differ by no more."""
+        """Return whether poses (rad, m), positions of sensors (m) and C agree to ``most``."""
         parts = [other.pose.localCoordinates(self.pose), self.sensors.t - other.sensors.t]
         parts.append((self.sensors.distortion - other.sensors.distortion)[:, :9])
         return all(float(np.abs(part).max(initial=0.0)) <= most for part in parts)
 
     def moved(self, delta: FloatArray) -> Self:
-        """Return the belief elsewhere, by components as those of the covariance."""
+        """Return the belief with its mean moved by a step in the components of the covariance."""
         sensors = self.sensors
         if len(delta) > POSE:
             by = delta[POSE:].reshape(-1, SENSOR)
@@ -170,16 +177,16 @@ class Belief:
 
 @dataclass(frozen=True)
 class PredictedBelief(Belief):
-    """What is known between a key pose and the next.
+    """The joint belief of a key pose, the sensors and the step to the next key pose.
 
     Attributes
     ----------
     pose, sensors
-        The key pose behind, and the sensors.
+        The previous key pose in the map, and the sensors.
     covariance
-        As that of a belief, and of a right perturbation of the step as the last six components.
+        Of a belief's components and, as the last six, of a right perturbation of the step.
     step
-        From there to the next key pose.
+        The next key pose in the frame of the previous.
     """
 
     step: gtsam.Pose3
@@ -190,17 +197,18 @@ class PredictedBelief(Belief):
         return len(self.covariance) > 2 * POSE
 
     def moved(self, delta: FloatArray) -> Self:
-        """Return the belief elsewhere, by components as those of the covariance."""
+        """Return the belief with its mean moved by a step in the components of the covariance."""
         return replace(super().moved(delta[:-POSE]), step=self.step.retract(delta[-POSE:]))
 
     def marginalize_previous(self) -> Belief:
-        """Return what is known of the next key pose."""
+        """Return the belief of the next key pose, the previous one marginalised out."""
+        # X' = X S: Exp(x') = Exp(Ad_{S^-1} x + s) to first order, for right perturbations.
         J = np.eye(len(self.covariance) - POSE, len(self.covariance))
         J[:POSE, :POSE], J[:POSE, -POSE:] = self.step.inverse().AdjointMap(), np.eye(POSE)
         return Belief(self.pose.compose(self.step), self.sensors, J @ self.covariance @ J.T)
 
 
 def kalman_gain(P: FloatArray, J: FloatArray) -> FloatArray:
-    """Return Kalman's gain for white evidence of unit variance, shape (P, m)."""
+    """Return the Kalman gain of a white measurement of unit variance, shape (P, m)."""
     crossed = P @ J.T
     return np.asarray(cho_solve(cho_factor(J @ crossed + np.eye(len(J))), crossed.T).T)

@@ -1,13 +1,13 @@
-"""Follow a drive from its start, key pose by key pose.
+"""Follow a drive from its start, key pose by key pose: a Kalman filter, and iSAM2 behind it.
 
-Odometry drifts out of the reach of a descent within some tens of metres; followed from where the
-drive begins, each key pose is found from the last, which the map has corrected already. There it
-is known how far a reading may be off, and one that is further counts for nothing: a field that a
-door adds to all sensors would otherwise be taken for a turn.
+Within some tens of metres odometry drifts out of the optimiser's basin of convergence. Followed
+from the start, each key pose is predicted from the last, which the map has corrected already; the
+prediction's covariance bounds how far a reading may be off, and outliers are gated. A field that a
+door adds to all sensors would otherwise be taken for a rotation.
 
-A Kalman filter takes each key pose as it comes; iSAM2 takes them by the dozen, linearises anew what
-has moved, and tells the filter what it found. What a key pose costs, and the memory that is needed
-beside the poses, does not grow with the drive: it is solved section by section.
+The filter takes each key pose as it comes; iSAM2 takes them in groups, relinearises what has moved,
+and hands its estimate back to the filter. Cost per key pose, and memory beside the poses, do not
+grow with the drive: it is solved in sections.
 """
 
 from collections.abc import Iterator
@@ -55,23 +55,23 @@ from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.solve.robust import RobustOptions
 
 SECTION = 200  # key poses that are solved together
-GROUP = 10  # key poses that come to iSAM2 together,
-EARLY = 30  # and the first so many one by one: in calibrations far off, readings are not linear
-AGAIN = 2  # more steps with each group, so that the next one starts from where this one converged
+GROUP = 10  # key poses that are added to iSAM2 together,
+EARLY = 30  # but the first ones one by one: readings are not linear in calibrations far off
+AGAIN = 2  # further iterations with each group, so that the next one starts from convergence
 
 
 @dataclass(frozen=True)
 class AcceptedReadings:
-    """Readings between two key poses that the filter took.
+    """Readings between two key poses that the filter was updated with.
 
     Attributes
     ----------
     rows
-        Which, shape (n,).
+        Their rows in the drive, shape (n,).
     whitening
-        Of their residuals.
+        Of the n residuals together.
     step
-        As the filter has it, and what they feel of its error.
+        The filter's estimate of the step, and the residuals' derivatives by it.
     """
 
     rows: IntArray
@@ -81,14 +81,14 @@ class AcceptedReadings:
 
 @dataclass
 class PendingKeyPoses:
-    """Key poses that the filter has taken and iSAM2 has not.
+    """Key poses that the filter has processed and iSAM2 has not.
 
     Attributes
     ----------
     graph, values
-        Odometry and key poses.
-    legs
-        Readings between them that passed.
+        Odometry factors and key poses.
+    accepted
+        Gated readings of each step.
     """
 
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
@@ -97,16 +97,16 @@ class PendingKeyPoses:
 
 
 class Follower:
-    """A drive as far as it was followed.
+    """Localises a drive on line: its state after the key poses that were added so far.
 
     Parameters
     ----------
     drive
-        The drive.
+        K key poses with odometry and readings.
     field_map
-        The map.
+        Map that is queried for field and variance.
     robust
-        Which readings pass where a pose is predicted.
+        Loss and confidence of the gate.
     free
         Whether calibrations are variables.
     section
@@ -134,86 +134,86 @@ class Follower:
         self._calibrations = [key for i in sensors for key in (T(i), D(i))]
         self._length, self._first, self._past = section, 0, gtsam.Values()
         self._section = Section(self._calibrations)
-        self._belief, self._pending = self._at_start(), self._opening()
+        self._belief, self._pending = self._prior(), self._opening()
 
     def step(self, number: int) -> Belief:
-        """Add a key pose, and return what is known of it then; they come in order.
+        """Add the next key pose, and return its posterior.
 
         Raises
         ------
         CalibrationError
-            What is known of poses and sensors is too many orders of magnitude apart.
+            The system is too badly scaled to be solved.
         """
         if number > 0:
             self._advance(number)
-        self._fix(number)
+        self._update_by_fixes(number)
         self._pending.values.insert(X(number), self._belief.pose)
         last = len(self._drive) - 1
-        # Not before there was a reading: calibrations far off have to come from the filter.
+        # Not before there was a reading: iSAM2 needs the filter's estimate of calibrations far off.
         if 0 < number < EARLY or (number + 1) % GROUP == 0 or number == last:
             with reported_ill_conditioning():
                 self._update_section(number)
         return self._belief
 
     def values(self) -> gtsam.Values:
-        """Return all variables, as their sections have them."""
+        """Return the estimates of all variables, by the section that each was solved in."""
         values = gtsam.Values(self._past)
         values.insert(self._section.values())
         return values
 
     def _opening(self) -> PendingKeyPoses:
-        """Return what is known before the first key pose."""
+        """Return the priors of the first key pose and the calibrations."""
         pending = PendingKeyPoses()
         pending.graph.add(start_factor(self._drive.start))
         if self._free:
             pending.graph.push_back(calibration_graph(self._drive.sensors))
         return pending
 
-    def _at_start(self) -> Belief:
+    def _prior(self) -> Belief:
         start, sensors = self._drive.start, self._drive.sensors
         known = sensors.covariance if self._free else ()
         covariance = block_diag(start.covariance, *known)
         return Belief(as_pose(start.T_map_lidar), sensors, covariance)
 
-    def _fix(self, number: int) -> None:
-        """Take what scans say of a key pose's place in the map, as far as it passes for such."""
+    def _update_by_fixes(self, number: int) -> None:
+        """Update by the scan fixes of a key pose that pass the gate."""
         links, most = self._drive.links, self._robust.largest_of(POSE)
         for row in self._fixes[self._fix_ends[number] : self._fix_ends[number + 1]].tolist():
             covariance = self._belief.pose_covariance + links.covariance[row]
             off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
             if off @ np.linalg.solve(covariance, off) <= most:
-                seen = partial(fix_measurement, link_pose(links, row), links.covariance[row])
-                self._belief = self._belief.updated(seen)
+                measure = partial(fix_measurement, link_pose(links, row), links.covariance[row])
+                self._belief = self._belief.updated(measure)
                 self._pending.graph.add(link_factor(links, row))
 
     def _advance(self, number: int) -> None:
-        """Go on to a key pose from the one before, and take what was read on the way."""
+        """Predict a key pose from the one before, and update by the readings between them."""
         before, steps = number - 1, self._drive.steps
         belief = self._belief.predicted(self._drive.step(before), steps.covariance[before])
-        self._belief = self._read(before, belief).marginalize_previous()
+        self._belief = self._update_by_readings(before, belief).marginalize_previous()
         self._pending.graph.add(step_factor(self._drive, before))
 
-    def _read(self, number: int, belief: PredictedBelief) -> PredictedBelief:
-        """Take the readings after a key pose as far as they pass for such."""
+    def _update_by_readings(self, number: int, belief: PredictedBelief) -> PredictedBelief:
+        """Return the belief updated by the readings after a key pose that pass the gate."""
         rows = np.arange(self._ends[number], self._ends[number + 1])
         if not len(rows):
             return belief
-        view = StepMeasurement(StepReadings.of(self._drive, rows, number), self._map)
-        gated = gate(view, self._variance, belief, self._robust)
+        measurement = StepMeasurement(StepReadings.of(self._drive, rows, number), self._map)
+        gated = gate(measurement, self._variance, belief, self._robust)
         if not len(gated.rows):
             return belief
-        updated = update(view.of(gated.rows), gated.own, belief)
+        updated = update(measurement.of(gated.rows), gated.own, belief)
         step = StepError(number, updated.belief.step, updated.by_step)
         self._pending.accepted.append(AcceptedReadings(rows[gated.rows], updated.whitening, step))
         return updated.belief
 
     def _update_section(self, number: int) -> None:
-        """Give iSAM2 the key poses that wait, and take from it what is known of the last."""
+        """Add the pending key poses to iSAM2, and take the posterior of the last from it."""
         pending, self._pending = self._pending, PendingKeyPoses()
         for factor in self._reading_factors(pending):
             pending.graph.add(factor)
         if self._free and pending.values.exists(X(0)):
-            # From the filter's estimate: linearised at values far off, readings would lead astray.
+            # From the filter's estimate: linearised far off, readings would lead astray.
             pending.values.insert(calibration_values(self._belief.sensors))
         self._section.add(pending.graph, pending.values, number, AGAIN)
         sensors, section = self._drive.sensors, self._section
@@ -226,25 +226,21 @@ class Follower:
     def _reading_factors(self, pending: PendingKeyPoses) -> Iterator[gtsam.NonlinearFactor]:
         if not pending.accepted:
             return
-        rows = np.concatenate([readings_of_step.rows for readings_of_step in pending.accepted])
-        steps = [
-            readings_of_step.step.step
-            for readings_of_step in pending.accepted
-            for _ in readings_of_step.rows
-        ]
+        rows = np.concatenate([each.rows for each in pending.accepted])
+        steps = [each.step.step for each in pending.accepted for _ in each.rows]
         readings = interpolated_readings(self._drive, rows, steps)
         fixed = None if self._free else self._drive.sensors.fixed()
         batch = MapBatch(self._map, readings, fixed)
-        for readings_of_step in pending.accepted:
+        for each in pending.accepted:
             yield key_pose_factor(
                 batch,
-                readings_of_step.step.key_pose,
-                readings_of_step.whitening,
-                step=readings_of_step.step,
+                each.step.key_pose,
+                each.whitening,
+                step=each.step,
             )
 
     def _hand_over(self, last: int) -> None:
-        """Begin a section with the last key pose of this one."""
+        """Begin a new section at the last key pose of this one."""
         values = self._section.values()
         self._past.insert(values.extract([X(k) for k in range(self._first, last)]))
         self._section = self._section.next(last)
@@ -252,7 +248,7 @@ class Follower:
 
 
 def follow(follower: Follower, count: int, progress: Progress) -> gtsam.Values:
-    """Follow a drive of so many key poses to its end and return its values."""
+    """Follow a drive of ``count`` key poses to its end and return its values."""
     for number in range(count):
         follower.step(number)
         progress("following the drive", (number + 1) / count)

@@ -11,25 +11,31 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place_readings
-from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, PredictedBelief, WhitenedMeasurement
+from l2m_gtsam.slam.online.belief import (
+    POSE,
+    SENSOR,
+    Belief,
+    PredictedBelief,
+    WhitenedMeasurement,
+)
 from l2m_gtsam.slam.pose_graph import stated_information_root
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
-# Of cells over which the variance counts as constant: sigmas are off by a tenth, seldom a quarter.
+# Edge of cells over which the map's variance counts as constant: sigmas are off by 10 %, rarely 25.
 CELL_M = 0.25
+MAX_RELINEARISATIONS = 3  # of the covariance that odometry's errors within a step give readings
+CONVERGED = 0.03  # m, rad, or of an entry of C: the covariance changes no more
 
 
 class CachedVariance:
-    """A map's variance, asked once in each cell that is come to.
-
-    A harmonic map needs a hundred times as long for it as for the field.
+    """A map's variance, queried once per cell: a harmonic map takes 100 times as long as the field.
 
     Parameters
     ----------
     field_map
-        The map.
+        Map with ``query``.
     """
 
     def __init__(self, field_map: QueryableMap) -> None:
@@ -39,7 +45,7 @@ class CachedVariance:
     def at(self, points: FloatArray) -> FloatArray:
         """Return the variance per axis in uT^2, shape (N, 3); infinite outside of the map.
 
-        It is that of the middle of the cell that a point lies in.
+        It is that of the centre of the cell that a point lies in.
 
         Parameters
         ----------
@@ -49,8 +55,8 @@ class CachedVariance:
         cells = [tuple(cell) for cell in np.floor(points / CELL_M).astype(np.int64).tolist()]
         new = list({cell for cell in cells if cell not in self._known})
         if new:
-            told = self._map.query(CELL_M * (np.array(new) + 0.5)).variance
-            self._known.update(zip(new, told, strict=True))
+            variance = self._map.query(CELL_M * (np.array(new) + 0.5)).variance
+            self._known.update(zip(new, variance, strict=True))
         return np.stack([self._known[cell] for cell in cells])
 
 
@@ -61,11 +67,11 @@ class StepReadings:
     Attributes
     ----------
     readings
-        As odometry hangs them on the first of these, n in number.
+        n readings, relative to the first key pose by odometry.
     step
-        The step to the second by odometry.
+        The second key pose in the frame of the first, by odometry.
     covariance
-        Of a right perturbation of it, shape (6, 6).
+        Of a right perturbation of the step, shape (6, 6).
     """
 
     readings: KeyPoseReadings
@@ -74,7 +80,7 @@ class StepReadings:
 
     @classmethod
     def of(cls, drive: Drive, rows: IntArray, number: int) -> "StepReadings":
-        """Return some of a drive's readings, all on a key pose of this number."""
+        """Return some of a drive's readings, all on the key pose of this number."""
         return cls(drive.readings[rows], drive.step(number), drive.steps.covariance[number])
 
     def __getitem__(self, rows: IntArray) -> "StepReadings":
@@ -84,7 +90,7 @@ class StepReadings:
         return len(self.readings)
 
     def shifted(self, step: gtsam.Pose3) -> KeyPoseReadings:
-        """Return the readings where they are if the step is this."""
+        """Return the readings relative to the first key pose for another estimate of the step."""
         if step.equals(self.step, 0.0):
             return self.readings
         R, p = self.step.rotation(), self.step.translation()
@@ -94,17 +100,17 @@ class StepReadings:
 
 @dataclass(frozen=True)
 class StepPrediction:
-    """Readings of a leg beside what a map predicts.
+    """Readings of a step against the map's prediction.
 
     Attributes
     ----------
     readings
-        Where they are.
+        n readings, relative to the first key pose by the estimate of the step.
     residuals
-        Residuals and derivatives.
+        Residuals in uT and their derivatives by first key pose and calibration.
     by_end
-        Derivatives by a perturbation of the end of the step that the lidar were rigidly fixed to,
-        shape (n, 3, 6).
+        Derivatives by a perturbation of the end of the step, as if the lidar were rigidly fixed to
+        it, shape (n, 3, 6).
     """
 
     readings: KeyPoseReadings
@@ -118,52 +124,48 @@ class StepPrediction:
 
 
 class StepMeasurement:
-    """A leg beside a map, which is asked once where a belief is looked at again.
+    """Readings of a step in a map, which is queried once per belief.
 
     Parameters
     ----------
-    leg
+    step
         n readings.
     field_map
-        The map.
+        Map with ``field_and_gradient``.
     """
 
-    def __init__(self, leg: StepReadings, field_map: QueryableMap) -> None:
-        self.leg, self._map = leg, field_map
+    def __init__(self, step: StepReadings, field_map: QueryableMap) -> None:
+        self.step, self._map = step, field_map
         self._at: PredictedBelief | None = None
-        self._seen: StepPrediction | None = None
+        self._prediction: StepPrediction | None = None
 
     def of(self, rows: IntArray) -> "StepMeasurement":
-        """Return the view of some readings: this one if they are all."""
-        return self if len(rows) == len(self.leg) else StepMeasurement(self.leg[rows], self._map)
+        """Return the measurement by some readings: this one if they are all."""
+        if len(rows) == len(self.step):
+            return self
+        return StepMeasurement(self.step[rows], self._map)
 
     def predicted(self, belief: PredictedBelief) -> StepPrediction:
-        """Compare the readings with what the map predicts from a belief."""
-        if self._seen is None or self._at is not belief:
-            self._at, self._seen = belief, self._compared(belief)
-        return self._seen
-
-    def _compared(self, belief: PredictedBelief) -> StepPrediction:
-        n, pose, readings = len(self.leg), belief.pose, self.leg.shifted(belief.step)
-        R, p = np.tile(pose.rotation().matrix(), (n, 1, 1)), np.tile(pose.translation(), (n, 1))
-        predicted = key_pose_residuals(readings, self._map, R, p, belief.sensors.fixed())
-        return StepPrediction(readings, predicted, predicted.de_dX @ belief.step.AdjointMap())
-
-
-MAX_RELINEARISATIONS = 3  # at what errors of the way do
-NEAR = 0.03  # m, rad, or of an entry of C: there they do the same
+        """Compare the readings with what the map predicts at a belief."""
+        if self._prediction is None or self._at is not belief:
+            n, pose, readings = len(self.step), belief.pose, self.step.shifted(belief.step)
+            R, p = np.tile(pose.rotation().matrix(), (n, 1, 1)), np.tile(pose.translation(), (n, 1))
+            residuals = key_pose_residuals(readings, self._map, R, p, belief.sensors.fixed())
+            by_end = residuals.de_dX @ belief.step.AdjointMap()
+            self._at, self._prediction = belief, StepPrediction(readings, residuals, by_end)
+        return self._prediction
 
 
 @dataclass(frozen=True)
 class Gated:
-    """Readings of a leg that pass for such.
+    """Readings of a step that passed the gate.
 
     Attributes
     ----------
     rows
-        Which, shape (n,).
+        Their rows in the step, shape (n,).
     own
-        What makes the noise of each white, weighted by how far it counts, 1/uT, shape (n, 3, 3).
+        Whitening of each one's own noise, times the root of its weight, 1/uT, shape (n, 3, 3).
     """
 
     rows: IntArray
@@ -172,16 +174,16 @@ class Gated:
 
 @dataclass(frozen=True)
 class Updated:
-    """What is known once the readings of a leg were taken.
+    """A belief after the readings of a step.
 
     Attributes
     ----------
     belief
-        By them.
+        The posterior, of the first key pose and the step.
     whitening
-        Of their residuals, there.
+        Of the n residuals together.
     by_step
-        Their derivatives by a right perturbation of the step, shape (n, 3, 6).
+        Derivatives of the residuals by a right perturbation of the step, shape (n, 3, 6).
     """
 
     belief: PredictedBelief
@@ -190,93 +192,96 @@ class Updated:
 
 
 def gate(
-    view: StepMeasurement,
+    measurement: StepMeasurement,
     variance: CachedVariance,
     belief: PredictedBelief,
     robust: RobustOptions,
 ) -> Gated:
-    """Return the readings of a leg that a belief explains, by what it and they may be off."""
-    leg, predicted, sensors = view.leg, view.predicted(belief), belief.sensors
-    where = place_readings(
-        predicted.readings, {int(k): belief.pose for k in leg.readings.key_pose[:1]}, sensors
-    )
-    known = variance.at(where.x)
+    """Return the readings that the belief explains, by their Mahalanobis distances.
+
+    Innovations are correlated through the belief; each is gated alone, by its own covariance.
+    """
+    step, sensors, prediction = measurement.step, belief.sensors, measurement.predicted(belief)
+    poses = {int(k): belief.pose for k in step.readings.key_pose[:1]}
+    placed = place_readings(prediction.readings, poses, sensors)
+    known = variance.at(placed.x)
     rows = np.flatnonzero(np.isfinite(known[:, 0]))
-    R, sensor = where.readings.R_map_lidar[rows], leg.readings.sensor[rows]
-    noise = reading_covariance(sensors.noise[sensor], map_covariance(where.C[rows], R, known[rows]))
-    e, S = (
-        predicted.residuals.reading.residual[rows],
-        belief_covariance(leg, predicted, belief)[rows] + noise,
-    )
+    R, sensor = placed.readings.R_map_lidar[rows], step.readings.sensor[rows]
+    of_map = map_covariance(placed.C[rows], R, known[rows])
+    noise = reading_covariance(sensors.noise[sensor], of_map)
+    S = belief_covariance(step, prediction, belief)[rows] + noise
+    e = prediction.residuals.reading.residual[rows]
     r2 = np.einsum("ni,ni->n", e, np.linalg.solve(S, e[:, :, None])[:, :, 0])
     trust = WEIGHTS[robust.loss](r2, robust.largest, np.inf)
     good = np.flatnonzero(trust > 0)
-    own = whitening(noise[good]) * np.sqrt(trust[good])[:, None, None]
-    return Gated(rows[good], own)
+    return Gated(rows[good], whitening(noise[good]) * np.sqrt(trust[good])[:, None, None])
 
 
-def update(view: StepMeasurement, own: FloatArray, belief: PredictedBelief) -> Updated:
-    """Return what is known by the readings of a leg, too.
+def update(measurement: StepMeasurement, own: FloatArray, belief: PredictedBelief) -> Updated:
+    """Return the belief updated by readings of a step.
 
-    What the errors of the way do to them goes with the field's gradient and the calibration: it is
-    looked at again where these come out elsewhere than they were taken for.
+    Odometry's errors within the step enter residuals through the field's gradient and the
+    calibration. The residuals' covariance is computed again where these change in the update.
 
     Parameters
     ----------
-    view, belief
-        The readings, and what is known without them.
+    measurement
+        n readings that passed the gate.
     own
-        What makes the noise of each reading white, 1/uT, shape (n, 3, 3).
+        Whitening of each one's own noise, 1/uT, shape (n, 3, 3).
+    belief
+        Prior.
     """
-    at, leg = belief, view.leg
+    at, step = belief, measurement.step
     for _ in range(MAX_RELINEARISATIONS):
-        predicted = view.predicted(at)
-        white = bridge_whitening(own, predicted.by_end, leg.readings.fraction, leg.covariance)
-        found = belief.updated(partial(whitened_measurement, view, white))
-        if found.is_near(at, NEAR):
+        prediction = measurement.predicted(at)
+        white = bridge_whitening(own, prediction.by_end, step.readings.fraction, step.covariance)
+        posterior = belief.updated(partial(whitened_measurement, measurement, white))
+        if posterior.is_near(at, CONVERGED):
             break
-        at = found
-    return Updated(found, white, predicted.by_step)
+        at = posterior
+    return Updated(posterior, white, prediction.by_step)
 
 
 def belief_covariance(
-    leg: StepReadings, predicted: StepPrediction, belief: PredictedBelief
+    step: StepReadings, prediction: StepPrediction, belief: PredictedBelief
 ) -> FloatArray:
-    """Return what an uncertain belief adds to the covariance of residuals, uT^2, (n, 3, 3).
+    """Return the covariance of residuals by an uncertain belief, uT^2, shape (n, 3, 3).
 
-    That is, by the pose, by the calibrations, and by the way from there.
+    Its parts are the pose, the calibrations, the step, and odometry's errors within the step.
     """
-    P, sensor, residuals = belief.covariance, leg.readings.sensor, predicted.residuals
-    parts = [residuals.de_dX, predicted.by_step]
-    at = np.tile(np.append(np.arange(POSE), np.arange(len(P) - POSE, len(P))), (len(leg), 1))
+    P, sensor, residuals = belief.covariance, step.readings.sensor, prediction.residuals
+    parts = [residuals.de_dX, prediction.by_step]
+    at = np.tile(np.append(np.arange(POSE), np.arange(len(P) - POSE, len(P))), (len(step), 1))
     if belief.has_calibrations:
         parts += [residuals.reading.de_dt, residuals.reading.de_dD]
         at = np.hstack([at, columns_of(sensor)])
     J = np.concatenate(parts, axis=2)
-    s = leg.readings.fraction[:, None, None]
-    bridge = s * (1 - s) * (predicted.by_end @ leg.covariance @ predicted.by_end.transpose(0, 2, 1))
+    # Between two known ends odometry's random walk is a Brownian bridge of variance s (1 - s) Q.
+    s, F = step.readings.fraction[:, None, None], prediction.by_end
+    bridge = s * (1 - s) * (F @ step.covariance @ F.transpose(0, 2, 1))
     return np.asarray(J @ P[at[:, :, None], at[:, None, :]] @ J.transpose(0, 2, 1) + bridge)
 
 
 def whitened_measurement(
-    view: StepMeasurement, white: Whitening, belief: PredictedBelief
+    measurement: StepMeasurement, white: Whitening, belief: PredictedBelief
 ) -> WhitenedMeasurement:
-    """Return the n readings of a leg as evidence."""
-    leg, predicted, n = view.leg, view.predicted(belief), len(view.leg)
+    """Return the n readings of a step at a belief, white."""
+    prediction, n = measurement.predicted(belief), len(measurement.step)
     J = np.zeros((n, 3, len(belief.covariance)))
-    J[:, :, :POSE], J[:, :, -POSE:] = predicted.residuals.de_dX, predicted.by_step
-    reading = predicted.residuals.reading
+    J[:, :, :POSE], J[:, :, -POSE:] = prediction.residuals.de_dX, prediction.by_step
+    reading = prediction.residuals.reading
     if belief.has_calibrations:
         by_sensor = np.concatenate([reading.de_dt, reading.de_dD], axis=2)
         at = np.arange(n)[:, None, None], np.arange(3)[:, None]
-        J[(*at, columns_of(leg.readings.sensor)[:, None])] = by_sensor
+        J[(*at, columns_of(measurement.step.readings.sensor)[:, None])] = by_sensor
     return WhitenedMeasurement(white(reading.residual[:, :, None]).ravel(), white(J))
 
 
 def fix_measurement(
     fix: gtsam.Pose3, covariance: FloatArray, belief: Belief
 ) -> WhitenedMeasurement:
-    """Return a key pose's place in the map, with its covariance (6, 6), as evidence."""
+    """Return a key pose in the map, measured with a covariance of shape (6, 6), white."""
     W = stated_information_root(covariance)
     J = np.zeros((POSE, len(belief.covariance)))
     J[:, :POSE] = W
@@ -284,5 +289,5 @@ def fix_measurement(
 
 
 def columns_of(sensor: IntArray) -> IntArray:
-    """Return which components of a belief are those of each reading's sensor, shape (n, 15)."""
+    """Return the components of a belief that are each reading's sensor's, shape (n, 15)."""
     return np.asarray(POSE + SENSOR * sensor[:, None] + np.arange(SENSOR))

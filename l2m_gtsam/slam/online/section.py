@@ -1,4 +1,4 @@
-"""The last key poses of a drive, solved by iSAM2 as they come; all that was before is a prior."""
+"""The last key poses of a drive, solved incrementally by iSAM2; earlier ones are a prior."""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.solver import covariance_of, ordered, unless_indeterminate
 
-# Steps after which a variable is linearised anew: rad and m, as a map bends within decimetres;
+# Steps after which a variable is relinearised: rad and m, as a field is curved within decimetres;
 # entries of C; never for H, in which readings are linear.
 RELINEARISE = {
     "X": np.full(6, 0.01),
@@ -18,12 +18,12 @@ RELINEARISE = {
     "D": np.concatenate([np.full(9, 0.01), np.full(3, np.inf)]),
 }
 CHOLESKY, QR = "CHOLESKY", "QR"
-ANEW = 10  # steps of a section that is solved again from its beginning
+ANEW = 10  # iterations of a section that is solved again from its beginning
 
 
 @dataclass
 class SectionContents:
-    """All that came to a section: factors, and values to begin with."""
+    """All that was added to a section: factors and initial values."""
 
     graph: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     values: gtsam.Values = field(default_factory=gtsam.Values)
@@ -32,12 +32,12 @@ class SectionContents:
 class Section:
     """A stretch of a drive that is solved as it grows.
 
-    What it has learnt goes over to the next one as a Gaussian prior of the variables that both
-    have. GTSAM's fixed-lag smoothers, which let go of one pose after the other, hold such variables
-    where they were when the first one went; here calibrations stay free to be linearised anew.
+    Its marginal becomes a Gaussian prior of the next section's variables that both share. GTSAM's
+    fixed-lag smoothers, which marginalise one pose after the other, fix such variables at their
+    linearisation point of the first marginalisation; here calibrations can be relinearised.
 
     Linear systems are solved by Cholesky: where calibrations are refined QR takes twice the time.
-    Once a system is refused, the section is solved by QR from its beginning, and so are later ones.
+    Once GTSAM calls a system indeterminate, this and later sections are solved by QR.
 
     Parameters
     ----------
@@ -50,12 +50,12 @@ class Section:
     def __init__(self, calibrations: list[int], solver: str = CHOLESKY) -> None:
         self._engine, self._calibrations, self._solver = _engine(solver), calibrations, solver
         self._contents = SectionContents()
-        self._observed: set[int] = set()  # those of sensors that were heard
+        self._observed: set[int] = set()  # calibrations of sensors with readings
 
     def add(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: int, again: int
     ) -> None:
-        """Add factors and new variables up to a key pose, and take so many more steps."""
+        """Add factors and new variables up to a key pose, with ``again`` further iterations."""
         for n in range(graph.size()):
             keys = set(graph.at(n).keys())
             if not keys.issubset(self._calibrations):
@@ -78,10 +78,10 @@ class Section:
         return result
 
     def _last_group(self, last: int) -> gtsam.KeyGroupMap:
-        """Return which variables are eliminated last.
+        """Return the groups of variables that are eliminated last.
 
-        What is asked for at each key pose stands in the root of the tree then. The very last are
-        poses: Cholesky takes a part of a calibration that only its prior holds for undetermined.
+        What is asked for at each key pose is in the root clique then. The very last are poses:
+        Cholesky calls a calibration that only its prior determines indeterminate.
         """
         order = gtsam.KeyGroupMap()
         for key in self._observed:
@@ -98,7 +98,7 @@ class Section:
         return self._engine.calculateEstimate(self._calibrations)
 
     def values(self) -> gtsam.Values:
-        """Return all its variables."""
+        """Return the estimates of all variables."""
         return self._engine.calculateEstimate()
 
     def covariance(self, last: int) -> FloatArray:
@@ -116,9 +116,9 @@ class Section:
         return np.roll(covariance, POSE, axis=(0, 1))
 
     def next(self, last: int) -> "Section":
-        """Return a section that begins with what this one knows of key pose and calibrations."""
+        """Return a section whose prior is this one's marginal of a key pose and calibrations."""
         keys = [*self._calibrations, X(last)]
-        # As it was linearised; what has moved by more than a little was linearised anew.
+        # At its linearisation point; what has moved far from it was relinearised.
         at = self._engine.getLinearizationPoint().extract(keys)
         information = None
         if self._solver == CHOLESKY:
@@ -132,7 +132,7 @@ class Section:
 
 
 def _engine(solver: str) -> gtsam.ISAM2:
-    """Return an empty graph that is solved as it grows."""
+    """Return an empty iSAM2."""
     thresholds = gtsam.ISAM2ThresholdMap()
     for symbol, steps in RELINEARISE.items():
         thresholds.insert((symbol, steps))

@@ -254,8 +254,8 @@ class TiledProblem:
             predictions, interpolation_covariances(tiled, motions, predictions), strict=True
         )
         parts = [
-            prediction.squared(prediction.whitening(noise, more=share))
-            for prediction, share in pairs
+            prediction.squared(prediction.whitening(noise, extra=interpolation_covariance))
+            for prediction, interpolation_covariance in pairs
         ]
         return self._gathered(tiled, parts)
 
@@ -288,4 +288,7 @@ def interpolation_covariances(
 ) -> list[FloatArray]:
     """Return of each tile what errors of the ways contribute to its residuals, (n, 3, 3)."""
     pairs = zip(tiled.tiles, predictions, strict=True)
-    return [motions.share(tile.rows, prediction.by_lidar) for tile, prediction in pairs]
+    return [
+        motions.interpolation_covariance(tile.rows, prediction.by_lidar)
+        for tile, prediction in pairs
+    ]

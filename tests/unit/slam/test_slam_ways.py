@@ -186,7 +186,7 @@ def test_what_a_way_contributes_is_what_whitening_knows() -> None:
     half = white(S.reshape(n, 3, 3 * n))
     # Errors of less than a thousandth of the noise's variance are left out.
     np.testing.assert_allclose(white(half.T.reshape(n, 3, 3 * n)), np.eye(3 * n), atol=2e-3)
-    share = motions.share(rows, by_lidar[rows])
+    share = motions.interpolation_covariance(rows, by_lidar[rows])
     for i in range(n):
         block = S[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] - NOISE**2 * np.eye(3)
         np.testing.assert_allclose(share[i], block, atol=1e-12)
