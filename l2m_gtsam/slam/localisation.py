@@ -95,7 +95,7 @@ def localise(
         Called with a stage and the fraction of it that is done.
     sources
         Of map and calibration.
-    seen
+    evidence
         What the drive's scans say of its poses.
 
     Raises
@@ -144,7 +144,7 @@ def prepared(
 
     Parameters
     ----------
-    recording, calibration, options, seen
+    recording, calibration, options, evidence
         As of ``localise``.
 
     Raises
