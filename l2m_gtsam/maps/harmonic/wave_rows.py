@@ -35,8 +35,18 @@ def write_wave_rows(
     for m in range(len(numbers)):
         p, q = numbers[m, 0], numbers[m, 1]
         cx, sx, cy, sy, e = cos_x[p], sin_x[p], cos_y[q], sin_y[q], growth[which[m]]
-        by_x, by_y, by_z = rows[m, 0], rows[m, 1], rows[m, 2]
-        ax, ay, az = factors[0, m], factors[1, m], factors[2, m]
-        for n in range(len(e)):
-            c, s = cx[n] * e[n], sx[n] * e[n]
-            by_x[n], by_y[n], by_z[n] = s * cy[n] * ax, c * sy[n] * ay, c * cy[n] * az
+        write_product(sx, cy, e, factors[0, m], rows[m, 0])
+        write_product(cx, sy, e, factors[1, m], rows[m, 1])
+        write_product(cx, cy, e, factors[2, m], rows[m, 2])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def write_product(
+    x: FloatArray, y: FloatArray, e: FloatArray, factor: float, row: FloatArray
+) -> None:
+    """Write the product of three functions and a factor at points, all of shape (N,).
+
+    One row at a time: among more arrays loops would not run in vector registers.
+    """
+    for n in range(len(e)):
+        row[n] = x[n] * e[n] * y[n] * factor
