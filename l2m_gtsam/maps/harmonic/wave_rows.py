@@ -1,8 +1,27 @@
 """The field of waves at many points, one wave after the other; see ``modes``."""
 
+import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.wave_sum import turned
+
+
+def wave_table(phase: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return cosines and sines of the first multiples of phases (N,), from 0, shapes (count, N)."""
+    cosines, sines = np.empty((count, len(phase))), np.empty((count, len(phase)))
+    write_multiples(np.cos(phase), np.sin(phase), cosines, sines)
+    return cosines, sines
+
+
+@njit(cache=True, nogil=True)
+def write_multiples(c: FloatArray, s: FloatArray, cosines: FloatArray, sines: FloatArray) -> None:
+    """Write cosines and sines of multiples of phases with these, (N,); see ``turned``."""
+    for n in range(len(c)):
+        cosines[0, n], sines[0, n] = 1.0, 0.0
+    for p in range(1, len(cosines)):
+        for n in range(len(c)):
+            cosines[p, n], sines[p, n] = turned(cosines[p - 1, n], sines[p - 1, n], c[n], s[n])
 
 
 @njit(cache=True, nogil=True)
