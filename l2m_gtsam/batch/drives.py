@@ -1,7 +1,7 @@
 """Drives: inspected, calibrated and planned."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from l2m_gtsam.appraise import FIGURES, appraise, scene_of
@@ -11,6 +11,7 @@ from l2m_gtsam.batch.scan_poses import read_drives_on
 from l2m_gtsam.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording
+from l2m_gtsam.metric_results import Metrics
 from l2m_gtsam.plan import assumed_recording, plan
 from l2m_gtsam.plan_results import DrivePlan
 from l2m_gtsam.progress import Progress, counter
@@ -29,6 +30,14 @@ OVERVIEW_FILE = "overview.png"
 METRICS_FILE = "metrics.json"
 
 
+@dataclass(frozen=True)
+class Appraised:
+    """A calibration that was written, and the figures that it is judged by."""
+
+    result: CalibrationResult
+    metrics: Metrics
+
+
 def inspect_file(bag: Path, config: Config, progress: Progress) -> BagReport:
     """Return what is in a bag and what would be used of it."""
     return inspect_bag(bag, config.bag, counter(f"reading {bag.name}", progress))
@@ -44,7 +53,7 @@ def calibrate_bag(
     view: Path | None = None,
 ) -> CalibrationResult:
     """Calibrate all magnetometers of a bag, as `calibrate_bags` does."""
-    return calibrate_bags([bag], map_path, config, out, progress, truth, view)
+    return calibrate_bags([bag], map_path, config, out, progress, truth, view).result
 
 
 def calibrate_bags(
@@ -55,7 +64,7 @@ def calibrate_bags(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> CalibrationResult:
+) -> Appraised:
     """Calibrate all magnetometers; write `calibration.yaml`, metrics and a picture.
 
     Parameters
@@ -100,7 +109,7 @@ def calibrate_drive(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> CalibrationResult:
+) -> Appraised:
     """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bags`."""
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
@@ -117,7 +126,7 @@ def calibrate_drive(
     progress(FIGURES, 1.0)
     if view is not None:
         write_scene(view, scene_of(recording, found))
-    return result
+    return Appraised(result, metrics)
 
 
 def plan_bag(
