@@ -1,7 +1,7 @@
 """Drives: inspected, calibrated and planned."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from l2m_gtsam.batch.files import (
@@ -22,6 +22,7 @@ from l2m_gtsam.qa.evaluate import FIGURES, appraise, scene_of
 from l2m_gtsam.qa.figures import calibration_figure, save_figure
 from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.plan import DrivePlan
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
 from l2m_gtsam.storage.calibration_file import write_calibration
@@ -33,6 +34,14 @@ from l2m_gtsam.storage.rerun_file import require_rerun, write_scene
 CALIBRATION_FILE = "calibration.yaml"
 OVERVIEW_FILE = "overview.png"
 METRICS_FILE = "metrics.json"
+
+
+@dataclass(frozen=True)
+class Appraised:
+    """A calibration that was written, and the figures that it is judged by."""
+
+    result: CalibrationResult
+    metrics: Metrics
 
 
 def inspect_file(bag: Path, config: Config, progress: Progress) -> BagReport:
@@ -50,7 +59,7 @@ def calibrate_bag(
     view: Path | None = None,
 ) -> CalibrationResult:
     """Calibrate all magnetometers of a bag, as `calibrate_bags` does."""
-    return calibrate_bags([bag], map_path, config, out, progress, truth, view)
+    return calibrate_bags([bag], map_path, config, out, progress, truth, view).result
 
 
 def calibrate_bags(
@@ -61,7 +70,7 @@ def calibrate_bags(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> CalibrationResult:
+) -> Appraised:
     """Calibrate all magnetometers; write `calibration.yaml`, metrics and a picture.
 
     Parameters
@@ -106,7 +115,7 @@ def calibrate_drive(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> CalibrationResult:
+) -> Appraised:
     """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bags`."""
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
@@ -123,7 +132,7 @@ def calibrate_drive(
     progress(FIGURES, 1.0)
     if view is not None:
         write_scene(view, scene_of(recording, found))
-    return result
+    return Appraised(result, metrics)
 
 
 def plan_bag(

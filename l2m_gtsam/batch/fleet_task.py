@@ -15,7 +15,7 @@ from l2m_gtsam.batch.drives import (
     calibrate_drive,
 )
 from l2m_gtsam.batch.files import OpenMap, SavedMap, check_outputs, ensure_folder
-from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
+from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_calibration
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
@@ -280,13 +280,13 @@ def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
 def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float) -> DriveOutcome:
     recording = read_drive_on(saved, task.drive.bag, task.config, _quiet)
     saved.check_frame(recording)
-    result = calibrate_drive(recording, opened, task.config, task.out, _quiet)
-    verdict = report_folder(task.out, None)
+    found = calibrate_drive(recording, opened, task.config, task.out, _quiet)
+    verdict = report_calibration(task.out, found, task.config.qa)
     return DriveOutcome(
         key=task.key(recording.source.sha256),
         start=_start(recording),
         duration=_duration(recording),
-        sensors=sensor_rows(result, verdict),
+        sensors=sensor_rows(found.result, verdict),
         error="",
         lasting=True,
         made=_made(begun),

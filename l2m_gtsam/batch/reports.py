@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE
+from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, Appraised
 from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
@@ -153,6 +153,36 @@ def report_folder(
         verdict = _report_calibration(folder, config, tell)
     if pdf:
         print_page(folder / REPORT_FILE, folder / PDF_FILE)
+    tell(STAGE, 1.0)
+    return verdict
+
+
+def report_calibration(
+    folder: Path, found: Appraised, options: QaOptions, progress: Progress | None = None
+) -> Verdict:
+    """Write `report.html` on what was just written to a folder, as `report_folder` would.
+
+    Parameters
+    ----------
+    folder
+        Where the calibration was written to.
+    found
+        The calibration and its figures.
+    options
+        Thresholds.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        The report cannot be written, or the folder holds a localisation, too; one line.
+    """
+    tell = progress or (lambda stage, fraction: None)
+    tell(STAGE, 0.0)
+    check_outputs(folder / REPORT_FILE)
+    holds_localisation(folder)
+    verdict = write_report(folder, found.result, found.metrics, options, tell)
     tell(STAGE, 1.0)
     return verdict
 

@@ -1,18 +1,38 @@
 """Readings of a solve as models of a sensor take them: beside what the map predicts."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from l2m_factors import PoseMotion, field_rate
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.trust import FEWEST
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray, Readings
 from l2m_gtsam.records.sensor_models import Samples
 from l2m_gtsam.solve.robust import Loss, RobustOptions, consistent
 
 
+def predicted(
+    parts: Sequence[Readings], field_map: QueryableMap, estimate: Estimate
+) -> list[FieldSample]:
+    """Return what a map predicts for readings of one sensor each, at least one, part by part.
+
+    The map is asked once: many places in a tile cost less than few many times.
+    """
+    if not parts:
+        return []
+    places = [
+        part.R_map_lidar @ estimate.t[int(part.sensor[0])] + part.p_map_lidar for part in parts
+    ]
+    sample = field_map.query(np.concatenate(places))
+    ends = np.cumsum([len(place) for place in places])[:-1]
+    columns = (sample.field, sample.gradient, sample.variance, sample.inside)
+    return [FieldSample(*each) for each in zip(*(np.split(c, ends) for c in columns), strict=True)]
+
+
 def model_samples(
-    readings: Readings, field_map: QueryableMap, estimate: Estimate, names: tuple[str, ...]
+    readings: Readings, sample: FieldSample, estimate: Estimate, names: tuple[str, ...]
 ) -> Samples:
     """Return readings of one sensor beside what the map predicts where an estimate puts it.
 
@@ -22,8 +42,8 @@ def model_samples(
     ----------
     readings
         Of one sensor, at least one, in order of time; those outside the map do not count.
-    field_map
-        The map.
+    sample
+        What the map predicts for them; see ``predicted``.
     estimate
         Of its place and noise.
     names
@@ -31,7 +51,6 @@ def model_samples(
     """
     sensor = int(readings.sensor[0])
     t, noise = estimate.t[sensor], estimate.noise[sensor]
-    sample = field_map.query(readings.R_map_lidar @ t + readings.p_map_lidar)
     inside = sample.inside
     readings, R_lidar_map = readings.select(inside), readings.R_map_lidar[inside].transpose(0, 2, 1)
     b = np.einsum("nij,nj->ni", R_lidar_map, sample.field[inside])

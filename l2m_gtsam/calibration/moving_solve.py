@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, Progress
-from l2m_gtsam.calibration.model_samples import explicable, model_samples
+from l2m_gtsam.calibration.model_samples import explicable, model_samples, predicted
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, Readings, Trajectory
+from l2m_gtsam.data import FieldSample, FloatArray, Readings, Trajectory
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.solve.model_comparison import ModelOptions, compare_models
@@ -100,23 +100,33 @@ class MovingProblem:
         self, solution: OneKeySolution
     ) -> tuple[dict[int, ModelComparison], dict[int, str]]:
         compared, not_compared = {}, {}
-        for sensor in (found.sensor for found in solution.solved):
+        parts = self._parts(solution)
+        samples = predicted(list(parts.values()), self.field_map, solution.estimate)
+        for (sensor, own), sample in zip(parts.items(), samples, strict=True):
             try:
-                compared[sensor] = self._comparison(solution, sensor)
+                compared[sensor] = self._comparison(solution, own, sample)
             except CalibrationError as error:
                 not_compared[sensor] = str(error)
         return compared, not_compared
 
-    def _comparison(self, solution: OneKeySolution, sensor: int) -> ModelComparison:
-        """Compare models of a sensor on its readings as they were read, at the solve's poses."""
+    def _parts(self, solution: OneKeySolution) -> dict[int, Readings]:
+        """Return the readings of each solved sensor as they were read, at the solve's poses."""
         whole = replace(
             solution.readings, field=self.readings.field, regressors=self.readings.regressors
         )
         counts = solution.inside if self.names else solution.used
-        own = whole.select(counts & (whole.sensor == sensor))
-        samples = model_samples(own, self.field_map, solution.estimate, self.names)
+        return {
+            found.sensor: whole.select(counts & (whole.sensor == found.sensor))
+            for found in solution.solved
+        }
+
+    def _comparison(
+        self, solution: OneKeySolution, own: Readings, sample: FieldSample
+    ) -> ModelComparison:
+        """Compare models of a sensor on its readings and what the map predicts for them."""
+        samples = model_samples(own, sample, solution.estimate, self.names)
         if self.names:
-            noise = float(solution.estimate.noise[sensor])
+            noise = float(solution.estimate.noise[int(own.sensor[0])])
             samples = samples[explicable(samples, noise, self.options.robust)]
         return compare_models(samples, self.models)
 

@@ -201,15 +201,15 @@ def calibrate(
     """Calibrate every magnetometer of one drive or several; write a picture and a report, too."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
-        from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
+        from l2m_gtsam.batch.reports import REPORT_FILE, report_calibration
         from l2m_gtsam.cli.tables.verdict_text import verdict_lines
         from l2m_gtsam.config import load_config, with_uncertainty
 
         chosen = with_uncertainty(load_config(config), uncertainty)
         drives = [*(bags or ()), *(more or ())]
-        result = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
-        verdict = report_folder(out, config, progress)
-    _print_calibration(result, models)
+        found = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
+        verdict = report_calibration(out, found, chosen.qa, progress)
+    _print_calibration(found.result, models)
     typer.echo("\n".join(verdict_lines(verdict)))
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
     typer.echo(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")

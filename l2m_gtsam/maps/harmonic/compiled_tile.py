@@ -7,8 +7,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.harmonic.blend import Blend
+from l2m_gtsam.maps.harmonic.compiled_sum import add_compiled
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import Modes
@@ -69,14 +71,41 @@ class CompiledTile:
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
-        frame = self.tile.basis.frame
-        local = self.tile.clipped(frame.localise(points))
-        field, gradient = self.grid.field_and_gradient(local)
-        self.near.add_to(local, field, gradient)
-        missing = np.flatnonzero(np.isnan(field[:, 0]))
-        if len(missing):
-            field[missing], gradient[missing] = self.terms.field_and_gradient(local[missing])
-        return in_map(frame, field, gradient)
+        blend = Blend.of(len(points))
+        self.add_to(blend, points, np.arange(len(points)), np.ones(len(points)))
+        return blend.field, blend.gradient
+
+    def add_to(self, blend: Blend, points: FloatArray, rows: IntArray, share: FloatArray) -> None:
+        """Add what the tile says, times its share, to what others say.
+
+        Parameters
+        ----------
+        blend
+            Of all N points.
+        points
+            In the map frame in metres, shape (N, 3).
+        rows, share
+            As of ``Blend.add``.
+        """
+        frame, grid, near = self.tile.basis.frame, self.grid, self.near
+        missing = np.empty(len(rows), dtype=np.int64)
+        count = add_compiled(
+            points,
+            rows,
+            share,
+            (frame.corner, frame.R_map_tile),
+            self.tile.walls,
+            (grid.lower, grid.spacing, grid.coefficients),
+            (near.corner, near.shape, near.starts, near.table),
+            blend.field,
+            blend.gradient,
+            missing,
+        )
+        if count:
+            left = missing[:count]
+            local = self.tile.clipped(frame.localise(points[rows[left]]))
+            said = in_map(frame, *self.terms.field_and_gradient(local))
+            blend.add(rows[left], share[left], said)
 
 
 def in_map(

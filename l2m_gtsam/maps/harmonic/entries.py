@@ -12,7 +12,7 @@ from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.tile_store import Entry
 
-ALGORITHM = 1
+ALGORITHM = 2
 """To be raised with every change to what is solved, compiled or kept of the same readings."""
 
 

@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
-from l2m_gtsam.maps.harmonic.triangular import solve_rows
+from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 from l2m_gtsam.maps.training import TrainingSet
 
 ROUNDING, LOST = 1e-14, 1e-11
@@ -125,30 +125,31 @@ class Weights:
     prior_sigma
         Diagonal of D: prior standard deviations, shape (m,).
     factor
-        K, lower triangular, shape (m, m).
+        K.
     """
 
     mean: FloatArray
     prior_sigma: FloatArray
-    factor: FloatArray
+    factor: TriangularFactor
 
     def root(self, features: FloatArray) -> FloatArray:
         """Return ``F L`` for features F, both of shape (J, m)."""
-        white = (features * self.prior_sigma).T
-        return np.asarray(
-            solve_triangular(self.factor, white, lower=True, overwrite_b=True, check_finite=False).T
-        )
+        white = np.multiply(features.T, self.prior_sigma[:, None], order="C")
+        self.factor.solve_rows(white)
+        return np.asarray(white.T)
 
     def root_rows(self, basis: Basis, points: FloatArray) -> FloatArray:
         """Return ``F L`` at points (N, 3), uT, but weight by weight, shape (m, 3, N)."""
         rows = basis.rows(points, self.prior_sigma)
-        solve_rows(self.factor, rows.reshape(len(rows), 3 * len(points)))
+        self.factor.solve_rows(rows.reshape(len(rows), 3 * len(points)))
         return rows
 
     def unwhitened(self, directions: FloatArray) -> FloatArray:
         """Return ``L U`` for directions U, both of shape (m, r)."""
-        turned = solve_triangular(self.factor, directions, trans=1, lower=True, check_finite=False)
-        return np.asarray(self.prior_sigma[:, None] * turned)
+        turned = np.array(directions, order="C")
+        self.factor.solve_transposed(turned)
+        turned *= self.prior_sigma[:, None]
+        return turned
 
 
 def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights:
@@ -156,7 +157,8 @@ def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights
     D = np.exp(0.5 * log_variance)
     K = whitened_factor(normal, D, noise)
     u = D * normal.Fy / noise**2
-    return Weights(D * cho_solve((K, True), u, check_finite=False), D, K)
+    mean = D * cho_solve((K, True), u, check_finite=False)
+    return Weights(mean, D, TriangularFactor.of(K))
 
 
 def whitened_factor(normal: Normal, D: FloatArray, noise: float) -> FloatArray:

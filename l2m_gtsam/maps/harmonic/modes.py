@@ -22,7 +22,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.harmonic.wave_rows import write_wave_rows
+from l2m_gtsam.maps.harmonic.wave_rows import wave_table, write_wave_rows
 from l2m_gtsam.maps.harmonic.wave_sum import add_waves
 
 FLOOR, CEILING = "floor", "ceiling"
@@ -90,12 +90,11 @@ class Modes:
 
     def _tables(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return cosines and sines along x, then along y, by half waves, shapes (p, N), (q, N)."""
-        most = self.numbers.max(axis=0) + 1
-        x, y = (
-            np.arange(most[axis])[:, None] * (np.pi * points[:, axis] / self.size[axis])
-            for axis in (0, 1)
+        count = self.numbers.max(axis=0) + 1
+        return (
+            *wave_table(np.pi * points[:, 0] / self.size[0], int(count[0])),
+            *wave_table(np.pi * points[:, 1] / self.size[1], int(count[1])),
         )
-        return np.cos(x), np.sin(x), np.cos(y), np.sin(y)
 
     @cached_property
     def _log_share(self) -> FloatArray:

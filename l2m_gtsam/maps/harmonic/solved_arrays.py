@@ -5,10 +5,8 @@ its readings see. Box, waves and places of sources follow from the map.
 """
 
 import numpy as np
-from numba import njit
 from pydantic import ValidationError
 
-from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import Weights
@@ -18,6 +16,7 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.kept_arrays import finite
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.triangular import TriangularFactor, count
 from l2m_gtsam.maps.tile_store import Arrays
 from l2m_gtsam.maps.trained import first_complaint
 
@@ -32,7 +31,7 @@ def solved_to_arrays(tile: Tile) -> Arrays:
         "hyperparameters": np.array([getattr(own, name) for name in NAMES]),
         "mean": tile.weights.mean,
         "prior_sigma": tile.weights.prior_sigma,
-        "factor": packed(tile.weights.factor),
+        "factor": tile.weights.factor.values,
         # By columns, as they lie in memory: products with them are then the same to the last bit.
         **{f"combinations{k}": each.combinations.T for k, each in enumerate(dipoles)},
     }
@@ -49,9 +48,9 @@ def solved_from_arrays(learnt: Learnt, index: int, arrays: Arrays) -> Tile:
     frame = learnt.frame(index)
     basis = basis_with(frame, learnt.resolution, dipoles_from(learnt, index, frame, arrays))
     m = len(basis)
-    factor = unpacked(finite(arrays, "factor", (m * (m + 1) // 2,)), m)
+    factor = TriangularFactor(m, finite(arrays, "factor", (count(m),)))
     weights = Weights(finite(arrays, "mean", (m,)), finite(arrays, "prior_sigma", (m,)), factor)
-    if not (factor.diagonal() > 0).all():
+    if not all((block.inverse.diagonal() > 0).all() for block in factor.blocks):
         raise MapError("factor is not that of a covariance")
     return Tile(basis, weights, hyperparameters_from(arrays), learnt.resolution)
 
@@ -77,38 +76,3 @@ def hyperparameters_from(arrays: Arrays) -> Hyperparameters:
         return Hyperparameters(**dict(zip(NAMES, values.tolist(), strict=True)))
     except ValidationError as error:
         raise MapError(first_complaint(error)) from None
-
-
-def packed(factor: FloatArray) -> FloatArray:
-    """Return the lower triangle of a matrix (m, m), column by column, shape (m (m + 1) / 2,)."""
-    m = len(factor)
-    values = np.empty(m * (m + 1) // 2)
-    write_packed(factor, values)
-    return values
-
-
-def unpacked(values: FloatArray, m: int) -> FloatArray:
-    """Return the matrix (m, m) that ``packed`` took apart, as LAPACK lays it out."""
-    factor = np.zeros((m, m), order="F")
-    write_unpacked(values, factor)
-    return factor
-
-
-@njit(cache=True, nogil=True)
-def write_packed(factor: FloatArray, values: FloatArray) -> None:
-    """Write the lower triangle of a matrix (m, m), column by column."""
-    at = 0
-    for j in range(len(factor)):
-        for i in range(j, len(factor)):
-            values[at] = factor[i, j]
-            at += 1
-
-
-@njit(cache=True, nogil=True)
-def write_unpacked(values: FloatArray, factor: FloatArray) -> None:
-    """Write values, column by column, as the lower triangle of a matrix (m, m)."""
-    at = 0
-    for j in range(len(factor)):
-        for i in range(j, len(factor)):
-            factor[i, j] = values[at]
-            at += 1

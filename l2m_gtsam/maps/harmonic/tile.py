@@ -1,6 +1,7 @@
 """One tile: its basis and the posterior of its weights."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -59,12 +60,16 @@ class Tile:
 
     def clipped(self, local: FloatArray) -> FloatArray:
         """Return points in the tile's frame moved into the box; see ``within``."""
+        inside = np.empty_like(local)
+        clip_rows(local, *self.walls, inside)
+        return inside
+
+    @cached_property
+    def walls(self) -> tuple[FloatArray, FloatArray]:
+        """Lowest and highest coordinates in the tile's frame where it is asked, metres, (3,)."""
         frame, h = self.basis.frame, self.hyperparameters
         low = np.array([0.0, 0.0, -NEAREST * h.floor_depth])
-        high = np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
-        inside = np.empty_like(local)
-        clip_rows(local, low, high, inside)
-        return inside
+        return low, np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
 
     def root(self, points: FloatArray) -> FloatArray:
         """Return ``F L``, whose rows' products are the map's covariance, uT, shape (N, 3, m)."""

@@ -1,5 +1,10 @@
-"""Solves with a triangular factor for many right sides, in place and block by block."""
+"""A triangular factor as solves for many right sides want it: block of rows by block of rows."""
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
 from scipy.linalg.blas import dgemm, dtrmm
 from scipy.linalg.lapack import dtrtri
 
@@ -8,27 +13,100 @@ from l2m_gtsam.data import FloatArray
 BLOCK = 96  # rows: large enough for products of matrices, small beside the whole
 
 
-def solve_rows(factor: FloatArray, rows: FloatArray) -> None:
-    """Replace ``rows`` by ``K^-1 rows``.
+class Block(NamedTuple):
+    """Some rows of a factor K.
+
+    Attributes
+    ----------
+    rows
+        Which.
+    before
+        K left of the diagonal block, shape (b, rows.start), in Fortran order.
+    inverse
+        Inverse of the diagonal block, lower triangular, shape (b, b), in Fortran order.
+    """
+
+    rows: slice
+    before: FloatArray
+    inverse: FloatArray
+
+
+@dataclass(frozen=True)
+class TriangularFactor:
+    """A lower triangular matrix K, shape (m, m), with its diagonal blocks inverted.
 
     LAPACK's own solve reaches half the speed of a product of matrices. Here all but the blocks on
-    the diagonal are products, and those are inverted.
+    the diagonal are products, and those are inverted once.
 
-    Parameters
+    Attributes
     ----------
-    factor
-        K, lower triangular, shape (m, m).
-    rows
-        Right sides, shape (m, J), in C order.
+    size
+        m.
+    values
+        ``before`` and ``inverse`` of each block side by side in Fortran order, block after block,
+        shape (``count(m)``,).
     """
-    if not rows.size:
-        return
-    columns = rows.T  # as BLAS sees it: a slice of its columns needs no copy
-    for start in range(0, len(factor), BLOCK):
-        stop = min(start + BLOCK, len(factor))
-        own = columns[:, start:stop]
-        if start:
-            known, before = columns[:, :start], factor[start:stop, :start]
-            dgemm(-1.0, known, before, beta=1.0, c=own, trans_b=1, overwrite_c=1)
-        inverse, _ = dtrtri(factor[start:stop, start:stop], lower=1)
-        dtrmm(1.0, inverse, own, side=1, lower=1, trans_a=1, overwrite_b=1)
+
+    size: int
+    values: FloatArray
+
+    @classmethod
+    def of(cls, K: FloatArray) -> "TriangularFactor":
+        """Return the factor of a lower triangular matrix, shape (m, m)."""
+        factor = cls(len(K), np.empty(count(len(K))))
+        for rows, before, inverse in factor.blocks:
+            before[:] = K[rows, : rows.start]
+            inverse[:] = np.tril(dtrtri(K[rows, rows], lower=1)[0])
+        return factor
+
+    def __len__(self) -> int:
+        return self.size
+
+    @property
+    def nbytes(self) -> int:
+        """Memory in bytes."""
+        return self.values.nbytes
+
+    @cached_property
+    def blocks(self) -> tuple[Block, ...]:
+        """Blocks of rows from the first to the last, which share the memory of ``values``."""
+        found, at = [], 0
+        for start, stop in edges(self.size):
+            end = at + (stop - start) * stop
+            both = self.values[at:end].reshape((stop - start, stop), order="F")
+            found.append(Block(slice(start, stop), both[:, :start], both[:, start:]))
+            at = end
+        return tuple(found)
+
+    def solve_rows(self, rows: FloatArray) -> None:
+        """Replace ``rows``, shape (m, J) in C order, by ``K^-1 rows``."""
+        if not rows.size:
+            return
+        columns = rows.T  # as BLAS sees it: a slice of its columns needs no copy
+        for at, before, inverse in self.blocks:
+            own = columns[:, at]
+            if at.start:
+                known = columns[:, : at.start]
+                dgemm(-1.0, known, before, beta=1.0, c=own, trans_b=1, overwrite_c=1)
+            dtrmm(1.0, inverse, own, side=1, lower=1, trans_a=1, overwrite_b=1)
+
+    def solve_transposed(self, rows: FloatArray) -> None:
+        """Replace ``rows``, shape (m, J) in C order, by ``K^-T rows``."""
+        if not rows.size:
+            return
+        columns = rows.T
+        for at, before, inverse in reversed(self.blocks):
+            own = columns[:, at]
+            dtrmm(1.0, inverse, own, side=1, lower=1, overwrite_b=1)
+            if at.start:
+                dgemm(-1.0, own, before, beta=1.0, c=columns[:, : at.start], overwrite_c=1)
+
+
+def edges(size: int) -> list[tuple[int, int]]:
+    """Return where the blocks of so many rows start and stop."""
+    return [(start, min(start + BLOCK, size)) for start in range(0, size, BLOCK)]
+
+
+def count(size: int) -> int:
+    """Return how many numbers a factor of so many rows takes."""
+    return sum((stop - start) * stop for start, stop in edges(size))

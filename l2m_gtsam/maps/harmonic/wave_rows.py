@@ -1,8 +1,27 @@
 """The field of waves at many points, one wave after the other; see ``modes``."""
 
+import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.wave_sum import turned
+
+
+def wave_table(phase: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return cosines and sines of the first multiples of phases (N,), from 0, shapes (count, N)."""
+    cosines, sines = np.empty((count, len(phase))), np.empty((count, len(phase)))
+    write_multiples(np.cos(phase), np.sin(phase), cosines, sines)
+    return cosines, sines
+
+
+@njit(cache=True, nogil=True)
+def write_multiples(c: FloatArray, s: FloatArray, cosines: FloatArray, sines: FloatArray) -> None:
+    """Write cosines and sines of multiples of phases with these, (N,); see ``turned``."""
+    for n in range(len(c)):
+        cosines[0, n], sines[0, n] = 1.0, 0.0
+    for p in range(1, len(cosines)):
+        for n in range(len(c)):
+            cosines[p, n], sines[p, n] = turned(cosines[p - 1, n], sines[p - 1, n], c[n], s[n])
 
 
 @njit(cache=True, nogil=True)
@@ -35,8 +54,18 @@ def write_wave_rows(
     for m in range(len(numbers)):
         p, q = numbers[m, 0], numbers[m, 1]
         cx, sx, cy, sy, e = cos_x[p], sin_x[p], cos_y[q], sin_y[q], growth[which[m]]
-        by_x, by_y, by_z = rows[m, 0], rows[m, 1], rows[m, 2]
-        ax, ay, az = factors[0, m], factors[1, m], factors[2, m]
-        for n in range(len(e)):
-            c, s = cx[n] * e[n], sx[n] * e[n]
-            by_x[n], by_y[n], by_z[n] = s * cy[n] * ax, c * sy[n] * ay, c * cy[n] * az
+        write_product(sx, cy, e, factors[0, m], rows[m, 0])
+        write_product(cx, sy, e, factors[1, m], rows[m, 1])
+        write_product(cx, cy, e, factors[2, m], rows[m, 2])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def write_product(
+    x: FloatArray, y: FloatArray, e: FloatArray, factor: float, row: FloatArray
+) -> None:
+    """Write the product of three functions and a factor at points, all of shape (N,).
+
+    One row at a time: among more arrays loops would not run in vector registers.
+    """
+    for n in range(len(e)):
+        row[n] = x[n] * e[n] * y[n] * factor

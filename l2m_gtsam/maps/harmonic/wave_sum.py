@@ -49,5 +49,16 @@ def add_waves(
 @njit(cache=True, nogil=True)
 def write_phases(phase: float, cosines: FloatArray, sines: FloatArray) -> None:
     """Write the cosine and sine of all multiples of a phase."""
-    for p in range(len(cosines)):
-        cosines[p], sines[p] = np.cos(p * phase), np.sin(p * phase)
+    cosines[0], sines[0] = 1.0, 0.0
+    c, s = np.cos(phase), np.sin(phase)
+    for p in range(1, len(cosines)):
+        cosines[p], sines[p] = turned(cosines[p - 1], sines[p - 1], c, s)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def turned(cosine: float, sine: float, c: float, s: float) -> tuple[float, float]:
+    """Return the cosine and sine of an angle turned by another.
+
+    A multiple by so many turns is as exact as that many roundings, far cheaper than a cosine.
+    """
+    return cosine * c - sine * s, sine * c + cosine * s

@@ -20,6 +20,7 @@ from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
+from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 from l2m_gtsam.maps.harmonic.uniform import UniformField
 from l2m_gtsam.simulate.hall_drives import survey
 from l2m_gtsam.simulate.steel_hall import STRONG, CloudVariant, hall_cloud, steel_hall
@@ -250,7 +251,8 @@ def test_a_grid_that_errs_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
 def plain_tile() -> Tile:
     """Return a tile that knows a uniform field and nothing else."""
     frame = TileFrame(np.eye(3), np.zeros(3), np.array([4.0, 4.0]), 1.0)
-    weights = Weights(np.array([20.0, -3.0, 40.0]), np.ones(3), np.eye(3))
+    factor = TriangularFactor.of(np.eye(3))
+    weights = Weights(np.array([20.0, -3.0, 40.0]), np.ones(3), factor)
     return Tile(Basis(frame, (UniformField(100.0),)), weights, PRIOR, Resolution(0.5, 0.5))
 
 

@@ -15,6 +15,7 @@ from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
+from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 from l2m_gtsam.maps.harmonic.uniform import UniformField
 
 PRIOR = Hyperparameters(
@@ -49,7 +50,9 @@ FAMILIES["all"] = tuple(family for each in list(FAMILIES.values()) for family in
 def test_the_terms_add_up_to_the_basis(name: str) -> None:
     basis = Basis(TileFrame(np.eye(3), np.zeros(3), SIZE, HEIGHT), FAMILIES[name])
     m = len(basis)
-    weights = Weights(np.random.default_rng(1).normal(size=m), np.ones(m), np.eye(m))
+    weights = Weights(
+        np.random.default_rng(1).normal(size=m), np.ones(m), TriangularFactor.of(np.eye(m))
+    )
     tile = Tile(basis, weights, PRIOR, Resolution(6.0, 3.0))
     places = np.random.default_rng(2).uniform([-1, -1, -0.5], [6, 6, 2], (40, 3))
     # At a source and so near to one that its field is that at the distance where it is capped.
