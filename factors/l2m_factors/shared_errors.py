@@ -12,6 +12,7 @@ where the graph is linearised; it changes over decimetres.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import gtsam
 import numpy as np
@@ -22,7 +23,7 @@ from l2m_factors.keys import D, M, P
 from l2m_factors.reading import BatchedReadings
 
 POSE = 6  # rotation and translation
-PARTS = 8  # of a triangular root: GTSAM then squares 0.4 of what it would
+PARTS = 8  # of a triangular root: 0.4 of all its products are then formed
 
 
 @dataclass(frozen=True)
@@ -220,25 +221,31 @@ def map_weights_information(
     """Return the same prior as a matrix of information.
 
     GTSAM's Cholesky squares the rows of a factor whenever it is eliminated; those of a prior on
-    thousands of weights cost as much as all else. Here they are squared once, part by part, for
-    half of a triangular root is zero.
+    thousands of weights cost as much as all else. Here they are squared once, by BLAS and part by
+    part, for half of a triangular root is zero, and given to GTSAM in pairs of tiles.
 
     Parameters
     ----------
     sizes, root_information
         As of ``map_weights_prior``; R is lower triangular.
     """
-    tiles, ends = list(sizes), np.cumsum([0, *sizes.values()])
-    parts, zero = gtsam.GaussianFactorGraph(), gtsam.Values()
-    for tile, size in sizes.items():
-        zero.insert(M(tile), np.zeros(size))
-    for part in np.array_split(np.arange(len(tiles)), min(PARTS, len(tiles))):
-        first, last = ends[part[0]], ends[part[-1] + 1]
-        touched = {tile: sizes[tile] for tile in tiles[: part[-1] + 1]}
-        parts.push_back(
-            map_weights_prior(touched, root_information[first:last, :last]).linearize(zero)
-        )
-    return gtsam.LinearContainerFactor(gtsam.HessianFactor(parts), zero)
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    at = {tile: slice(*ends[row : row + 2]) for row, tile in enumerate(sizes)}
+    information = np.zeros_like(root_information)
+    for rows in np.array_split(np.arange(len(root_information)), PARTS):
+        last = int(rows.max(initial=-1)) + 1
+        part = root_information[rows, :last]
+        information[:last, :last] += part.T @ part
+    pairs, zero = gtsam.GaussianFactorGraph(), gtsam.Values()
+    nothing = {tile: (np.zeros((size, size)), np.zeros(size)) for tile, size in sizes.items()}
+    for tile, (_, g) in nothing.items():
+        zero.insert(M(tile), g)
+        pairs.push_back(gtsam.HessianFactor(M(tile), information[at[tile], at[tile]], g, 0.0))
+    for one, other in combinations(sizes, 2):
+        (G, g), (other_G, other_g) = nothing[one], nothing[other]
+        shared = information[at[one], at[other]]
+        pairs.push_back(gtsam.HessianFactor(M(one), M(other), G, shared, g, other_G, other_g, 0.0))
+    return gtsam.LinearContainerFactor(gtsam.HessianFactor(pairs), zero)
 
 
 def pose_errors_prior(correlation: Sequence[float]) -> gtsam.NonlinearFactorGraph:
