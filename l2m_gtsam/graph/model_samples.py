@@ -6,7 +6,7 @@ from l2m_factors import PoseMotion, field_rate
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.trust import FEWEST
-from l2m_gtsam.graph.view import QueryableMap
+from l2m_gtsam.graph.view import QueryableMap, places_of
 from l2m_gtsam.models import Samples
 from l2m_gtsam.solve.robust import Loss, RobustOptions, consistent
 
@@ -31,7 +31,7 @@ def model_samples(
     """
     sensor = int(readings.sensor[0])
     t, noise = estimate.t[sensor], estimate.noise[sensor]
-    sample = field_map.query(readings.R_map_lidar @ t + readings.p_map_lidar)
+    sample = field_map.query(places_of(readings, estimate.t))
     inside = sample.inside
     readings, R_lidar_map = readings.select(inside), readings.R_map_lidar[inside].transpose(0, 2, 1)
     b = np.einsum("nij,nj->ni", R_lidar_map, sample.field[inside])

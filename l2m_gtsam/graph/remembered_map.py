@@ -50,10 +50,15 @@ class RememberedMap:
         with self._lock:
             return self._recalled(np.ascontiguousarray(points, dtype=np.float64))
 
+    def remember(self, points: FloatArray, sample: FieldSample) -> None:
+        """Take what is known of places, shape (N, 3), from elsewhere for the map's own answer."""
+        with self._lock:
+            self._make_room(len(points))
+            self._keep(_names(np.ascontiguousarray(points, dtype=np.float64)), sample)
+
     def _recalled(self, points: FloatArray) -> FieldSample:
-        names = points.view(f"V{points.itemsize * points.shape[1]}").ravel().tolist()
-        if len(self._rows) + len(points) > MOST:
-            self._rows, self._values, self._inside = {}, self._values[:0], self._inside[:0]
+        names = _names(points)
+        self._make_room(len(points))
         fresh = np.array([name not in self._rows for name in names], dtype=np.bool_)
         if fresh.any():
             self._learn(points[fresh], [names[row] for row in np.flatnonzero(fresh)])
@@ -61,14 +66,25 @@ class RememberedMap:
         return self._sample(at)
 
     def _learn(self, points: FloatArray, names: list[bytes]) -> None:
-        sample = self._map.query(points)
+        self._keep(names, self._map.query(points))
+
+    def _keep(self, names: list[bytes], sample: FieldSample) -> None:
         parts = (sample.field, sample.gradient.reshape(-1, 9), sample.variance)
         first = len(self._values)
         self._rows.update((name, first + row) for row, name in enumerate(names))
         self._values = np.concatenate([self._values, np.hstack(parts)])
         self._inside = np.concatenate([self._inside, sample.inside])
 
+    def _make_room(self, count: int) -> None:
+        if len(self._rows) + count > MOST:
+            self._rows, self._values, self._inside = {}, self._values[:0], self._inside[:0]
+
     def _sample(self, at: IntArray) -> FieldSample:
         values = self._values[at]
         gradient = values[:, 3:12].reshape(-1, 3, 3)
         return FieldSample(values[:, :3], gradient, values[:, 12:], self._inside[at])
+
+
+def _names(points: FloatArray) -> list[bytes]:
+    """Return the bits of each point."""
+    return points.view(f"V{points.itemsize * points.shape[1]}").ravel().tolist()

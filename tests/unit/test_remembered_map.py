@@ -47,6 +47,21 @@ def test_answers_are_the_maps_own_and_places_are_asked_once(rows: list[list[int]
         assert counting.asked == asked
 
 
+def test_what_is_known_from_elsewhere_is_not_asked() -> None:
+    """To the last bit; of places that were not told the map is asked."""
+    counting, places = Counting(), np.random.default_rng(0).normal(size=(5, 3))
+    remembered, told = RememberedMap(counting), Counting().query(places[:3])
+    variance = np.full((3, 3), 7.0)
+    remembered.remember(
+        places[:3], FieldSample(told.field, told.gradient, variance, np.ones(3, dtype=np.bool_))
+    )
+    found = remembered.query(places)
+    assert counting.asked == 2
+    np.testing.assert_array_equal(found.field[:3], told.field)
+    np.testing.assert_array_equal(found.variance, np.vstack([variance, places[3:] ** 2]))
+    assert found.inside[:3].all()
+
+
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond it all is forgotten, and answers stay right."""
     monkeypatch.setattr(remembered_map, "MOST", 10)
