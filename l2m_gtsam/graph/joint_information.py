@@ -96,6 +96,13 @@ class JointInformation:
         """Return the longest step of some sensors in standard deviations."""
         return max(self.sigmas(sensor) for sensor in sensors)
 
+    def stepped(self, values: gtsam.Values) -> gtsam.Values:
+        """Return the values after the step."""
+        delta = gtsam.VectorValues()
+        for key, at in self.columns.items():
+            delta.insert(key, self.step[at])
+        return values.retract(delta)
+
     def taken(self, sensor: int) -> float:
         """Return the degrees of freedom that a sensor's rows take beside its own sixteen.
 

@@ -192,7 +192,8 @@ def test_what_cholesky_refuses_qr_solves(
 
     monkeypatch.setattr(uncertain, "polish", refusing)
     found = solve_one_key(readings, field_map, STARTS, DEFAULT)
-    assert asked == [LinearSolver.CHOLESKY, LinearSolver.QR]
+    assert list(dict.fromkeys(asked)) == [LinearSolver.CHOLESKY, LinearSolver.QR]
+    assert asked.count(LinearSolver.CHOLESKY) == 1
     assert found.ending is Ending.TOLERANCE
     usual = solutions[FactorForm.BLOCK, Optimizer.LM]
     np.testing.assert_allclose(found.estimate.t, usual.estimate.t, atol=1e-7)
