@@ -401,7 +401,7 @@ class UncertainProblem:
             Rows(
                 each.sensor,
                 columns_at(columns, each.keys),
-                np.hstack(found.jacobians),
+                found.jacobian,
                 found.residual,
             )
             for each in self._groups
