@@ -19,7 +19,7 @@ from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
 from l2m_gtsam.repeat_results import Repeatability
 from l2m_gtsam.threads import one_blas_thread
 
-STEPS = 3  # alternations from where the whole was found; the joint graph does the rest
+STEPS = 1  # alternation from where the whole was found; the joint graph does the rest
 MORE = 4  # times as many readings of a drive as of a half
 
 

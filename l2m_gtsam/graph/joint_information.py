@@ -7,7 +7,8 @@ How many degrees of freedom the fit takes of a sensor's readings is a trace over
 
 and needs the covariances of each group of readings' variables: of all sensors, weights and knots.
 GTSAM's ``jointMarginalCovariance`` of all of them takes ten times as long as LAPACK's inverse of
-the same matrix (2,663 variables: 7.2 s and 0.6 s). The Newton step that remains comes with it.
+the same matrix (2,663 variables: 7.2 s and 0.6 s). The Newton step that remains comes with it, and
+is taken where it is short.
 
 Columns are scaled to unit information: sigmas of metres, microtesla and seconds are then alike,
 and Cholesky factors what GTSAM's test of neighbouring pivots refuses; QR does the rest.

@@ -11,10 +11,6 @@ TOLERANCE = 1e-5
 # Relative rise of the error that the seams of a map explain: measured 3e-5.
 SEAM_RISE = 1e-3
 
-# A step that changes the error by so little is 5e-5 standard deviations long, for half its squared
-# length is what the error falls by; the next one is a fourth of it at most.
-STILL = 1e-9
-
 
 class Optimizer(StrEnum):
     """A nonlinear least-squares method."""
@@ -99,10 +95,7 @@ def polish(
     worst = (1 + SEAM_RISE) * engine.error() + SEAM_RISE
     try:
         for _ in range(steps):
-            before = engine.error()
             engine.iterate()
-            if abs(engine.error() - before) < STILL:
-                break
     except RuntimeError as error:
         if not refused(error):
             raise

@@ -32,6 +32,7 @@ class RememberedMap:
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
+        self._last = np.empty((0, 3)), (np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def __getattr__(self, name: str) -> Any:
         if name == "_map":  # before there is one, as when another process unpacks it
@@ -42,8 +43,18 @@ class RememberedMap:
         return RememberedMap, (self._map,)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return field and gradient, which are not remembered: they cost little."""
-        return self._map.field_and_gradient(points)
+        """Return field and gradient, to be read only.
+
+        They cost little, and only the last answer is remembered: a round of the solve asks for
+        residuals, for their derivatives and for what errors of the poses do at the same places.
+        """
+        asked, answer = self._last
+        if not np.array_equal(points, asked):
+            answer = self._map.field_and_gradient(points)
+            for each in answer:
+                each.setflags(write=False)
+            self._last = points.copy(), answer
+        return answer
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""

@@ -60,6 +60,7 @@ MAX_ROUNDS = 6
 # 0.0005 on a drive with 2,477 weights. It is taken with the information that is there for the
 # degrees of freedom; a linearisation and an elimination by GTSAM would cost a second.
 NEAR_SIGMAS = 0.3
+SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
 NEARLY = 0.1  # smallest decrease of the error, as a share, after which a descent goes on to there
 POLISHING_STEPS = 2  # each shortens what remains fourfold at least
 
@@ -223,7 +224,8 @@ def settle(
         if options.sensor_noise_ut is None:
             after = replace(after, noise=problem.noise(joint, values, estimate))
         # The weights of the first round are those of the optimum with independent errors.
-        settled = near and after.same_noise(estimate) and round_ > 0
+        at_rest = joint.furthest(sensors) < SETTLED_SIGMAS
+        settled = at_rest and after.same_noise(estimate) and round_ > 0
         estimate = after
         if settled:
             break
