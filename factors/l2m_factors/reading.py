@@ -44,6 +44,7 @@ class BatchedReadings:
         self._keys = {s: self._variables(s) for s in self._sensors}
         self._seen: dict[int, bytes] = {}
         self._residuals = ReadingResiduals(*(np.empty(0),) * 4)
+        self._derived: tuple[ReadingResiduals, FloatArray] | None = None
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -79,6 +80,18 @@ class BatchedReadings:
         """Return the derivatives by each of ``keys_of``, each of shape (N, 3, .)."""
         by_D = [residuals.de_dD] if self._fixed is None else []
         return [residuals.de_dt, *by_D, *([residuals.de_dS] if self._timed else [])]
+
+    @property
+    def widths(self) -> list[int]:
+        """Numbers of parameters of each of ``keys_of``."""
+        return [3, *([12] if self._fixed is None else []), *([1] if self._timed else [])]
+
+    def jacobian(self, values: gtsam.Values, sensor: int) -> FloatArray:
+        """Return the derivatives by all parameters of a sensor, shape (N, 3, sum of widths)."""
+        residuals = self.residuals(values, sensor)
+        if self._derived is None or self._derived[0] is not residuals:
+            self._derived = residuals, np.concatenate(self.jacobians(residuals), axis=2)
+        return self._derived[1]
 
     def stamp(self, values: gtsam.Values, sensor: int) -> bytes:
         """Return the sensor's values as bytes, which compare faster than arrays."""

@@ -12,6 +12,7 @@ where the graph is linearised; it changes over decimetres.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations, pairwise
 
 import gtsam
 import numpy as np
@@ -22,7 +23,6 @@ from l2m_factors.keys import D, M, P
 from l2m_factors.reading import BatchedReadings
 
 POSE = 6  # rotation and translation
-PARTS = 8  # of a triangular root: GTSAM then squares 0.4 of what it would
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,15 @@ class WhiteRows:
     ----------
     residual
         ``W e``, shape (3 n,).
-    jacobians
-        Derivatives by each of the keys in order, each of shape (3 n, .).
+    jacobian
+        Derivatives by all variables, those of the keys in order, shape (3 n, k).
+    blocks
+        Which of its columns are each key's.
     """
 
     residual: FloatArray
-    jacobians: tuple[FloatArray, ...]
+    jacobian: FloatArray
+    blocks: tuple[slice, ...]
 
 
 class UncertainReadings:
@@ -85,7 +88,12 @@ class UncertainReadings:
     ) -> None:
         self.sensor = batch.sensor_of(int(rows[0]))
         self.keys = [*batch.keys_of(self.sensor), *(each.key for each in errors)]
-        self._batch, self._rows, self._errors, self._W = batch, rows, errors, whitening
+        self._batch, self._rows, self._W = batch, rows, whitening
+        self._weights = [each.key for each in errors]
+        self._features = np.concatenate([each.features for each in errors], axis=2)
+        widths = [each.features.shape[2] for each in errors]
+        ends = np.cumsum([0, *batch.widths, *widths]).tolist()
+        self._blocks = tuple(slice(*pair) for pair in pairwise(ends))
         self._seen = b""
         self._white = np.empty(0)
         self._linearised: WhiteRows | None = None
@@ -97,7 +105,7 @@ class UncertainReadings:
         """Return ``e`` in uT, shape (n, 3)."""
         C = values.atVector(D(self.sensor))[:9].reshape(3, 3)
         e = self._batch.residuals(values, self.sensor).residual[self._rows]
-        return np.asarray(e + shared_error(self._errors, values) @ C.T)
+        return np.asarray(e + self._shared(values) @ C.T)
 
     def white_residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``W e``, shape (3 n,), evaluated anew only if the values changed."""
@@ -111,22 +119,31 @@ class UncertainReadings:
         """Return residuals and derivatives, evaluated anew only if the values changed."""
         white = self.white_residual(values)
         if self._linearised is None:
-            self._linearised = WhiteRows(white, self._jacobians(values))
+            jacobian = whitened(self._W, self._jacobian(values))
+            self._linearised = WhiteRows(white, jacobian, self._blocks)
         return self._linearised
 
-    def _jacobians(self, values: gtsam.Values) -> tuple[FloatArray, ...]:
-        residuals = self._batch.residuals(values, self.sensor)
-        C = values.atVector(D(self.sensor))[:9].reshape(3, 3)
-        more = shared_error(self._errors, values)
-        by_T, by_D, *by_S = (each[self._rows] for each in self._batch.jacobians(residuals))
+    def _jacobian(self, values: gtsam.Values) -> FloatArray:
+        """Return derivatives by all variables, shape (n, 3, k)."""
+        own = self._batch.jacobian(values, self.sensor)
+        J = np.empty((len(self), 3, self._blocks[-1].stop))
+        J[:, :, : own.shape[2]] = own[self._rows]
+        by_C, more = self._blocks[1].start, self._shared(values)
         for axis in range(3):
-            by_D[:, axis, 3 * axis : 3 * axis + 3] += more
-        by_weights = (C @ each.features for each in self._errors)
-        return tuple(whitened(self._W, each) for each in (by_T, by_D, *by_S, *by_weights))
+            first = by_C + 3 * axis
+            J[:, axis, first : first + 3] += more
+        C = values.atVector(D(self.sensor))[:9].reshape(3, 3)
+        np.matmul(C, self._features, out=J[:, :, own.shape[2] :])
+        return J
+
+    def _shared(self, values: gtsam.Values) -> FloatArray:
+        """Return the sum of the errors in the lidar frame in uT, shape (n, 3)."""
+        weights = np.concatenate([values.atVector(key) for key in self._weights])
+        return np.asarray(self._features @ weights)
 
     def _stamp(self, values: gtsam.Values) -> bytes:
         """Return the values as bytes, which compare faster than arrays."""
-        weights = (values.atVector(each.key).tobytes() for each in self._errors)
+        weights = (values.atVector(key).tobytes() for key in self._weights)
         return b"".join((self._batch.stamp(values, self.sensor), *weights))
 
 
@@ -139,8 +156,8 @@ def uncertain_block_factor(readings: UncertainReadings) -> gtsam.CustomFactor:
         if jacobians is None:
             return readings.white_residual(values)
         found = readings.linearised(values)
-        for slot, jacobian in enumerate(found.jacobians):
-            jacobians[slot] = jacobian
+        for slot, block in enumerate(found.blocks):
+            jacobians[slot] = found.jacobian[:, block]
         return found.residual
 
     unit = gtsam.noiseModel.Unit.Create(3 * len(readings))
@@ -167,8 +184,8 @@ def uncertain_reading_factor(readings: UncertainReadings, reading: int) -> gtsam
     ) -> FloatArray:
         found = readings.linearised(values)
         if jacobians is not None:
-            for slot, jacobian in enumerate(found.jacobians):
-                jacobians[slot] = jacobian[own]
+            for slot, block in enumerate(found.blocks):
+                jacobians[slot] = found.jacobian[own, block]
         return found.residual[own]
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3), readings.keys, error)
@@ -215,30 +232,34 @@ def map_weights_prior(sizes: Mapping[int, int], root_information: FloatArray) ->
 
 
 def map_weights_information(
-    sizes: Mapping[int, int], root_information: FloatArray
+    sizes: Mapping[int, int], information: FloatArray
 ) -> gtsam.LinearContainerFactor:
-    """Return the same prior as a matrix of information.
+    """Return the same prior as a matrix of information, which GTSAM takes in pairs of tiles.
 
-    GTSAM's Cholesky squares the rows of a factor whenever it is eliminated; those of a prior on
-    thousands of weights cost as much as all else. Here they are squared once, part by part, for
-    half of a triangular root is zero.
+    Its Cholesky squares the rows of a factor whenever it is eliminated; those of a prior on
+    thousands of weights cost as much as all else.
 
     Parameters
     ----------
-    sizes, root_information
-        As of ``map_weights_prior``; R is lower triangular.
+    sizes
+        As of ``map_weights_prior``.
+    information
+        Inverse of the covariance; its lower triangle is enough, shape (K, K).
     """
-    tiles, ends = list(sizes), np.cumsum([0, *sizes.values()])
-    parts, zero = gtsam.GaussianFactorGraph(), gtsam.Values()
-    for tile, size in sizes.items():
-        zero.insert(M(tile), np.zeros(size))
-    for part in np.array_split(np.arange(len(tiles)), min(PARTS, len(tiles))):
-        first, last = ends[part[0]], ends[part[-1] + 1]
-        touched = {tile: sizes[tile] for tile in tiles[: part[-1] + 1]}
-        parts.push_back(
-            map_weights_prior(touched, root_information[first:last, :last]).linearize(zero)
-        )
-    return gtsam.LinearContainerFactor(gtsam.HessianFactor(parts), zero)
+    ends = np.cumsum([0, *sizes.values()]).tolist()
+    at = {tile: slice(*pair) for tile, pair in zip(sizes, pairwise(ends), strict=True)}
+    nothing = {tile: (np.zeros((size, size)), np.zeros(size)) for tile, size in sizes.items()}
+    pairs, zero = gtsam.GaussianFactorGraph(), gtsam.Values()
+    for tile, (_, g) in nothing.items():
+        zero.insert(M(tile), g)
+        own = np.tril(information[at[tile], at[tile]])
+        own += np.tril(own, -1).T
+        pairs.push_back(gtsam.HessianFactor(M(tile), own, g, 0.0))
+    for one, other in combinations(sizes, 2):
+        (G, g), (other_G, other_g) = nothing[one], nothing[other]
+        shared = information[at[other], at[one]].T
+        pairs.push_back(gtsam.HessianFactor(M(one), M(other), G, shared, g, other_G, other_g, 0.0))
+    return gtsam.LinearContainerFactor(gtsam.HessianFactor(pairs), zero)
 
 
 def pose_errors_prior(correlation: Sequence[float]) -> gtsam.NonlinearFactorGraph:

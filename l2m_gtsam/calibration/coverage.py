@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import gtsam
 import numpy as np
-from scipy.linalg.lapack import dtrtri
+from scipy.linalg import cholesky
+from scipy.linalg.lapack import dpotri, dtrtri
 
 from l2m_factors import M, P, map_weights_information, pose_errors_prior
 from l2m_gtsam.calibration.factor_graph import Estimate
@@ -105,8 +107,8 @@ class Coverage:
         Variance of each reading that stays independent, per axis of the map in uT^2, (N, 3).
     tiles
         Number of weights of each tile.
-    root_information
-        Square root of the information of all tiles' weights, lower triangular, shape (K, K).
+    lower
+        Cholesky root of the covariance of all tiles' weights, shape (K, K).
     knots
         Where pose errors are variables; absent where poses are taken for exact.
     seconds
@@ -118,10 +120,16 @@ class Coverage:
     groups: tuple[Group, ...]
     rest: FloatArray
     tiles: dict[int, int]
-    root_information: FloatArray
+    lower: FloatArray
     knots: PoseKnots | None
     seconds: FloatArray
     moving: MovingFields = field(default_factory=MovingFields)
+
+    @cached_property
+    def root_information(self) -> FloatArray:
+        """Square root of the information of all tiles' weights, lower triangular, (K, K)."""
+        root, _ = dtrtri(self.lower, lower=1)
+        return np.asarray(root)
 
     @property
     def sizes(self) -> dict[int, int]:
@@ -140,7 +148,8 @@ class Coverage:
     def prior(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior of all weights, which is linear in them."""
         graph = gtsam.NonlinearFactorGraph()
-        graph.add(map_weights_information(self.tiles, self.root_information))
+        information, _ = dpotri(self.lower, lower=1)  # the lower triangle
+        graph.add(map_weights_information(self.tiles, information))
         if self.knots is not None:
             graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
         graph.push_back(self.moving.prior())
@@ -179,8 +188,8 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
             first = rows[own[0]]
             where = int(readings.sensor[first]), tile, int(segment[first])
             groups.append(Group(*where, rows[own], features[own]))
-    root, _ = dtrtri(np.linalg.cholesky(told.covariance), lower=1)
-    return Coverage(tuple(groups), rest, told.sizes(), root, knots, seconds)
+    lower = cholesky(told.covariance, lower=True, check_finite=False)
+    return Coverage(tuple(groups), rest, told.sizes(), lower, knots, seconds)
 
 
 def together(

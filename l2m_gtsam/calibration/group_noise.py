@@ -52,25 +52,30 @@ class PoseShare:
         F in the lidar frame in uT, shape (N, 3, 6).
     in_sensor
         C F, shape (N, 3, 6).
+    weights, at_knots
+        What the knots say of each time, and are correlated with it, shapes (N, 2).
     """
 
     knots: PoseKnots
     seconds: FloatArray
     features: FloatArray
     in_sensor: FloatArray
+    weights: FloatArray
+    at_knots: FloatArray
 
     def errors(self, group: Group) -> tuple[SharedError, SharedError]:
         """Return what the readings of a group share: the knots before and after."""
-        weights = self.knots.weights(self.seconds[group.rows])[:, :, None, None]
+        weights = self.weights[group.rows][:, :, None, None]
         F, segment = self.features[group.rows], group.segment
         before = SharedError(P(segment), weights[:, 0] * F)
         return before, SharedError(P(segment + 1), weights[:, 1] * F)
 
     def bridge(self, group: Group) -> FloatArray:
         """Return the covariance of a group's readings that knots leave in uT^2, (3 n, 3 n)."""
-        n = len(group.rows)
-        CF = self.in_sensor[group.rows].reshape(3 * n, -1)
-        left = self.knots.bridge(self.seconds[group.rows])[:, None, :, None]
+        rows, n = group.rows, len(group.rows)
+        CF = self.in_sensor[rows].reshape(3 * n, -1)
+        left = self.knots.left(self.seconds[rows], self.weights[rows], self.at_knots[rows])
+        left = left[:, None, :, None]
         return np.asarray(((CF @ CF.T).reshape(n, 3, n, 3) * left).reshape(3 * n, 3 * n))
 
 
@@ -133,7 +138,9 @@ def pose_share(
         return None
     F = error_of_poses(readings, field_map, estimate)
     C = estimate.C()[readings.sensor]
-    return PoseShare(coverage.knots, coverage.seconds, F, C @ F)
+    knots, seconds = coverage.knots, coverage.seconds
+    weights, at_knots = knots.weights(seconds), knots.at_knots(seconds)
+    return PoseShare(knots, seconds, F, C @ F, weights, at_knots)
 
 
 def _inverse_root(covariance: FloatArray) -> FloatArray:

@@ -7,7 +7,8 @@ How many degrees of freedom the fit takes of a sensor's readings is a trace over
 
 and needs the covariances of each group of readings' variables: of all sensors, weights and knots.
 GTSAM's ``jointMarginalCovariance`` of all of them takes ten times as long as LAPACK's inverse of
-the same matrix (2,663 variables: 7.2 s and 0.6 s). The Newton step that remains comes with it.
+the same matrix (2,663 variables: 7.2 s and 0.6 s). The Newton step that remains comes with it, and
+is taken where it is short.
 
 Columns are scaled to unit information: sigmas of metres, microtesla and seconds are then alike,
 and Cholesky factors what GTSAM's test of neighbouring pivots refuses; QR does the rest.
@@ -95,6 +96,13 @@ class JointInformation:
     def furthest(self, sensors: Sequence[int]) -> float:
         """Return the longest step of some sensors in standard deviations."""
         return max(self.sigmas(sensor) for sensor in sensors)
+
+    def stepped(self, values: gtsam.Values) -> gtsam.Values:
+        """Return the values after the step."""
+        delta = gtsam.VectorValues()
+        for key, at in self.columns.items():
+            delta.insert(key, self.step[at])
+        return values.retract(delta)
 
     def taken(self, sensor: int) -> float:
         """Return the degrees of freedom that a sensor's rows take beside its own sixteen.

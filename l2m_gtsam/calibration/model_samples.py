@@ -7,7 +7,7 @@ import numpy as np
 from l2m_factors import PoseMotion, field_rate
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.trust import FEWEST
-from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, places_of
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray, Readings
 from l2m_gtsam.records.sensor_models import Samples
 from l2m_gtsam.solve.robust import Loss, RobustOptions, consistent
@@ -22,9 +22,7 @@ def predicted(
     """
     if not parts:
         return []
-    places = [
-        part.R_map_lidar @ estimate.t[int(part.sensor[0])] + part.p_map_lidar for part in parts
-    ]
+    places = [places_of(part, estimate.t) for part in parts]
     sample = field_map.query(np.concatenate(places))
     ends = np.cumsum([len(place) for place in places])[:-1]
     columns = (sample.field, sample.gradient, sample.variance, sample.inside)

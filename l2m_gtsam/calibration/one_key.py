@@ -29,10 +29,11 @@ from l2m_gtsam.calibration.joint import (
 )
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
+from l2m_gtsam.calibration.remembered_map import RememberedMap
 from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
-from l2m_gtsam.calibration.view import QueryableMap, View, observe
-from l2m_gtsam.data import BoolArray, FloatArray, Readings, Trajectory
+from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings, Trajectory
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
@@ -193,6 +194,8 @@ def _solved(
     if errors is None:
         return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
     full = finish(view, field_map, errors, joint.estimate, tests, options)
+    if isinstance(field_map, RememberedMap):
+        remember_near(field_map, joint, full.estimate)
     unshared = isinstance(errors, NothingShared)
     return replace(
         outcome,
@@ -202,6 +205,20 @@ def _solved(
         settled=joint.settled and full.settled,
         uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
     )
+
+
+def remember_near(field_map: RememberedMap, joint: "Joint", estimate: Estimate) -> None:
+    """Let the map remember its variance where sensors are found: it was asked near by.
+
+    Field and gradient are those of the places themselves.
+    """
+    near = np.abs(estimate.t - joint.asked).max(axis=1) <= REOBSERVE_M
+    whole = joint.whole.readings
+    rows = np.flatnonzero(near[whole.sensor])
+    x = places_of(whole[rows], estimate.t)
+    field, gradient = field_map.field_and_gradient(x)
+    variance, inside = joint.whole.map_variance[rows], np.ones(len(rows), dtype=np.bool_)
+    field_map.remember(x, FieldSample(field, gradient, variance, inside))
 
 
 def shared_errors(
@@ -226,8 +243,10 @@ class Joint:
         All, with their poses at the estimated time offsets.
     estimate
         All sensors.
+    asked
+        Where the map was asked for its variance: places of all sensors, metres, shape (S, 3).
     whole
-        Those inside the map.
+        The readings inside the map.
     weights
         How far each of them counts, shape (M,).
     problem
@@ -240,6 +259,7 @@ class Joint:
 
     readings: Readings
     estimate: Estimate
+    asked: FloatArray
     whole: View
     weights: FloatArray
     problem: JointProblem | None
@@ -267,14 +287,15 @@ def settle(
     That is the graduated loop too: each round trusts readings as the residuals of the last say.
     """
     whole = observe(readings, field_map, estimate, options.min_readings)
-    ending, settled = Ending.TOLERANCE, False
+    asked, ending, settled = estimate.t, Ending.TOLERANCE, False
     last: Trusted | None = None
     problem: JointProblem | None = None
     for round_ in range(MAX_ROUNDS):
         tell("joint graph", round_ / MAX_ROUNDS)
         now = trusted(whole, field_map, estimate, options, round_, last)
         if not now.view.sensors:
-            return Joint(readings, estimate, whole, now.weights, None, ending, settled=False)
+            weights = now.weights
+            return Joint(readings, estimate, asked, whole, weights, None, ending, settled=False)
         problem = joint_problem(now.view, field_map, estimate, options)
         step = joint_step(problem, estimate, options)
         moved = float(np.abs(step.estimate.t - estimate.t).max())
@@ -288,8 +309,9 @@ def settle(
             readings = with_offsets(readings, trajectory, estimate.offset)
         if moved > REOBSERVE_M or late > SETTLED_S:
             whole = observe(readings, field_map, estimate, options.min_readings)
+            asked = estimate.t
     tell("joint graph", 1.0)
     if last is None or not settled:  # the last round's weights are not those of its result
         last = trusted(whole, field_map, estimate, options, MAX_ROUNDS, None)
         problem = joint_problem(last.view, field_map, estimate, options)
-    return Joint(readings, estimate, whole, last.weights, problem, ending, settled)
+    return Joint(readings, estimate, asked, whole, last.weights, problem, ending, settled)

@@ -60,9 +60,13 @@ def optimise(
     optimizer: Optimizer,
     max_iterations: int,
     solver: LinearSolver = LinearSolver.QR,
+    tolerance: float = TOLERANCE,
 ) -> Optimised:
-    """Minimise a graph's error from a start, with at most so many linearisations."""
-    engine = _engine(graph, start, optimizer, max_iterations, solver)
+    """Minimise a graph's error from a start, with at most so many linearisations.
+
+    It ends where the error falls by less than the tolerance, relative or absolute.
+    """
+    engine = _engine(graph, start, optimizer, max_iterations, solver, tolerance)
     try:
         values = engine.optimize()
     except RuntimeError as error:
@@ -79,15 +83,16 @@ def polish(
     steps: int,
     solver: LinearSolver = LinearSolver.QR,
 ) -> Optimised:
-    """Take Gauss-Newton steps to where the gradient vanishes, without asking the error.
+    """Take Gauss-Newton steps to where the gradient vanishes, whatever the error does.
 
     A map of blocks leaves small steps in the error where readings cross from block to block. A
     descent stops at them, a third of a standard deviation early in the simulated warehouse; the
     gradient does not see them. A rise of the error beyond what such steps make is refused.
     """
     params = gtsam.GaussNewtonParams()
-    _limit(params, steps, solver)
+    _limit(params, steps, solver, TOLERANCE)
     engine = gtsam.GaussNewtonOptimizer(graph, values, params)
+    worst = (1 + SEAM_RISE) * engine.error() + SEAM_RISE
     try:
         for _ in range(steps):
             engine.iterate()
@@ -95,8 +100,7 @@ def polish(
         if not refused(error):
             raise
         return Optimised(values, Ending.SINGULAR)
-    worst = (1 + SEAM_RISE) * graph.error(values) + SEAM_RISE
-    good = graph.error(engine.values()) <= worst
+    good = engine.error() <= worst  # which the engine knows: readings are not asked again
     return Optimised(engine.values() if good else values, Ending.TOLERANCE)
 
 
@@ -114,13 +118,14 @@ def _engine(
     optimizer: Optimizer,
     max_iterations: int,
     solver: LinearSolver,
+    tolerance: float,
 ) -> gtsam.NonlinearOptimizer:
     if optimizer is Optimizer.GN:
         gauss_newton = gtsam.GaussNewtonParams()
-        _limit(gauss_newton, max_iterations, solver)
+        _limit(gauss_newton, max_iterations, solver, tolerance)
         return gtsam.GaussNewtonOptimizer(graph, start, gauss_newton)
     levenberg = gtsam.LevenbergMarquardtParams()
-    _limit(levenberg, max_iterations, solver)
+    _limit(levenberg, max_iterations, solver, tolerance)
     return gtsam.LevenbergMarquardtOptimizer(graph, start, levenberg)
 
 
@@ -128,8 +133,9 @@ def _limit(
     params: gtsam.NonlinearOptimizerParams,
     max_iterations: int,
     solver: LinearSolver,
+    tolerance: float,
 ) -> None:
     params.setMaxIterations(max_iterations)
-    params.setRelativeErrorTol(TOLERANCE)
-    params.setAbsoluteErrorTol(TOLERANCE)
+    params.setRelativeErrorTol(tolerance)
+    params.setAbsoluteErrorTol(tolerance)
     params.setLinearSolverType(solver.value)

@@ -80,10 +80,16 @@ class PoseKnots:
 
     def bridge(self, seconds: FloatArray) -> FloatArray:
         """Return the covariance of what the knots leave open at times of one segment, (n, n)."""
+        return self.left(seconds, self.weights(seconds), self.at_knots(seconds))
+
+    def at_knots(self, seconds: FloatArray) -> FloatArray:
+        """Return the correlation of each time with the knots before and after, shape (N, 2)."""
         after, spacing = self._between(seconds)
-        at_knots = np.column_stack([self._like(after), self._like(spacing - after)])
-        apart = np.abs(seconds[:, None] - seconds)
-        return np.asarray(self._like(apart) - self._weights(after, spacing) @ at_knots.T)
+        return np.column_stack([self._like(after), self._like(spacing - after)])
+
+    def left(self, seconds: FloatArray, weights: FloatArray, at_knots: FloatArray) -> FloatArray:
+        """Return ``bridge`` from what ``weights`` and ``at_knots`` say of these times."""
+        return np.asarray(self._like(np.abs(seconds[:, None] - seconds)) - weights @ at_knots.T)
 
     def _between(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the time since the knot before and that from it to the next, shapes (N,)."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
-from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.calibration.view import QueryableMap, View, places_of
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.solve.disagreement import Judged
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
@@ -78,8 +78,7 @@ def plausible(
     keep = np.ones(len(readings), dtype=np.bool_)
     if options.loss is Loss.SQUARED:
         return keep
-    R = readings.R_map_lidar
-    sample = field_map.query(np.einsum("nij,nj->ni", R, t[readings.sensor]) + readings.p_map_lidar)
+    R, sample = readings.R_map_lidar, field_map.query(places_of(readings, t))
     for sensor in range(len(readings.sensors)):
         own = np.arange(len(readings))[readings.rows_of(sensor)]
         own = own[sample.inside[own]]

@@ -61,13 +61,28 @@ class View:
     sensors: list[int]
 
 
+def places_of(readings: Readings, t: FloatArray) -> FloatArray:
+    """Return where readings were taken in the map, metres, shape (N, 3).
+
+    All that ask the map along a drive ask it at these very bits, so that it may remember them.
+
+    Parameters
+    ----------
+    readings
+        Of S sensors.
+    t
+        Where these are in the lidar frame in metres, shape (S, 3).
+    """
+    turned = np.einsum("nij,nj->ni", readings.R_map_lidar, t[readings.sensor])
+    return np.asarray(turned + readings.p_map_lidar)
+
+
 def observe(
     readings: Readings, field_map: QueryableMap, estimate: Estimate, min_readings: int
 ) -> View:
     """Ask the map at the estimated sensor positions, once for all sensors."""
     R = readings.R_map_lidar
-    x = np.einsum("nij,nj->ni", R, estimate.t[readings.sensor]) + readings.p_map_lidar
-    sample = field_map.query(x)
+    sample = field_map.query(places_of(readings, estimate.t))
     counts = np.bincount(readings.sensor[sample.inside], minlength=len(estimate.t))
     usable = counts >= min_readings
     keep = sample.inside & usable[readings.sensor]

@@ -18,7 +18,7 @@ from l2m_gtsam.qa.metrics.drives import compare_drives
 from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
 from l2m_gtsam.records.metrics import Halves, Repeatability
 
-STEPS = 3  # alternations from where the whole was found; the joint graph does the rest
+STEPS = 1  # alternation from where the whole was found; the joint graph does the rest
 MORE = 4  # times as many readings of a drive as of a half
 
 

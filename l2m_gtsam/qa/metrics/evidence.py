@@ -116,7 +116,8 @@ def _where_inside(sample: FieldSample) -> FieldSample:
 
 def _places(readings: Readings, sensor: SensorCalibration) -> FloatArray:
     """Return where a sensor was at its readings in the map in metres, shape (N, 3)."""
-    return np.asarray(readings.R_map_lidar @ sensor.t_lidar_mag + readings.p_map_lidar)
+    turned = np.einsum("nij,j->ni", readings.R_map_lidar, sensor.t_lidar_mag)
+    return np.asarray(turned + readings.p_map_lidar)
 
 
 def _pose_share(

@@ -19,9 +19,10 @@ class Counting:
     """A world with a made-up variance that counts the places it is asked for."""
 
     def __init__(self) -> None:
-        self.world, self.asked = dipole_world(1), 0
+        self.world, self.asked, self.fields = dipole_world(1), 0, 0
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        self.fields += len(points)
         return self.world.field_and_gradient(points)
 
     def query(self, points: FloatArray, /) -> FieldSample:
@@ -45,6 +46,35 @@ def test_answers_are_the_maps_own_and_places_are_asked_once(rows: list[list[int]
         asked = counting.asked
         remembered.query(at)
         assert counting.asked == asked
+
+
+def test_what_is_known_from_elsewhere_is_not_asked() -> None:
+    """To the last bit; of places that were not told the map is asked."""
+    counting, places = Counting(), np.random.default_rng(0).normal(size=(5, 3))
+    remembered, told = RememberedMap(counting), Counting().query(places[:3])
+    variance = np.full((3, 3), 7.0)
+    remembered.remember(
+        places[:3], FieldSample(told.field, told.gradient, variance, np.ones(3, dtype=np.bool_))
+    )
+    found = remembered.query(places)
+    assert counting.asked == 2
+    np.testing.assert_array_equal(found.field[:3], told.field)
+    np.testing.assert_array_equal(found.variance, np.vstack([variance, places[3:] ** 2]))
+    assert found.inside[:3].all()
+
+
+def test_the_last_field_is_not_asked_again() -> None:
+    """To the last bit; what a caller does to its places afterwards changes nothing."""
+    counting, places = Counting(), np.random.default_rng(0).normal(size=(4, 3))
+    remembered, asked = RememberedMap(counting), places.copy()
+    first = remembered.field_and_gradient(asked)
+    asked += 1.0
+    for at in (places, places + 1.0):
+        found = remembered.field_and_gradient(at)
+        for mine, own in zip(found, counting.world.field_and_gradient(at), strict=True):
+            np.testing.assert_array_equal(mine, own)
+    assert counting.fields == 8
+    assert not first[0].flags.writeable
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
