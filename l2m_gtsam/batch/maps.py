@@ -16,7 +16,8 @@ from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.figures import map_figure, save_figure
+from l2m_gtsam.qa.report.figures.map import map_figure
+from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import save_map
 

@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.reasons.reason import Level
-from l2m_gtsam.qa.slam.judge import judge_localisation, slam_thresholds
+from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_thresholds
 from l2m_gtsam.records.localisation import LocalisationStatus, OdometryScale, ScanUse
 from l2m_gtsam.records.localisation_file import (
     LocalisationRecord,
@@ -18,6 +16,7 @@ from l2m_gtsam.records.localisation_file import (
     Timeline,
 )
 from l2m_gtsam.records.validation import ChiSquare
+from l2m_gtsam.records.verdict import Level, Verdict
 from tests.drives.localised import record
 
 
@@ -192,7 +191,7 @@ def test_a_calibration_that_was_not_as_sure_as_it_said_is_named() -> None:
 
 
 def test_thresholds_are_those_of_the_options() -> None:
-    named = {each.name: each for each in slam_thresholds(QaOptions())}
+    named = {each.name: each for each in localisation_thresholds(QaOptions())}
     assert {"rejected", "outside_map", "chi_square", "slam.position_sigma_m", "slam.nees"} <= set(
         named
     )
