@@ -45,7 +45,7 @@ def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
     drift, covariance = result.drift, result.trajectory.covariance
     drifted = (
         f"{len(result.trajectory)} key poses over {drift.way_m:.1f} m; odometry ended "
-        f"{drift.end_m:.2f} m and {drift.end_deg:.1f} deg off ({drift.end_share:.1%} of the way), "
+        f"{drift.end_m:.2f} m and {drift.end_deg:.1f} deg off ({drift.end_share:.1%} of the path), "
         f"{drift.largest_m:.2f} m at most"
     )
     lines = [f"{result.status.value}: {result.message}", drifted]
@@ -65,7 +65,7 @@ def scan_lines(scans: ScanUse | None) -> tuple[str, ...]:
         return ()
     line = (
         f"scans: {scans.fixes} fixes in the map and {scans.loops} loops counted (chi2 per dof "
-        f"{scans.chi2_per_dof:.2f}), {scans.rejected} were not believed"
+        f"{scans.chi2_per_dof:.2f}), {scans.rejected} were rejected"
     )
     return (line,)
 

@@ -68,7 +68,7 @@ def check_truth(truth: Trajectory, drive: Trajectory, max_pose_gap_s: float, nam
 
 
 @dataclass(frozen=True)
-class TestedTrajectories:
+class ComparedTrajectories:
     """What is compared with a truth, at the same key poses.
 
     Attributes
@@ -87,7 +87,7 @@ class TestedTrajectories:
 
 
 def truth_record(
-    truth: Trajectory, tested: TestedTrajectories, max_pose_gap_s: float
+    truth: Trajectory, tested: ComparedTrajectories, max_pose_gap_s: float
 ) -> TruthRecord | None:
     """Return a localisation beside the truth; None if no key pose lies within it.
 
