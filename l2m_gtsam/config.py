@@ -10,9 +10,8 @@ from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.lidar.options import LidarOptions
 from l2m_gtsam.mapping.map_building import MappingOptions
 from l2m_gtsam.options import Options
-from l2m_gtsam.planning.options import PlanOptions
-from l2m_gtsam.qa.fleet.options import FleetOptions
-from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.planning.motion import PlanOptions
+from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.bag_options import BagOptions

@@ -18,9 +18,11 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording
 from l2m_gtsam.planning.plan import assumed_recording, plan
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.qa.evaluate import FIGURES, appraise, scene_of
-from l2m_gtsam.qa.figures import calibration_figure, save_figure
-from l2m_gtsam.qa.nominal import check_names
+from l2m_gtsam.qa.evaluate import FIGURES, evaluate
+from l2m_gtsam.qa.report.figures.vehicle import calibration_figure
+from l2m_gtsam.qa.report.svg import save_figure
+from l2m_gtsam.qa.scene import scene_of
+from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.plan import DrivePlan
@@ -119,7 +121,7 @@ def calibrate_drive(
     """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bags`."""
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
-    metrics = appraise(recording, found, config.calibration, config.qa, progress)
+    metrics = evaluate(recording, found, config.calibration, config.qa, progress)
     result = replace(found.result, options=config.model_dump(mode="json"))
     drives = [each.trajectory for each in recording.parts]
     figure = calibration_figure(metrics.map, drives, result, truth)

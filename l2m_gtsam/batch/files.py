@@ -94,12 +94,12 @@ def read_numbers(bag: Path, config: Config, progress: Progress) -> tuple[ScalarS
 
 
 def check_bags(bags: Sequence[Path]) -> None:
-    """Raise a BagError, before any is read, if there is no bag or one is given twice."""
+    """Raise a BagError, before any is read, if there is no bag or one is listed twice."""
     if not bags:
         raise BagError("no bag is given: name one or several")
     places = [bag.resolve() for bag in bags]
     if twice := [str(bag) for k, bag in enumerate(bags) if places[k] in places[:k]]:
-        raise BagError(f"{twice[0]} is given twice; it cannot be its own witness, give it once")
+        raise BagError(f"{twice[0]} is listed twice; list each drive once")
 
 
 @dataclass(frozen=True)

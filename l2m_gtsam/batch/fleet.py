@@ -26,9 +26,9 @@ from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.qa.fleet.options import FleetOptions
-from l2m_gtsam.qa.fleet.outliers import with_outliers
-from l2m_gtsam.qa.fleet.page import fleet_page
+from l2m_gtsam.qa.fleet import with_outliers
+from l2m_gtsam.qa.options import FleetOptions
+from l2m_gtsam.qa.report.fleet_page import fleet_page
 from l2m_gtsam.records.fleet import DriveOutcome, FleetRow
 from l2m_gtsam.storage.files import atomic_path, printable, source_file
 from l2m_gtsam.storage.fleet_table import write_csv, write_parquet

@@ -20,7 +20,7 @@ from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import BagError, ConfigError, L2MError, OutputError
-from l2m_gtsam.qa.fleet.rows import sensor_rows
+from l2m_gtsam.qa.fleet import sensor_rows
 from l2m_gtsam.records.fleet import DATE, DriveOutcome, Made, RowKey
 from l2m_gtsam.storage.drive_lists import (
     FILES,

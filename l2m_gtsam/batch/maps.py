@@ -16,7 +16,8 @@ from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.figures import map_figure, save_figure
+from l2m_gtsam.qa.report.figures.map import map_figure
+from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import save_map
 
@@ -202,7 +203,7 @@ def write_map(
 def _check_new(
     map_path: Path, known: Sequence[dict[str, Any]], recordings: Sequence[Recording]
 ) -> None:
-    """Raise a MapError for a recording that a map has: twice, it would count as two witnesses."""
+    """Raise a MapError for a recording that a map has: its errors would count twice."""
     digests = [bag.get("sha256") for bag in known]
     if twice := [each.source.path for each in recordings if each.source.sha256 in digests]:
         raise MapError(f"{map_path} was made from {twice[0]} already; give bags that are new")

@@ -13,15 +13,16 @@ from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.judge import Verdict, judge
-from l2m_gtsam.qa.nominal import check_names
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.report.page import STAGE, report_page
-from l2m_gtsam.qa.report.slam_page import slam_page
-from l2m_gtsam.qa.slam.judge import judge_localisation
+from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
+from l2m_gtsam.qa.report.localisation_page import localisation_page
+from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.qa.verdict.localisation import judge_localisation
+from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.verdict import Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.record_files import read_metrics, read_slam
@@ -57,7 +58,7 @@ def report_localisation(folder: Path, config: Path | None, page: Path) -> Verdic
 
 def write_slam_report(page: Path, record: LocalisationRecord, options: QaOptions) -> Verdict:
     """Write the report on a localisation and return its verdict."""
-    text = slam_page(record, options)
+    text = localisation_page(record, options)
     with atomic_path(page) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="replace")
     return judge_localisation(record, options)
@@ -229,7 +230,7 @@ def write_report(
         It cannot be written.
     """
     check_names([each.sensor for each in result.sensors], options)
-    page = report_page(result, metrics, options, progress)
+    page = calibration_page(result, metrics, options, progress)
     with atomic_path(folder / REPORT_FILE) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="replace")
     return judge(result, metrics, options)

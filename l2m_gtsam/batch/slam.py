@@ -21,14 +21,14 @@ from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.qa.judge import Verdict
-from l2m_gtsam.qa.slam.errors import check_truth
+from l2m_gtsam.qa.metrics.pose_errors import check_truth
 from l2m_gtsam.recording.odometry_jumps import without_jumps
 from l2m_gtsam.recording.sync import twists
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.scans import ScanEvidence
+from l2m_gtsam.records.verdict import Verdict
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import NO_SCANS, Sources, localise, start_pose
 from l2m_gtsam.slam.odometry import scan_odometry

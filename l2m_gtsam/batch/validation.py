@@ -17,7 +17,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.changes import compare_calibrations, is_calibrated
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.validation_page import validation_page
-from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
+from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
@@ -92,7 +92,7 @@ def validate_calibration(asked: ValidationRequest, progress: Progress) -> Valida
         verdict=judge_validation(drive, comparison, config.qa),
         drive=drive,
         comparison=comparison,
-        thresholds=thresholds(config.qa),
+        thresholds=validation_thresholds(config.qa),
         sources=tuple(sources),
         versions={name: version(name) for name in VERSIONED},
     )

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from l2m_gtsam.cli.terminal import print_table, shown_progress
+from l2m_gtsam.cli.terminal import CalibrationOption, OutOption, print_table, shown_progress
 
 
 def slam(
@@ -13,10 +13,8 @@ def slam(
         Path,
         typer.Argument(metavar="BAG", help="Drive with odometry: ROS1 .bag, ROS2 folder, .mcap."),
     ],
-    calibration: Annotated[
-        Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
-    ],
-    out: Annotated[Path, typer.Option("--out", help="Folder for the results.")],
+    calibration: CalibrationOption,
+    out: OutOption,
     map_path: Annotated[
         Path | None,
         typer.Option("--map", help="Map file; without one the field is found with the poses."),
@@ -32,22 +30,24 @@ def slam(
     """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.slam import SlamInput, slam_bag
-        from l2m_gtsam.cli.tables.slam_tables import (
+        from l2m_gtsam.cli.tables.slam import (
             drift_lines,
             scan_lines,
             slam_table,
             start_lines,
             truth_lines,
         )
-        from l2m_gtsam.cli.tables.verdict_text import verdict_lines
         from l2m_gtsam.config import load_config
 
         given = SlamInput(bag, map_path, calibration, truth)
         done = slam_bag(given, load_config(config), out, progress)
     print_table(slam_table(done.result))
-    lines = (*start_lines(done.result.start), *drift_lines(done.result))
-    for line in (*lines, *scan_lines(done.result.scans), *truth_lines(done.record.truth)):
-        typer.echo(line)
-    for line in verdict_lines(done.verdict):
-        typer.echo(line)
+    lines = (
+        *start_lines(done.result.start),
+        *drift_lines(done.result),
+        *scan_lines(done.result.scans),
+        *truth_lines(done.record.truth),
+        *done.verdict.lines(),
+    )
+    typer.echo("\n".join(lines))
     typer.echo(f"written: {out}")

@@ -1,8 +1,9 @@
-"""What commands have in common: tables, warnings and progress at a terminal."""
+"""What commands have in common: arguments, tables, warnings and progress at a terminal."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TextIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
@@ -15,9 +16,28 @@ if TYPE_CHECKING:
 STARTING = "starting"
 ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
 
+BagArgument = Annotated[
+    Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
+]
+MapOption = Annotated[Path, typer.Option("--map", help="Map file made by `l2m map build`.")]
+ConfigOption = Annotated[
+    Path | None, typer.Option("--config", help="YAML configuration; see configs/.")
+]
+OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+WorkersOption = Annotated[
+    int | None, typer.Option(min=1, help="Processes; as many as there are cores if not given.")
+]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(metavar="TCP://HOST:PORT", help="A running Dask cluster that computes."),
+]
+CalibrationOption = Annotated[
+    Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
+]
+
 
 def warn(doubts: Sequence[str]) -> None:
-    """Say on the error stream what speaks against a result that was written all the same."""
+    """Print doubts about a result that was written all the same on the error stream."""
     for doubt in doubts:
         typer.echo(f"l2m: warning: {doubt}", err=True)
 
@@ -63,7 +83,7 @@ def print_table(table: "Table") -> None:
 def shown_progress() -> "Iterator[Progress]":
     """Show one bar per stage on the error stream while it runs.
 
-    One that says "starting" stands there from the first until there is a stage: what a command
+    One named "starting" is there from the first until there is a stage: what a command
     needs is best imported inside.
     """
     from rich.console import Console

@@ -1,4 +1,4 @@
-"""Motions that a driver could add to a drive, as poses."""
+"""Motions that a driver could add to a drive, as poses, and options of a plan."""
 
 from dataclasses import dataclass
 
@@ -30,8 +30,21 @@ class MotionOptions(Options):
     """Such a place is looked for so far around the drive."""
 
 
+class PlanOptions(Options):
+    """What is assumed and tried before a drive is calibrated."""
+
+    rate_hz: float = Field(default=10.0, gt=0, le=1000)
+    """Readings per second of sensors that the bag does not have yet."""
+    noise_ut: float = Field(default=0.2, gt=0)
+    """Standard deviation of the sensors' noise in microtesla, where neither
+    `calibration.solve.sensor_noise_ut` nor the map says one: a map that learns it gives that of
+    the mapping suite."""
+    motion: MotionOptions = MotionOptions()
+    """Extra motions that are tried."""
+
+
 @dataclass(frozen=True)
-class Motion:
+class ExtraMotion:
     """Poses of the lidar in the map.
 
     Attributes
@@ -60,7 +73,7 @@ class Motion:
         return np.asarray(np.hstack([turn, way]) / between[:, None])
 
 
-def extra_motions(drive: Motion, options: MotionOptions) -> tuple[Motion, ...]:
+def extra_motions(drive: ExtraMotion, options: MotionOptions) -> tuple[ExtraMotion, ...]:
     """Return what could be done on the path of a drive, the drive itself once more first.
 
     Parameters
@@ -80,26 +93,26 @@ def extra_motions(drive: Motion, options: MotionOptions) -> tuple[Motion, ...]:
     middle = len(p) // 2
     spot = np.broadcast_to(p[middle], p.shape)
     return (
-        Motion("the same drive once more", R, p, seconds),
-        Motion(
+        ExtraMotion("the same drive once more", R, p, seconds),
+        ExtraMotion(
             f"heave by {options.heave_m:g} m up and down",
             R,
             p + options.heave_m * swing[:, None] * up,
             seconds,
         ),
-        Motion(
+        ExtraMotion(
             f"roll by {options.tilt_deg:g} deg either way", R @ _turns(tilt, [1, 0, 0]), p, seconds
         ),
-        Motion(
+        ExtraMotion(
             f"pitch by {options.tilt_deg:g} deg either way", R @ _turns(tilt, [0, 1, 0]), p, seconds
         ),
-        Motion(
+        ExtraMotion(
             f"turn round on the spot at {_place(p[middle])}",
             _turns(round_, up) @ R[middle],
             spot,
             round_ / options.turn_rad_s,
         ),
-        Motion(
+        ExtraMotion(
             "the same path the other way round",
             (_turns(np.pi, up) @ R)[::-1],
             p[::-1],
@@ -108,17 +121,17 @@ def extra_motions(drive: Motion, options: MotionOptions) -> tuple[Motion, ...]:
     )
 
 
-def loop(drive: Motion, centre: FloatArray, options: MotionOptions) -> Motion:
+def loop(drive: ExtraMotion, centre: FloatArray, options: MotionOptions) -> ExtraMotion:
     """Return a circle about a place of the map, shape (3,), in metres, heading along it."""
     angle = np.linspace(0, 2 * np.pi, options.poses)
     around = np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
     upright = _turns(angle + np.pi / 2 - _heading(drive.R[0]), [0.0, 0.0, 1.0]) @ drive.R[0]
     name = f"a loop of {options.loop_m:g} m radius about {_place(centre)}, if it is free"
     seconds = angle / options.turn_rad_s
-    return Motion(name, upright, centre + options.loop_m * around, seconds)
+    return ExtraMotion(name, upright, centre + options.loop_m * around, seconds)
 
 
-def places_around(drive: Motion, options: MotionOptions) -> FloatArray:
+def places_around(drive: ExtraMotion, options: MotionOptions) -> FloatArray:
     """Return the corners of a grid over and around a drive at its middle height, shape (K, 3)."""
     low, high = drive.p.min(axis=0) - options.detour_m, drive.p.max(axis=0) + options.detour_m
     x, y = (np.arange(low[axis], high[axis], options.loop_m) for axis in range(2))

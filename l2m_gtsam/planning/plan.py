@@ -28,8 +28,14 @@ from l2m_gtsam.data import (
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread
-from l2m_gtsam.planning.motion import Motion, extra_motions, loop, places_around, strongest
-from l2m_gtsam.planning.options import PlanOptions
+from l2m_gtsam.planning.motion import (
+    ExtraMotion,
+    PlanOptions,
+    extra_motions,
+    loop,
+    places_around,
+    strongest,
+)
 from l2m_gtsam.records.plan import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
@@ -141,7 +147,7 @@ def plan(
 
 
 def _with_motions(
-    task: Task, readings: Readings, motions: tuple[Motion, ...], tell: Progress
+    task: Task, readings: Readings, motions: tuple[ExtraMotion, ...], tell: Progress
 ) -> tuple[MotionPlan, ...]:
     """Return what each motion would leave of a sensor, the best first."""
     plans = []
@@ -169,7 +175,7 @@ def only(readings: Readings, sensor: int) -> Readings:
     return replace(own, sensors=(readings.sensors[sensor],), sensor=np.zeros_like(own.sensor))
 
 
-def with_motion(readings: Readings, motion: Motion) -> Readings:
+def with_motion(readings: Readings, motion: ExtraMotion) -> Readings:
     """Return the readings of a drive to which a motion is added: one per sensor and pose."""
     S, K, moving, roots = len(readings.sensors), len(motion.p), None, readings.pose_root
     later = BREAK_NS + np.round(NANOSECONDS * motion.seconds).astype(np.int64)
@@ -224,12 +230,12 @@ def _places(sensors: tuple[str, ...], options: CalibrationOptions, priors: Prior
 
 def _motions(
     readings: Readings, field_map: QueryableMap, planning: PlanOptions
-) -> tuple[Motion, ...]:
+) -> tuple[ExtraMotion, ...]:
     """Return the motions to try on a drive."""
     # Sensors that share their stamps share their poses: each counts once.
     stamps, first = np.unique(readings.stamp_ns, return_index=True)
     seconds = (stamps - stamps[0]) / NANOSECONDS
-    drive = Motion("drive", readings.R_map_lidar[first], readings.p_map_lidar[first], seconds)
+    drive = ExtraMotion("drive", readings.R_map_lidar[first], readings.p_map_lidar[first], seconds)
     motions = extra_motions(drive, planning.motion)
     places = places_around(drive, planning.motion)
     strong = strongest(places, field_map.query(places))

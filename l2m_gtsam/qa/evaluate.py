@@ -1,24 +1,40 @@
-"""A calibration -> the figures that it is judged by, and its view. Pure: no files, no terminal."""
+"""Calibration -> the figures that it is judged by. Pure: no files, no terminal.
 
+Parts of what was driven are calibrated by themselves: of one drive both halves, of several each
+drive.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.alternation import spread
 from l2m_gtsam.calibration.calibrate import Calibrated
+from l2m_gtsam.calibration.one_key import solve_part
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import Recording
+from l2m_gtsam.data import FloatArray, Readings, Recording
+from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
+from l2m_gtsam.qa.metrics.repeatability import (
+    PartialEstimate,
+    compare_drives,
+    compare_halves,
+    no_halves,
+)
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.repeatability import compared_drives, compared_halves
-from l2m_gtsam.qa.scene import calibration_scene
 from l2m_gtsam.records.metrics import Halves, Metrics, Repeatability
-from l2m_gtsam.records.scene import Scene
 
 FIGURES = "figures"
 """Stage of the figures of a calibration and its picture."""
+STEPS = 1  # alternation from where the whole was found; the joint graph does the rest
+MORE = 4  # times as many readings of a drive as of a half
 
 
 @one_blas_thread()
-def appraise(
+def evaluate(
     recording: Recording,
     calibrated: Calibrated,
     options: CalibrationOptions,
@@ -52,33 +68,150 @@ def appraise(
             halves = compared_halves(calibrated, options, qa.half_readings)
         tell(stage, 1.0)
     tell(FIGURES, 0.0)
-    evidence, maps = _evidence(calibrated), _maps(calibrated)
+    evidence, maps = evidence_of(calibrated), maps_of(calibrated)
     metrics = metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
     tell(FIGURES, 0.5)
     return metrics
 
 
-@one_blas_thread()
-def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
-    """Return what there is to see of a calibration in three dimensions.
-
-    Parameters
-    ----------
-    recording
-        That was calibrated.
-    calibrated
-        The calibration, with what it rests on.
-    """
-    evidence, maps = _evidence(calibrated), _maps(calibrated)
-    name = recording.source.sha256
-    drives = [each.trajectory for each in recording.parts]
-    return calibration_scene(calibrated.result, evidence, drives, maps, name)
-
-
-def _evidence(calibrated: Calibrated) -> DriveEvidence:
+def evidence_of(calibrated: Calibrated) -> DriveEvidence:
+    """Return the readings of a calibration as its solve left them."""
     solution = calibrated.solution
     return DriveEvidence(solution.readings, solution.inside, solution.rejected)
 
 
-def _maps(calibrated: Calibrated) -> MapForms:
+def maps_of(calibrated: Calibrated) -> MapForms:
+    """Return the map of a calibration in both its forms."""
     return MapForms(calibrated.field_map, calibrated.solver_map)
+
+
+@one_blas_thread()
+def compared_halves(
+    calibrated: Calibrated, options: CalibrationOptions, each_half: int
+) -> dict[str, Halves]:
+    """Calibrate the first and the second half of a drive, and compare them sensor by sensor.
+
+    Each starts where the whole was found, with its time offsets and without priors: what a half
+    leaves open takes no part. Readings that the whole rejected are looked at again: of a sensor
+    that moved on the way they are one half.
+
+    Parameters
+    ----------
+    calibrated
+        The calibration of the whole drive.
+    options
+        That it was computed with.
+    each_half
+        Readings of each sensor that a half is calibrated on, at the most.
+    """
+    readings, t = _usable(calibrated), calibrated.solution.estimate.t
+    solved = [found.sensor for found in calibrated.solution.solved]
+    middle = np.median(readings.stamp_ns)
+    parts = (readings.stamp_ns < middle, readings.stamp_ns >= middle)
+    try:
+        first, second = (
+            _parts(calibrated, readings.select(part), t, options, each_half) for part in parts
+        )
+    except (CalibrationError, np.linalg.LinAlgError) as error:
+        # The whole is calibrated: that a half is not is no reason to lose it.
+        reason = f"a half of the drive cannot be calibrated: {error}"
+        return {readings.sensors[index]: no_halves(reason) for index in solved}
+    return {readings.sensors[index]: _compared(first, second, index) for index in solved}
+
+
+@one_blas_thread()
+def compared_drives(
+    calibrated: Calibrated, recording: Recording, options: CalibrationOptions, each_half: int
+) -> dict[str, Repeatability]:
+    """Calibrate each drive of a recording by itself, and compare them sensor by sensor.
+
+    They start as halves do. All are one graph, in which every drive has a place and a distortion
+    of its own for each sensor, but there is one map: its errors, which drives through the same
+    places share, are known to be shared and do not count as a difference.
+
+    Parameters
+    ----------
+    calibrated
+        The calibration of all drives together.
+    recording
+        The drives.
+    options
+        That it was computed with.
+    each_half
+        Readings of each sensor that half a drive would be calibrated on, a fourth of those here.
+    """
+    readings, count = _usable(calibrated), len(recording.drives)
+    solved = [found.sensor for found in calibrated.solution.solved]
+    own = by_drive(readings, count)
+    t = np.repeat(calibrated.solution.estimate.t, count, axis=0)
+    try:
+        found = _parts(calibrated, own, t, options, MORE * each_half)
+    except (CalibrationError, np.linalg.LinAlgError) as error:
+        found, failed = {}, f"the drives cannot be calibrated by themselves: {error}"
+    else:
+        failed = ""
+    paths = [drive.source.path for drive in recording.drives]
+    return {
+        readings.sensors[index]: compare_drives(
+            [
+                (path, found.get(index * count + k) or failed or _too_few(own, index * count + k))
+                for k, path in enumerate(paths)
+            ]
+        )
+        for index in solved
+    }
+
+
+def by_drive(readings: Readings, count: int) -> Readings:
+    """Return readings as if each of so many drives had sensors of its own.
+
+    Sensor s of drive k then counts as ``s * count + k``.
+    """
+    names = tuple(f"{name} of drive {k + 1}" for name in readings.sensors for k in range(count))
+    return replace(readings, sensors=names, sensor=readings.sensor * count + readings.of_drive)
+
+
+def _too_few(readings: Readings, sensor: int) -> str:
+    rows = readings.rows_of(sensor)
+    read = rows.stop - rows.start
+    if not read:
+        return "nothing usable was read of it in this drive"
+    return f"its {read} usable readings in this drive are too few to calibrate on"
+
+
+def _usable(calibrated: Calibrated) -> Readings:
+    """Return the readings of solved sensors inside the map, at fixed time offsets."""
+    solution = calibrated.solution
+    solved = [found.sensor for found in solution.solved]
+    usable = solution.inside & np.isin(solution.readings.sensor, solved)
+    return replace(solution.readings, motion=None).select(usable)
+
+
+def _parts(
+    calibrated: Calibrated,
+    readings: Readings,
+    t: FloatArray,
+    options: CalibrationOptions,
+    most: int,
+) -> dict[int, PartialEstimate]:
+    """Return what some of the readings determine of each sensor that they are enough for."""
+    few = spread(readings, max(most, options.solve.min_readings))
+    near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
+    solution = solve_part(few, calibrated.solver_map, t, near)
+    return {
+        found.sensor: PartialEstimate(
+            solution.estimate.vector(found.sensor), found.covariance, found.shared_root
+        )
+        for found in solution.solved
+    }
+
+
+def _compared(
+    first: dict[int, PartialEstimate], second: dict[int, PartialEstimate], sensor: int
+) -> Halves:
+    for name, half in (("first", first), ("second", second)):
+        if sensor not in half:
+            return no_halves(f"the {name} half of the drive has too few readings to calibrate on")
+    # Each half was solved by itself: nothing is known of what their errors share.
+    one, other = (replace(half[sensor], shared_root=None) for half in (first, second))
+    return compare_halves(one, other)

@@ -1,10 +1,12 @@
-"""Where a verdict changes from PASS to WARN and from WARN to FAIL."""
+"""Thresholds of verdicts, and of outliers in a fleet."""
 
+from collections.abc import Iterable
 from typing import Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
 from l2m_gtsam.options import Options
+from l2m_gtsam.records.verdict import Level, Reason, Threshold
 
 UNIT = 1e-3  # a quaternion given to three digits is as long as this
 
@@ -23,6 +25,29 @@ class Limit(Options):
             msg = f"fail must not be less than warn, it is {self.fail:g} against {self.warn:g}"
             raise ValueError(msg)
         return self
+
+    def level(self, value: float) -> Level:
+        """Return the level that a figure leads to; NaN passes."""
+        if value > self.fail:
+            return Level.FAIL
+        return Level.WARN if value > self.warn else Level.PASS
+
+    def reasons(self, value: float, text: str) -> list[Reason]:
+        """Return a reason with this text if a figure is above the limit; else none."""
+        level = self.level(value)
+        return [] if level is Level.PASS else [Reason(level, text)]
+
+
+def thresholds(
+    options: Options, names: Iterable[str] | None = None, prefix: str = ""
+) -> tuple[Threshold, ...]:
+    """Return the limits among some options, all if none are named."""
+    fields = type(options).model_fields
+    return tuple(
+        Threshold(prefix + name, limit.warn, limit.fail, fields[name].description or "")
+        for name in names or fields
+        if isinstance(limit := getattr(options, name), Limit)
+    )
 
 
 class Nominal(Options):
@@ -85,7 +110,7 @@ class SlamQaOptions(Options):
     of the graph they are judged by `steps`."""
     nees: Limit = Limit(warn=3.0, fail=10.0)
     """Normalised squared error of the poses against the truth, if one is given, per degree of
-    freedom; 1 is honest. Poses of a drive err together, so that a drive counts as one."""
+    freedom; 1 is consistent. Pose errors of a drive are correlated: a drive counts as one case."""
     chance: float = Field(default=1e-3, gt=0, lt=0.1)
     """Share of true calibrations of which it may be said, by chance, that refining them changed
     them by more than they allow."""
@@ -154,3 +179,23 @@ class QaOptions(Options):
     """Thresholds of `l2m validate`."""
     slam: SlamQaOptions = SlamQaOptions()
     """Thresholds of `l2m slam`."""
+
+
+class FleetOptions(Options):
+    """Thresholds and size of the fleet's page."""
+
+    outlier: PositiveFloat = 5.0
+    """How many times further than expected a parameter must be from the median of the vehicle's
+    drives to be marked: both in standard deviations of the difference and in standard deviations
+    of the drives' spread (1.4826 times their median absolute deviation)."""
+    drives: int = Field(default=4, ge=3)
+    """Drives of a vehicle that know the parameter, below which nothing is marked: of two that
+    differ none is the outlier, and of three the spread is hardly known."""
+    least_m: float = Field(default=0.003, ge=0)
+    """Positions that are closer than this to the median are never marked, metres."""
+    least_deg: float = Field(default=0.2, ge=0)
+    """The same for rotations, degrees."""
+    least_ut: float = Field(default=0.3, ge=0)
+    """The same for H, microtesla."""
+    pictures: int = Field(default=60, ge=0)
+    """Most trends that the page draws, those with outliers first: it stays small and quick."""

@@ -4,12 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.qa.metrics.assemble import MapForms
-from l2m_gtsam.qa.metrics.curves import curves
+from l2m_gtsam.calibration.calibrate import Calibrated
+from l2m_gtsam.data import FloatArray, Recording, Trajectory
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.qa.evaluate import evidence_of, maps_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, sensor_evidence
+from l2m_gtsam.qa.metrics.fit import curves
 from l2m_gtsam.qa.metrics.plain import evenly
-from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.scene import DriveView, MapView, Scene, SensorView
 
 AROUND = 1.5  # metres of the map on each side of a drive
@@ -18,32 +20,25 @@ POSES, READINGS = 2000, 2000  # of all drives, and of each sensor, at most
 PAUSE_S = 1.0  # between two drives on the view's time line
 
 
-def calibration_scene(
-    result: CalibrationResult,
-    evidence: DriveEvidence,
-    drives: Sequence[Trajectory],
-    maps: MapForms,
-    name: str,
-) -> Scene:
+@one_blas_thread()
+def scene_of(recording: Recording, calibrated: Calibrated) -> Scene:
     """Return what there is to see of the sensors that were solved.
 
     Parameters
     ----------
-    result
-        The calibration.
-    evidence
-        Its readings.
-    drives
-        Poses of the lidar in the map, drive by drive.
-    maps
-        The map.
-    name
-        Of the recording.
+    recording
+        That was calibrated.
+    calibrated
+        The calibration, with what it rests on.
     """
-    solved = [each for each in result.sensors if each.residuals is not None]
+    evidence, maps = evidence_of(calibrated), maps_of(calibrated)
+    solved = [each for each in calibrated.result.sensors if each.residuals is not None]
     sensors = tuple(_sensor(each, evidence, maps.along_drive) for each in solved)
     places = np.concatenate([each.place for each in sensors])
-    return Scene(name, map_view(maps.anywhere, places), drive_views(drives), sensors)
+    drives = [each.trajectory for each in recording.parts]
+    return Scene(
+        recording.source.sha256, map_view(maps.anywhere, places), drive_views(drives), sensors
+    )
 
 
 def map_view(field_map: Queryable, places: FloatArray) -> MapView:

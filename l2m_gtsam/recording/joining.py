@@ -124,8 +124,8 @@ def _check(recordings: Sequence[Recording]) -> None:
     for one, other in combinations(recordings, 2):
         if _same(one, other):
             raise CalibrationError(
-                f"{one.source.path} and {other.source.path} are the same drive, which cannot be "
-                "its own witness; give each drive once"
+                f"{one.source.path} and {other.source.path} are the same drive, listed twice; "
+                "list each drive once"
             )
     first = recordings[0]
     for each in recordings:

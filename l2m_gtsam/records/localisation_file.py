@@ -146,9 +146,9 @@ class TruthRecord(Record):
     by_scans
         Errors of odometry and scans without magnetometers; absent without scans.
     nees
-        Mean of the squared errors of localised poses in units of their covariances; 6 is honest.
+        Mean of the squared errors of localised poses in units of their covariances; expected 6.
     beyond_95
-        Share of those beyond the 95 % quantile of chi-square of six; 0.05 is honest.
+        Share of those beyond the 95 % quantile of chi-square of six; expected 0.05.
     path
         True places at all K key poses, (K, 3); NaN where there is none.
     odometry_m, localised_m, squared
@@ -174,7 +174,7 @@ class TruthRecord(Record):
 
     @property
     def nees_ratio(self) -> float:
-        """NEES per degree of freedom; 1 is honest."""
+        """NEES per degree of freedom; 1 is consistent."""
         return self.nees / POSE_FREEDOM
 
 

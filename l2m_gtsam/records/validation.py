@@ -6,11 +6,15 @@ does not exist is NaN. Rows of axes are in the order x, y, z.
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
+
+from pydantic import AliasChoices, Field
 
 from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Record, Row, Series
+from l2m_gtsam.records.verdict import Threshold, Verdict
 
 
-class Part(StrEnum):
+class CalibrationPart(StrEnum):
     """A part of a calibration that may change by itself."""
 
     PLACE = "place"
@@ -22,12 +26,12 @@ class Part(StrEnum):
 
 
 UNITS = {
-    Part.PLACE: "m",
-    Part.ROTATION: "deg",
-    Part.GAINS: "1",
-    Part.ANGLES: "deg",
-    Part.OFFSET: "uT",
-    Part.CLOCK: "s",
+    CalibrationPart.PLACE: "m",
+    CalibrationPart.ROTATION: "deg",
+    CalibrationPart.GAINS: "1",
+    CalibrationPart.ANGLES: "deg",
+    CalibrationPart.OFFSET: "uT",
+    CalibrationPart.CLOCK: "s",
 }
 
 
@@ -102,7 +106,7 @@ class Change(Record):
         How often chance alone makes as much of it.
     """
 
-    part: Part
+    part: CalibrationPart
     change: Row
     sigma: Row
     size: float
@@ -110,13 +114,13 @@ class Change(Record):
 
 
 @dataclass(frozen=True)
-class Noticeable(Record):
+class MinimumDetectableChange(Record):
     """The smallest change of a part, all others as calibrated, that a drive surely shows.
 
-    Infinite where it shows none.
+    Five standard deviations, in the units of ``Change``; infinite where it shows none.
     """
 
-    part: Part
+    part: CalibrationPart
     size: float
 
 
@@ -129,7 +133,7 @@ class ValidatedSensor(Record):
     sensor
         Name.
     ending
-        What the calibration says against itself; empty where it was simply solved.
+        How the solve of the calibration ended; empty where it simply succeeded.
     readings, rejected, outside
         That count; that no calibration explains beside the others; without map.
     before, after
@@ -142,11 +146,11 @@ class ValidatedSensor(Record):
     nis
         Normalised innovation squared of all readings together.
     parameters
-        The same of the calibration's own parameters: what this drive says of them beside what the
-        calibration does.
+        The same of the calibration's own parameters: the estimate of this drive beside that of the
+        calibration.
     changes
         Parts that are no longer right, the plainest first.
-    noticeable
+    detectable
         What the drive would have shown.
     series
         The course of the drive, thinned.
@@ -165,7 +169,13 @@ class ValidatedSensor(Record):
     nis: ChiSquare
     parameters: ChiSquare
     changes: tuple[Change, ...]
-    noticeable: tuple[Noticeable, ...]
+    detectable: Annotated[
+        tuple[MinimumDetectableChange, ...],
+        Field(
+            validation_alias=AliasChoices("noticeable", "detectable"),
+            serialization_alias="noticeable",  # as `validation.json` has always called them
+        ),
+    ]
     series: Series
 
     @property
@@ -176,7 +186,7 @@ class ValidatedSensor(Record):
 
 @dataclass(frozen=True)
 class NotValidated(Record):
-    """A sensor that nothing can be said of.
+    """A sensor that was not tested.
 
     Attributes
     ----------
@@ -284,46 +294,6 @@ class CalibrationComparison(Record):
 
 
 @dataclass(frozen=True)
-class Remark(Record):
-    """A sentence and what it makes of the verdict: "pass", "warn" or "fail"."""
-
-    level: str
-    text: str
-
-
-@dataclass(frozen=True)
-class SensorRemarks(Record):
-    """The verdict on one sensor with its reasons, from the gravest."""
-
-    sensor: str
-    level: str
-    remarks: tuple[Remark, ...]
-
-
-@dataclass(frozen=True)
-class ValidationVerdict(Record):
-    """The verdict on the whole, what concerns all sensors, and a verdict on each."""
-
-    level: str
-    remarks: tuple[Remark, ...]
-    sensors: tuple[SensorRemarks, ...]
-
-    def count(self, level: str) -> int:
-        """Return the number of sensors with this verdict."""
-        return sum(each.level == level for each in self.sensors)
-
-
-@dataclass(frozen=True)
-class Threshold(Record):
-    """Where the verdict changed: name of the option, warning, failure, and what it is of."""
-
-    name: str
-    warn: float
-    fail: float
-    text: str
-
-
-@dataclass(frozen=True)
 class NamedSource(Record):
     """A file that took part: what it was, its path and the SHA-256 of its content."""
 
@@ -352,7 +322,7 @@ class Validation(Record):
         Of the packages that computed it.
     """
 
-    verdict: ValidationVerdict
+    verdict: Verdict
     drive: DriveValidation | None
     comparison: CalibrationComparison | None
     thresholds: tuple[Threshold, ...]

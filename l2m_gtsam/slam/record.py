@@ -15,11 +15,10 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Sourc
 from l2m_gtsam.geometry import moved, to_ros
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
-from l2m_gtsam.qa.metrics.curves import curves, series
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
-from l2m_gtsam.qa.metrics.fit import fit_figures, normalised_figures
+from l2m_gtsam.qa.metrics.fit import curves, fit_figures, normalised_figures, series
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.qa.slam.errors import Ways, truth_record
+from l2m_gtsam.qa.metrics.pose_errors import ComparedTrajectories, truth_record
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult, SensorUse, StartSearch
 from l2m_gtsam.records.localisation_file import (
@@ -90,7 +89,7 @@ def localisation_record(
     """
     truth = None
     if told.truth is not None:
-        ways = Ways(result.trajectory, result.odometry, result.by_scans)
+        ways = ComparedTrajectories(result.trajectory, result.odometry, result.by_scans)
         truth = truth_record(told.truth, ways, told.max_pose_gap_s)
     now = result.calibration or told.calibration
     return LocalisationRecord(

@@ -99,7 +99,9 @@ def read_metrics(path: Path) -> Metrics:
 
 def write_validation(path: Path, validation: Validation) -> None:
     """Write ``validation.json``; `read_validation` gives it back equal."""
-    _write(path, _VALIDATION.dump_json(_ValidationFile("l2m-validation", 1, validation)))
+    _write(
+        path, _VALIDATION.dump_json(_ValidationFile("l2m-validation", 1, validation), by_alias=True)
+    )
 
 
 def read_validation(path: Path) -> Validation:

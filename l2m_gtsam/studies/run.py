@@ -13,7 +13,7 @@ from pydantic import TypeAdapter
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.qa.figures import save_figure
+from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.studies.cell_files import CellFolder, Made
 from l2m_gtsam.studies.provenance import Provenance, code_version, machine_class

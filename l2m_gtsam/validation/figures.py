@@ -8,29 +8,38 @@ from scipy.stats import chi2, f
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.qa.metrics.changes import change_of
-from l2m_gtsam.qa.metrics.curves import curves, series
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
-from l2m_gtsam.qa.metrics.field_error import field_error, refitted
-from l2m_gtsam.qa.metrics.fit import fit_figures
+from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, refitted, series
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
-from l2m_gtsam.records.validation import Change, ChiSquare, Noticeable, ValidatedSensor
-from l2m_gtsam.validation.alterations import COLUMNS, PARAMETERS, columns_of, noticeable, width
+from l2m_gtsam.records.validation import (
+    Change,
+    ChiSquare,
+    MinimumDetectableChange,
+    ValidatedSensor,
+)
+from l2m_gtsam.validation.innovation import (
+    COLUMNS,
+    PARAMETERS,
+    columns_of,
+    detectable_change,
+    width,
+)
 from l2m_gtsam.validation.recheck import Recheck, SensorDrive
 
 BAND = np.array([0.025, 0.975])
-NOTICED_SIGMAS = 5.0  # a change of so many is missed once in a hundred times, or less often
+DETECTED_SIGMAS = 5.0  # a change of so many is missed once in a hundred times, or less often
 
 
 @dataclass(frozen=True)
-class Course:
-    """How a drive is kept: since when, shape (1,), and in how many readings at most."""
+class Thinning:
+    """What is kept of a drive: since when, shape (1,), and how many readings at most."""
 
     start_ns: IntArray
     most: int
 
 
 def offset_s(sensor: SensorCalibration) -> float:
-    """Return the time offset of a sensor in seconds; zero if its file does not speak of it."""
+    """Return the time offset of a sensor in seconds; zero if its file has none."""
     return 0.0 if sensor.time_offset is None else sensor.time_offset.seconds
 
 
@@ -39,7 +48,7 @@ def sensor_figures(
     field_map: QueryableMap,
     sensor: SensorCalibration,
     found: Recheck,
-    course: Course,
+    thinning: Thinning,
 ) -> ValidatedSensor:
     """Return the figures of one sensor.
 
@@ -52,8 +61,8 @@ def sensor_figures(
     sensor
         Its calibration.
     found
-        What the drive says of that.
-    course
+        The test of that on the drive.
+    thinning
         How much of the drive is kept.
     """
     readings = drive.at(offset_s(sensor))
@@ -64,7 +73,7 @@ def sensor_figures(
     )
     used, fields = evidence.used, curves(evidence, sensor)
     fit = fit_figures(evidence, sensor.noise)
-    told, freedom = found.told, found.freedom
+    likelihood, freedom = found.likelihood, found.freedom
     return ValidatedSensor(
         sensor=sensor.sensor,
         ending="" if sensor.status is SensorStatus.SOLVED else sensor.message,
@@ -76,13 +85,14 @@ def sensor_figures(
         expected=float(np.sqrt(fit.sensor_noise**2 + fit.map_noise**2 + fit.pose_noise**2)),
         refitted=refitted(evidence.b_lidar[used], evidence.readings.field[used]),
         uniform=fit.without_map,
-        nis=_of_readings(told.squared, freedom[0], sensor),
-        parameters=_chi_square(told.explained(range(PARAMETERS)), freedom[1]),
+        nis=_of_readings(likelihood.squared, freedom[0], sensor),
+        parameters=_chi_square(likelihood.explained(range(PARAMETERS)), freedom[1]),
         changes=_changes(found),
-        noticeable=tuple(
-            Noticeable(part, noticeable(told, part, NOTICED_SIGMAS)) for part in COLUMNS
+        detectable=tuple(
+            MinimumDetectableChange(part, detectable_change(likelihood, part, DETECTED_SIGMAS))
+            for part in COLUMNS
         ),
-        series=series(fields, evidence, course.start_ns, course.most),
+        series=series(fields, evidence, thinning.start_ns, thinning.most),
     )
 
 
@@ -108,7 +118,7 @@ def _changes(found: Recheck) -> tuple[Change, ...]:
     changes = []
     for part in found.parts:
         others = [each for each in found.parts if each is not part]
-        gain = found.told.explained(columns_of(found.parts)) - found.told.explained(
+        gain = found.likelihood.explained(columns_of(found.parts)) - found.likelihood.explained(
             columns_of(others)
         )
         first = len(columns_of(found.parts[: found.parts.index(part)]))

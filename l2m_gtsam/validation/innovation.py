@@ -1,10 +1,20 @@
-"""Readings of one sensor beside what a map and a known calibration predict, made white together.
+r"""Changes of a calibration, tested on readings that it did not see: a likelihood ratio.
 
-Errors of the map, shared by readings near each other, errors of the poses, shared by readings
-near each other in time, and fields of recorded numbers are weights with a prior, as in the solve;
-QR takes them out. What remains of the readings is white.
+With the innovation e = z - (C b + H), white under the noise of sensor, map and poses, and J its
+derivatives by the sixteen parameters,
+
+.. math::
+    e = J (\varepsilon + \delta) + n, \quad \varepsilon \sim N(0, P), \quad n \sim N(0, I)
+
+P is the covariance that the calibration states, delta what has changed since. Errors of the map,
+shared by readings near each other, errors of the poses, shared by readings near each other in
+time, and fields of recorded numbers are weights with a prior, as in the solve; QR takes them out,
+and epsilon, too. The squared length of what remains is the normalised innovation squared. Parts of
+delta are tested by how much of that they explain (chi-square of as many degrees of freedom as the
+part has) and named one after the other.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +26,78 @@ from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.view import QueryableMap, observe
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.validation.alterations import PARAMETERS, Told, reduced
+from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.solve.chi_square import chance_beyond
 
 ROWS = 4000  # that are reduced at once
+PARAMETERS = 16  # t, C row by row, H, time offset
+COLUMNS = {
+    CalibrationPart.PLACE: slice(0, 3),
+    CalibrationPart.ROTATION: slice(3, 6),
+    CalibrationPart.GAINS: slice(6, 9),
+    CalibrationPart.ANGLES: slice(9, 12),
+    CalibrationPart.OFFSET: slice(12, 15),
+    CalibrationPart.CLOCK: slice(15, 16),
+}
+PAIRS = ((0, 1), (1, 2), (2, 0))
+UNOBSERVABLE = 1e-9  # of the best observed direction of a part: zero but for rounding
+OPEN_SIGMAS = 30.0  # of the largest useful ones: a parameter that a calibration leaves open
+
+
+@dataclass(frozen=True)
+class ChangeLikelihood:
+    """Minus twice the log-likelihood of a change x of parameters: ``|white - root x|^2 + rest``.
+
+    Attributes
+    ----------
+    root
+        Triangular, shape (P, P).
+    white
+        Shape (P,).
+    rest
+        What no parameters explain.
+    """
+
+    root: FloatArray
+    white: FloatArray
+    rest: float
+
+    @classmethod
+    def of(cls, rows: FloatArray) -> "ChangeLikelihood":
+        """Reduce white rows of parameters and, in the last column, of the innovation."""
+        square = reduced(rows)
+        return cls(square[:-1, :-1], square[:-1, -1], float(square[-1, -1] ** 2))
+
+    @property
+    def squared(self) -> float:
+        """Squared length of the innovation with all parameters zero."""
+        return float(self.white @ self.white) + self.rest
+
+    def explained(self, columns: Sequence[int]) -> float:
+        """Return how much less that is with these parameters free."""
+        if not columns:
+            return 0.0
+        Q, s, _ = np.linalg.svd(self.root[:, columns], full_matrices=False)
+        seen = Q[:, s > 1e-9 * max(float(s[0]), 1e-300)].T @ self.white
+        return float(seen @ seen)
+
+    def estimate(self, columns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return the values of parameters that explain most, and their covariance."""
+        own = self.root[:, columns]
+        inverse = np.linalg.pinv(own, rcond=1e-12)
+        return np.asarray(inverse @ self.white), np.asarray(inverse @ inverse.T)
+
+    def recentred(self, by: FloatArray) -> "ChangeLikelihood":
+        """Return the same of parameters that count from elsewhere: x + ``by``."""
+        return ChangeLikelihood(self.root, self.white + self.root @ by, self.rest)
+
+
+def reduced(rows: FloatArray) -> FloatArray:
+    """Return the square triangular matrix with the same inner products of columns."""
+    triangular = np.asarray(np.linalg.qr(rows, mode="r"))
+    square = np.zeros((rows.shape[1], rows.shape[1]))
+    square[: len(triangular)] = triangular
+    return square
 
 
 @dataclass(frozen=True)
@@ -52,14 +131,14 @@ class KnownCalibration:
 
 
 def knows_its_errors(field_map: QueryableMap) -> bool:
-    """Return whether a map tells how its errors are correlated."""
+    """Return whether a map states how its errors are correlated."""
     return isinstance(field_map, UncertainMap)
 
 
-def told_by(
+def change_likelihood(
     readings: Readings, field_map: QueryableMap, known: KnownCalibration, correlation_s: float
-) -> Told:
-    """Return what readings tell of a sensor's parameters about those that are known.
+) -> ChangeLikelihood:
+    """Return the likelihood of changes of a sensor's known parameters.
 
     Parameters
     ----------
@@ -75,7 +154,7 @@ def told_by(
 
     Returns
     -------
-    Told
+    ChangeLikelihood
         Of a change of (t, C row by row, H, time offset).
     """
     estimate = known.estimate()
@@ -89,7 +168,7 @@ def told_by(
     shared = sum(coverage.sizes.values())
     numbers = slice(shared, shared + by_number.shape[2])
     width = numbers.stop + PARAMETERS + 1
-    collected = _Collected(width, priors_of(coverage, width, numbers))
+    collected = _SequentialQR(width, prior_rows(coverage, width, numbers))
     for group, own, W in zip(coverage.groups, noise.errors, noise.whitenings, strict=True):
         rows = np.zeros((3 * len(group.rows), width))
         for each in own:
@@ -98,10 +177,10 @@ def told_by(
         rows[:, numbers.stop : -1] = whitened(W, J[group.rows])
         rows[:, -1:] = whitened(W, e[group.rows, :, None])
         collected.add(rows)
-    return Told.of(collected.root()[numbers.stop :, numbers.stop :])
+    return ChangeLikelihood.of(collected.root()[numbers.stop :, numbers.stop :])
 
 
-class _Collected:
+class _SequentialQR:
     """Rows of a least-squares problem, reduced as they come: memory stays bounded."""
 
     def __init__(self, width: int, first: FloatArray) -> None:
@@ -118,7 +197,7 @@ class _Collected:
         return reduced(np.concatenate(self._parts))
 
 
-def priors_of(coverage: Coverage, width: int, numbers: slice) -> FloatArray:
+def prior_rows(coverage: Coverage, width: int, numbers: slice) -> FloatArray:
     """Return white rows of what is known of the weights, shape (K, width)."""
     at = coverage.columns
     tiles = np.concatenate([np.arange(at[M(t)].start, at[M(t)].stop) for t in coverage.tiles])
@@ -126,7 +205,8 @@ def priors_of(coverage: Coverage, width: int, numbers: slice) -> FloatArray:
     rows[: len(tiles), tiles] = coverage.root_information
     rows[numbers, numbers] = np.eye(numbers.stop - numbers.start)
     if coverage.knots is not None:
-        # each knot is like the one before it in part
+        # Errors of poses are a first-order Gauss-Markov process from knot to knot:
+        # x_k = like x_(k-1) + sqrt(1 - like^2) w_k with white w_k.
         first = at[P(0)]
         size = first.stop - first.start
         rows[first, first] = np.eye(size)
@@ -152,3 +232,116 @@ def _number_errors(readings: Readings, sigma: FloatArray) -> FloatArray:
         return np.zeros((len(readings), 3, 0))
     features = np.einsum("nk,ki,ij->nikj", readings.regressors, sigma, np.eye(3))
     return np.asarray(features.reshape(len(readings), 3, -1))
+
+
+def marginalise_calibration(
+    likelihood: ChangeLikelihood, covariance: FloatArray, basis: FloatArray
+) -> ChangeLikelihood:
+    """Return the likelihood of a change with the calibration's own errors marginalised.
+
+    Parameters
+    ----------
+    likelihood
+        Of t, C row by row, H and the time offset.
+    covariance
+        Of the calibration, shape (16, 16), finite.
+    basis
+        Change of these per unit of each of Q coordinates of a change, shape (16, Q).
+    """
+    # epsilon = root u with u ~ N(0, I): rows for u and the change, then the prior of u; what QR
+    # leaves below u is the marginal likelihood of the change (Bierman 1977, ch. 5).
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    count = len(root)
+    rows = np.zeros((2 * count, count + basis.shape[1] + 1))
+    rows[:count, :count] = likelihood.root @ root
+    rows[:count, count:-1] = likelihood.root @ basis
+    rows[:count, -1] = likelihood.white
+    rows[count:, :count] = np.eye(count)
+    left = reduced(rows)[count:, count:]
+    found = ChangeLikelihood.of(left)
+    return ChangeLikelihood(found.root, found.white, found.rest + likelihood.rest)
+
+
+def changes_of(C: FloatArray) -> FloatArray:
+    """Return what a change of each part does to (t, C row by row, H, time offset), (16, 16).
+
+    Columns are those of ``COLUMNS``: metres; degrees by which the sensor turns about its own axes,
+    R_lidar_mag to R_lidar_mag exp(d), so that field vectors turn the other way in it and C becomes
+    exp(-d) C; relative gains; degrees by which the angles x y, y z, z x between axes become
+    smaller; microtesla; seconds.
+    """
+    basis = np.zeros((PARAMETERS, PARAMETERS))
+    basis[:3, COLUMNS[CalibrationPart.PLACE]] = np.eye(3)
+    basis[12:15, COLUMNS[CalibrationPart.OFFSET]] = np.eye(3)
+    basis[15:, COLUMNS[CalibrationPart.CLOCK]] = 1.0
+    degree = np.deg2rad(1.0)
+    for k, (i, j) in enumerate(PAIRS):
+        turn, skew, gain = np.zeros((3, 3, 3))
+        # about the axis that completes the pair: -[d]x, what a sensor that turns by d reads
+        turn[j, i], turn[i, j] = -degree, degree
+        skew[i, j] = skew[j, i] = degree / 2
+        gain[k, k] = 1.0
+        axis = 3 - i - j
+        for part, column, A in (
+            (CalibrationPart.ROTATION, axis, turn),
+            (CalibrationPart.ANGLES, k, skew),
+            (CalibrationPart.GAINS, k, gain),
+        ):
+            basis[3:12, COLUMNS[part].start + column] = (A @ C).ravel()
+    return basis
+
+
+def parts_changed(
+    likelihood: ChangeLikelihood, freedom: int, chance: float
+) -> tuple[CalibrationPart, ...]:
+    """Return the parts that have changed, the plainest first.
+
+    At each step the part that explains most is added, each of its degrees of freedom costing the
+    logarithm of the number of readings' values (as in the BIC), as long as chance would do as
+    much less often than in ``chance`` of all drives.
+
+    Parameters
+    ----------
+    likelihood
+        Of the coordinates of ``COLUMNS``.
+    freedom
+        Number of values read.
+    chance
+        For all parts together.
+    """
+    named: list[CalibrationPart] = []
+    left = [part for part in COLUMNS if is_observable(likelihood, part)]
+    price = np.log(max(freedom, 3))  # of a degree of freedom (Schwarz 1978)
+    while left:
+        before = likelihood.explained(columns_of(named))
+        gains = [likelihood.explained(columns_of([*named, part])) - before for part in left]
+        sizes = [width(part) for part in left]
+        scores = [gain - size * price for gain, size in zip(gains, sizes, strict=True)]
+        best = int(np.argmax(scores))
+        if chance_beyond(gains[best], sizes[best]) >= chance / len(COLUMNS):
+            break
+        named.append(left.pop(best))
+    return tuple(named)
+
+
+def columns_of(parts: Sequence[CalibrationPart]) -> list[int]:
+    """Return the columns of parts, in their order."""
+    return [k for part in parts for k in range(COLUMNS[part].start, COLUMNS[part].stop)]
+
+
+def width(part: CalibrationPart) -> int:
+    """Return the number of coordinates of a part."""
+    return COLUMNS[part].stop - COLUMNS[part].start
+
+
+def is_observable(likelihood: ChangeLikelihood, part: CalibrationPart) -> bool:
+    """Return whether readings depend on a part at all."""
+    return bool(np.linalg.norm(likelihood.root[:, COLUMNS[part]], axis=0).all())
+
+
+def detectable_change(likelihood: ChangeLikelihood, part: CalibrationPart, sigmas: float) -> float:
+    """Return the largest standard deviation of a part by itself, so many times; maybe infinite."""
+    own = likelihood.root[:, COLUMNS[part]]
+    values = np.linalg.svd(own, compute_uv=False)
+    return float(sigmas / values[-1]) if values[-1] > UNOBSERVABLE * values[0] else float("inf")

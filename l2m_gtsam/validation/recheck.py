@@ -9,17 +9,18 @@ from l2m_gtsam.calibration.trust import plausible, residuals
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings, Trajectory
 from l2m_gtsam.recording.sync import with_offsets
-from l2m_gtsam.records.validation import Part
+from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.solve.robust import grown, median_noise
-from l2m_gtsam.validation.alterations import (
+from l2m_gtsam.validation.innovation import (
     OPEN_SIGMAS,
-    Told,
-    against_calibration,
+    ChangeLikelihood,
+    KnownCalibration,
+    change_likelihood,
     changes_of,
     columns_of,
+    marginalise_calibration,
     parts_changed,
 )
-from l2m_gtsam.validation.innovation import KnownCalibration, told_by
 
 ROUNDS = 8
 SETTLED_SIGMAS = 0.05
@@ -50,13 +51,12 @@ class SensorDrive:
 
 @dataclass(frozen=True)
 class Recheck:
-    """What a drive says of a calibration.
+    """A calibration, tested on a drive.
 
     Attributes
     ----------
-    told
-        Of a change in the coordinates of ``solve.alterations.COLUMNS``, the calibration's own
-        errors counted.
+    likelihood
+        Of a change in the coordinates of ``COLUMNS``, the calibration's own errors marginalised.
     freedom
         Degrees of freedom of the innovation, and of that of the parameters.
     parts
@@ -67,9 +67,9 @@ class Recheck:
         Which readings count: inside the map, and explained beside the others, shape (N,).
     """
 
-    told: Told
+    likelihood: ChangeLikelihood
     freedom: tuple[int, int]
-    parts: tuple[Part, ...]
+    parts: tuple[CalibrationPart, ...]
     change: FloatArray
     covariance: FloatArray
     used: BoolArray
@@ -103,27 +103,27 @@ def recheck(
     """
     spread, basis = finite(covariance, options), changes_of(known.vector[3:12].reshape(3, 3))
     followed = _followed(drive, field_map, known, spread, options, chance)
-    told, used = followed.told, followed.used
+    likelihood, used = followed.likelihood, followed.used
     if followed.parts:
         used = used & inside(drive, field_map, known)
         if used.sum() < options.min_readings:
             used = usable(drive, field_map, known, options)
-        told = _about(drive, field_map, known, known, used, options)
-        told = against_calibration(told, spread, basis)
+        likelihood = _about(drive, field_map, known, known, used, options)
+        likelihood = marginalise_calibration(likelihood, spread, basis)
     # What is open takes a degree of freedom, unless readings do not depend on it, as on a clock
     # where motion is not known. (All depend on C, where coordinates are not the parameters.)
-    matters = np.linalg.norm(told.root, axis=0) > 0
+    matters = np.linalg.norm(likelihood.root, axis=0) > 0
     open_ = int(np.sum(~np.isfinite(np.diag(covariance)) & matters))
     freedom = 3 * int(used.sum()) - open_, int(matters.sum()) - open_
-    return Recheck(told, freedom, followed.parts, followed.change, followed.covariance, used)
+    return Recheck(likelihood, freedom, followed.parts, followed.change, followed.covariance, used)
 
 
 @dataclass(frozen=True)
 class _Followed:
-    """Where a change was followed to: its parts and their coordinates, and what is told there."""
+    """Where a change was followed to: its parts, their coordinates and the likelihood there."""
 
-    told: Told
-    parts: tuple[Part, ...]
+    likelihood: ChangeLikelihood
+    parts: tuple[CalibrationPart, ...]
     change: FloatArray
     covariance: FloatArray
     used: BoolArray
@@ -140,13 +140,13 @@ def _followed(
     basis = changes_of(known.vector[3:12].reshape(3, 3))
     used = usable(drive, field_map, known, options)
     last, here = np.empty(0), known
-    parts: tuple[Part, ...] = ()
+    parts: tuple[CalibrationPart, ...] = ()
     for _ in range(ROUNDS):
-        told = _about(drive, field_map, here, known, used, options)
-        told = against_calibration(told, spread, basis)
-        before, parts = parts, parts_changed(told, 3 * int(used.sum()), chance)
+        likelihood = _about(drive, field_map, here, known, used, options)
+        likelihood = marginalise_calibration(likelihood, spread, basis)
+        before, parts = parts, parts_changed(likelihood, 3 * int(used.sum()), chance)
         columns = columns_of(parts)
-        found = _Followed(told, parts, *told.estimate(columns), used)
+        found = _Followed(likelihood, parts, *likelihood.estimate(columns), used)
         if parts == before and _settled(found.change - last, found.covariance):
             break
         last = found.change
@@ -170,11 +170,11 @@ def _about(
     known: KnownCalibration,
     used: BoolArray,
     options: OneKeyOptions,
-) -> Told:
-    """Return what readings tell about the calibration, linearised elsewhere."""
+) -> ChangeLikelihood:
+    """Return the likelihood of a change of the calibration, linearised elsewhere."""
     readings = drive.at(float(here.vector[15])).select(used)
-    told = told_by(readings, field_map, here, options.pose_noise.correlation_s)
-    return told.moved(here.vector - known.vector)
+    likelihood = change_likelihood(readings, field_map, here, options.pose_noise.correlation_s)
+    return likelihood.recentred(here.vector - known.vector)
 
 
 def inside(drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration) -> BoolArray:

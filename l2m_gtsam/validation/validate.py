@@ -8,20 +8,37 @@ import numpy as np
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
+from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, same_content
 from l2m_gtsam.errors import CalibrationError, ConfigError
+from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
+from l2m_gtsam.qa.metrics.changes import is_calibrated
 from l2m_gtsam.qa.metrics.coverage import drive_metrics
 from l2m_gtsam.recording.sync import stuck_sensors
-from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
 from l2m_gtsam.records.validation import DriveValidation, NotValidated, ValidatedSensor
 from l2m_gtsam.solve.correction import without_moving
-from l2m_gtsam.validation.figures import Course, offset_s, sensor_figures
-from l2m_gtsam.validation.innovation import KnownCalibration
+from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
+from l2m_gtsam.validation.innovation import KnownCalibration, knows_its_errors
 from l2m_gtsam.validation.recheck import SensorDrive, recheck
-from l2m_gtsam.validation.remarks import is_sound, missing_sensors, nothing_shared, remarks
+
+SAME_BAG = (
+    "This is the drive that the calibration was computed from: it agrees with itself. Take another."
+)
+SAME_MAP = (
+    "This is the map that it was calibrated with: errors of the map that the calibration took over "
+    "do not show. A map of another survey would show them."
+)
+NOT_CORRELATED = (
+    "This kind of map does not know how its errors are correlated; they count as each reading's "
+    "own, and chance may be reported as a change."
+)
+LOWER_BOUNDS = (
+    "The calibration's sigmas are lower bounds (`uncertainty: independent`): small changes may be "
+    "named that are none."
+)
 
 
 @one_blas_thread()
@@ -47,7 +64,7 @@ def validate(
     options
         Synchronisation, the loss, and how wrong poses are.
     chance
-        Share of unchanged sensors of which it may be said that something changed.
+        Share of unchanged sensors in which a change may be found.
     map_source
         Where the map came from.
     progress
@@ -75,7 +92,7 @@ def validate(
         found.append(_tested(test, sensor))
     tell("validating", 1.0)
     places = np.concatenate([_places(test.readings, each) for each in known])
-    doubts, notes = remarks(recording, field_map, calibration, map_source)
+    doubts, notes = doubts_and_notes(recording, field_map, calibration, map_source)
     return DriveValidation(
         sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
         missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
@@ -100,7 +117,7 @@ class _Test:
         Names of sensors that report one value.
     options, chance
         As of `validate`.
-    course
+    thinning
         How much of the drive is kept.
     """
 
@@ -110,7 +127,7 @@ class _Test:
     stuck: frozenset[str]
     options: CalibrationOptions
     chance: float
-    course: Course
+    thinning: Thinning
 
 
 def _test_of(
@@ -131,20 +148,20 @@ def _test_of(
         stuck=frozenset(readings.sensors[k] for k in stuck_sensors(readings)),
         options=options,
         chance=chance,
-        course=Course(
+        thinning=Thinning(
             readings.stamp_ns.min(keepdims=True), int(np.clip(DRAWN // len(known), FEWEST, MOST))
         ),
     )
 
 
 def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:
-    """Return what the drive says of one sensor, or why it says nothing."""
+    """Return one sensor tested on the drive, or why it cannot be."""
     drive, options = drive_of(test.readings, test.recording, sensor), test.options
-    if reason := _why_silent(drive, test.field_map, sensor, options, sensor.sensor in test.stuck):
+    if reason := _why_untested(drive, test.field_map, sensor, options, sensor.sensor in test.stuck):
         return NotValidated(sensor.sensor, reason, faulty=True)
     known, covariance = _known(test.recording, sensor), joint_covariance(sensor)
     found = recheck(drive, test.field_map, known, covariance, options.solve, test.chance)
-    return sensor_figures(drive, test.field_map, sensor, found, test.course)
+    return sensor_figures(drive, test.field_map, sensor, found, test.thinning)
 
 
 def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration) -> SensorDrive:
@@ -173,7 +190,7 @@ def drive_of(readings: Readings, recording: Recording, sensor: SensorCalibration
 def joint_covariance(sensor: SensorCalibration) -> FloatArray:
     """Return the covariance of (t, C row by row, H, time offset), shape (16, 16).
 
-    The variance of a time offset that was held, or that the file does not speak of, is infinite:
+    The variance of a time offset that was held, or that the file does not have, is infinite:
     nothing is known of that clock.
     """
     joint = np.zeros((16, 16))
@@ -205,14 +222,14 @@ def _places(readings: Readings, sensor: SensorCalibration) -> FloatArray:
     return np.asarray(readings.R_map_lidar[own] @ sensor.t_lidar_mag + readings.p_map_lidar[own])
 
 
-def _why_silent(
+def _why_untested(
     drive: SensorDrive,
     field_map: QueryableMap,
     sensor: SensorCalibration,
     options: CalibrationOptions,
     stuck: bool,
 ) -> str:
-    """Return why nothing can be said of a sensor; nothing if something can."""
+    """Return why a sensor cannot be tested; empty if it can."""
     readings, needed = drive.at(offset_s(sensor)), options.solve.min_readings
     if stuck:
         return "It reports one constant value: it is stuck."
@@ -227,3 +244,65 @@ def _why_silent(
             "frame?"
         )
     return ""
+
+
+def is_sound(sensor: SensorCalibration) -> bool:
+    """Return whether readings can be predicted and corrected with a calibration of a sensor."""
+    C = sensor.distortion.C
+    return bool(
+        is_calibrated(sensor) and sensor.noise > 0 and np.linalg.cond(C) < 1e6
+    )  # gains a million apart are no magnetometer's
+
+
+def missing_sensors(recording: Recording, calibration: CalibrationResult) -> list[NotValidated]:
+    """Return sensors of the drive or the calibration that cannot be compared."""
+    here, missing = [each.sensor for each in recording.series], []
+    known = {each.sensor: each for each in calibration.sensors}
+    for name in here:
+        if name not in known:
+            reason = "It is on the drive, but not in the calibration: nothing is known of it."
+            missing.append(NotValidated(name, reason, faulty=False))
+        elif not is_sound(known[name]):
+            reason = f"The calibration does not know it: {known[name].message}."
+            missing.append(NotValidated(name, reason, faulty=True))
+    missing += [
+        NotValidated(name, "It is in the calibration, but not on the drive.", faulty=False)
+        for name in known
+        if name not in here
+    ]
+    return missing
+
+
+def nothing_shared(
+    recording: Recording, calibration: CalibrationResult, missing: Sequence[NotValidated]
+) -> str:
+    """Return why no sensor can be compared, with what to do about it."""
+    faulty = [each for each in missing if each.faulty]
+    if faulty:
+        return f"nothing to validate: {faulty[0].sensor}: {faulty[0].reason}"
+    there = ", ".join(each.sensor for each in calibration.sensors) or "none"
+    here = ", ".join(each.sensor for each in recording.series) or "none"
+    return (
+        f"{recording.source.path}: none of its sensors ({here}) is in the calibration ({there}); "
+        "names come from topics or from `bag.fields` in --config"
+    )
+
+
+def doubts_and_notes(
+    recording: Recording,
+    field_map: QueryableMap,
+    calibration: CalibrationResult,
+    map_source: SourceFile | None,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what speaks against the outcome, and what is worth knowing."""
+    of_map = field_map.summary.doubts if isinstance(field_map, Summarised) else ()
+    doubts, notes = [f"Of the map: {each}." for each in of_map], list[str]()
+    if any(same_content(drive, recording.source) for drive in calibration.drives):
+        doubts.append(SAME_BAG)
+    elif same_content(calibration.map, map_source):
+        notes.append(SAME_MAP)
+    if not knows_its_errors(field_map):
+        notes.append(NOT_CORRELATED)
+    if calibration.uncertainty is Uncertainty.INDEPENDENT:
+        notes.append(LOWER_BOUNDS)
+    return tuple(doubts), tuple(notes)

@@ -10,7 +10,7 @@ from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import SourceFile
-from l2m_gtsam.qa.evaluate import appraise
+from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.record_files import write_metrics
@@ -28,7 +28,7 @@ def hostile_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     start = {HOSTILE[name]: place for name, place in NOMINAL.items()}
     options = drive.options.model_copy(update={"start": start})
     found = calibrated(recording, drive.field_map, options)
-    metrics = appraise(recording, found, options, QaOptions())
+    metrics = evaluate(recording, found, options, QaOptions())
     whole = Config(calibration=options).model_dump(mode="json")
     write_calibration(folder / CALIBRATION_FILE, replace(found.result, options=whole))
     write_metrics(folder / METRICS_FILE, metrics)

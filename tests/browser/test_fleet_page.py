@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from l2m_gtsam.qa.fleet.options import FleetOptions
-from l2m_gtsam.qa.fleet.outliers import with_outliers
-from l2m_gtsam.qa.fleet.page import fleet_page
+from l2m_gtsam.qa.fleet import with_outliers
+from l2m_gtsam.qa.options import FleetOptions
+from l2m_gtsam.qa.report.fleet_page import fleet_page
 from l2m_gtsam.records.fleet import FleetRow
 from tests.drives.fleet_rows import row, sensor_row
 from tests.support.browsing import (

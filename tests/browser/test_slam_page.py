@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.report.slam_page import slam_page
+from l2m_gtsam.qa.report.localisation_page import localisation_page
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.validation import NamedSource
 from tests.drives.localised import record
@@ -46,7 +46,7 @@ def hostile() -> LocalisationRecord:
 def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
     folder: Path = tmp_path_factory.mktemp("localisation")
     page = folder / "report.html"
-    page.write_text(slam_page(hostile(), QaOptions()), encoding="utf-8")
+    page.write_text(localisation_page(hostile(), QaOptions()), encoding="utf-8")
     return look(browser, page, folder)
 
 

@@ -9,7 +9,7 @@ import pytest
 from l2m_gtsam.qa.metrics.changes import compare_calibrations
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.validation_page import validation_page
-from l2m_gtsam.qa.validation.judge import judge_validation, thresholds
+from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.validation import NamedSource, Validation
 from l2m_gtsam.validation.validate import validate
@@ -47,7 +47,7 @@ def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
         judge_validation(drive, comparison, options),
         drive,
         comparison,
-        thresholds(options),
+        validation_thresholds(options),
         (NamedSource("drive", BAG, "ab12"),),
         {"l2m-gtsam": "0"},
     )

@@ -14,7 +14,7 @@ def test_bags_that_are_missing_or_given_twice(tmp_path: Path) -> None:
     assert "no bag is given: name one or several" in complaint_here("calibrate", *rest)
     for again in ("a.bag", "link.bag", "../" + tmp_path.name + "/a.bag"):
         twice = (tmp_path / "a.bag", "--bag", tmp_path / again)
-        assert "is given twice" in complaint_here("calibrate", *twice, *rest)
+        assert "is listed twice" in complaint_here("calibrate", *twice, *rest)
     assert not (tmp_path / "out").exists()
 
 

@@ -12,7 +12,7 @@ from evo.tools import file_interface
 
 from l2m_gtsam.batch.reports import report_folder
 from l2m_gtsam.data import Distortion
-from l2m_gtsam.qa.reasons.reason import Level
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration

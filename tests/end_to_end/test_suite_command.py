@@ -37,7 +37,7 @@ def test_what_cannot_be_done_is_said_in_one_line(shared_data: Path, tmp_path: Pa
     assert "the name must end in .yaml" in complaint_here(
         "map", "suite", bag, "--out", tmp_path / "suite.npz"
     )
-    assert "is given twice" in complaint_here("map", "suite", bag, bag, "--out", out)
+    assert "is listed twice" in complaint_here("map", "suite", bag, bag, "--out", out)
     missing = complaint_here("map", "suite", tmp_path / "no.bag", "--out", out)
     assert "no.bag" in missing
     assert not out.exists()

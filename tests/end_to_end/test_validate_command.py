@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.batch.validation import ValidationRequest, validate_calibration
-from l2m_gtsam.cli.tables.validation import validation_lines
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
@@ -85,7 +85,7 @@ def test_a_magnet_on_the_vehicle_is_named(
     bag = written(tmp_path, "mcap", "moved", seed=7, offset=H + np.array([3.0, 0, 0]))
     asked = ValidationRequest(calibration, bag, field_map, out=tmp_path / "out")
     found = validate_calibration(asked, silent)
-    told = "\n".join(validation_lines(found.verdict))
+    told = "\n".join(found.verdict.lines(Level.PASS))
     assert "verdict: FAIL" in told
     assert "On this drive its offset H is not as calibrated, by 3 µT" in told
     assert read_validation(tmp_path / "out" / "validation.json").verdict == found.verdict
@@ -97,7 +97,7 @@ def test_a_change_since_an_older_calibration(calibration: Path, tmp_path: Path) 
     shifted = (sensor.t_lidar_mag + np.array([0.3, 0.0, 0.0])).tolist()
     old = changed_file(calibration, tmp_path / "old.yaml", t_lidar_mag=shifted)
     found = validate_calibration(ValidationRequest(calibration, compare=old), silent)
-    told = "\n".join(validation_lines(found.verdict))
+    told = "\n".join(found.verdict.lines(Level.PASS))
     assert "Since the old calibration its place t has changed by 300 mm" in told
     assert "verdict: FAIL" in told
 

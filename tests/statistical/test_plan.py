@@ -16,8 +16,7 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
-from l2m_gtsam.planning.motion import MotionOptions
-from l2m_gtsam.planning.options import PlanOptions
+from l2m_gtsam.planning.motion import MotionOptions, PlanOptions
 from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.records.calibration import SensorStatus
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors

@@ -10,13 +10,13 @@ from l2m_gtsam.records.validation import (
     DriveValidation,
     FieldError,
     ValidatedSensor,
-    ValidationVerdict,
 )
+from l2m_gtsam.records.verdict import Verdict
 
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
 
 
-def validation_table(drive: DriveValidation, verdict: ValidationVerdict) -> Table:
+def validation_table(drive: DriveValidation, verdict: Verdict) -> Table:
     """Return one row per sensor: field errors before and after, NIS, and the verdict."""
     table = Table(
         title="Readings beside pose, map and calibration",
@@ -105,13 +105,3 @@ def _test(sensor: ComparedSensor, name: str) -> str:
     test = sensor.test(name)
     mark = " !" if test.chance < 1e-3 else ""
     return f"{test.chi_square:.1f} / {test.freedom}{mark}" if test.freedom else "-"
-
-
-def validation_lines(verdict: ValidationVerdict) -> list[str]:
-    """Return the verdict on the whole with its reasons, then on every sensor with reasons."""
-    lines = [f"verdict: {verdict.level.upper()}"]
-    lines += [f"  {each.level.upper()}: {each.text}" for each in verdict.remarks]
-    for sensor in verdict.sensors:
-        told = " ".join(each.text for each in sensor.remarks)
-        lines.append(f"  {sensor.level.upper()} {sensor.sensor}{': ' if told else ''}{told}")
-    return lines

@@ -6,19 +6,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Recording
-from l2m_gtsam.qa.metrics.autocorrelation import autocorrelation
 from l2m_gtsam.qa.metrics.coverage import directions, drive_metrics
-from l2m_gtsam.qa.metrics.curves import curve_errors, curves, series
 from l2m_gtsam.qa.metrics.evidence import (
     DriveEvidence,
     Queryable,
     SensorEvidence,
     sensor_evidence,
 )
-from l2m_gtsam.qa.metrics.fit import fit_figures, normalised_figures
-from l2m_gtsam.qa.metrics.halves import NOT_DONE, SEVERAL, no_halves
+from l2m_gtsam.qa.metrics.fit import (
+    autocorrelation,
+    curve_errors,
+    curves,
+    fit_figures,
+    normalised_figures,
+    series,
+)
 from l2m_gtsam.qa.metrics.mounting import mounting
 from l2m_gtsam.qa.metrics.plain import row, rows
+from l2m_gtsam.qa.metrics.repeatability import NOT_DONE, SEVERAL, no_halves
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Halves, MapPicture, Metrics, Repeatability, SensorMetrics
 
@@ -70,16 +75,7 @@ def metrics_of(
     most = int(np.clip(DRAWN // max(len(solved), 1), FEWEST, MOST))
     start_ns = starts_of(evidence)
     seen = {each.sensor: sensor_evidence(evidence, each, maps.along_drive) for each in solved}
-    sensors = tuple(
-        _sensor(
-            each,
-            seen[each.sensor],
-            repeats,
-            start_ns,
-            most,
-        )
-        for each in solved
-    )
+    sensors = tuple(_sensor(each, seen[each.sensor], repeats, start_ns, most) for each in solved)
     places = np.concatenate([each.place for each in seen.values()])
     picture = map_picture(maps.anywhere, places)
     bags = tuple(each.source.path for each in recording.drives) or None
@@ -117,21 +113,57 @@ def _sensor(
     )
 
 
+@dataclass(frozen=True)
+class MapSlice:
+    """A map at one height.
+
+    Attributes
+    ----------
+    extent
+        Left, right, bottom, top in metres.
+    strength
+        Of the field in uT, NaN where the map has no data, shape (rows, columns).
+    sigma
+        Standard deviation of the field per axis in uT, NaN where the map has no data.
+    """
+
+    extent: tuple[float, float, float, float]
+    strength: FloatArray
+    sigma: FloatArray
+
+
+def slice_map(
+    field_map: Queryable, low: FloatArray, high: FloatArray, height: float, cells: int
+) -> MapSlice:
+    """Return a map on a horizontal grid.
+
+    Parameters
+    ----------
+    field_map
+        The map.
+    low, high
+        Corners of the grid, x and y in metres, shape (2,).
+    height
+        In metres.
+    cells
+        Along the longer side.
+    """
+    cell = float((high - low).max()) / cells
+    x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    sample = field_map.query(np.column_stack([grid, np.full(len(grid), height)]))
+    sigma = np.sqrt(np.where(sample.inside[:, None], sample.variance, np.nan).mean(axis=1))
+    return MapSlice(
+        (float(x[0]), float(x[-1]), float(y[0]), float(y[-1])),
+        np.linalg.norm(sample.field, axis=1).reshape(len(y), len(x)),
+        sigma.reshape(len(y), len(x)),
+    )
+
+
 def map_picture(field_map: Queryable, places: FloatArray) -> MapPicture:
     """Return the map around places, shape (N, 3), at their middle height, coarsely."""
     low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
     around = AROUND * max(float((high - low).max()), 1.0)
-    low, high = low - around, high + around
-    cell = float((high - low).max()) / CELLS
-    x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
     height = float(np.median(places[:, 2]))
-    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    sample = field_map.query(np.column_stack([grid, np.full(len(grid), height)]))
-    sigma = np.sqrt(np.where(sample.inside[:, None], sample.variance, np.nan).mean(axis=1))
-    strength = np.linalg.norm(sample.field, axis=1)
-    return MapPicture(
-        extent=row([x[0], x[-1], y[0], y[-1]], 3),
-        height=height,
-        strength=rows(strength.reshape(len(y), len(x)), 2),
-        sigma=rows(sigma.reshape(len(y), len(x)), 3),
-    )
+    cut = slice_map(field_map, low - around, high + around, height, CELLS)
+    return MapPicture(row(cut.extent, 3), height, rows(cut.strength, 2), rows(cut.sigma, 3))

@@ -13,11 +13,11 @@ from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
+    CalibrationPart,
     Change,
     ChangeTest,
     ComparedSensor,
     NotValidated,
-    Part,
 )
 from l2m_gtsam.solve.chi_square import chance_beyond
 
@@ -37,7 +37,7 @@ SHARED_BAG = (
 
 
 @dataclass(frozen=True)
-class Difference:
+class CalibrationDifference:
     """A difference of two vectors and its covariance; infinite variances for what is open."""
 
     value: FloatArray
@@ -55,9 +55,9 @@ class Difference:
         sigma = np.sqrt(np.diag(self.covariance))
         return np.asarray(np.where(self.known, sigma, np.inf))
 
-    def part(self, at: slice) -> "Difference":
+    def part(self, at: slice) -> "CalibrationDifference":
         """Return some of its entries."""
-        return Difference(self.value[at], self.covariance[at, at])
+        return CalibrationDifference(self.value[at], self.covariance[at, at])
 
     def tested(self, name: str) -> ChangeTest:
         """Return the chi-square test of all entries that are known."""
@@ -128,7 +128,7 @@ def is_calibrated(sensor: SensorCalibration) -> bool:
 def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float) -> ComparedSensor:
     """Return what has changed of one sensor."""
     vectors = [np.concatenate([s.t_lidar_mag, s.distortion.vector()]) for s in (new, old)]
-    whole = Difference(vectors[0] - vectors[1], new.covariance + old.covariance)
+    whole = CalibrationDifference(vectors[0] - vectors[1], new.covariance + old.covariance)
     parts = differences(new, old, whole)
     tests = {part.value: each.tested(part.value) for part, each in parts.items()}
     tests["C"] = whole.part(slice(3, 12)).tested("C")
@@ -143,8 +143,8 @@ def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float
 
 
 def differences(
-    new: SensorCalibration, old: SensorCalibration, whole: Difference
-) -> dict[Part, Difference]:
+    new: SensorCalibration, old: SensorCalibration, whole: CalibrationDifference
+) -> dict[CalibrationPart, CalibrationDifference]:
     """Return the differences of the parts of a calibration, in the units of ``Change``."""
     jacobians = [shape_derivatives(s.distortion.C) for s in (new, old)]
     shapes = [
@@ -154,17 +154,17 @@ def differences(
         (through(J, s.covariance[3:12, 3:12]) for J, s in zip(jacobians, (new, old), strict=True)),
         np.zeros((6, 6)),
     )
-    shape = Difference(shapes[0] - shapes[1], spread)
+    shape = CalibrationDifference(shapes[0] - shapes[1], spread)
     return {
-        Part.PLACE: whole.part(slice(0, 3)),
-        Part.ROTATION: rotation_difference(new, old),
-        Part.GAINS: shape.part(slice(0, 3)),
-        Part.ANGLES: shape.part(slice(3, 6)),
-        Part.OFFSET: whole.part(slice(12, 15)),
+        CalibrationPart.PLACE: whole.part(slice(0, 3)),
+        CalibrationPart.ROTATION: rotation_difference(new, old),
+        CalibrationPart.GAINS: shape.part(slice(0, 3)),
+        CalibrationPart.ANGLES: shape.part(slice(3, 6)),
+        CalibrationPart.OFFSET: whole.part(slice(12, 15)),
     }
 
 
-def rotation_difference(new: SensorCalibration, old: SensorCalibration) -> Difference:
+def rotation_difference(new: SensorCalibration, old: SensorCalibration) -> CalibrationDifference:
     """Return the d by which a sensor has turned about its own axes, in degrees.
 
     R_lidar_mag = R_lidar_mag_old exp(d). With true R_mag_lidar = exp(error) @ estimate, d is off by
@@ -172,11 +172,11 @@ def rotation_difference(new: SensorCalibration, old: SensorCalibration) -> Diffe
     """
     turn = old.R_lidar_mag.T @ new.R_lidar_mag
     if not np.isfinite(turn).all():
-        return Difference(np.full(3, np.nan), np.diag(np.full(3, np.inf)))
+        return CalibrationDifference(np.full(3, np.nan), np.diag(np.full(3, np.inf)))
     d = Rotation.from_matrix(turn).as_rotvec()
     spread = new.rotation_covariance + through(turn.T, old.rotation_covariance)
     degree = np.rad2deg(1.0)
-    return Difference(degree * d, degree**2 * spread)
+    return CalibrationDifference(degree * d, degree**2 * spread)
 
 
 def through(J: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -207,7 +207,9 @@ def shape_derivatives(C: FloatArray) -> FloatArray:
 
 
 def _changes(
-    parts: Mapping[Part, Difference], tests: Mapping[str, ChangeTest], chance: float
+    parts: Mapping[CalibrationPart, CalibrationDifference],
+    tests: Mapping[str, ChangeTest],
+    chance: float,
 ) -> tuple[Change, ...]:
     """Return the parts that chance does not explain, the surest first.
 
@@ -222,11 +224,11 @@ def _changes(
     )
 
 
-def change_of(part: Part, value: FloatArray, sigma: FloatArray, chance: float) -> Change:
+def change_of(part: CalibrationPart, value: FloatArray, sigma: FloatArray, chance: float) -> Change:
     """Return a change of a part; entries that are open do not count for its size."""
     known = np.isfinite(sigma) & np.isfinite(value)
     seen = np.abs(value[known])
-    longest = part in (Part.GAINS, Part.ANGLES)
+    longest = part in (CalibrationPart.GAINS, CalibrationPart.ANGLES)
     size = seen.max(initial=0.0) if longest else np.linalg.norm(seen)
     shown = np.where(known, value, np.nan)
     return Change(part, row(shown), row(sigma), float(size), chance)

@@ -1,121 +1,100 @@
-"""The report: one page that needs nothing else."""
+"""What the pages have in common: templates, numbers, pictures. A page needs no other file."""
 
-import hashlib
-import json
+from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from matplotlib.figure import Figure
 
-from l2m_gtsam.progress import Progress, counter
-from l2m_gtsam.qa.judge import judge
-from l2m_gtsam.qa.options import Limit, QaOptions
-from l2m_gtsam.qa.report import words
-from l2m_gtsam.qa.report.sections import overall_pictures, sensor_section
-from l2m_gtsam.qa.report.svg import SETTINGS
-from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.metrics import Metrics
-from l2m_gtsam.solve.rank import PARAMETERS
-from l2m_gtsam.storage.calibration_file import MODEL, UNCERTAINTY
-
-STAGE = "report"
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.report.drawing import Drawing
+from l2m_gtsam.qa.report.figures.map import residual_figure
+from l2m_gtsam.qa.report.figures.statistics import chi_square_figure
+from l2m_gtsam.qa.report.svg import as_svg
+from l2m_gtsam.records.metrics import Normalised, Series
 
 
-def report_page(
-    result: CalibrationResult,
-    metrics: Metrics,
-    options: QaOptions,
-    progress: Progress | None = None,
-) -> str:
-    """Return the report on a calibration as HTML.
+@dataclass(frozen=True)
+class Picture:
+    """A figure of a page: its title, the drawing, and what to look for."""
 
-    Text from bags is escaped; nothing is loaded from anywhere.
+    title: str
+    svg: Markup
+    caption: str
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    metrics
-        Its figures.
-    options
-        Thresholds of the verdict.
-    progress
-        Called with a stage and the fraction of it that is done.
-    """
-    tell = counter(STAGE, progress or (lambda stage, fraction: None))
-    steps = len(result.sensors) + 2
-    tell(0, steps)
-    verdict, sections = judge(result, metrics, options), []
-    with mpl.rc_context(SETTINGS):
-        vehicle, place = overall_pictures(result, metrics, verdict)
-        for k, each in enumerate(result.sensors):
-            tell(k + 1, steps)
-            sections.append(sensor_section(k, each, result, metrics, verdict[each.sensor]))
-    tell(steps - 1, steps)
-    return (
-        environment()
-        .get_template("report.html.j2")
-        .render(
-            result=result,
-            metrics=metrics,
-            verdict=verdict,
-            vehicle=vehicle,
-            place=place,
-            sections=sections,
-            limits=limits(options),
-            parameters=PARAMETERS,
-            uncertainty=UNCERTAINTY[result.uncertainty],
-            model=MODEL,
-            options=json.dumps(result.options, indent=2, ensure_ascii=False),
-            fingerprint=fingerprint(result),
-            style=style(),
-        )
+
+def picture(title: str, figure: Figure | Drawing, name: str, alt: str, caption: str) -> Picture:
+    """Return a figure of the page; see ``Picture`` and ``as_svg``."""
+    return Picture(title, as_svg(figure, name, alt), caption)
+
+
+def residual_map_picture(anchor: str, sensor: str, series: Series) -> Picture:
+    """Return the residuals of a sensor over the map."""
+    return picture(
+        "Residuals over the map",
+        residual_figure(series),
+        f"{anchor}-place",
+        f"Length of the residuals of {sensor} where they were read.",
+        "Bright spots that keep together are places where map and readings disagree.",
     )
 
 
-def limits(options: QaOptions) -> list[tuple[str, float, float, str]]:
-    """Return the thresholds of the verdict: name, warning, failure and what it is."""
-    fields = type(options).model_fields
-    return [
-        (name, value.warn, value.fail, fields[name].description or "")
-        for name, value in options
-        if isinstance(value, Limit)
-    ]
+def normalised_picture(anchor: str, sensor: str, found: Normalised, as_stated: str) -> Picture:
+    """Return the normalised residuals of a sensor, and what bars on the dashed line mean."""
+    std = ", ".join(f"{each:.2f}" for each in found.std)
+    return picture(
+        "Normalised residuals",
+        chi_square_figure(found),
+        f"{anchor}-chi2",
+        f"Squared normalised residuals of {sensor} beside chi-square: standard deviations {std} "
+        f"along x, y, z, {found.beyond_95:.1%} beyond the 95 % quantile.",
+        f"Bars on the dashed line: {as_stated}. Standard deviations {std} (1 is consistent).",
+    )
 
 
-def fingerprint(result: CalibrationResult) -> str:
-    """Return what tells this calibration from any other: of its numbers, in ten digits."""
-    digest = hashlib.sha256()
-    for sensor in result.sensors:
-        digest.update(sensor.sensor.encode(errors="surrogatepass"))
-        for part in (sensor.t_lidar_mag, sensor.distortion.vector(), sensor.covariance):
-            digest.update(np.ascontiguousarray(part).tobytes())
-    return digest.hexdigest()[:10]
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with so many significant digits; a dash where it is none or infinite."""
+    return f"{value:.{digits}g}" if np.isfinite(value) else "–"
 
 
-def style() -> Markup:
-    """Return the page's style."""
-    found = environment()
-    text, _, _ = found.loader.get_source(found, "style.css")  # type: ignore[union-attr]  # it has one
+def with_sigma(value: float, sigma: float, digits: int) -> str:
+    """Return a value with its standard deviation; "not determined" where that is infinite."""
+    if not np.isfinite(sigma) or not np.isfinite(value):
+        return "not determined"
+    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+
+
+def vector(values: FloatArray, digits: int) -> str:
+    """Return a vector in brackets."""
+    # adding zero takes the sign from a zero
+    rounded = np.round(np.asarray(values, dtype=float), digits) + 0.0
+    return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
+
+
+def render(template: str, **values: Any) -> str:
+    """Return a page as HTML; text is escaped, nothing is loaded from anywhere."""
+    given = {"style": own_file("style.css"), **values}
+    return _environment().get_template(template).render(**given)
+
+
+def own_file(name: str) -> Markup:
+    """Return a file beside the templates as it is."""
+    environment = _environment()
+    text, _, _ = environment.loader.get_source(environment, name)  # type: ignore[union-attr]  # it has one
     return Markup(text)  # noqa: S704 - our own file
 
 
 @cache
-def environment() -> Environment:
-    """Return what renders the templates."""
-    made = Environment(
+def _environment() -> Environment:
+    environment = Environment(
         loader=PackageLoader("l2m_gtsam.qa.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"number": number, "position": words.position, "vector": words.vector}
-    return made
-
-
-def number(value: float, digits: int = 3) -> str:
-    """Return a number with so many significant digits; a dash where it is none or infinite."""
-    return f"{value:.{digits}g}" if np.isfinite(value) else "–"
+    environment.filters |= {"number": number, "vector": vector, "with_sigma": with_sigma}
+    return environment

@@ -1,16 +1,21 @@
-"""Matplotlib figures as SVG that belongs to a page: its colours, its fonts, no names in common."""
+"""Matplotlib figures: new ones, their parts, and as SVG in the colours and fonts of a page."""
 
 import re
 from functools import singledispatch
 from io import StringIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.storage.files import atomic_path
 
 # Colours that stand for variables of the page's style, so that a figure follows light and dark.
 INK, MUTED, GRID, PAPER = "#010203", "#040506", "#070809", "#0a0b0c"
@@ -125,6 +130,37 @@ def dots(axes: Axes, x: FloatArray, y: FloatArray, size: float, **style: Any) ->
     across = np.column_stack([x, x, np.full(len(x), np.nan)]).ravel()
     along = np.column_stack([y, y, np.full(len(y), np.nan)]).ravel()
     axes.plot(across, along, "-", linewidth=size, solid_capstyle="round", **style)
+
+
+def ellipse(centre: FloatArray, covariance: FloatArray, sigmas: float) -> Ellipse:
+    """Return an error ellipse.
+
+    Parameters
+    ----------
+    centre
+        Shape (2,).
+    covariance
+        Shape (2, 2).
+    sigmas
+        Half axes in standard deviations along them.
+    """
+    variances, directions = np.linalg.eigh(covariance)
+    width, height = 2 * sigmas * np.sqrt(np.maximum(variances, 0.0))
+    angle = float(np.rad2deg(np.arctan2(directions[1, 0], directions[0, 0])))
+    return Ellipse((float(centre[0]), float(centre[1])), width, height, angle=angle)
+
+
+def plain_decades(axis: Axis, wide: bool) -> None:
+    """Label a logarithmic axis with plain numbers: mathematics is text in these figures."""
+    axis.set_major_locator(LogLocator(subs=[1.0] if wide else [1.0, 2.0, 5.0]))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG, whole or not at all."""
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png")
 
 
 def short_name(name: str) -> str:

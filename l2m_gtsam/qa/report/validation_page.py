@@ -6,21 +6,26 @@ from dataclasses import dataclass
 import matplotlib as mpl
 import numpy as np
 
-from l2m_gtsam.qa.report.figures import course, place
+from l2m_gtsam.qa.report.figures import map as map_figures
+from l2m_gtsam.qa.report.figures import readings
+from l2m_gtsam.qa.report.figures.comparison import field_errors_figure, nis_figure
 from l2m_gtsam.qa.report.figures.statistics import sigmas_figure
-from l2m_gtsam.qa.report.figures.validation import field_errors_figure, nis_figure
-from l2m_gtsam.qa.report.page import environment, style
-from l2m_gtsam.qa.report.sections import Picture, picture
+from l2m_gtsam.qa.report.page import (
+    Picture,
+    picture,
+    render,
+    residual_map_picture,
+)
 from l2m_gtsam.qa.report.svg import SETTINGS
-from l2m_gtsam.qa.validation.sentences import NAMES, amount
+from l2m_gtsam.qa.verdict.validation import NAMES, amount
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.validation import (
     ComparedSensor,
     DriveValidation,
-    SensorRemarks,
     ValidatedSensor,
     Validation,
 )
+from l2m_gtsam.records.verdict import SensorVerdict
 from l2m_gtsam.solve.rank import PARAMETERS
 
 
@@ -36,17 +41,17 @@ class ValidationSection:
         Its verdict.
     tested, compared
         On the drive, and beside the older calibration; absent where that was not done.
-    noticed
+    detectable
         The smallest changes that the drive would have shown, in words.
     pictures
         In the order of the page.
     """
 
     anchor: str
-    verdict: SensorRemarks
+    verdict: SensorVerdict
     tested: ValidatedSensor | None
     compared: ComparedSensor | None
-    noticed: str
+    detectable: str
     pictures: tuple[Picture, ...]
 
 
@@ -58,18 +63,18 @@ def validation_page(found: Validation) -> str:
     with mpl.rc_context(SETTINGS):
         sections = [_section(k, each, found) for k, each in enumerate(found.verdict.sensors)]
         pictures = () if found.drive is None else _overall(found.drive)
-    template = environment().get_template("validation.html.j2")
-    return template.render(
+    return render(
+        "validation.html.j2",
         found=found,
         verdict=found.verdict,
         sections=sections,
         pictures=pictures,
+        thresholds=found.thresholds,
         parameters=PARAMETERS,
-        style=style(),
     )
 
 
-def _section(index: int, verdict: SensorRemarks, found: Validation) -> ValidationSection:
+def _section(index: int, verdict: SensorVerdict, found: Validation) -> ValidationSection:
     anchor = f"sensor-{index}"
     drive = () if found.drive is None else found.drive.sensors
     both = () if found.comparison is None else found.comparison.sensors
@@ -78,15 +83,15 @@ def _section(index: int, verdict: SensorRemarks, found: Validation) -> Validatio
     pictures = [] if tested is None else _of_drive(anchor, tested)
     if compared is not None:
         pictures.append(_of_comparison(anchor, compared))
-    noticed = "" if tested is None else _noticed(tested)
-    return ValidationSection(anchor, verdict, tested, compared, noticed, tuple(pictures))
+    detectable = "" if tested is None else _detectable(tested)
+    return ValidationSection(anchor, verdict, tested, compared, detectable, tuple(pictures))
 
 
-def _noticed(sensor: ValidatedSensor) -> str:
+def _detectable(sensor: ValidatedSensor) -> str:
     """Return what the drive would have shown, as a sentence."""
     shown = [
         f"{NAMES[each.part]} by {amount(each.part, each.size)}"
-        for each in sensor.noticeable
+        for each in sensor.detectable
         if np.isfinite(each.size)
     ]
     if not shown:
@@ -101,17 +106,17 @@ def _overall(drive: DriveValidation) -> tuple[Picture, ...]:
     on_map = (
         picture(
             "Field and drive",
-            place.strength_figure(metrics, ()),
+            map_figures.strength_figure(metrics, ()),
             "map-strength",
             f"{where} over the map's field strength.",
             "What the readings are compared with: the field of the map along this drive.",
         ),
         picture(
             "How well the map knows it",
-            place.sigma_figure(metrics),
+            map_figures.sigma_figure(metrics),
             "map-sigma",
             f"{where} over the map's standard deviation.",
-            "Where the map is not sure of itself, a drive says little of a calibration.",
+            "Where the map is not well known, a drive is a weak test of a calibration.",
         ),
     )
     return (*_of_all(drive.sensors), *on_map) if drive.sensors else on_map
@@ -150,7 +155,7 @@ def _of_drive(anchor: str, sensor: ValidatedSensor) -> list[Picture]:
     return [
         picture(
             "Before, after, map",
-            course.curves_figure(sensor.series),
+            readings.curves_figure(sensor.series),
             f"{anchor}-curves",
             f"Readings of {name} along the lidar's axes before and after the calibration beside "
             f"the map's: {before:.1f} and {after:.2f} µT rms away from it.",
@@ -159,19 +164,13 @@ def _of_drive(anchor: str, sensor: ValidatedSensor) -> list[Picture]:
         ),
         picture(
             "Residuals over time",
-            course.residuals_figure(sensor.series),
+            readings.residuals_figure(sensor.series),
             f"{anchor}-residuals",
             f"Residuals of {name} over time; {wrong} drawn readings are rejected.",
             "Should look like noise around zero. A level that is off is a changed H; crosses do "
             "not count.",
         ),
-        picture(
-            "Residuals over the map",
-            place.residual_figure(sensor.series),
-            f"{anchor}-place",
-            f"Length of the residuals of {name} where they were read.",
-            "Bright spots that keep together are places where map and readings disagree.",
-        ),
+        residual_map_picture(anchor, name, sensor.series),
     ]
 
 
@@ -184,5 +183,5 @@ def _of_comparison(anchor: str, sensor: ComparedSensor) -> Picture:
         f"Differences of the parameters of {sensor.sensor} in sigmas: chi-square "
         f"{whole.chi_square:.1f} of {whole.freedom} degrees of freedom.",
         "Bars beyond the band differ by more than both uncertainties allow. Correlated parameters "
-        "move together: the tests beside say which part has changed.",
+        "move together: the tests beside show which part has changed.",
     )

@@ -3,25 +3,11 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.report.figures.correlations import NAMES, correlations
+from l2m_gtsam.qa.report.figures.statistics import NAMES, correlations
+from l2m_gtsam.qa.report.page import vector, with_sigma
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
 from l2m_gtsam.records.metrics import Repeatability, SensorMetrics
 from l2m_gtsam.storage.calibration_file import UNCERTAINTY
-
-
-def with_sigma(value: float, sigma: float, digits: int) -> str:
-    """Return a value with its standard deviation; "not determined" where that is infinite."""
-    if not np.isfinite(sigma) or not np.isfinite(value):
-        return "not determined"
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}"
-
-
-def vector(values: FloatArray, digits: int) -> str:
-    """Return a vector in brackets."""
-    # adding zero takes the sign from a zero
-    rounded = np.round(np.asarray(values, dtype=float), digits) + 0.0
-    return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
 
 
 def position(sensor: SensorCalibration) -> list[tuple[str, str]]:
@@ -76,7 +62,7 @@ def rests_on(metrics: SensorMetrics, result: CalibrationResult) -> list[str]:
     missing = next(each.missing_in for each in result.sensors if each.sensor == metrics.sensor)
     sentences = [f"Nothing usable was read of it in {', '.join(missing)}."] if missing else []
     sentences += [
-        f"{fit.readings:,} readings, as correlated in time as {worth:,.0f} independent ones.",
+        f"{fit.readings:,} readings (effective: {worth:,.0f}, as they are correlated in time).",
         f"Noise of each, per axis: {parts}.",
         f"How the map's errors count: {UNCERTAINTY[result.uncertainty]}.",
     ]
@@ -88,7 +74,7 @@ def rests_on(metrics: SensorMetrics, result: CalibrationResult) -> list[str]:
 def drives(found: Repeatability) -> str:
     """Return how far drives are apart beside what chance allows, as a sentence without its end."""
     if not found.freedom:
-        return "Too few drives tell the same parameters to compare them"
+        return "Too few drives determine the same parameters to compare them"
     ratio, low, high = (each / found.freedom for each in (found.squared, found.low, found.high))
     return (
         f"Normalised square of what they differ by, per degree of freedom: {ratio:.2f} (1 is "

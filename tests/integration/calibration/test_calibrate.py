@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.start.global_start import StartOptions
-from l2m_gtsam.cli.tables.tables import disagreement_note
+from l2m_gtsam.cli.tables.calibration import disagreement_note
 from l2m_gtsam.data import (
     Distortion,
     FieldSample,

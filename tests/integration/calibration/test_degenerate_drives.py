@@ -8,7 +8,7 @@ from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.planning.options import PlanOptions
+from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
 from l2m_gtsam.records.plan import DrivePlan

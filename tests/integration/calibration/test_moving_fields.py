@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from l2m_gtsam.calibration.calibrate import calibrate
-from l2m_gtsam.cli.tables.model_table import model_note, model_tables
+from l2m_gtsam.cli.tables.calibration import model_note, model_tables
 from l2m_gtsam.data import FloatArray, ScalarSeries
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap

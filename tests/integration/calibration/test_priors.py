@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.cli.tables.tables import calibration_table
+from l2m_gtsam.cli.tables.calibration import calibration_table
 from l2m_gtsam.config import load_config
 from l2m_gtsam.data import Distortion, FieldSeries, FloatArray, KnownSensor, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
-from l2m_gtsam.planning.options import PlanOptions
+from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration

@@ -11,9 +11,9 @@ from numpy.testing import assert_array_equal
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.cli.tables.tables import calibration_table, held_clocks_note
+from l2m_gtsam.cli.tables.calibration import calibration_table, held_clocks_note
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
-from l2m_gtsam.planning.options import PlanOptions
+from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import plan
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration

@@ -12,7 +12,7 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FieldSeries, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.planning.options import PlanOptions
+from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.planning.plan import assumed_recording, plan
 from l2m_gtsam.records.calibration import Uncertainty
 from tests.drives.degenerate import STRONG, eight

@@ -12,15 +12,14 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrate, calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
-from l2m_gtsam.qa.evaluate import appraise
-from l2m_gtsam.qa.judge import Verdict, judge
+from l2m_gtsam.qa.evaluate import by_drive, evaluate
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.reasons.reason import Level
-from l2m_gtsam.qa.repeatability import by_drive
+from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.degenerate import STRONG, at_height, poses
@@ -91,7 +90,7 @@ class Made:
 def made(*drives: Recording) -> Made:
     recording = joined(drives)
     found = calibrated(recording, STRONG, OPTIONS)
-    metrics = appraise(recording, found, OPTIONS, QaOptions())
+    metrics = evaluate(recording, found, OPTIONS, QaOptions())
     return Made(recording, found, metrics, judge(found.result, metrics, QaOptions()))
 
 
@@ -295,7 +294,7 @@ def test_files_of_one_drive_do_not_speak_of_several(tmp_path: Path) -> None:
     one = monday()
     found = calibrated(joined([one]), STRONG, OPTIONS)
     write_calibration(tmp_path / "c.yaml", found.result)
-    metrics = appraise(one, found, OPTIONS, QaOptions(halves=False))
+    metrics = evaluate(one, found, OPTIONS, QaOptions(halves=False))
     write_metrics(tmp_path / "m.json", metrics)
     text = (tmp_path / "c.yaml").read_text()
     for name in ("\nbags:", "missing_in:"):
@@ -321,7 +320,7 @@ def test_drives_share_the_errors_of_the_map() -> None:
     options = options.model_copy(update={"solve": solve})
     recording = joined([first, second])
     found = calibrated(recording, field_map, options)
-    metrics = appraise(recording, found, options, QaOptions())
+    metrics = evaluate(recording, found, options, QaOptions())
     (sensor,), (figures,) = found.result.sensors, metrics.sensors
     assert figures.drives is not None
     assert figures.drives.freedom == 15

@@ -13,12 +13,12 @@ from l2m_gtsam.batch.reports import REPORT_FILE, report_folder, write_report
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.config import Config
-from l2m_gtsam.qa.evaluate import appraise
-from l2m_gtsam.qa.judge import judge
+from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.options import Limit, QaOptions
-from l2m_gtsam.qa.reasons.reason import Level
+from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.record_files import read_metrics, write_metrics
 from tests.drives.verdict import EIGHT, changed_place, drive, with_series
@@ -38,7 +38,7 @@ class Made:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     drive = changed_place()
     found = calibrated(drive.recording, drive.field_map, drive.options)
-    metrics = appraise(drive.recording, found, drive.options, QaOptions())
+    metrics = evaluate(drive.recording, found, drive.options, QaOptions())
     folder = tmp_path_factory.mktemp("made")
     options = Config(calibration=drive.options).model_dump(mode="json")
     write_calibration(folder / CALIBRATION_FILE, replace(found.result, options=options))
@@ -167,7 +167,7 @@ def test_a_stuck_sensor_has_its_place_in_the_report(tmp_path: Path) -> None:
     whole = drive()
     whole = with_series(whole, 1, np.tile([1.0, 2.0, 3.0], (len(EIGHT), 1)))
     found = calibrated(whole.recording, whole.field_map, whole.options)
-    metrics = appraise(whole.recording, found, whole.options, QaOptions(halves=False))
+    metrics = evaluate(whole.recording, found, whole.options, QaOptions(halves=False))
     verdict = write_report(tmp_path, found.result, metrics, QaOptions())
     assert verdict["mag_1"].level is Level.FAIL
     assert "it is stuck" in verdict["mag_1"].reasons[0].text

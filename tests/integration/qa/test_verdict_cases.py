@@ -9,10 +9,10 @@ import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.errors import UnitsError
-from l2m_gtsam.qa.evaluate import appraise
-from l2m_gtsam.qa.judge import Verdict, judge
+from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import Nominal, QaOptions
-from l2m_gtsam.qa.reasons.reason import Level
+from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.bag_options import BagOptions
 from tests.drives.bags import Entry, ros, write
@@ -134,7 +134,7 @@ def verdict_on(make: Callable[[], Drive]) -> Verdict:
 def judged(make: Callable[[], Drive], options: QaOptions) -> Verdict:
     whole = make()
     found = calibrated(whole.recording, whole.field_map, whole.options)
-    metrics = appraise(whole.recording, found, whole.options, options)
+    metrics = evaluate(whole.recording, found, whole.options, options)
     return judge(found.result, metrics, options)
 
 

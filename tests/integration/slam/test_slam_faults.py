@@ -8,7 +8,7 @@ import pytest
 from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, RigidTransform
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.slam.judge import judge_localisation
+from l2m_gtsam.qa.verdict.localisation import judge_localisation
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.scans import PoseFix, ScanEvidence

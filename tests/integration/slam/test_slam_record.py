@@ -12,7 +12,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.geometry import to_ros
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.metrics.evidence import sensor_evidence as asked_again
-from l2m_gtsam.qa.slam.course import course_of
+from l2m_gtsam.qa.metrics.trajectory import localised_trajectory
 from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.slam.map_prediction import poses_in
@@ -49,7 +49,7 @@ def test_odometry_is_as_sure_as_its_graph() -> None:
         )
         np.testing.assert_allclose(pose.rotation().matrix(), R[k], atol=1e-12)
     sigma = np.sqrt(np.diagonal(to_ros(found, R), axis1=1, axis2=2))
-    told = course_of(record()).odometry_sigma
+    told = localised_trajectory(record()).odometry_sigma
     # Nine digits are kept.
     np.testing.assert_allclose(told[:, :3], sigma[:, :3], rtol=0, atol=1e-9)
     np.testing.assert_allclose(told[:, 3:], np.rad2deg(sigma[:, 3:]), rtol=0, atol=1e-9)

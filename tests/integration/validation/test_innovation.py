@@ -10,8 +10,12 @@ from l2m_factors import skew
 from l2m_gtsam.calibration.pose_errors import pose_seconds
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.validation.alterations import against_calibration, changes_of
-from l2m_gtsam.validation.innovation import KnownCalibration, told_by
+from l2m_gtsam.validation.innovation import (
+    KnownCalibration,
+    change_likelihood,
+    changes_of,
+    marginalise_calibration,
+)
 from tests.drives.calibrations import SIGMA
 from tests.drives.uncertain import GIVEN, NOISE, OPTIONS, WORLD, small_sensors
 
@@ -104,8 +108,8 @@ def test_the_square_is_that_of_the_full_covariance(
     P[:15, :15] = np.diag(SIGMA**2)
     e = readings.field.ravel() - prediction(readings, field_map, calibration.vector)
     S = dense(readings, field_map, calibration, P)
-    told = told_by(readings, field_map, calibration, LASTS_S)
-    found = against_calibration(told, P, changes_of(np.eye(3)))
+    told = change_likelihood(readings, field_map, calibration, LASTS_S)
+    found = marginalise_calibration(told, P, changes_of(np.eye(3)))
     assert found.squared == pytest.approx(e @ np.linalg.solve(S, e), rel=1e-8)
     independent = NOISE**-2 * float(e @ e)
     assert found.squared < 0.8 * independent
@@ -133,5 +137,5 @@ def test_errors_of_poses_last(readings: Readings, field_map: HarmonicMap) -> Non
     alike = np.exp(-np.abs(seconds[:, None] - seconds) / LASTS_S)
     F = F.reshape(3 * count, 6)
     S = dense(readings, field_map, calibration, P) + F @ F.T * np.kron(alike, np.ones((3, 3)))
-    found = told_by(moved, field_map, calibration, LASTS_S)
+    found = change_likelihood(moved, field_map, calibration, LASTS_S)
     assert found.squared == pytest.approx(e @ np.linalg.solve(S, e), rel=1e-6)

@@ -5,7 +5,7 @@ import pytest
 from pydantic import ValidationError
 from rich.console import Console
 
-from l2m_gtsam.cli.tables.comparison import comparison_table
+from l2m_gtsam.cli.tables.maps import comparison_table
 from l2m_gtsam.data import FieldSample, FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import KINDS

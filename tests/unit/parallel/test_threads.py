@@ -12,15 +12,14 @@ from l2m_gtsam.calibration import calibrate
 from l2m_gtsam.mapping import map_building, suite_calibration
 from l2m_gtsam.parallel.threads import in_threads, one_blas_thread
 from l2m_gtsam.planning import plan
-from l2m_gtsam.qa import evaluate as appraise
-from l2m_gtsam.qa import repeatability
+from l2m_gtsam.qa import evaluate, scene
 from l2m_gtsam.slam import exploration, localisation, record
 from l2m_gtsam.validation import validate
 
 GIVEN = 2
 ENTRIES = (
-    appraise.appraise,
-    appraise.scene_of,
+    evaluate.evaluate,
+    scene.scene_of,
     calibrate.calibrate,
     calibrate.calibrated,
     exploration.explore,
@@ -30,8 +29,8 @@ ENTRIES = (
     map_building.suite_readings,
     map_building.update_map,
     plan.plan,
-    repeatability.compared_drives,
-    repeatability.compared_halves,
+    evaluate.compared_drives,
+    evaluate.compared_halves,
     record.localisation_record,
     suite_calibration.calibrate_suite,
     validate.validate,

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.planning.motion import (
-    Motion,
+    ExtraMotion,
     MotionOptions,
     extra_motions,
     loop,
@@ -16,23 +16,23 @@ from l2m_gtsam.planning.motion import (
 OPTIONS = MotionOptions()
 
 
-def drive() -> Motion:
+def drive() -> ExtraMotion:
     """A straight line with one heading, the lidar mounted with a tilt."""
     R = Rotation.from_euler("ZYX", [30, 2, -1], degrees=True).as_matrix()
     p = np.column_stack([np.linspace(0, 4, 300), np.linspace(0, 2, 300), np.full(300, 0.8)])
-    return Motion("drive", np.broadcast_to(R, (300, 3, 3)), p, np.linspace(0, 5, 300))
+    return ExtraMotion("drive", np.broadcast_to(R, (300, 3, 3)), p, np.linspace(0, 5, 300))
 
 
-def named(word: str) -> Motion:
+def named(word: str) -> ExtraMotion:
     return next(each for each in extra_motions(drive(), OPTIONS) if word in each.name)
 
 
-def turned(motion: Motion) -> FloatArray:
+def turned(motion: ExtraMotion) -> FloatArray:
     """Rotation of each pose away from the drive's, in the lidar frame, degrees."""
     return turned_from(drive(), motion)
 
 
-def turned_from(one: Motion, other: Motion) -> FloatArray:
+def turned_from(one: ExtraMotion, other: ExtraMotion) -> FloatArray:
     return np.degrees(Rotation.from_matrix(one.R[0].T @ other.R).as_rotvec())
 
 
@@ -126,7 +126,7 @@ def test_going_back_is_the_opposite_velocity_in_the_map() -> None:
 def test_a_drive_with_fewer_poses_than_a_motion_may_have() -> None:
     """No pose stands in a motion twice, which would have no velocity to speak of."""
     few = drive()
-    few = Motion("drive", few.R[::8], few.p[::8], few.seconds[::8])
+    few = ExtraMotion("drive", few.R[::8], few.p[::8], few.seconds[::8])
     for each in extra_motions(few, OPTIONS):
         assert len(each.p) == len(few.p)
         # Seven swings of 0.2 m in five seconds are 1.8 m/s, the other motions are slower.

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, SourceFile
-from l2m_gtsam.qa.fleet.outliers import rotations_apart
+from l2m_gtsam.qa.fleet import rotations_apart
 from l2m_gtsam.qa.metrics.changes import (
     compare_calibrations,
     compare_sensor,
@@ -19,9 +19,9 @@ from l2m_gtsam.qa.metrics.changes import (
 )
 from l2m_gtsam.qa.metrics.mounting import gains, skews_deg
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.validation.judge import judge_validation
+from l2m_gtsam.qa.verdict.validation import judge_validation
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
-from l2m_gtsam.records.validation import Part
+from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.solve.rotation import polar_rotation
 from tests.drives.calibrations import SIGMA, calibration, open_in, rotations, sensor, unsolved
 
@@ -92,12 +92,14 @@ def test_it_does_not_matter_which_is_the_new_one(seed: int) -> None:
 @pytest.mark.parametrize(
     ("part", "vector", "size"),
     [
-        (Part.PLACE, 0.03 * np.eye(15)[1], 0.03),
-        (Part.OFFSET, -3.0 * np.eye(15)[13], 3.0),
-        (Part.GAINS, 0.05 * np.eye(15)[3], 0.05),
+        (CalibrationPart.PLACE, 0.03 * np.eye(15)[1], 0.03),
+        (CalibrationPart.OFFSET, -3.0 * np.eye(15)[13], 3.0),
+        (CalibrationPart.GAINS, 0.05 * np.eye(15)[3], 0.05),
     ],
 )
-def test_the_part_that_changed_is_named(part: Part, vector: FloatArray, size: float) -> None:
+def test_the_part_that_changed_is_named(
+    part: CalibrationPart, vector: FloatArray, size: float
+) -> None:
     (change,) = compare_sensor(altered(plain(), vector), plain(), CHANCE).changes
     assert change.part is part
     assert change.size == pytest.approx(size, rel=1e-5)
@@ -110,7 +112,9 @@ def test_a_turn_is_found_about_the_axes_of_the_sensor(R: FloatArray, angle: floa
     turned = R.T @ Rotation.from_euler("z", angle, degrees=True).as_matrix()
     new, old = sensor(R_mag_lidar=turned.T), sensor(R_mag_lidar=R)
     (change,) = [
-        each for each in compare_sensor(new, old, CHANCE).changes if each.part is Part.ROTATION
+        each
+        for each in compare_sensor(new, old, CHANCE).changes
+        if each.part is CalibrationPart.ROTATION
     ]
     np.testing.assert_allclose(change.change, [0, 0, angle], atol=1e-5)
     assert change.size == pytest.approx(angle, rel=1e-5)

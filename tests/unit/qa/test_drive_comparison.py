@@ -6,15 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.metrics.drives import common, compare_drives
-from l2m_gtsam.qa.metrics.halves import Part, compare_halves
+from l2m_gtsam.qa.metrics.repeatability import (
+    PartialEstimate,
+    common,
+    compare_drives,
+    compare_halves,
+)
 
 TRUE = np.concatenate([[0.1, 0.2, 0.3], np.eye(3).ravel(), [1.0, 2.0, 3.0]])
 SCALE = np.repeat([1e-3, 1e-3, 1e-1], [3, 9, 3])
 SEEDS = st.integers(0, 10_000)
 
 
-def parts(seed: int, count: int, shared: float = 1.0) -> list[Part]:
+def parts(seed: int, count: int, shared: float = 1.0) -> list[PartialEstimate]:
     """Return honest parts: errors of their own, and errors of one map that all feel in their way.
 
     ``shared`` is the size of the latter beside the former.
@@ -25,15 +29,15 @@ def parts(seed: int, count: int, shared: float = 1.0) -> list[Part]:
         root = SCALE[:, None] * rng.normal(size=(15, 40)) / 40**0.5
         G = shared * SCALE[:, None] * rng.normal(size=(15, 8)) / 8**0.5
         vector = TRUE + root @ rng.normal(size=40) + G @ beta
-        found.append(Part(vector, root @ root.T + G @ G.T, G))
+        found.append(PartialEstimate(vector, root @ root.T + G @ G.T, G))
     return found
 
 
-def named(found: list[Part]) -> list[tuple[str, Part | str]]:
+def named(found: list[PartialEstimate]) -> list[tuple[str, PartialEstimate | str]]:
     return [(f"{k}.bag", each) for k, each in enumerate(found)]
 
 
-def stacked(found: list[Part]) -> FloatArray:
+def stacked(found: list[PartialEstimate]) -> FloatArray:
     """Return the covariance of all parts side by side."""
     G = np.vstack([each.shared_root for each in found if each.shared_root is not None])
     whole = G @ G.T
@@ -92,7 +96,7 @@ def test_shared_errors_that_are_alike_drop_out() -> None:
     """Of the same way driven twice the map errs alike. To rounding in the sixth digit."""
     own, G = np.diag((0.1 * SCALE) ** 2), np.diag(SCALE)
     error = G @ np.random.default_rng(1).normal(size=15)
-    one, other = (Part(TRUE + error, own + G @ G.T, G) for _ in range(2))
+    one, other = (PartialEstimate(TRUE + error, own + G @ G.T, G) for _ in range(2))
     np.testing.assert_allclose(
         compare_halves(one, other).sigma, np.sqrt(2) * 0.1 * SCALE, atol=1e-6
     )
@@ -102,7 +106,7 @@ def test_shared_errors_that_are_alike_drop_out() -> None:
 def test_the_drive_in_which_a_sensor_moved_is_the_furthest(moved: int) -> None:
     found = parts(5, 4)
     shifted = found[moved].vector + np.concatenate([[0.03, 0, 0], np.zeros(12)])
-    found[moved] = Part(shifted, found[moved].covariance, found[moved].shared_root)
+    found[moved] = PartialEstimate(shifted, found[moved].covariance, found[moved].shared_root)
     repeat = compare_drives(named(found))
     distances = [each.others.distance for each in repeat.drives]
     assert int(np.argmax(distances)) == moved
@@ -119,7 +123,7 @@ def test_what_a_drive_leaves_open_takes_no_part() -> None:
     open_[2, 2] = np.inf
     wild = found[1].vector.copy()
     wild[2] = 1e6
-    found[1] = Part(wild, open_, found[1].shared_root)
+    found[1] = PartialEstimate(wild, open_, found[1].shared_root)
     repeat = compare_drives(named(found))
     assert repeat.freedom == 15 + 14
     assert repeat.squared < 2 * repeat.high
@@ -130,7 +134,7 @@ def test_what_a_drive_leaves_open_takes_no_part() -> None:
 
 def test_drives_that_say_nothing_are_said() -> None:
     one = parts(1, 1)[0]
-    nothing = Part(np.zeros(15), np.diag(np.full(15, np.inf)))
+    nothing = PartialEstimate(np.zeros(15), np.diag(np.full(15, np.inf)))
     found = compare_drives([("a", one), ("b", "12 readings are too few"), ("c", nothing)])
     assert found.freedom == 0
     assert not found.compared

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.fleet import outliers
-from l2m_gtsam.qa.fleet.options import FleetOptions
-from l2m_gtsam.qa.fleet.outliers import expected_deviation, rotations_apart, with_outliers
-from l2m_gtsam.qa.fleet.trends import trends, weighted_mean
+from l2m_gtsam.qa import fleet as fleet_module
+from l2m_gtsam.qa.fleet import expected_deviation, rotations_apart, with_outliers
+from l2m_gtsam.qa.options import FleetOptions
+from l2m_gtsam.qa.report.figures.trends import trends, weighted_mean
 from l2m_gtsam.records.fleet import FleetRow
 from tests.drives.fleet_rows import row, sensor_row
 
@@ -127,7 +127,7 @@ def test_the_middle_of_a_sample_is_nearly_that_of_all(seed: int) -> None:
     q = near(seed, 200).as_quat()
     whole = rotations_apart(q)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(outliers, "MOST", 40)
+        patch.setattr(fleet_module, "MOST", 40)
         sampled = rotations_apart(q)
         assert (sampled == rotations_apart(q)).all()
     between = (

@@ -6,10 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.qa.fleet.rows import sensor_rows
-from l2m_gtsam.qa.judge import SensorVerdict, Verdict
-from l2m_gtsam.qa.reasons.reason import Level, Reason
+from l2m_gtsam.qa.fleet import sensor_rows
 from l2m_gtsam.records.calibration import ResidualFigures, SensorStatus
+from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Verdict
 from tests.drives.calibrations import calibration, open_in, sensor, unsolved
 
 NOTE, DOUBT, GRAVE = (Reason(level, level.upper()) for level in Level)

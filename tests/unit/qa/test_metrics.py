@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.qa.metrics.autocorrelation import correlation, lasting
 from l2m_gtsam.qa.metrics.coverage import sphere
 from l2m_gtsam.qa.metrics.evidence import cross
-from l2m_gtsam.qa.metrics.halves import Part, compare_halves, no_halves
-from l2m_gtsam.qa.metrics.misfit import halves_agree
+from l2m_gtsam.qa.metrics.fit import correlation, lasting
 from l2m_gtsam.qa.metrics.mounting import axis_order, gains, skews_deg
 from l2m_gtsam.qa.metrics.plain import evenly
+from l2m_gtsam.qa.metrics.repeatability import PartialEstimate, compare_halves, no_halves
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.repeatability import halves_agree
 from l2m_gtsam.records.metrics import Halves
 from l2m_gtsam.storage.record_files import read_metrics
 
@@ -103,10 +103,10 @@ def test_thinning_keeps_both_ends(count: int, most: int) -> None:
     assert (np.diff(kept) > 0).all()
 
 
-def half(seed: int, covariance: np.ndarray) -> Part:
+def half(seed: int, covariance: np.ndarray) -> PartialEstimate:
     rng = np.random.default_rng(seed)
     true = np.concatenate([[0.1, 0.2, 0.3], np.eye(3).ravel(), [1.0, 2.0, 3.0]])
-    return Part(rng.multivariate_normal(true, covariance), covariance)
+    return PartialEstimate(rng.multivariate_normal(true, covariance), covariance)
 
 
 def covariance(seed: int) -> np.ndarray:
@@ -132,14 +132,14 @@ def test_what_a_half_leaves_open_takes_no_part() -> None:
     open_ = S.copy()
     open_[2, :] = open_[:, 2] = 0.0
     open_[2, 2] = np.inf
-    found = compare_halves(half(1, S), Part(half(2, S).vector, open_))
+    found = compare_halves(half(1, S), PartialEstimate(half(2, S).vector, open_))
     assert found.determined == 14
     assert np.isinf(found.sigma[2])
     assert np.isfinite(found.distance)
 
 
 def test_halves_of_nothing_say_why() -> None:
-    nothing = Part(np.zeros(15), np.diag(np.full(15, np.inf)))
+    nothing = PartialEstimate(np.zeros(15), np.diag(np.full(15, np.inf)))
     assert "determine nothing" in compare_halves(nothing, nothing).reason
 
 
@@ -151,8 +151,12 @@ def test_halves_that_differ_by_what_nobody_minds_agree() -> None:
     near[:3] += 5e-4
     far[:3] += 5e-2
     options = QaOptions()
-    assert halves_agree(compare_halves(Part(vector, S), Part(near, S)), options)
-    assert not halves_agree(compare_halves(Part(vector, S), Part(far, S)), options)
+    assert halves_agree(
+        compare_halves(PartialEstimate(vector, S), PartialEstimate(near, S)), options
+    )
+    assert not halves_agree(
+        compare_halves(PartialEstimate(vector, S), PartialEstimate(far, S)), options
+    )
     assert halves_agree(no_halves("not looked at"), options)
 
 
@@ -161,7 +165,7 @@ def test_a_turn_between_halves_is_its_angle() -> None:
     one, two = (
         np.concatenate([np.zeros(3), C.ravel(), np.zeros(3)]) for C in (1.1 * np.eye(3), turn)
     )
-    found: Halves = compare_halves(Part(one, S), Part(two, S))
+    found: Halves = compare_halves(PartialEstimate(one, S), PartialEstimate(two, S))
     assert found.turned_deg == pytest.approx(7)
 
 

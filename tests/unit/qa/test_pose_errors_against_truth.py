@@ -12,7 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import SyncError
-from l2m_gtsam.qa.slam.errors import Ways, check_truth, compared, truth_record
+from l2m_gtsam.qa.metrics.pose_errors import (
+    ComparedTrajectories,
+    check_truth,
+    compared,
+    truth_record,
+)
 
 STEP_NS = 100_000_000
 
@@ -62,12 +67,14 @@ def test_nees_is_honest_where_covariances_are() -> None:
     truth = trajectory(rng, count)
     error = np.einsum("nij,nj->ni", root, rng.normal(size=(count, 6)))
     found = replace(perturbed(truth, error), covariance=covariance)
-    record = truth_record(truth, Ways(found, found), 1.0)
+    record = truth_record(truth, ComparedTrajectories(found, found), 1.0)
     assert record is not None
     # The mean of 4,000 chi-squares of six has a standard deviation of 0.055, the share 0.0034.
     assert record.nees == pytest.approx(6, abs=0.22)
     assert record.beyond_95 == pytest.approx(0.05, abs=0.014)
-    bold = truth_record(truth, Ways(replace(found, covariance=covariance / 4), found), 1.0)
+    bold = truth_record(
+        truth, ComparedTrajectories(replace(found, covariance=covariance / 4), found), 1.0
+    )
     assert bold is not None
     assert bold.nees == pytest.approx(4 * record.nees, rel=1e-9)
 
@@ -80,17 +87,17 @@ def test_truth_is_interpolated_within_its_time_only() -> None:
     found = Trajectory(halfway, truth.R[:-1], p, "map", "lidar", np.tile(np.eye(6), (9, 1, 1)))
     away = replace(found, p=p + np.array([3.0, 0, 4.0]))
     half = replace(truth, stamp_ns=truth.stamp_ns[:5], R=truth.R[:5], p=truth.p[:5])
-    record = truth_record(half, Ways(found, away), 0.2)
+    record = truth_record(half, ComparedTrajectories(found, away), 0.2)
     assert record is not None
     assert record.poses == 4
     assert record.localised.largest_m < 1e-9
     assert record.odometry.rms_m == pytest.approx(5.0)
     assert record.removed == pytest.approx(1.0)
     assert np.isnan(record.odometry_m[4:]).all()
-    assert truth_record(half, Ways(found, away), 0.05) is None
+    assert truth_record(half, ComparedTrajectories(found, away), 0.05) is None
 
 
-def test_a_truth_of_another_time_is_told() -> None:
+def test_a_truth_of_another_time_is_an_error() -> None:
     truth = trajectory(np.random.default_rng(7))
     later = replace(truth, stamp_ns=truth.stamp_ns + 3_600_000_000_000)
     check_truth(truth, truth, 0.5, "truth.tum")

@@ -5,11 +5,20 @@ import re
 import numpy as np
 import pytest
 
-from l2m_gtsam.qa.report.drawing import Drawing, Entry, legend
-from l2m_gtsam.qa.report.figures.course import curves_figure, residuals_figure
-from l2m_gtsam.qa.report.figures.place import residual_figure
+from l2m_gtsam.qa.report.drawing import (
+    Drawing,
+    LegendEntry,
+    Panel,
+    Rectangle,
+    Stroke,
+    legend,
+    nice,
+    numbers,
+    spread,
+)
+from l2m_gtsam.qa.report.figures.map import residual_figure
+from l2m_gtsam.qa.report.figures.readings import curves_figure, residuals_figure
 from l2m_gtsam.qa.report.figures.statistics import chi_square_figure, sigmas_figure
-from l2m_gtsam.qa.report.panel import Box, Panel, Stroke, nice, numbers, spread
 from l2m_gtsam.qa.report.svg import VARIABLES, X, as_svg
 from l2m_gtsam.records.metrics import Normalised, Series
 
@@ -75,7 +84,7 @@ def test_all_is_inside_and_finite(rejected: int) -> None:
 
 
 def test_points_stand_where_they_belong() -> None:
-    panel = Panel(Box(10, 20, 100, 50), (0.0, 10.0), (-1.0, 1.0))
+    panel = Panel(Rectangle(10, 20, 100, 50), (0.0, 10.0), (-1.0, 1.0))
     panel.line(np.array([0.0, 5.0, np.nan, 10.0]), np.array([-1.0, 0.0, 0.0, 1.0]), Stroke(X))
     panel.dots(np.array([5.0, 11.0]), np.array([0.0, 0.0]), 2.0, X, 1.0)
     line, dots = panel.parts
@@ -85,12 +94,12 @@ def test_points_stand_where_they_belong() -> None:
 
 
 def test_words_are_text() -> None:
-    panel = Panel(Box(10, 20, 100, 50), (0.0, 1.0), (0.0, 1.0))
+    panel = Panel(Rectangle(10, 20, 100, 50), (0.0, 1.0), (0.0, 1.0))
     panel.x_axis(HOSTILE)
     panel.y_axis(HOSTILE)
-    legend(panel, [Entry(HOSTILE, Stroke(X))])
+    legend(panel, [LegendEntry(HOSTILE, Stroke(X))])
     figure = Drawing(2.0, (panel,))
-    figure.legend_above([Entry(HOSTILE, Stroke(X))])
+    figure.legend_above([LegendEntry(HOSTILE, Stroke(X))])
     assert "<script" not in as_svg(figure, "a", HOSTILE)
 
 

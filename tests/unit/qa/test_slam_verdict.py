@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from l2m_gtsam.qa.judge import Verdict
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.reasons.reason import Level
-from l2m_gtsam.qa.slam.judge import judge_localisation, slam_thresholds
+from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_thresholds
 from l2m_gtsam.records.localisation import LocalisationStatus, OdometryScale, ScanUse
 from l2m_gtsam.records.localisation_file import (
     LocalisationRecord,
@@ -18,6 +16,7 @@ from l2m_gtsam.records.localisation_file import (
     Timeline,
 )
 from l2m_gtsam.records.validation import ChiSquare
+from l2m_gtsam.records.verdict import Level, Verdict
 from tests.drives.localised import record
 
 
@@ -89,12 +88,12 @@ def test_the_ending_counts() -> None:
     ("position", "rotation", "level", "told"),
     [
         (0.2, 0.5, Level.WARN, "The position is known to no better than 200 mm (1 sigma) at worst"),
-        (0.7, 0.5, Level.FAIL, "and to no better than 100 mm for 50% of the way"),
+        (0.7, 0.5, Level.FAIL, "and to no better than 100 mm for 50% of the path"),
         (0.02, 3.0, Level.WARN, "The heading is known to no better than 3.0°"),
-        (0.02, 12.0, Level.FAIL, "and to no better than 2° for 50% of the way"),
+        (0.02, 12.0, Level.FAIL, "and to no better than 2° for 50% of the path"),
     ],
 )
-def test_poses_that_are_not_sure_are_named(
+def test_poses_of_large_sigmas_are_named(
     position: float, rotation: float, level: Level, told: str
 ) -> None:
     start = good()
@@ -107,9 +106,9 @@ def test_poses_that_are_not_sure_are_named(
     verdict = judged(replace(start, poses=tuple(poses)))
     assert verdict.level is level
     (text,) = texts(verdict, level)
-    # Half of the way but for a key pose's: 20 cm of five metres.
-    share = [f"{percent}% of the way" for percent in range(46, 55)]
-    assert told.replace("50% of the way", "") in text
+    # Half of the path but for a key pose's: 20 cm of five metres.
+    share = [f"{percent}% of the path" for percent in range(46, 55)]
+    assert told.replace("50% of the path", "") in text
     assert any(each in text for each in share)
 
 
@@ -123,7 +122,7 @@ def test_the_truth_counts() -> None:
     truth = good().truth
     assert truth is not None
     (text,) = texts(judged(replace(good(), truth=replace(truth, nees=36.0))), Level.WARN)
-    assert "2.4 times as large as their standard deviations say (NEES 36.0; 6 is honest)" in text
+    assert "2.4 times their standard deviations (NEES 36.0; consistent: expected 6)" in text
     worse = replace(truth, odometry=truth.localised, localised=truth.odometry)
     (text,) = texts(judged(replace(good(), truth=worse)), Level.WARN)
     assert "made the error of the position larger" in text
@@ -162,7 +161,7 @@ def test_a_place_that_changed_is_told_once_for_all_sensors() -> None:
     assert judged(fits).level is judged(replace(start, sensors=(seen,))).level is Level.PASS
 
 
-def test_a_start_that_is_wrong_is_told() -> None:
+def test_a_wrong_start_is_reported() -> None:
     start = good()
     away = np.array([0.6, 0.0, 0.0])
     poses = tuple(replace(each, p=tuple(np.add(each.p, away))) for each in start.poses)
@@ -171,7 +170,7 @@ def test_a_start_that_is_wrong_is_told() -> None:
     assert f"The drive begins {apart:.2f} m and" in text
 
 
-def test_what_sigmas_leave_out_is_told() -> None:
+def test_what_sigmas_leave_out_is_reported() -> None:
     blind = judged(replace(good(), map_errors_shared=False))
     assert "standard deviations come out too small" in texts(blind, Level.WARN)[0]
     fixed = judged(replace(good(), refined=()))
@@ -179,7 +178,7 @@ def test_what_sigmas_leave_out_is_told() -> None:
     assert any("counts as exact" in each for each in texts(fixed, Level.PASS))
     nothing = tuple(replace(each, covariance=None) for each in good().poses)
     unknown = judged(replace(good(), poses=nothing))
-    assert texts(unknown, Level.WARN) == ["How sure the poses are is not known."]
+    assert texts(unknown, Level.WARN) == ["The uncertainty of the poses is not known."]
     noted = judged(replace(good(), notes=("mag_02 is left out: it has no calibration",)))
     assert texts(noted, Level.WARN) == ["mag_02 is left out: it has no calibration."]
 
@@ -192,7 +191,7 @@ def test_a_calibration_that_was_not_as_sure_as_it_said_is_named() -> None:
 
 
 def test_thresholds_are_those_of_the_options() -> None:
-    named = {each.name: each for each in slam_thresholds(QaOptions())}
+    named = {each.name: each for each in localisation_thresholds(QaOptions())}
     assert {"rejected", "outside_map", "chi_square", "slam.position_sigma_m", "slam.nees"} <= set(
         named
     )
@@ -200,16 +199,16 @@ def test_thresholds_are_those_of_the_options() -> None:
     assert "metres" in named["slam.position_sigma_m"].text
 
 
-def test_a_scale_that_was_found_is_told() -> None:
+def test_a_scale_that_was_found_is_reported() -> None:
     """As what ways are; where it is no variable nothing is said of it."""
     shorter = replace(good(), scale=OdometryScale(-0.0111, 0.0018))
-    told = "Ways are 1.11% ± 0.18% (1 sigma) shorter than odometry has them."
+    told = "Distances are 1.11% ± 0.18% (1 sigma) shorter than odometry's."
     assert told in texts(judged(shorter), Level.PASS)
     longer = replace(good(), scale=OdometryScale(0.02, 0.001))
     assert any(
         "2.00% ± 0.10% (1 sigma) longer" in each for each in texts(judged(longer), Level.PASS)
     )
-    assert not any("Ways are" in each for each in texts(judged(good()), Level.PASS))
+    assert not any("Distances are" in each for each in texts(judged(good()), Level.PASS))
 
 
 def test_scans_that_contradict_odometry_are_told() -> None:

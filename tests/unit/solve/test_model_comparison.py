@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from rich.console import Console
 from scipy.signal import lfilter
 
-from l2m_gtsam.cli.tables.model_table import model_table
+from l2m_gtsam.cli.tables.calibration import model_table
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.sensor_models import Coefficients, Model, Samples
 from l2m_gtsam.solve.model_choice import HeldOut, Trial, choose, reason_of

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.qa.fleet.rows import DIGITS
+from l2m_gtsam.qa.fleet import DIGITS
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.qa.reasons.reason import Level
 from l2m_gtsam.records.fleet import VERDICTS, DriveOutcome, Made, RowKey
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.record_files import read_outcome, write_outcome
 from tests.drives.fleet_rows import sensor_row
 

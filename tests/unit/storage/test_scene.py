@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import OutputError
-from l2m_gtsam.qa.evaluate import scene_of
-from l2m_gtsam.qa.scene import drive_views
+from l2m_gtsam.qa.scene import drive_views, scene_of
 from l2m_gtsam.records.scene import Scene
 from l2m_gtsam.storage import rerun_file
 from l2m_gtsam.storage.rerun_file import arrow_scale, ellipsoid, write_scene

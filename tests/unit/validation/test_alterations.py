@@ -9,15 +9,15 @@ from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.mounting import gains, skews_deg
-from l2m_gtsam.records.validation import Part
-from l2m_gtsam.validation.alterations import (
+from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.validation.innovation import (
     COLUMNS,
     PARAMETERS,
-    Told,
-    against_calibration,
+    ChangeLikelihood,
     changes_of,
     columns_of,
-    noticeable,
+    detectable_change,
+    marginalise_calibration,
     parts_changed,
 )
 from tests.drives.calibrations import SIGMA, rotations
@@ -38,8 +38,8 @@ def spread(seed: int) -> FloatArray:
     return np.asarray(mixing @ mixing.T * np.outer(SIGMAS, SIGMAS))
 
 
-def told(J: FloatArray, innovation: FloatArray) -> Told:
-    return Told.of(np.column_stack([J, innovation]))
+def told(J: FloatArray, innovation: FloatArray) -> ChangeLikelihood:
+    return ChangeLikelihood.of(np.column_stack([J, innovation]))
 
 
 @given(SEEDS)
@@ -47,7 +47,7 @@ def test_the_innovation_is_white_under_its_full_covariance(seed: int) -> None:
     """Against the definition: e^T S^-1 e with S = I + J P J^T."""
     J, P, rng = readings(seed), spread(seed), np.random.default_rng(seed + 1)
     e = rng.normal(size=len(J)) + J @ rng.multivariate_normal(np.zeros(PARAMETERS), P)
-    found = against_calibration(told(J, e), P, changes_of(np.eye(3)))
+    found = marginalise_calibration(told(J, e), P, changes_of(np.eye(3)))
     S = np.eye(len(J)) + J @ P @ J.T
     assert found.squared == pytest.approx(e @ np.linalg.solve(S, e), rel=1e-9)
 
@@ -57,9 +57,9 @@ def test_a_change_is_estimated_as_least_squares_do(seed: int) -> None:
     """Generalised least squares over one part, written out with the full covariance."""
     J, P, basis = readings(seed), spread(seed), changes_of(np.eye(3))
     e = np.random.default_rng(seed).normal(size=len(J))
-    found = against_calibration(told(J, e), P, basis)
+    found = marginalise_calibration(told(J, e), P, basis)
     weights = np.linalg.inv(np.eye(len(J)) + J @ P @ J.T)
-    for part in Part:
+    for part in CalibrationPart:
         A = J @ basis[:, COLUMNS[part]]
         information = A.T @ weights @ A
         expected = np.linalg.solve(information, A.T @ weights @ e)
@@ -69,7 +69,7 @@ def test_a_change_is_estimated_as_least_squares_do(seed: int) -> None:
         gain = expected @ information @ expected
         assert found.explained(columns_of([part])) == pytest.approx(gain, rel=1e-7)
         worst = np.sqrt(np.linalg.eigvalsh(covariance)[-1])
-        assert noticeable(found, part, 5.0) == pytest.approx(5 * worst, rel=1e-7)
+        assert detectable_change(found, part, 5.0) == pytest.approx(5 * worst, rel=1e-7)
 
 
 @given(SEEDS)
@@ -78,9 +78,12 @@ def test_readings_told_elsewhere_tell_the_same(seed: int) -> None:
     J, rng = readings(seed), np.random.default_rng(seed)
     e, away = rng.normal(size=len(J)), rng.normal(size=PARAMETERS) * SIGMAS
     here, there = told(J, e), told(J, e - J @ away)
-    assert there.moved(away).squared == pytest.approx(here.squared, rel=1e-9)
+    assert there.recentred(away).squared == pytest.approx(here.squared, rel=1e-9)
     np.testing.assert_allclose(
-        there.moved(away).estimate(range(16))[0], here.estimate(range(16))[0], rtol=1e-6, atol=1e-9
+        there.recentred(away).estimate(range(16))[0],
+        here.estimate(range(16))[0],
+        rtol=1e-6,
+        atol=1e-9,
     )
 
 
@@ -101,22 +104,22 @@ def test_coordinates_are_what_they_are_called(R: FloatArray, seed: int) -> None:
 
 
 AMOUNTS = {
-    Part.PLACE: [0.04, 0.0, -0.02],
-    Part.ROTATION: [0.0, 3.0, 1.0],
-    Part.GAINS: [0.0, 0.05, 0.0],
-    Part.ANGLES: [3.0, 0.0, 0.0],
-    Part.OFFSET: [3.0, 0.0, 0.0],
-    Part.CLOCK: [0.03],
+    CalibrationPart.PLACE: [0.04, 0.0, -0.02],
+    CalibrationPart.ROTATION: [0.0, 3.0, 1.0],
+    CalibrationPart.GAINS: [0.0, 0.05, 0.0],
+    CalibrationPart.ANGLES: [3.0, 0.0, 0.0],
+    CalibrationPart.OFFSET: [3.0, 0.0, 0.0],
+    CalibrationPart.CLOCK: [0.03],
 }
 
 
-@pytest.mark.parametrize("part", list(Part))
-def test_the_part_that_changed_is_named(part: Part) -> None:
+@pytest.mark.parametrize("part", list(CalibrationPart))
+def test_the_part_that_changed_is_named(part: CalibrationPart) -> None:
     """And no other, with the amount by which it changed, in readings without noise."""
     J, basis = readings(3), changes_of(np.eye(3))
     change = np.zeros(PARAMETERS)
     change[COLUMNS[part]] = AMOUNTS[part]
-    found = against_calibration(told(J, J @ basis @ change), spread(3), basis)
+    found = marginalise_calibration(told(J, J @ basis @ change), spread(3), basis)
     assert parts_changed(found, len(J), 1e-3) == (part,)
     value, _ = found.estimate(columns_of([part]))
     np.testing.assert_allclose(value, AMOUNTS[part], rtol=1e-6, atol=1e-9)
@@ -125,10 +128,13 @@ def test_the_part_that_changed_is_named(part: Part) -> None:
 def test_two_parts_that_changed_are_both_named() -> None:
     J, basis = readings(4), changes_of(np.eye(3))
     change = np.zeros(PARAMETERS)
-    for part in (Part.PLACE, Part.ROTATION):
+    for part in (CalibrationPart.PLACE, CalibrationPart.ROTATION):
         change[COLUMNS[part]] = AMOUNTS[part]
-    found = against_calibration(told(J, J @ basis @ change), spread(4), basis)
-    assert set(parts_changed(found, len(J), 1e-3)) == {Part.PLACE, Part.ROTATION}
+    found = marginalise_calibration(told(J, J @ basis @ change), spread(4), basis)
+    assert set(parts_changed(found, len(J), 1e-3)) == {
+        CalibrationPart.PLACE,
+        CalibrationPart.ROTATION,
+    }
 
 
 def test_nothing_is_named_by_chance() -> None:
@@ -139,7 +145,7 @@ def test_nothing_is_named_by_chance() -> None:
     for seed in range(400):
         rng, J = np.random.default_rng([seed, 1]), readings(seed, 60)
         e = J @ root @ rng.normal(size=PARAMETERS) + rng.normal(size=len(J))
-        found = against_calibration(told(J, e), P, basis)
+        found = marginalise_calibration(told(J, e), P, basis)
         named += bool(parts_changed(found, len(J), 1e-2))
         parameters.append(found.explained(range(16)))
         whole.append(found.squared)
@@ -157,6 +163,6 @@ def test_what_readings_do_not_depend_on_is_not_named() -> None:
     J, basis = readings(6), changes_of(np.eye(3))
     J[:, 15] = 0.0
     e = J[:, 12] * 5.0
-    found = against_calibration(told(J, e), spread(6), basis)
-    assert Part.CLOCK not in parts_changed(found, len(J), 1e-3)
-    assert noticeable(found, Part.CLOCK, 5.0) == np.inf
+    found = marginalise_calibration(told(J, e), spread(6), basis)
+    assert CalibrationPart.CLOCK not in parts_changed(found, len(J), 1e-3)
+    assert detectable_change(found, CalibrationPart.CLOCK, 5.0) == np.inf

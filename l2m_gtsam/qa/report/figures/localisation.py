@@ -1,4 +1,4 @@
-"""A localised drive: its way over the map, odometry's drift, and how sure poses are."""
+"""A localised drive: its path over the map, drift of odometry, sigmas and errors of poses."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 from matplotlib.patheffects import Normal, Stroke
-from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.plain import evenly
-from l2m_gtsam.qa.report.figures.place import mark, strength_background, wide
+from l2m_gtsam.qa.metrics.trajectory import HEADING, LocalisedTrajectory
+from l2m_gtsam.qa.report.figures.map import mark, strength_background, wide
 from l2m_gtsam.qa.report.svg import (
     AXES,
     BAD,
@@ -25,11 +24,12 @@ from l2m_gtsam.qa.report.svg import (
     X,
     Y,
     dots,
+    ellipse,
     new_figure,
+    plain_decades,
     plain_figure,
     short_name,
 )
-from l2m_gtsam.qa.slam.course import HEADING, Course
 from l2m_gtsam.records.localisation_file import SensorRecord, TruthRecord
 from l2m_gtsam.records.metrics import MapPicture, Rows
 
@@ -43,50 +43,52 @@ DECADE = 10.0
 SHORTEST = 1e-4  # m and degrees: less is nothing on an axis of decades
 
 
-def ellipse_scale(course: Course, picture: MapPicture) -> int:
+def ellipse_scale(path: LocalisedTrajectory, picture: MapPicture) -> int:
     """Return how many times as large as they are ellipses can be drawn."""
     left, right, bottom, top = picture.extent
     room = LARGEST * max(right - left, top - bottom)
-    largest = float(course.sigma[_chosen(course), :2].max())
+    largest = float(path.sigma[_chosen(path), :2].max())
     fitting = [scale for scale in SCALES if scale * largest <= room]
     return fitting[-1] if fitting else SCALES[0]
 
 
-def way_figure(course: Course, picture: MapPicture, truth: Rows | None) -> Figure:
-    """Draw the localised way over the map beside odometry's, with ellipses of one sigma."""
+def path_figure(path: LocalisedTrajectory, picture: MapPicture, truth: Rows | None) -> Figure:
+    """Draw the localised path over the map beside odometry's, with ellipses of one sigma."""
     figure, axes = strength_background(picture)
-    keep = evenly(len(course.p), DRAWN)
-    _line(axes, course.odometry[keep], "--", color="#ffb000", label="odometry")
-    _line(axes, course.p[keep], "-", color="white", label="localised")
+    keep = evenly(len(path.p), DRAWN)
+    _line(axes, path.odometry[keep], "--", color="#ffb000", label="odometry")
+    _line(axes, path.p[keep], "-", color="white", label="localised")
     if truth is not None:
         axes.plot(*np.array(truth)[keep, :2].T, ":", color="#ff4fd8", linewidth=1.6, label="truth")
-    scale = ellipse_scale(course, picture)
-    for k in _chosen(course):
-        axes.add_patch(_ellipse(course, int(k), scale))
-    mark(axes, course.p[0, :2], "start")
-    mark(axes, course.p[-1, :2], "end")
+    scale = ellipse_scale(path, picture)
+    for k in _chosen(path):
+        shape = ellipse(path.p[k, :2], path.covariance[k, :2, :2], scale)
+        shape.set(facecolor="#ffffff66", edgecolor="black")
+        axes.add_patch(shape)
+    mark(axes, path.p[0, :2], "start")
+    mark(axes, path.p[-1, :2], "end")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
 
 
-def drift_figure(course: Course) -> Figure:
-    """Draw how far odometry alone is from the localised poses over the way."""
+def drift_figure(path: LocalisedTrajectory) -> Figure:
+    """Draw how far odometry alone is from the localised poses along the path."""
     figure = plain_figure(3.2)
     above, below = figure.subplots(2, 1, sharex=True)
-    keep = evenly(len(course.way), DRAWN)
-    above.plot(course.way[keep], course.apart[keep], "-", color=X)
-    below.plot(course.way[keep], course.turned[keep], "-", color=Y)
+    keep = evenly(len(path.distance), DRAWN)
+    above.plot(path.distance[keep], path.apart[keep], "-", color=X)
+    below.plot(path.distance[keep], path.turned[keep], "-", color=Y)
     above.set(ylabel="distance (m)", ylim=(0, None))
-    below.set(ylabel="angle (°)", ylim=(0, None), xlabel="localised way (m)")
+    below.set(ylabel="angle (°)", ylim=(0, None), xlabel="localised path (m)")
     return figure
 
 
-def sigma_figure(course: Course) -> Figure:
-    """Draw how sure poses are over time, and how sure odometry alone would be."""
+def sigma_figure(path: LocalisedTrajectory) -> Figure:
+    """Draw standard deviations of poses over time, and those of odometry alone."""
     figure = plain_figure(4.2)
     above, below = figure.subplots(2, 1, sharex=True)
-    keep = evenly(len(course.seconds), DRAWN)
-    at, own, alone = course.seconds[keep], course.sigma[keep], course.odometry_sigma[keep]
+    keep = evenly(len(path.seconds), DRAWN)
+    at, own, alone = path.seconds[keep], path.sigma[keep], path.odometry_sigma[keep]
     for k, axis in enumerate("xyz"):
         above.plot(at, own[:, k], DASHES[k], color=AXES[k], label=axis)
     label = "odometry alone"
@@ -101,20 +103,20 @@ def sigma_figure(course: Course) -> Figure:
     return figure
 
 
-def truth_figure(course: Course, truth: TruthRecord) -> Figure:
-    """Draw errors against the truth over the way, and whether covariances say so."""
+def truth_figure(path: LocalisedTrajectory, truth: TruthRecord) -> Figure:
+    """Draw errors against the truth along the path, and in units of covariances."""
     figure = plain_figure(4.2)
     above, below = figure.subplots(2, 1, sharex=True)
-    keep = evenly(len(course.way), DRAWN)
-    way = course.way[keep]
-    above.plot(way, np.array(truth.odometry_m)[keep], "--", color=Y, label="odometry")
-    above.plot(way, np.array(truth.localised_m)[keep], "-", color=X, label="localised")
-    expected = np.sqrt(np.trace(course.covariance[keep], axis1=1, axis2=2))
-    above.plot(way, expected, ":", color=MUTED, linewidth=1.6, label="stated (1 sigma)")
+    keep = evenly(len(path.distance), DRAWN)
+    distance = path.distance[keep]
+    above.plot(distance, np.array(truth.odometry_m)[keep], "--", color=Y, label="odometry")
+    above.plot(distance, np.array(truth.localised_m)[keep], "-", color=X, label="localised")
+    expected = np.sqrt(np.trace(path.covariance[keep], axis1=1, axis2=2))
+    above.plot(distance, expected, ":", color=MUTED, linewidth=1.6, label="stated (1 sigma)")
     above.set(ylabel="error (m)", ylim=(0, None))
-    below.axhspan(0, BAND_95, color=GRID, label="95 % if honest")
-    dots(below, way, np.array(truth.squared)[keep], 2.2, color=X)
-    below.set(ylabel="NEES", ylim=(0, None), xlabel="localised way (m)")
+    below.axhspan(0, BAND_95, color=GRID, label="95 % if consistent")
+    dots(below, distance, np.array(truth.squared)[keep], 2.2, color=X)
+    below.set(ylabel="NEES", ylim=(0, None), xlabel="localised path (m)")
     below.legend(loc="best")
     figure.legend(*above.get_legend_handles_labels(), loc="upper center", ncols=3)
     return figure
@@ -146,20 +148,20 @@ def counted_figure(sensors: Sequence[SensorRecord]) -> Figure:
     return figure
 
 
-def rejected_figure(course: Course, sensors: Sequence[SensorRecord]) -> Figure:
+def rejected_figure(path: LocalisedTrajectory, sensors: Sequence[SensorRecord]) -> Figure:
     """Draw where readings were rejected that the map has data for."""
-    figure, axes = wide(np.ptp(course.p[:, :2], axis=0))
-    keep = evenly(len(course.p), DRAWN)
-    axes.plot(*course.p[keep, :2].T, "-", color=MUTED, linewidth=0.9, label="lidar")
+    figure, axes = wide(np.ptp(path.p[:, :2], axis=0))
+    keep = evenly(len(path.p), DRAWN)
+    axes.plot(*path.p[keep, :2].T, "-", color=MUTED, linewidth=0.9, label="lidar")
     for sensor in sensors:
         if sensor.series is not None:
             wrong = np.array(sensor.series.rejected)
             place = np.array(sensor.series.place)[wrong]
             axes.plot(*place.reshape(-1, 3)[:, :2].T, "x", color=BAD, markersize=4)
     axes.plot([], [], "x", color=BAD, markersize=4, label="rejected readings")
-    axes.plot(*course.p[0, :2], "o", color=INK, markersize=5)
+    axes.plot(*path.p[0, :2], "o", color=INK, markersize=5)
     axes.annotate(
-        "start", tuple(course.p[0, :2]), xytext=(6, 6), textcoords="offset points", fontsize=SMALL
+        "start", tuple(path.p[0, :2]), xytext=(6, 6), textcoords="offset points", fontsize=SMALL
     )
     axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
     axes.margins(0.08)
@@ -181,32 +183,20 @@ def _bars(
 
 
 def _line(axes: Axes, p: FloatArray, dashes: str, **style: Any) -> None:
-    """Draw a way that is seen on any colour of the map, and beside it in the legend."""
+    """Draw a path that is seen on any colour of the map, and beside it in the legend."""
     edge = [Stroke(linewidth=2.8, foreground="black"), Normal()]
     axes.plot(*p[:, :2].T, dashes, linewidth=1.4, path_effects=edge, **style)
 
 
-def _chosen(course: Course) -> FloatArray:
-    """Return some poses that are far apart along the way, the last among them."""
-    wanted = np.linspace(0, course.way[-1], ELLIPSES + 1)[1:]
-    rows = np.searchsorted(course.way, wanted)
-    return np.unique(np.minimum(rows, len(course.way) - 1))
-
-
-def _ellipse(course: Course, k: int, scale: int) -> Ellipse:
-    values, vectors = np.linalg.eigh(course.covariance[k, :2, :2])
-    width, height = 2 * scale * np.sqrt(np.maximum(values, 0.0))
-    angle = float(np.rad2deg(np.arctan2(vectors[1, 0], vectors[0, 0])))
-    return Ellipse(
-        tuple(course.p[k, :2]), width, height, angle=angle, facecolor="#ffffff66", edgecolor="black"
-    )
+def _chosen(path: LocalisedTrajectory) -> FloatArray:
+    """Return some poses that are far apart along the path, the last among them."""
+    wanted = np.linspace(0, path.distance[-1], ELLIPSES + 1)[1:]
+    rows = np.searchsorted(path.distance, wanted)
+    return np.unique(np.minimum(rows, len(path.distance) - 1))
 
 
 def _decades(axes: Axes) -> None:
-    """Count upwards in decades, with plain numbers: mathematics is text in these figures.
-
-    Within less than one a plain axis is easier to read.
-    """
+    """Count upwards in decades; within less than one a plain axis is easier to read."""
     low, high = axes.dataLim.intervaly
     if not low * DECADE < high:
         axes.set_ylim(0, None)
@@ -214,6 +204,4 @@ def _decades(axes: Axes) -> None:
     axes.set_yscale("log", nonpositive="clip")
     low, high = axes.get_ylim()
     axes.set_ylim(max(low, SHORTEST), high)
-    axes.yaxis.set_major_locator(LogLocator(subs=[1.0] if high > 50 * low else [1.0, 2.0, 5.0]))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
+    plain_decades(axes.yaxis, high > 50 * low)

@@ -1,10 +1,25 @@
-"""Whether residuals are what the noise says: their chi-square, and their correlation in time."""
+"""Statistics of a sensor: chi-square and autocorrelation of residuals, tests, correlations."""
 
 import numpy as np
 
-from l2m_gtsam.qa.report.drawing import Drawing, Entry, legend, usual
-from l2m_gtsam.qa.report.panel import Panel, Stroke, fill, letters, paint
-from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, SMALL, X, Y
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.report.drawing import (
+    COLOURS,
+    Drawing,
+    LegendEntry,
+    Panel,
+    Rectangle,
+    Stroke,
+    colours,
+    fill,
+    legend,
+    letters,
+    paint,
+    shades,
+    usual,
+)
+from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, PAPER, SMALL, X, Y
+from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import Normalised, Row, SensorMetrics
 from l2m_gtsam.solve.chi_square import density
 
@@ -15,6 +30,9 @@ NAMES = ("tx", "ty", "tz", *(f"C{r}{c}" for r in "xyz" for c in "xyz"), "Hx", "H
 BAR = 0.35  # half of a bar's width
 ZERO = Stroke(MUTED, 0.7)
 BAND = Stroke(GRID, 8)  # as it is in a legend
+HEIGHT_OF_MATRIX = 4.0  # inches
+MATRIX = Rectangle(34, 10, 240, 240)
+SCALE = Rectangle(286, 29, 10, 202)
 EXPECTED = Stroke(INK, dashes=(4.1, 1.8))
 
 
@@ -38,15 +56,15 @@ def chi_square_figure(found: Normalised) -> Drawing:
     panel.text(float(panel.across(CUT)) + 4, at, beyond, letters("start", SMALL))
     panel.frame()
     samples = [
-        Entry("read", Stroke(X, 8, alpha=0.5)),
-        Entry("expected: chi-square of 3", EXPECTED),
+        LegendEntry("read", Stroke(X, 8, alpha=0.5)),
+        LegendEntry("expected: chi-square of 3", EXPECTED),
     ]
     legend(panel, samples)
     return Drawing(HEIGHT, (panel,))
 
 
 def autocorrelation_figure(sensor: SensorMetrics) -> Drawing:
-    """Draw how alike residuals are that lie some readings apart."""
+    """Draw the autocorrelation of residuals over the number of readings between them."""
     found = sensor.autocorrelation
     lags, correlation = np.array(found.lags, dtype=float), np.array(found.correlation)
     bound = 1.96 / np.sqrt(max(sensor.fit.readings, 1))
@@ -63,7 +81,7 @@ def autocorrelation_figure(sensor: SensorMetrics) -> Drawing:
     panel.dots(lags, correlation, 4.2, Y, 1.0)
     panel.level(0, ZERO)
     panel.frame()
-    legend(panel, [Entry("chance (95 %)", BAND)])
+    legend(panel, [LegendEntry("chance (95 %)", BAND)])
     return Drawing(HEIGHT, (panel,))
 
 
@@ -92,5 +110,53 @@ def sigmas_figure(difference: Row, sigma_of: Row, label: str) -> Drawing:
         at = f"translate({x + 3:.1f} {panel.box.bottom + 11:.1f}) rotate(-60)"
         panel.parts.append(f'<text transform="{at}" style="{letters("end", SMALL)}">{name}</text>')
     panel.frame()
-    legend(panel, [Entry(f"± {ALIKE:g} sigmas", BAND)])
+    legend(panel, [LegendEntry(f"± {ALIKE:g} sigmas", BAND)])
     return Drawing(HEIGHT, (panel,))
+
+
+def correlations(sensor: SensorCalibration) -> FloatArray:
+    """Return the correlations of (t, C row by row, H), NaN for what is open, shape (15, 15)."""
+    variance = np.diag(sensor.covariance)
+    known = np.isfinite(variance) & (variance > 0)
+    sigma = np.sqrt(np.where(known, variance, 1.0))
+    rho = np.where(np.isfinite(sensor.covariance), sensor.covariance, 0) / np.outer(sigma, sigma)
+    rho[~known, :] = np.nan
+    rho[:, ~known] = np.nan
+    return np.asarray(rho)
+
+
+def correlation_figure(sensor: SensorCalibration) -> Drawing:
+    """Draw the correlations as a matrix; what is not determined stays blank."""
+    rho, ends = correlations(sensor), (-0.5, 14.5)
+    matrix, bar = Panel(MATRIX, ends, ends), Panel(SCALE, (0, 1), (-1, 1))
+    column, row = np.meshgrid(np.arange(15.0), 14 - np.arange(15.0))  # the first row is on top
+    palette, shade = colours("PuOr"), shades(np.nan_to_num(rho), bar.y)
+    for number in np.unique(shade[np.isfinite(rho)]):
+        own = (shade == number) & np.isfinite(rho)
+        sides = np.column_stack([column[own] - 0.5, column[own] + 0.5])
+        matrix.bars(sides, row[own] - 0.5, row[own] + 0.5, fill(palette[number]))
+    for edge in (2.5, 11.5):
+        matrix.level(14 - edge, Stroke(PAPER, 2))
+        matrix.upright(edge, Stroke(PAPER, 2))
+    _names(matrix)
+    # Strong ones have a sign, too: colours are not all that readers see.
+    for i, j in zip(*np.nonzero(np.abs(np.tril(np.nan_to_num(rho), -1)) > 0.5), strict=True):
+        sign = "+" if rho[i, j] > 0 else "−"
+        x, y = float(matrix.across(j)), float(matrix.down(14 - i))
+        matrix.text(x, y + 3, sign, letters("middle", SMALL, "white"))
+    steps = np.linspace(-1, 1, COLOURS + 1)
+    # Each to the end, below the next: there is no seam between two.
+    for low, colour in zip(steps[:-1], palette, strict=True):
+        bar.bars(np.array([[0.0, 1.0]]), np.array([low]), np.ones(1), fill(colour))
+    for value in (-1, -0.5, 0, 0.5, 1):
+        words = f"{value:.1f}".replace("-", "−")
+        bar.text(SCALE.right + 5, float(bar.down(value)) + 3.5, words, letters("start"))
+    return Drawing(HEIGHT_OF_MATRIX, (matrix, bar))
+
+
+def _names(matrix: Panel) -> None:
+    for k, name in enumerate(NAMES):
+        x, y = float(matrix.across(k)), float(matrix.down(14 - k))
+        matrix.text(MATRIX.left - 5, y + 3, name, letters("end", SMALL))
+        at = f"translate({x + 3:.1f} {MATRIX.bottom + 6:.1f}) rotate(-90)"
+        matrix.parts.append(f'<text transform="{at}" style="{letters("end", SMALL)}">{name}</text>')

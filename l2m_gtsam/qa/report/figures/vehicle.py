@@ -1,5 +1,6 @@
-"""Where the sensors sit on the vehicle, with their ellipses."""
+"""Where the sensors sit on the vehicle, with their ellipses: in the report, and as one picture."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,34 +8,46 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.judge import Verdict
-from l2m_gtsam.qa.reasons.reason import Level
-from l2m_gtsam.qa.report.svg import BAD, FAIR, GOOD, INK, MUTED, SMALL, new_figure, short_name
+from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
+from l2m_gtsam.qa.report.figures.map import draw_map
+from l2m_gtsam.qa.report.svg import (
+    BAD,
+    FAIR,
+    GOOD,
+    INK,
+    MUTED,
+    SMALL,
+    ellipse,
+    new_figure,
+    short_name,
+)
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.metrics import MapPicture
+from l2m_gtsam.records.verdict import Level, Verdict
 
-CHI2_95 = 5.991  # of two degrees of freedom
+SIGMAS_95 = 5.991**0.5  # half axes that hold 95 %: root of the quantile of chi-square of two
+ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds of colour vision
 COLOURS = {Level.PASS: GOOD, Level.WARN: FAIR, Level.FAIL: BAD}
 SHAPES = {Level.PASS: "o", Level.WARN: "^", Level.FAIL: "X"}
 # An ellipse that is less than this share of the picture is a dot: all are drawn larger then.
 SEEN = 0.06
 BEHIND = 0.08  # of the picture: names closer than this would cover each other
-FAR = 0.75  # of the picture: names beyond this stand on the left of their dot
+FAR = 0.75  # of the picture: names beyond this are written on the left of their dot
 ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200)
 
 
 @dataclass(frozen=True)
-class View:
+class Viewpoint:
     """A direction to look from: the axes that it shows, and its name."""
 
     axes: tuple[int, int]
     name: str
 
 
-TOP, SIDE = View((0, 1), "from above"), View((0, 2), "from the side")
+TOP, SIDE = Viewpoint((0, 1), "from above"), Viewpoint((0, 2), "from the side")
 
 
-def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: View) -> Figure:
+def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: Viewpoint) -> Figure:
     """Draw the sensors that were found around the lidar."""
     figure = new_figure(3.6)
     axes = figure.add_subplot()
@@ -54,7 +67,7 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: View) -> F
     return figure
 
 
-def enlargement(found: list[SensorCalibration], view: View) -> int:
+def enlargement(found: list[SensorCalibration], view: Viewpoint) -> int:
     """Return how many times larger than they are ellipses have to be drawn to be seen."""
     rows = list(view.axes)
     sizes = np.array([each.t_sigma[rows] for each in found]).ravel()
@@ -62,18 +75,18 @@ def enlargement(found: list[SensorCalibration], view: View) -> int:
     if not len(sizes):
         return 1
     span = float(np.ptp(_places(found, view), axis=0).max())
-    wanted = SEEN * span / (2 * np.sqrt(CHI2_95) * float(np.median(sizes)))
+    wanted = SEEN * span / (2 * SIGMAS_95 * float(np.median(sizes)))
     return max([each for each in ENLARGED if each <= max(wanted, 1)])
 
 
-def _places(found: list[SensorCalibration], view: View) -> FloatArray:
+def _places(found: list[SensorCalibration], view: Viewpoint) -> FloatArray:
     """Return places of lidar and sensors in a view, with room around a single one, (N, 2)."""
     room = np.array([[0.0, 0.0], [0.1, 0.1], [-0.1, -0.1]])
     own = [each.t_lidar_mag[list(view.axes)] for each in found]
     return np.vstack([room, *own])
 
 
-def _name(axes: Axes, found: list[SensorCalibration], view: View) -> None:
+def _name(axes: Axes, found: list[SensorCalibration], view: Viewpoint) -> None:
     """Write names; sensors that lie behind each other in this view share a label."""
     near = BEHIND * float(np.ptp(_places(found, view), axis=0).max())
     labels: list[tuple[FloatArray, list[str]]] = []
@@ -104,10 +117,12 @@ def _drawn(factor: int) -> str:
     return "" if factor == 1 else f", drawn {factor} times larger"
 
 
-def _draw(axes: Axes, sensor: SensorCalibration, level: Level, view: View, factor: int) -> None:
+def _draw(
+    axes: Axes, sensor: SensorCalibration, level: Level, view: Viewpoint, factor: int
+) -> None:
     rows = list(view.axes)
     at = sensor.t_lidar_mag[rows]
-    shape = ellipse(at, sensor.covariance[np.ix_(rows, rows)] * factor**2)
+    shape = _ellipse(sensor, rows, factor)
     if shape is None:
         _draw_open(axes, sensor, view)
     else:
@@ -116,7 +131,7 @@ def _draw(axes: Axes, sensor: SensorCalibration, level: Level, view: View, facto
     axes.plot(*at, SHAPES[level], color=COLOURS[level], markersize=5)
 
 
-def _draw_open(axes: Axes, sensor: SensorCalibration, view: View) -> None:
+def _draw_open(axes: Axes, sensor: SensorCalibration, view: Viewpoint) -> None:
     """Draw a line along each axis in which the place is not known."""
     open_ = ~np.isfinite(sensor.t_sigma)
     for k, axis in enumerate(view.axes):
@@ -127,11 +142,80 @@ def _draw_open(axes: Axes, sensor: SensorCalibration, view: View) -> None:
             axes.plot(*zip(low, high, strict=True), ":", color=BAD, linewidth=1.5)
 
 
-def ellipse(at: FloatArray, covariance: FloatArray) -> Ellipse | None:
+def _ellipse(sensor: SensorCalibration, rows: list[int], factor: float = 1.0) -> Ellipse | None:
     """Return the region that holds a sensor in 95 % of cases; none where it is unbounded."""
+    covariance = sensor.covariance[np.ix_(rows, rows)]
     if not np.isfinite(covariance).all():
         return None
-    variances, directions = np.linalg.eigh(covariance)
-    width, height = 2 * np.sqrt(CHI2_95 * np.maximum(variances, 0))
-    angle = np.degrees(np.arctan2(directions[1, 0], directions[0, 0]))
-    return Ellipse((float(at[0]), float(at[1])), width, height, angle=angle)
+    return ellipse(sensor.t_lidar_mag[rows], covariance, factor * SIGMAS_95)
+
+
+def calibration_figure(
+    picture: MapPicture,
+    drives: Sequence[Trajectory],
+    result: CalibrationResult,
+    truth: tuple[KnownSensor, ...],
+) -> Figure:
+    """Draw the map around the drive, and the sensors on the vehicle from above and from the side.
+
+    Parameters
+    ----------
+    picture
+        The map around the drive.
+    drives
+        Poses of the lidar in the map, drive by drive.
+    result
+        The calibration; sensors that were not solved are left out.
+    truth
+        True sensors, where they are known.
+    """
+    figure = Figure(figsize=(13, 6.5), layout="constrained", dpi=130)
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1), height_ratios=(1.5, 1))
+    place, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    side = figure.add_subplot(grid[1, 1])
+    strength, label = np.array(picture.strength), "field strength (uT)"
+    draw_map(figure, place, strength, picture.extent, label, "viridis", shrink=0.8)
+    place.set_facecolor("0.93")
+    for k, drive in enumerate(drives):
+        label = "_" if k else "drive of the lidar"  # one entry in the legend
+        place.plot(*drive.p[:, :2].T, color="white", linewidth=2.2)
+        place.plot(*drive.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label=label)
+    place.set_title(f"map at z = {picture.height:.2f} m and drive")
+    place.legend(loc="upper right")
+    solved = [s for s in result.sensors if s.residuals is not None]
+    _draw_vehicle(above, solved, truth, (0, 1))
+    _draw_vehicle(side, solved, truth, (0, 2))
+    above.set_title("sensors on the vehicle, from above")
+    side.set_title("from the side")
+    above.legend(loc="lower left", bbox_to_anchor=(0, 1.08), ncols=2, fontsize="small")
+    return figure
+
+
+def _draw_vehicle(
+    axes: Axes,
+    sensors: list[SensorCalibration],
+    truth: tuple[KnownSensor, ...],
+    plane: tuple[int, int],
+) -> None:
+    names = "xyz"
+    rows = list(plane)
+    for known in truth:
+        axes.plot(*known.t_lidar_mag[rows], "+", color=TRUTH, markersize=10)
+    for sensor in sensors:
+        at = sensor.t_lidar_mag[rows]
+        axes.plot(*at, ".", color=ESTIMATE, markersize=5)
+        if (region := _ellipse(sensor, rows)) is not None:
+            region.set(color=ESTIMATE, alpha=0.35)
+            axes.add_patch(region)
+        axes.annotate(
+            sensor.sensor, tuple(at), xytext=(4, 4), textcoords="offset points", fontsize=7
+        )
+    axes.plot(0, 0, "s", color="0.4", markersize=8)
+    axes.annotate("lidar", (0, 0), xytext=(6, -10), textcoords="offset points", fontsize=7)
+    axes.plot([], [], ".", color=ESTIMATE, label="estimate, 95 % ellipse")
+    if truth:
+        axes.plot([], [], "+", color=TRUTH, label="truth")
+    axes.set(xlabel=f"{names[plane[0]]} (m)", ylabel=f"{names[plane[1]]} (m)")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.2)
+    axes.grid(alpha=0.3)

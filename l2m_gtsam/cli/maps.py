@@ -1,0 +1,174 @@
+"""``l2m map``: maps of the magnetic field, and the suite of sensors that surveys them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from l2m_gtsam.cli.terminal import ConfigOption, print_table, shown_progress, warn
+
+map_app = typer.Typer(
+    help="Build, update, compare, describe and draw magnetic maps; calibrate a mapping suite.",
+    no_args_is_help=True,
+)
+MapArgument = Annotated[Path, typer.Argument(metavar="MAP", help="Map file.")]
+BagsArgument = Annotated[list[Path], typer.Argument(metavar="BAG...", help="Mapping bags.")]
+SuiteOption = Annotated[
+    Path | None,
+    typer.Option("--suite", help="Calibrations of the mapping suite; ideal sensors if not given."),
+]
+StructureOption = Annotated[
+    str | None,
+    typer.Option(
+        "--structure",
+        metavar="CLOUD",
+        help="What the LiDAR saw: .pcd, .ply or .npz in the map frame, or a PointCloud2 topic.",
+    ),
+]
+TilesOption = Annotated[
+    bool,
+    typer.Option(
+        help="Make all tiles of the map now and keep them in the folder MAP.tiles beside it; else "
+        "each is made, and kept, when it is first needed."
+    ),
+]
+MapFileOption = Annotated[Path, typer.Option("--out", help="Map file to write (.npz).")]
+
+
+@map_app.command("suite")
+def suite(
+    bags: Annotated[
+        list[Path], typer.Argument(metavar="BAG...", help="Mapping bags of one vehicle.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", help="Calibration to write (.yaml), for --suite and others.")
+    ],
+    config: Annotated[
+        Path | None, typer.Option("--config", help="YAML configuration; see `mapping.suite` in it.")
+    ] = None,
+    known: Annotated[
+        Path | None,
+        typer.Option(
+            "--suite",
+            help="What is known of the sensors; ideal ones at the lidar's origin if not given.",
+        ),
+    ] = None,
+) -> None:
+    """Calibrate a mapping suite from its own drive, before there is any map.
+
+    Poses have to be known well, the field does not: no field that can be looks the same to sensors
+    that sit or read otherwise.
+    """
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.survey import calibrate_suite_file
+        from l2m_gtsam.cli.tables.calibration import calibration_table
+        from l2m_gtsam.config import load_config
+
+        found = calibrate_suite_file(bags, out, load_config(config), known, progress)
+    print_table(calibration_table(found))
+    warn(found.doubts)
+    typer.echo(f"written: {out}")
+
+
+@map_app.command("build")
+def map_build(
+    bags: BagsArgument,
+    out: MapFileOption,
+    config: ConfigOption = None,
+    suite: SuiteOption = None,
+    structure: StructureOption = None,
+    lidar: Annotated[
+        bool,
+        typer.Option(
+            "--lidar",
+            help="Save the cloud of the bags' scans with the map, to localise drives on that have "
+            "point clouds and no poses.",
+        ),
+    ] = False,
+    tiles: TilesOption = True,
+) -> None:
+    """Build a map from one or several bags of a calibrated mapping suite."""
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.files import make_tiles
+        from l2m_gtsam.batch.maps import build_map_file
+        from l2m_gtsam.cli.tables.maps import map_table
+        from l2m_gtsam.config import load_config
+
+        built = build_map_file(bags, out, load_config(config), suite, progress, structure, lidar)
+        if tiles:
+            make_tiles(built.field_map, out, progress)
+    print_table(map_table(built.description))
+    warn(built.description.summary.doubts)
+    typer.echo(f"written: {out}")
+
+
+@map_app.command("update")
+def map_update(
+    map_path: MapArgument,
+    bags: BagsArgument,
+    out: MapFileOption,
+    config: ConfigOption = None,
+    suite: SuiteOption = None,
+    tiles: TilesOption = True,
+) -> None:
+    """Add bags to a map, which keeps its kind, its options and the prior of the whole map.
+
+    Where there are new readings, the scales of a harmonic map's tiles follow them.
+    """
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.files import make_tiles
+        from l2m_gtsam.batch.maps import update_map_file
+        from l2m_gtsam.cli.tables.maps import map_table
+        from l2m_gtsam.config import load_config
+
+        updated = update_map_file(map_path, bags, out, load_config(config), suite, progress)
+        if tiles:
+            make_tiles(updated.field_map, out, progress)
+    print_table(map_table(updated.description))
+    warn(updated.description.summary.doubts)
+    typer.echo(f"written: {out}")
+
+
+@map_app.command("compare")
+def map_compare(
+    bags: BagsArgument,
+    config: ConfigOption = None,
+    suite: SuiteOption = None,
+    structure: StructureOption = None,
+) -> None:
+    """Say which kind of map predicts places best that it has not seen."""
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import compare_map_kinds
+        from l2m_gtsam.cli.tables.maps import comparison_table
+        from l2m_gtsam.config import load_config
+
+        comparison = compare_map_kinds(bags, load_config(config), suite, structure, progress)
+    print_table(comparison_table(comparison))
+
+
+@map_app.command("info")
+def map_info(map_path: MapArgument) -> None:
+    """Say what a map is made of and what it covers."""
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import describe_map_file
+        from l2m_gtsam.cli.tables.maps import map_table
+
+        description = describe_map_file(map_path, progress)
+    print_table(map_table(description))
+    warn(description.summary.doubts)
+
+
+@map_app.command("plot")
+def map_plot(
+    map_path: MapArgument,
+    out: Annotated[Path, typer.Option("--out", help="Picture to write (.png).")],
+    height: Annotated[
+        float | None, typer.Option(help="Height in metres; the middle of the readings if absent.")
+    ] = None,
+) -> None:
+    """Draw strength and uncertainty of a map at one height."""
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.maps import plot_map_file
+
+        plot_map_file(map_path, out, height, progress)
+    typer.echo(f"written: {out}")

@@ -1,0 +1,150 @@
+"""``l2m report``, ``validate``, ``export`` and ``apply``: what is done with results."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from l2m_gtsam.cli.terminal import CalibrationOption, print_table, shown_progress, warn
+from l2m_gtsam.errors import ConfigError
+
+LidarFrameOption = Annotated[
+    str, typer.Option("--lidar-frame", help="Name of the LiDAR's frame (or link) there.")
+]
+
+
+def report(
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="Folder that `l2m calibrate` or `l2m slam` wrote to."),
+    ],
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config", help="YAML configuration whose `qa` has the thresholds of the verdict."
+        ),
+    ] = None,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write report.pdf, too: needs Chromium, Chrome or Edge.")
+    ] = False,
+) -> None:
+    """Write report.html: verdict, reasons, pictures; needs no bag and no map."""
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
+
+        verdict = report_folder(folder, config, progress, pdf=pdf)
+    typer.echo("\n".join(verdict.lines()))
+    written = [folder / REPORT_FILE, *([folder / PDF_FILE] if pdf else [])]
+    typer.echo(f"written: {', '.join(map(str, written))}")
+
+
+def validate(
+    calibration: CalibrationOption,
+    bag: Annotated[
+        Path | None,
+        typer.Argument(metavar="[BAG]", help="Another drive: ROS1 .bag, ROS2 folder, .db3, .mcap."),
+    ] = None,
+    map_path: Annotated[
+        Path | None, typer.Option("--map", help="Map file of the place of the drive.")
+    ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(help="An older calibration.yaml: what has changed since? Needs no BAG."),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", help="YAML configuration; that of the calibration if absent."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for validation.json and validation.html."),
+    ] = None,
+) -> None:
+    """Say whether a calibration still holds: on another drive and map, or beside an older one.
+
+    Readings are predicted from poses, map and calibration with all that is uncertain of these.
+    """
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.validation import (
+            PAGE_FILE,
+            VALIDATION_FILE,
+            ValidationRequest,
+            validate_calibration,
+        )
+        from l2m_gtsam.cli.tables.validation import change_table, validation_table
+        from l2m_gtsam.records.verdict import Level
+
+        asked = ValidationRequest(calibration, bag, map_path, compare, config, out)
+        found = validate_calibration(asked, progress)
+    if found.drive is not None:
+        print_table(validation_table(found.drive, found.verdict))
+    if found.comparison is not None:
+        print_table(change_table(found.comparison))
+    typer.echo("\n".join(found.verdict.lines(Level.PASS)))
+    if out is not None:
+        typer.echo(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")
+
+
+def export(
+    calibration: Annotated[
+        Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml of `l2m calibrate`.")
+    ],
+    format_name: Annotated[
+        str,
+        typer.Option("--format", help="ros2-launch, urdf, kalibr, json or bias-scale."),
+    ],
+    out: Annotated[Path, typer.Option("--out", help="File to write.")],
+    lidar_frame: LidarFrameOption = "lidar",
+    frame: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SENSOR=NAME",
+            help="Name of a sensor's frame, the sensor's own if not given; may be repeated.",
+        ),
+    ] = None,
+    into: Annotated[
+        Path | None,
+        typer.Option(help="URDF of a robot that the sensors are put into; --out gets the copy."),
+    ] = None,
+) -> None:
+    """Write a calibration for another program: tf, URDF, Kalibr, JSON, offsets and scales."""
+    from l2m_gtsam.batch.exports import Names, export_calibration
+
+    names = Names(lidar_frame, dict(_named(text) for text in frame or []))
+    warn(export_calibration(calibration, format_name, out, names, into))
+    typer.echo(f"written: {out}")
+
+
+def apply(
+    bag: Annotated[
+        Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
+    ],
+    calibration: CalibrationOption,
+    out: Annotated[Path, typer.Option("--out", help="Bag to write, of the same kind.")],
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", help="YAML configuration; that of the calibration if not given."),
+    ] = None,
+    lidar_frame: LidarFrameOption = "lidar",
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Leave the topics that are corrected out.")
+    ] = False,
+) -> None:
+    """Copy a bag and add the corrected readings, in the axes of the LiDAR, as TOPIC/calibrated."""
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.exports import Application, apply_calibration
+
+        wanted = Application(bag, calibration, out, config, lidar_frame, replace)
+        applied = apply_calibration(wanted, progress)
+    warn(applied.notes)
+    for sensor, topic in applied.topics.items():
+        typer.echo(f"{sensor}: {topic}")
+    typer.echo(f"written: {out}")
+
+
+def _named(text: str) -> tuple[str, str]:
+    """Return a sensor and its frame."""
+    sensor, equals, name = text.rpartition("=")
+    if not (sensor and equals):
+        raise ConfigError(f"--frame: {text!r} is not understood; accepted: SENSOR=NAME")
+    return sensor, name

@@ -1,0 +1,231 @@
+"""Calibrations in the terminal: sensors, models of a sensor, and truth."""
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.records.calibration import (
+    CalibrationResult,
+    Disagreement,
+    Return,
+    SensorCalibration,
+    SensorStatus,
+    TimeOffset,
+)
+from l2m_gtsam.records.sensor_models import Model, ModelComparison, ModelFigures, MovingField
+
+MODEL_HEADINGS = (
+    "parameters",
+    "rms (uT)",
+    "held out (uT)",
+    "score",
+    "behind the best",
+    "BIC above the least",
+)
+
+
+def calibration_table(result: CalibrationResult) -> Table:
+    """Return one row per sensor: position, sigma, offset, scale, rotation, residual, status."""
+    table = Table(title="Calibration: B_meas = C @ B_lidar + H", title_justify="left")
+    table.add_column("sensor", no_wrap=True)
+    for heading in (
+        "t_lidar_mag (m)",
+        "± (mm)",
+        "H (uT)",
+        "|C - R| max",
+        "rotation (deg)",
+        "clock (ms)",
+        "|residual| rms (uT)",
+        "readings used",
+        "outside map",
+        "rejected",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("status")
+    for sensor in result.sensors:
+        table.add_row(*_calibration_row(sensor))
+    return table
+
+
+def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
+    status = _status(sensor)
+    if sensor.residuals is None:
+        counts = (f"{sensor.outside_map:,}", f"{sensor.rejected:,}")
+        return (escape(sensor.sensor), *("-",) * 8, *counts, status)
+    distortion, R = sensor.distortion, sensor.R_lidar_mag.T
+    angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    return (
+        escape(sensor.sensor),
+        _vector(sensor.t_lidar_mag, 3),
+        _vector(1e3 * sensor.t_sigma, 1),
+        _vector(distortion.H, 2),
+        f"{np.abs(distortion.C - R).max():.3f}",
+        f"{angle:.2f}",
+        _clock(sensor.time_offset),
+        f"{sensor.residuals.rms:.3f}",
+        f"{sensor.residuals.readings:,}",
+        f"{sensor.outside_map:,}",
+        f"{sensor.rejected:,}",
+        status,
+    )
+
+
+def _clock(offset: TimeOffset | None) -> str:
+    """Return a time offset in milliseconds with its sigma; a dash where it is held at zero."""
+    if offset is None or not offset.estimated:
+        return "-"
+    return f"{1e3 * offset.seconds:.2f} ± {1e3 * offset.sigma:.2f}"
+
+
+def _vector(values: FloatArray, digits: int) -> str:
+    return " ".join(f"{value:{digits + 5}.{digits}f}" for value in values)
+
+
+def _status(sensor: SensorCalibration) -> str:
+    colour = "green" if sensor.status is SensorStatus.SOLVED else "yellow"
+    if sensor.status is SensorStatus.SOLVED:
+        known = f"; from priors: {', '.join(sensor.from_priors)}" if sensor.from_priors else ""
+        return f"[{colour}]{sensor.status.value}[/]{escape(known)}"
+    return f"[{colour}]{sensor.status.value}[/]: {escape(sensor.message)}"
+
+
+def disagreement_note(stretch: Disagreement) -> str:
+    """Return where, when and by how much readings and map disagree, as a sentence."""
+    (x0, y0), (x1, y1) = stretch.p_from[:2], stretch.p_to[:2]
+    meaning = {
+        Return.NEVER: "not passed again, so that a passing source and a changed place look alike",
+        Return.AS_MAPPED: "passed again it was as mapped: something moved by",
+        Return.DIFFERS: "passed again it differed too: the field has changed there",
+    }[stretch.passed_again]
+    where = f"{stretch.bag}: " if stretch.bag else ""
+    return (
+        f"{where}{', '.join(stretch.sensors)}: {stretch.readings} readings fit neither map nor "
+        f"distortion and do not count, {1e-9 * stretch.start_ns:.2f} to "
+        f"{1e-9 * stretch.end_ns:.2f} s, "
+        f"{stretch.length:.1f} m from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m, "
+        f"{stretch.size:.2g} uT off; {meaning}"
+    )
+
+
+def missing_note(result: CalibrationResult) -> tuple[str, ...]:
+    """Return which sensors are calibrated from some of several drives only, a sentence each."""
+    return tuple(
+        f"{sensor.sensor}: nothing usable was read in {', '.join(sensor.missing_in)}; it is "
+        "calibrated from the rest"
+        for sensor in result.sensors
+        if sensor.missing_in and len(sensor.missing_in) < len(result.bags)
+    )
+
+
+def held_clocks_note(result: CalibrationResult) -> str:
+    """Return which sensors' time offsets are taken as zero and why, as a sentence; else nothing."""
+    held = {
+        sensor.sensor: sensor.time_offset.held
+        for sensor in result.sensors
+        if sensor.time_offset is not None and not sensor.time_offset.estimated
+    }
+    if not held:
+        return ""
+    first, reason = next(iter(held.items()))
+    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
+    return f"time offset of {first}{more} {reason}"
+
+
+def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Table:
+    """Return truth, estimate, error and sigma of every sensor's position, and errors of C and H."""
+    table = Table(title="Truth and estimate", title_justify="left")
+    table.add_column("sensor")
+    for heading in ("true t (m)", "estimated t (m)", "error (mm)", "sigma (mm)"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for heading in ("|C error|", "sigma", "|H error| (uT)", "sigma"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for known in truth:
+        table.add_row(*_truth_row(known, result[known.sensor]))
+    return table
+
+
+def _truth_row(known: KnownSensor, sensor: SensorCalibration) -> tuple[str, ...]:
+    if sensor.residuals is None:
+        return (escape(known.sensor), _vector(known.t_lidar_mag, 3), *("-",) * 6, _status(sensor))
+    C_error = np.linalg.norm(sensor.distortion.C - known.distortion.C)
+    H_error = np.linalg.norm(sensor.distortion.H - known.distortion.H)
+    return (
+        escape(known.sensor),
+        _vector(known.t_lidar_mag, 3),
+        _vector(sensor.t_lidar_mag, 3),
+        _vector(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), 1),
+        _vector(1e3 * sensor.t_sigma, 1),
+        f"{C_error:.4f}",
+        f"{np.linalg.norm(sensor.C_sigma):.4f}",
+        f"{H_error:.3f}",
+        f"{np.linalg.norm(sensor.H_sigma):.3f}",
+    )
+
+
+def consistency_note(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> str:
+    """Return how the errors of all positions compare with their sigmas, as a sentence."""
+    ratios = [
+        (result[known.sensor].t_lidar_mag - known.t_lidar_mag) / result[known.sensor].t_sigma
+        for known in truth
+        if result[known.sensor].residuals is not None
+    ]
+    if not ratios:
+        return "no sensor was solved"
+    rms = float(np.sqrt(np.mean(np.square(ratios))))
+    return f"errors of t are {rms:.1f} times their sigmas (rms, expected 1)"
+
+
+def model_tables(result: CalibrationResult) -> list[Table]:
+    """Return the models of every sensor of which they are compared."""
+    compared = ((each.sensor, each.models) for each in result.sensors)
+    return [model_table(sensor, models) for sensor, models in compared if models is not None]
+
+
+def model_table(sensor: str, comparison: ModelComparison) -> Table:
+    """Return one row per model of a sensor: how it fits, and how it predicts held-out segments.
+
+    The score is the mean logarithm of the density of a held-out reading; "behind the best" is by
+    how much it is less than the best that the BIC admits.
+    """
+    numbers = f", {', '.join(comparison.regressors)}" if comparison.regressors else ""
+    table = Table(
+        title=f"Models of {escape(sensor)}{escape(numbers)}: {comparison.readings:,} readings that "
+        f"count as {comparison.independent:,.0f}, {comparison.segments} segments held out in turn",
+        title_justify="left",
+        caption=f"recommended: {comparison.recommended}; {comparison.reason}",
+        caption_justify="left",
+    )
+    table.add_column("model", no_wrap=True)
+    for heading in MODEL_HEADINGS:
+        table.add_column(heading, justify="right")
+    for fit in comparison.fits:
+        style = "green" if fit.model is comparison.recommended else None
+        table.add_row(*_model_row(fit), style=style)
+    return table
+
+
+def _model_row(fit: ModelFigures) -> tuple[str, ...]:
+    return (
+        fit.model.value,
+        str(fit.parameters),
+        f"{fit.rms:.3f}",
+        f"{fit.held_out_rms:.3f}",
+        f"{fit.held_out_score:.3f} ± {fit.score_error:.3f}",
+        f"{fit.behind:.3f} ± {fit.behind_error:.3f}",
+        f"{fit.bic_above:.1f}",
+    )
+
+
+def model_note(sensor: SensorCalibration) -> str:
+    """Return which model its readings ask for and what moves in it; nothing for the usual one."""
+    models = sensor.models
+    if models is None or models.recommended is Model.FULL:
+        return ""
+    moving = "".join(f"; {_moving(each)}" for each in sensor.moving)
+    return f"model of {sensor.sensor}: {models.recommended} ({models.reason}){moving}"
+
+
+def _moving(found: MovingField) -> str:
+    each = zip(found.h.tolist(), found.sigma.tolist(), strict=True)
+    return f"{found.name}: " + ", ".join(f"{h:.3g} ± {sigma:.1g}" for h, sigma in each) + " uT each"

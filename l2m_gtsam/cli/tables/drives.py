@@ -1,0 +1,140 @@
+"""Drives in the terminal: what a bag holds, and what a drive will determine."""
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.records.plan import DrivePlan, SensorPlan, Worst
+from l2m_gtsam.storage.inspect import BagReport, TopicReport
+
+OPEN = "-"  # for a sigma that nothing bounds
+UNITS = {"t": (1e3, "mm"), "C": (1.0, ""), "H": (1.0, "uT")}
+
+
+def plan_table(plan: DrivePlan) -> Table:
+    """Return one row per sensor: sigmas of position, C, H and rotation, and what stays open."""
+    table = Table(
+        title=f"What this drive will determine, with a noise of {plan.noise:.3g} uT",
+        title_justify="left",
+        caption="sigmas; of C the largest of each column; - is not determined",
+        caption_justify="left",
+    )
+    table.add_column("sensor")
+    for heading in (
+        "assumed t (m)",
+        "± t (mm)",
+        "± C by column",
+        "± H (uT)",
+        "± rotation (deg)",
+        "± clock (ms)",
+        "readings",
+        "outside map",
+    ):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("not determined", overflow="fold")
+    for sensor in plan.sensors:
+        table.add_row(*_sensor_row(sensor))
+    return table
+
+
+def held_plan_note(plan: DrivePlan) -> str:
+    """Return of which sensors time offsets will be taken as zero and why; else nothing."""
+    held = {sensor.sensor: sensor.offset_held for sensor in plan.sensors if sensor.offset_held}
+    if not held:
+        return ""
+    first, reason = next(iter(held.items()))
+    more = f" and {len(held) - 1} more" if len(held) > 1 else ""
+    return f"time offset of {first}{more} will be {reason}"
+
+
+def motion_table(plan: DrivePlan) -> Table:
+    """Return one row per extra motion for the sensor that is known least, the best first."""
+    title = f"What an extra motion would add for {escape(plan.worst.sensor)}, by itself"
+    table = Table(title=title, title_justify="left")
+    for heading in ("motion", "parameters not determined", "known least", "its sigma"):
+        table.add_column(heading, overflow="fold")
+    table.add_row("(the drive as it is)", *_worst_cells(plan.worst))
+    for each in plan.motions:
+        table.add_row(escape(each.motion), *_worst_cells(each.worst))
+    return table
+
+
+def advice(plan: DrivePlan) -> str:
+    """Return the motion that helps most, as a sentence."""
+    best = plan.motions[0]
+    if best.worst.badness >= plan.worst.badness:
+        return "no motion that was tried helps"
+    change = f"{_known(plan.worst)}; with it {_known(best.worst)}"
+    return f"helps {plan.worst.sensor} most: {best.motion} ({change})"
+
+
+def _known(worst: Worst) -> str:
+    left, parameter, sigma = _worst_cells(worst)
+    unknown = f"{left} parameters not determined" if worst.undetermined else ""
+    least = f"known least {parameter}, sigma {sigma}" if worst.parameter else ""
+    return ", ".join(part for part in (unknown, least) if part)
+
+
+def _worst_cells(worst: Worst) -> tuple[str, str, str]:
+    if not worst.parameter:
+        return str(worst.undetermined), "", ""
+    factor, unit = UNITS[worst.parameter[0]]
+    sigma = f"{factor * worst.sigma:.2g} {unit}".strip()
+    return str(worst.undetermined), worst.parameter, sigma
+
+
+def _sensor_row(sensor: SensorPlan) -> tuple[str, ...]:
+    sigma = sensor.sigma
+    priors = [f"from priors: {each}" for each in sensor.from_priors]
+    place = " ".join(f"{value:.3f}" for value in sensor.t_lidar_mag)
+    return (
+        escape(sensor.sensor),
+        place,
+        _sigmas(1e3 * sigma[:3]),
+        _sigmas(sigma[3:12].reshape(3, 3).max(axis=0)),
+        _sigmas(sigma[12:]),
+        _sigmas(np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))),
+        _sigmas(np.array([1e3 * sensor.offset_sigma])),
+        f"{sensor.readings:,}",
+        f"{sensor.outside_map:,}",
+        escape(". ".join([*sensor.undetermined, *priors])),
+    )
+
+
+def _sigmas(values: FloatArray) -> str:
+    return " ".join(f"{value:.2g}" if np.isfinite(value) else OPEN for value in values)
+
+
+def bag_table(report: BagReport) -> Table:
+    """Return one row per topic: type, frame, count, rate, gaps, NaN, strength, use."""
+    table = Table(title=escape(str(report.path)), title_justify="left")
+    for heading in ("topic", "type", "frame"):
+        table.add_column(heading, overflow="fold")
+    for heading in ("count", "Hz", "gap (s)", "clock (s)", "NaN", "|B| (uT)"):
+        table.add_column(heading, justify="right")
+    table.add_column("use", overflow="fold")
+    for topic in report.topics:
+        table.add_row(*_topic_row(topic))
+    return table
+
+
+def _topic_row(topic: TopicReport) -> tuple[str, ...]:
+    found = topic.strength
+    field = "" if found is None else f"{found.low:.4g} - {found.median:.4g} - {found.high:.4g}"
+    return (
+        escape(topic.topic),
+        escape(topic.msgtype.replace("/msg/", "/")),
+        escape(", ".join(topic.frames)),
+        f"{topic.count:,}",
+        _number(topic.rate_hz, ".4g"),
+        _number(topic.longest_gap_s, ".3g"),
+        _number(topic.clock_offset_s, ".3g"),
+        _number(topic.nan_share, ".1%"),
+        field,
+        escape(topic.use),
+    )
+
+
+def _number(value: float, form: str) -> str:
+    return "" if np.isnan(value) else format(value, form)

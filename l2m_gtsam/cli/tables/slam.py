@@ -1,0 +1,99 @@
+"""A localisation as tables in the terminal."""
+
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from l2m_gtsam.records.localisation import LocalisationResult, ScanUse, StartSearch
+from l2m_gtsam.records.localisation_file import TruthRecord
+
+
+def slam_table(result: LocalisationResult) -> Table:
+    """Return one row per sensor: what its readings were worth."""
+    table = Table(title="Readings", title_justify="left")
+    table.add_column("sensor", no_wrap=True)
+    for heading in ("on key poses", "outside map", "rejected", "residual rms (uT)", "chi2 per dof"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for each in result.sensors:
+        table.add_row(
+            escape(each.sensor),
+            str(each.readings),
+            str(each.outside_map),
+            str(each.rejected),
+            f"{each.rms:.3g}",
+            f"{each.chi2_per_dof:.2f}",
+        )
+    return table
+
+
+def start_lines(search: StartSearch | None) -> tuple[str, ...]:
+    """Return where the drive was found to begin, a line each; none where that was known."""
+    if search is None:
+        return ()
+    best = search.candidates[0]
+    sigma = np.sqrt(np.diag(best.covariance))
+    second = "no second place was found"
+    if np.isfinite(search.margin):
+        second = f"the second best place is less likely by exp({search.margin:.0f})"
+    place = f"{1e3 * sigma[3:].max():.0f} mm and {np.rad2deg(sigma[:3].max()):.1f} deg (one sigma)"
+    searched = f"{second}; {search.looked_at} places and headings were looked at"
+    return f"start: {search.message}", f"start known within {place}; {searched}"
+
+
+def drift_lines(result: LocalisationResult) -> tuple[str, ...]:
+    """Return how far odometry had drifted and how well poses are known, a line each."""
+    drift, covariance = result.drift, result.trajectory.covariance
+    drifted = (
+        f"{len(result.trajectory)} key poses over {drift.way_m:.1f} m; odometry ended "
+        f"{drift.end_m:.2f} m and {drift.end_deg:.1f} deg off ({drift.end_share:.1%} of the path), "
+        f"{drift.largest_m:.2f} m at most"
+    )
+    lines = [f"{result.status.value}: {result.message}", drifted]
+    if covariance is not None:
+        sigma = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2))
+        known = (
+            f"stated error of the positions: {1e3 * np.median(sigma):.0f} mm in the median, "
+            f"{1e3 * sigma.max():.0f} mm at most"
+        )
+        lines.append(known)
+    return tuple(lines)
+
+
+def scan_lines(scans: ScanUse | None) -> tuple[str, ...]:
+    """Return what scans were worth, a line; none without scans."""
+    if scans is None:
+        return ()
+    line = (
+        f"scans: {scans.fixes} fixes in the map and {scans.loops} loops counted (chi2 per dof "
+        f"{scans.chi2_per_dof:.2f}), {scans.rejected} were rejected"
+    )
+    return (line,)
+
+
+def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:
+    """Return errors against the truth before and after, a line each; none without a truth."""
+    if truth is None:
+        return ()
+    before, after = truth.odometry, truth.localised
+    errors = (
+        f"against the truth at {truth.poses} key poses: odometry {1e3 * before.rms_m:.0f} mm rms, "
+        f"{1e3 * before.largest_m:.0f} mm at most; {_scanned(truth)}localised "
+        f"{1e3 * after.rms_m:.0f} mm rms, {1e3 * after.largest_m:.0f} mm at most ({_gone(truth)})"
+    )
+    nees = (
+        f"rotations {before.rms_deg:.2f} deg rms before, {after.rms_deg:.2f} deg after; NEES of "
+        f"the poses {truth.nees:.1f}, expected 6"
+    )
+    return (errors, nees)
+
+
+def _scanned(truth: TruthRecord) -> str:
+    each = truth.by_scans
+    if each is None:
+        return ""
+    return f"with scans {1e3 * each.rms_m:.0f} mm rms, {1e3 * each.largest_m:.0f} mm at most; "
+
+
+def _gone(truth: TruthRecord) -> str:
+    gone = truth.removed
+    return f"{gone:.0%} less" if gone >= 0 else f"{-gone:.0%} more"

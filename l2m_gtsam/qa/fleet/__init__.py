@@ -1,1 +1,0 @@
-"""What many drives of many vehicles say together."""

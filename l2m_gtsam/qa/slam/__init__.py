@@ -1,1 +1,0 @@
-"""A localisation in figures and words."""

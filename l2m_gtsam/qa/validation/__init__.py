@@ -1,1 +1,0 @@
-"""The verdict of a validation, and how it is told."""

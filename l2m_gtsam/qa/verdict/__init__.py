@@ -1,0 +1,1 @@
+"""Verdicts: rules that turn figures into reasons, one sentence each."""

@@ -1,0 +1,147 @@
+"""The verdict on a calibration: PASS, WARN or FAIL, with reasons in plain sentences."""
+
+from pathlib import Path
+
+import numpy as np
+
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.mounting import mounting
+from l2m_gtsam.qa.verdict.repeatability import repeat
+from l2m_gtsam.qa.verdict.sensor import Case, clock, ending, fit, misfit, precision
+from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
+from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Verdict
+
+HEADS = {
+    Return.NEVER: "The environment has changed, or something passed by",
+    Return.AS_MAPPED: "Something passed by",
+    Return.DIFFERS: "The environment has changed since it was mapped",
+}
+TAILS = {
+    Return.NEVER: "It was not passed again, which would decide",
+    Return.AS_MAPPED: "Passed again the place was as mapped",
+    Return.DIFFERS: "Passed again it differed, too: map it anew",
+}
+OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED, SensorStatus.NO_READINGS)
+MANY = 4  # stretches that are listed one by one
+
+
+def judge(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Verdict:
+    """Return the verdict on a calibration.
+
+    Parameters
+    ----------
+    result
+        The calibration.
+    metrics
+        Its figures.
+    options
+        Thresholds.
+    """
+    cases = tuple(
+        Case(sensor, metrics.get(sensor.sensor), result, metrics, options)
+        for sensor in result.sensors
+    )
+    return Verdict.of(_shared_reasons(cases, result), [_on_sensor(case) for case in cases])
+
+
+def _on_sensor(case: Case) -> SensorVerdict:
+    rules = RULES_OF_A_MISFIT if misfit(case) else RULES
+    reasons = (reason for rule in rules for reason in rule(case))
+    return SensorVerdict.of(case.sensor.sensor, reasons)
+
+
+def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[Reason]:
+    """Return what speaks against map, place and drive."""
+    reasons = [Reason(Level.WARN, f"Of the map: {doubt}.") for doubt in result.doubts]
+    shared = [each for each in result.disagreements if _is_shared(each, result)]
+    reasons += [Reason(Level.WARN, _changed(each, result)) for each in shared[:MANY]]
+    if len(shared) > MANY:
+        more = f"The place differs from the map along {len(shared) - MANY} more stretches."
+        reasons.append(Reason(Level.WARN, more))
+    # A map of another place is no evidence on this one.
+    return _wrong_map(cases) or [*_on_drive(cases), *reasons]
+
+
+def _wrong_map(cases: tuple[Case, ...]) -> list[Reason]:
+    """Return that the map is the wrong one, if no sensor fits it."""
+    known = [case for case in cases if case.metrics and np.isfinite(case.sensor.t_sigma).all()]
+    if not known or not all(map(misfit, known)):
+        return []
+    text = (
+        "The map does not fit this drive: a field that is the same everywhere explains the "
+        "readings as well. Is it the map of this place, and are the poses in its frame?"
+    )
+    return [Reason(Level.FAIL, text)]
+
+
+def _on_drive(cases: tuple[Case, ...]) -> list[Reason]:
+    """Return what the drive lacks, if it left something open."""
+    if not any(map(_left_open, cases)):
+        return []
+    drive, options = cases[0].all.drive, cases[0].options
+    reasons = []
+    if drive.length < options.short_drive_m:
+        text = (
+            f"The drive is short, {drive.length:.1f} m in {drive.seconds:.0f} s: drive on, through "
+            "more places and headings."
+        )
+        reasons.append(Reason(Level.WARN, text))
+    if drive.heading < options.few_headings:
+        text = (
+            f"The vehicle took {drive.heading:.0%} of all headings only, much of a straight line: "
+            "drive curves and loops in both directions."
+        )
+        reasons.append(Reason(Level.WARN, text))
+    return reasons
+
+
+def _left_open(case: Case) -> bool:
+    """Whether the drive does not determine of a sensor what it should."""
+    too_large = case.sensor.t_sigma.max() > case.options.position_sigma_m.warn
+    return case.sensor.status in OPEN or bool(too_large)
+
+
+def _own_stretches(case: Case) -> list[Reason]:
+    """Return stretches over which this sensor alone, of several, disagreed with the map."""
+    own = [
+        each
+        for each in case.result.disagreements
+        if each.sensors == (case.sensor.sensor,) and not _is_shared(each, case.result)
+    ]
+    if not own:
+        return []
+    readings = sum(each.readings for each in own)
+    text = (
+        f"Along {len(own)} stretch{'es' if len(own) > 1 else ''} of the drive ({readings} "
+        "readings) it alone disagrees with the map, other sensors do not: something near it was "
+        "switched or moved."
+    )
+    return [Reason(Level.WARN, text)]
+
+
+def _is_shared(stretch: Disagreement, result: CalibrationResult) -> bool:
+    """Whether it concerns the place: more than one sensor, or the only one."""
+    solved = [each for each in result.sensors if each.residuals is not None]
+    return len(stretch.sensors) > 1 or len(solved) == 1
+
+
+def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
+    (x0, y0), (x1, y1) = stretch.p_from[:2], stretch.p_to[:2]
+    count = len(stretch.sensors)
+    start = min(each.start_ns for each in result.disagreements if each.bag == stretch.bag)
+    after = 1e-9 * (stretch.start_ns - start)
+    when = f", {after:.0f} s after the first" if after >= 1 else ""
+    drive = f" in {Path(stretch.bag).name}" if stretch.bag else ""
+    return (
+        f"{HEADS[stretch.passed_again]}: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on "
+        f"the map{drive}{when}, {stretch.length:.1f} m long, "
+        f"{count} sensor{'s' if count > 1 else ''} differ{'' if count > 1 else 's'} by "
+        f"{stretch.size:.2g} µT. "
+        f"{TAILS[stretch.passed_again]}. These {stretch.readings} readings do not count."
+    )
+
+
+# In the order in which a person would ask; the worst come first in the end.
+RULES = (repeat, ending, mounting, fit, _own_stretches, clock, precision)
+RULES_OF_A_MISFIT = (fit, ending)

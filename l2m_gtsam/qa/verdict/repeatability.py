@@ -1,0 +1,126 @@
+"""Rules on repeatability: halves of a drive, or several drives, calibrated by themselves."""
+
+from math import isfinite
+from pathlib import Path
+
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.sensor import Case
+from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.metrics import DriveRepeat, Halves, Repeatability, SensorMetrics
+from l2m_gtsam.records.verdict import Level, Reason
+
+# After any other ending the halves do not test the mounting.
+JUDGED = (SensorStatus.SOLVED, SensorStatus.CONTRADICTED, SensorStatus.NOT_CONVERGED)
+
+
+def repeat(case: Case) -> list[Reason]:
+    """Return by how much parts differ, where they do, and which cannot be looked at."""
+    if case.metrics is None or case.sensor.status not in JUDGED:
+        return []
+    notes = _not_looked_at(case.metrics)
+    halves = differing(case.metrics, case.options)
+    if halves is None:
+        return notes
+    level = case.options.halves_sigmas.level(halves.distance)
+    difference = _difference(halves, _where(case.metrics, case.options))
+    return [Reason(*_meaning(case, level, difference)), *notes]
+
+
+def halves_agree(halves: Halves, options: QaOptions) -> bool:
+    """Return whether two halves agree within their sigmas, or within what is negligible."""
+    if halves.reason or halves.distance <= options.halves_sigmas.warn:
+        return True
+    return _moved(halves, 0, 3) < options.halves_m and (
+        halves.turned_deg < options.halves_deg and _moved(halves, 12, 15) < options.halves_ut
+    )
+
+
+def _moved(halves: Halves, first: int, end: int) -> float:
+    return float(sum(each**2 for each in halves.difference[first:end]) ** 0.5)
+
+
+def differing(metrics: SensorMetrics, options: QaOptions) -> Halves | None:
+    """Return the comparison of parts that do not agree: of several drives the furthest one."""
+    if metrics.drives is None:
+        return None if halves_agree(metrics.halves, options) else metrics.halves
+    furthest = _furthest(metrics.drives, options)
+    return None if furthest is None else furthest.others
+
+
+def _furthest(drives: Repeatability, options: QaOptions) -> DriveRepeat | None:
+    """Return the drive that is furthest from the others; of two the later one."""
+    off = [each for each in drives.compared if not halves_agree(each.others, options)]
+    # Both of two drives are equally far from each other, to rounding.
+    return max(reversed(off), key=lambda each: round(each.others.distance, 6), default=None)
+
+
+def _compared(metrics: SensorMetrics) -> bool:
+    if metrics.drives is None:
+        return not metrics.halves.reason
+    return len(metrics.drives.compared) > 1
+
+
+def _where(metrics: SensorMetrics, options: QaOptions) -> str:
+    """Return where it differs, as the beginning of a clause."""
+    furthest = None if metrics.drives is None else _furthest(metrics.drives, options)
+    if metrics.drives is None or furthest is None:
+        return "calibrated on both halves of the drive it differs by"
+    name = Path(furthest.bag).name
+    others = [each for each in metrics.drives.compared if each is not furthest]
+    if len(others) == 1:
+        return (
+            "calibrated on each drive by itself it differs between "
+            f"{Path(others[0].bag).name} and {name} by"
+        )
+    return f"calibrated on each drive by itself it differs in {name} from the other drives by"
+
+
+def _difference(halves: Halves, where: str) -> str:
+    t = ", ".join(f"{1e3 * each:.0f}" for each in halves.difference[:3])
+    H = ", ".join(f"{each:.1f}" for each in halves.difference[12:])
+    return (
+        f"{where} ({t}) mm in place, "
+        f"{halves.turned_deg:.1f}° in rotation and ({H}) µT in H: {halves.distance:.1f} times as "
+        "much as the sigmas allow"
+    )
+
+
+def _meaning(case: Case, level: Level, difference: str) -> tuple[Level, str]:
+    """Return what it means: other sensors saw the same map from the same poses."""
+    others = [each for each in case.others if _compared(each)]
+    same = [differing(each, case.options) is None for each in others]
+    disturbed = any(case.sensor.sensor in each.sensors for each in case.result.disagreements)
+    if same and sum(same) > len(same) / 2 and level is Level.FAIL:
+        return level, (
+            f"It does not hold still: {difference}, while other sensors repeat. It moved on its "
+            f"mount, or something magnetic near it did; {_remedy(case)}."
+        )
+    if disturbed and not case.result.bags:
+        return Level.WARN, (
+            f"It repeats less well than its sigmas predict: {difference}. Readings where the place "
+            "has changed since it was mapped were rejected; near them others may be a little off."
+        )
+    return level, f"It does not repeat: {difference}."
+
+
+def _remedy(case: Case) -> str:
+    if case.result.bags:
+        return "fasten it, and calibrate drives from before and after apart"
+    return "fasten it and drive again"
+
+
+def _not_looked_at(metrics: SensorMetrics) -> list[Reason]:
+    """Return which of several drives determine nothing by themselves, and why.
+
+    That the only drive which does has nothing to be compared with follows from the others.
+    """
+    drives = () if metrics.drives is None else metrics.drives.drives
+    known = [each for each in drives if any(map(isfinite, each.estimate))]
+    return [
+        Reason(
+            Level.PASS,
+            f"{Path(each.bag).name} is not compared with the other drives: {each.reason}.",
+        )
+        for each in drives
+        if each.reason and known != [each]
+    ]

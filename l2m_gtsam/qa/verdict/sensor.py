@@ -1,0 +1,212 @@
+"""Rules on one sensor: how its solve ended, how its readings fit, how exact its calibration is."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.records.calibration import (
+    CalibrationResult,
+    SensorCalibration,
+    SensorStatus,
+    Uncertainty,
+)
+from l2m_gtsam.records.metrics import Metrics, SensorMetrics
+from l2m_gtsam.records.verdict import Level, Reason
+
+HEADS = {
+    SensorStatus.NOT_CONVERGED: "The solve did not converge",
+    SensorStatus.NO_READINGS: "There is nothing to calibrate on",
+    SensorStatus.OUTSIDE_MAP: "The map does not cover the drive",
+    SensorStatus.DEAD_AXIS: "An axis is dead",
+    SensorStatus.AMBIGUOUS: "Its place is not certain",
+    SensorStatus.CONTRADICTED: "What is known contradicts the readings",
+    SensorStatus.FLIPPED_AXIS: "An axis is reversed",
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One sensor to be judged.
+
+    Attributes
+    ----------
+    sensor
+        Its calibration.
+    metrics
+        Its figures; absent where it was not solved.
+    result, all
+        The whole calibration and the figures of all sensors.
+    options
+        Thresholds.
+    """
+
+    sensor: SensorCalibration
+    metrics: SensorMetrics | None
+    result: CalibrationResult
+    all: Metrics
+    options: QaOptions
+
+    @property
+    def others(self) -> tuple[SensorMetrics, ...]:
+        """Figures of the other solved sensors."""
+        return tuple(each for each in self.all.sensors if each.sensor != self.sensor.sensor)
+
+
+def ending(case: Case) -> list[Reason]:
+    """Return how the solve ended, where it did not end well."""
+    sensor = case.sensor
+    if sensor.status is SensorStatus.SOLVED:
+        return []
+    if sensor.status is SensorStatus.UNDETERMINED:
+        # Without a place or a rotation a sensor is useless; without an offset it is not.
+        known = np.isfinite(np.diag(sensor.covariance)[:3]).all()
+        turned = np.isfinite(np.diag(sensor.rotation_covariance)).all()
+        level = Level.WARN if known and turned else Level.FAIL
+        return [Reason(level, _sentence("Not everything can be known", sensor.message))]
+    if sensor.status is SensorStatus.FLIPPED_AXIS and (swapped := _swapped_axes(case)):
+        return [swapped]
+    if sensor.status is SensorStatus.CONTRADICTED:
+        if fits_elsewhere(case.others, case.options):
+            text = (
+                f"{sensor.rejected} of its readings fit no calibration that explains the others, "
+                "while other sensors fit the map: something about this sensor changed on the way."
+            )
+            return [Reason(Level.FAIL, text)]
+        if sensor.rejected:
+            head = "Its readings contradict the map or what is known"
+            return [Reason(Level.FAIL, _sentence(head, sensor.message))]
+    return [Reason(Level.FAIL, _sentence(HEADS[sensor.status], sensor.message))]
+
+
+def fits_elsewhere(others: Sequence[SensorMetrics], options: QaOptions) -> bool:
+    """Return whether there are other sensors and the map explains the readings of most."""
+    fit = [each.fit.unexplained <= options.unexplained.warn for each in others]
+    return sum(fit) > len(fit) / 2
+
+
+def _sentence(head: str, message: str) -> str:
+    return f"{head}: {message}" + ("" if message.endswith((".", "?")) else ".")
+
+
+def _swapped_axes(case: Case) -> Reason | None:
+    """Return which two axes are swapped, where two are; a single reversed one has its message."""
+    found = None if case.metrics is None else case.metrics.mounting.axes
+    if found is None or not found.mirrored:
+        return None
+    moved = [k for k in range(3) if found.along[k][1] != "xyz"[k]]
+    if len(moved) != 2 or any(found.along[k][0] == "-" for k in moved):
+        return None
+    one, two = ("xyz"[k] for k in moved)
+    return Reason(
+        Level.FAIL,
+        f"Axes {one} and {two} are swapped: {one} reads along the lidar's {found.along[moved[0]]}, "
+        f"{two} along its {found.along[moved[1]]}, which no mounting does; exchange them in the "
+        "driver.",
+    )
+
+
+def fit(case: Case) -> list[Reason]:
+    """Return what of the readings is not explained, and how many there are."""
+    sensor, options = case.sensor, case.options
+    reasons = [*_explained(case), *_consistent(case)]
+    used = 0 if sensor.residuals is None else sensor.residuals.readings
+    inside = used + sensor.rejected
+    if inside:
+        share = sensor.rejected / inside
+        text = f"{share:.0%} of its readings fit neither map nor distortion and do not count."
+        reasons += options.rejected.reasons(share, text)
+        lost = sensor.outside_map / (inside + sensor.outside_map)
+        text = f"{lost:.0%} of its readings lie outside the map and do not count."
+        reasons += options.outside_map.reasons(lost, text)
+    return reasons
+
+
+def misfit(case: Case) -> bool:
+    """Whether the map explains nothing: what else is found of the sensor means nothing then."""
+    return any(each.level is Level.FAIL for each in _explained(case))
+
+
+def _explained(case: Case) -> list[Reason]:
+    # Where the place is open, the field is too uniform to test the map.
+    if case.metrics is None or not np.isfinite(case.sensor.t_sigma).all():
+        return []
+    found = case.metrics.fit
+    text = (
+        f"The map leaves {found.left:.2g} µT of its readings unexplained, a field that is the same "
+        f"everywhere {found.without_map:.2g} µT: "
+    )
+    if found.unexplained > case.options.unexplained.fail:
+        text += (
+            "the map does not fit this drive. Is it of this place, and are the poses in its frame? "
+            "(Or the field here is too uniform to test the map.)"
+        )
+    else:
+        text += "it explains less than a map of this place should."
+    return case.options.unexplained.reasons(found.unexplained, text)
+
+
+def _consistent(case: Case) -> list[Reason]:
+    if case.metrics is None or case.sensor.residuals is None:
+        return []
+    chi2 = case.sensor.residuals.chi2_per_dof
+    text = (
+        f"Residuals are {chi2**0.5:.1f} times as large as the noise that was assumed: sigmas are "
+        "too small."
+    )
+    return case.options.chi_square.reasons(chi2, text)
+
+
+def clock(case: Case) -> list[Reason]:
+    """Return the time offset, where one was found that is worth mending."""
+    offset, limit = case.sensor.time_offset, case.options.time_offset_s
+    if offset is None or not offset.estimated or abs(offset.seconds) < 3 * offset.sigma:
+        return []
+    text = (
+        f"Its clock is off by {1e3 * offset.seconds:.1f} ± {1e3 * offset.sigma:.1f} ms against the "
+        "lidar's. That is taken into account here; correct its stamps before its readings are used."
+    )
+    size = abs(offset.seconds)
+    return limit.reasons(size, text) or [Reason(Level.PASS, text)] * (size > limit.warn / 5)
+
+
+def precision(case: Case) -> list[Reason]:
+    """Return sigmas that are too large, and reasons to think that they are too small."""
+    sensor, options = case.sensor, case.options
+    t, H = _largest(sensor.t_sigma), _largest(sensor.H_sigma)
+    angle = np.rad2deg(_largest(np.sqrt(np.diag(sensor.rotation_covariance))))
+    place = f"Its place is only known to ± {1e3 * t:.1f} mm (1 sigma)."
+    rotation = f"Its rotation is only known to ± {angle:.1f}°."
+    return [
+        *options.position_sigma_m.reasons(t, place),
+        *options.rotation_sigma_deg.reasons(angle, rotation),
+        *options.hard_iron_sigma_ut.reasons(H, f"Its offset H is only known to ± {H:.2g} µT."),
+        *_correlated(case),
+        *(
+            Reason(Level.PASS, f"Not from this drive but from what was known beforehand: {each}.")
+            for each in sensor.from_priors
+        ),
+    ]
+
+
+def _largest(sigmas: FloatArray) -> float:
+    """Return the largest finite sigma; undetermined parameters are reported by ``ending``."""
+    return float(max(sigmas[np.isfinite(sigmas)], default=0.0))
+
+
+def _correlated(case: Case) -> list[Reason]:
+    if case.metrics is None or case.result.uncertainty is Uncertainty.FULL:
+        return []
+    found = case.metrics.autocorrelation
+    if found.next <= case.options.autocorrelation:
+        return []
+    # N correlated readings carry the information of N_eff independent ones: sigmas that count N
+    # are too small by sqrt(N / N_eff).
+    times = (case.metrics.fit.readings / found.independent) ** 0.5
+    text = (
+        f"Errors of neighbouring readings are correlated ({found.next:.2f}), but its sigmas count "
+        f"each by itself: they are too small, by about {times:.1f} times."
+    )
+    return [Reason(Level.WARN, text)]

@@ -1,0 +1,254 @@
+"""The verdict on a calibration that was tested on another drive, or beside an older one."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
+from l2m_gtsam.records.validation import (
+    CalibrationComparison,
+    CalibrationPart,
+    Change,
+    ComparedSensor,
+    DriveValidation,
+    NotValidated,
+    ValidatedSensor,
+)
+from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
+
+SHARED_LIMITS = ("unexplained", "rejected", "outside_map")
+BLIND_TIMES = 2.0  # a change that would fail, so many times over, and would not show
+EXPECTED_TIMES = 2.0  # a refit that leaves no more than this of what is expected fits the map
+NAMES = {
+    CalibrationPart.PLACE: "its place t",
+    CalibrationPart.ROTATION: "its rotation",
+    CalibrationPart.GAINS: "the gains of its axes (C)",
+    CalibrationPart.ANGLES: "the angles between its axes (C)",
+    CalibrationPart.OFFSET: "its offset H",
+    CalibrationPart.CLOCK: "its clock",
+}
+# Factor from the units of ``Change``, unit, digits of its parts, and along what they are.
+SHOWN = {
+    CalibrationPart.PLACE: (1e3, "mm", 1, " along the lidar's x, y, z"),
+    CalibrationPart.ROTATION: (1.0, "°", 2, " about its own x, y, z"),
+    CalibrationPart.GAINS: (1e2, "%", 2, " of its x, y, z"),
+    CalibrationPart.ANGLES: (1.0, "°", 2, " less between x y, y z, z x"),
+    CalibrationPart.OFFSET: (1.0, "µT", 2, " along its x, y, z"),
+    CalibrationPart.CLOCK: (1e3, "ms", 1, ""),
+}
+MEANINGS = {
+    CalibrationPart.PLACE: "it was moved, or its mount gave way",
+    CalibrationPart.ROTATION: "it was turned, or its mount gave way",
+    CalibrationPart.GAINS: "its driver scales otherwise, or soft iron near it has changed",
+    CalibrationPart.ANGLES: "soft iron near it has changed",
+    CalibrationPart.OFFSET: "something magnetic on the vehicle was added, removed or magnetised",
+    CalibrationPart.CLOCK: "its stamps have another delay than before",
+}
+
+
+def judge_validation(
+    drive: DriveValidation | None, comparison: CalibrationComparison | None, options: QaOptions
+) -> Verdict:
+    """Return the verdict with its reasons.
+
+    Parameters
+    ----------
+    drive
+        The test on a drive, if there was one.
+    comparison
+        What has changed since an older calibration, if there was one.
+    options
+        Thresholds.
+    """
+    shared: list[Reason] = []
+    found: dict[str, list[Reason]] = {}
+    if drive is not None:
+        shared += _on_drive(drive, options)
+        for sensor in drive.sensors:
+            found.setdefault(sensor.sensor, []).extend(_on_sensor(sensor, options))
+        _add_missing(found, drive.missing)
+    if comparison is not None:
+        shared.append(Reason(Level.PASS, comparison.assumption))
+        if comparison.same_bag:
+            shared.append(Reason(Level.WARN, "One drive took part in both calibrations."))
+        for each in comparison.sensors:
+            found.setdefault(each.sensor, []).extend(_on_comparison(each, options))
+        _add_missing(found, comparison.missing)
+    return Verdict.of(shared, [SensorVerdict.of(*each) for each in found.items()])
+
+
+def validation_thresholds(options: QaOptions) -> tuple[Threshold, ...]:
+    """Return where the verdict changes."""
+    return thresholds(options, SHARED_LIMITS) + thresholds(options.validation, prefix="validation.")
+
+
+def _add_missing(found: dict[str, list[Reason]], missing: tuple[NotValidated, ...]) -> None:
+    for each in missing:
+        level = Level.FAIL if each.faulty else Level.WARN
+        found.setdefault(each.sensor, []).append(Reason(level, each.reason))
+
+
+def _on_drive(drive: DriveValidation, options: QaOptions) -> list[Reason]:
+    """Return what concerns all sensors."""
+    if drive.sensors and all(_misfit(each, options) for each in drive.sensors):
+        text = (
+            "The map does not fit this drive: a field that is the same everywhere explains the "
+            "readings as well. Is it the map of this place, and are the poses in its frame? "
+            "The calibration was not tested."
+        )
+        return [Reason(Level.FAIL, text)]
+    return [
+        *(Reason(Level.WARN, each) for each in drive.doubts),
+        *(Reason(Level.PASS, each) for each in drive.notes),
+    ]
+
+
+def _misfit(sensor: ValidatedSensor, options: QaOptions) -> bool:
+    """Whether no C and H make the readings of a sensor follow the map."""
+    above = options.unexplained.level(sensor.unexplained) is Level.FAIL
+    return above and sensor.refitted > EXPECTED_TIMES * sensor.expected
+
+
+def _on_sensor(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    if _misfit(sensor, options):
+        text = (
+            f"Whatever C and H are, the map leaves {sensor.refitted:.2g} µT of its readings, a "
+            f"field that is the same everywhere {sensor.uniform:.2g} µT: the map does not fit what "
+            "it reads here."
+        )
+        return [Reason(Level.FAIL, text)]
+    rules: tuple[Callable[[ValidatedSensor, QaOptions], list[Reason]], ...] = (
+        _changed,
+        _consistent,
+        _counted,
+        _blind,
+        _ending,
+    )
+    return [reason for rule in rules for reason in rule(sensor, options)]
+
+
+def _changed(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    share = sensor.rejected / (sensor.readings + sensor.rejected)
+    doubt = ""
+    if options.rejected.level(share) is not Level.PASS:
+        doubt = " (Readings were rejected, see below; what else differs near these pulls at this.)"
+    return [
+        _change(each, options, "On this drive {name} is not as calibrated, by {amount}", doubt)
+        for each in sensor.changes
+    ]
+
+
+def _change(change: Change, options: QaOptions, text: str, doubt: str = "") -> Reason:
+    """Return a change as a reason; a negligible one is only a note."""
+    level = limits_of(options.validation)[change.part].level(change.size)
+    what = text.format(name=NAMES[change.part], amount=by_how_much(change))
+    what = what[0].upper() + what[1:]
+    if level is Level.PASS:
+        return Reason(level, f"{what}: significant but negligible.")
+    return Reason(level, f"{what}: {MEANINGS[change.part]}.{doubt}")
+
+
+def _consistent(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    """Return that residuals are larger than they should be, where no change explains it."""
+    if sensor.changes:
+        return []
+    times = sensor.nis.ratio**0.5
+    text = (
+        f"Its residuals are {times:.1f} times as large as noise, map and calibration lead to "
+        "expect, and no change of the calibration explains it: it is noisier than it was, or the "
+        "map is less exact here than it states."
+    )
+    return options.validation.nis.reasons(sensor.nis.ratio, text)
+
+
+def _counted(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    within = sensor.readings + sensor.rejected
+    share, lost = sensor.rejected / within, sensor.outside / (within + sensor.outside)
+    return [
+        *options.rejected.reasons(
+            share,
+            f"{share:.0%} of its readings fit no calibration that explains the others and do not "
+            "count: the place has changed there since it was mapped, or something passed by.",
+        ),
+        *options.outside_map.reasons(
+            lost, f"{lost:.0%} of its readings lie outside the map and do not count."
+        ),
+    ]
+
+
+def _blind(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
+    """Return which changes the drive would not have shown."""
+    limits, named = limits_of(options.validation), {each.part for each in sensor.changes}
+    hidden = [
+        f"{NAMES[each.part]} (a change of less than {amount(each.part, each.size)})"
+        if np.isfinite(each.size)
+        else f"{NAMES[each.part]} (however it changed)"
+        for each in sensor.detectable
+        if each.part not in (*named, CalibrationPart.CLOCK)
+        and each.size > BLIND_TIMES * limits[each.part].fail
+    ]
+    if not hidden:
+        return []
+    text = f"This drive cannot test {', '.join(hidden)}."
+    return [Reason(Level.WARN, text)]
+
+
+def _ending(sensor: ValidatedSensor, _: QaOptions) -> list[Reason]:
+    if not sensor.ending:
+        return []
+    return [Reason(Level.WARN, f"Of its calibration: {sensor.ending.rstrip('.')}.")]
+
+
+def _on_comparison(sensor: ComparedSensor, options: QaOptions) -> list[Reason]:
+    """Return what has changed since the older calibration."""
+    whole = sensor.test("all")
+    if not whole.freedom:
+        return [Reason(Level.WARN, "The two calibrations determine nothing of it in common.")]
+    if sensor.changes:
+        return [
+            _change(each, options, "since the old calibration {name} has changed by {amount}")
+            for each in sensor.changes
+        ]
+    if whole.chance < options.validation.chance / (len(NAMES)):
+        times = (whole.chi_square / whole.freedom) ** 0.5
+        text = (
+            f"The two calibrations differ {times:.1f} times as much as their uncertainties allow, "
+            "in no single part of it beyond chance: several parts have changed a little together."
+        )
+        return [Reason(Level.WARN, text)]
+    return [Reason(Level.PASS, "No change since the old calibration beyond both uncertainties.")]
+
+
+def limits_of(options: ValidationOptions) -> dict[CalibrationPart, Limit]:
+    """Return from where on a change of each part is worth a warning or a failure."""
+    return {
+        CalibrationPart.PLACE: options.place_m,
+        CalibrationPart.ROTATION: options.rotation_deg,
+        CalibrationPart.GAINS: options.gain,
+        CalibrationPart.ANGLES: options.angle_deg,
+        CalibrationPart.OFFSET: options.offset_ut,
+        CalibrationPart.CLOCK: options.clock_s,
+    }
+
+
+def amount(part: CalibrationPart, size: float) -> str:
+    """Return a size with its unit."""
+    factor, unit, _, _ = SHOWN[part]
+    value = factor * size
+    number = f"{value:.2g}" if value < 10 else f"{value:.0f}"
+    return f"{number}{'' if unit == '°' else ' '}{unit}"
+
+
+def by_how_much(change: Change) -> str:
+    """Return size, parts and sigmas of a change."""
+    factor, unit, digits, along = SHOWN[change.part]
+    space = "" if unit == "°" else " "
+    parts = ", ".join(
+        f"{factor * value:.{digits}f} ± {factor * sigma:.{digits}f}"
+        if np.isfinite(value) and np.isfinite(sigma)
+        else "unknown"
+        for value, sigma in zip(change.change, change.sigma, strict=True)
+    )
+    if len(change.change) == 1:
+        return f"{parts}{space}{unit}"
+    return f"{amount(change.part, change.size)}: ({parts}){space}{unit}{along}"
