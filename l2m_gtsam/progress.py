@@ -1,11 +1,18 @@
-"""How long work tells how far it is."""
+"""Progress of long work, reported to whoever asked for it."""
 
 from collections.abc import Callable
 
 Progress = Callable[[str, float], None]
-"""Called with the name of a stage and the fraction of it that is done."""
+"""Called with the name of a stage and the fraction of it that is done, 0 to 1."""
+
+Count = Callable[[int, int], None]
+"""Called with a number of pieces done and the number of all."""
 
 
-def counter(stage: str, progress: Progress) -> Callable[[int, int], None]:
-    """Return what is called with a number done and the number of all, to tell it as a stage."""
+def silent(_stage: str, _fraction: float) -> None:
+    """Report nothing."""
+
+
+def counter(stage: str, progress: Progress) -> Count:
+    """Return what reports counts as the fraction of a stage."""
     return lambda done, total: progress(stage, done / max(total, 1))

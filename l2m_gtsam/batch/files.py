@@ -1,6 +1,6 @@
 """Drives and maps opened from their files, tiles kept beside maps, folders for results."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -14,7 +14,7 @@ from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.options import Options
-from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.progress import Count, Progress, counter
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.map_file import load_map
 from l2m_gtsam.storage.regressors import read_scalars
@@ -51,7 +51,7 @@ class Tiled(Protocol):
         """Return the map that keeps its tiles in a store."""
         ...
 
-    def make_tiles(self, told: Callable[[int, int], None]) -> int:
+    def make_tiles(self, told: Count) -> int:
         """Have all tiles in the store, and return how many there are."""
         ...
 

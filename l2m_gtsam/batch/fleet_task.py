@@ -20,6 +20,7 @@ from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import BagError, ConfigError, L2MError, OutputError
+from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.fleet import sensor_rows
 from l2m_gtsam.records.fleet import DATE, DriveOutcome, Made, RowKey
 from l2m_gtsam.storage.drive_lists import (
@@ -235,7 +236,7 @@ def open_map(path: Path) -> FleetMap:
     """Open a map, once for all drives on it; whatever happens is the reason of their rows."""
     try:
         saved = SavedMap.read(path)
-        opened = OpenMap(saved.open(_quiet), source_file(path))
+        opened = OpenMap(saved.open(silent), source_file(path))
         return FleetMap(opened, SavedMap(path, replace(saved.state, arrays={})))
     except L2MError as error:
         return FleetMap(None, None, str(error))
@@ -278,9 +279,9 @@ def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
 
 
 def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float) -> DriveOutcome:
-    recording = read_drive_on(saved, task.drive.bag, task.config, _quiet)
+    recording = read_drive_on(saved, task.drive.bag, task.config, silent)
     saved.check_frame(recording)
-    found = calibrate_drive(recording, opened, task.config, task.out, _quiet)
+    found = calibrate_drive(recording, opened, task.config, task.out, silent)
     verdict = report_calibration(task.out, found, task.config.qa)
     return DriveOutcome(
         key=task.key(recording.source.sha256),
@@ -338,7 +339,3 @@ def _duration(recording: Recording) -> float:
 def _made(begun: float) -> Made:
     now = datetime.now(UTC).strftime(DATE)
     return Made(now, round(perf_counter() - begun, 3))
-
-
-def _quiet(stage: str, fraction: float) -> None:
-    """Tell nobody: workers have no terminal."""

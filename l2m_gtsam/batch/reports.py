@@ -12,7 +12,7 @@ from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, Appraised
 from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
 from l2m_gtsam.qa.report.localisation_page import localisation_page
@@ -124,7 +124,7 @@ PDF_FILE = "report.pdf"
 
 
 def report_folder(
-    folder: Path, config: Path | None, progress: Progress | None = None, *, pdf: bool = False
+    folder: Path, config: Path | None, progress: Progress = silent, *, pdf: bool = False
 ) -> Verdict:
     """Write `report.html` from what is in a folder.
 
@@ -145,16 +145,15 @@ def report_folder(
     L2MError
         A file is missing or damaged, or there is no browser to print with; one line.
     """
-    tell = progress or (lambda stage, fraction: None)
-    tell(STAGE, 0.0)
+    progress(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE, folder / PDF_FILE)
     if holds_localisation(folder):
         verdict = report_localisation(folder, config, folder / REPORT_FILE)
     else:
-        verdict = _report_calibration(folder, config, tell)
+        verdict = _report_calibration(folder, config, progress)
     if pdf:
         print_page(folder / REPORT_FILE, folder / PDF_FILE)
-    tell(STAGE, 1.0)
+    progress(STAGE, 1.0)
     return verdict
 
 
@@ -218,7 +217,7 @@ def write_report(
     result: CalibrationResult,
     metrics: Metrics,
     options: QaOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Verdict:
     """Write the report on a calibration and return its verdict.
 

@@ -1,6 +1,5 @@
 """The paper's two-step loop: a closed form for C and H, then a graph for t, until t settles."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -14,6 +13,7 @@ from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.view import QueryableMap, View, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.options import Options
+from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.closed_form import (
@@ -25,8 +25,6 @@ from l2m_gtsam.solve.closed_form import (
 from l2m_gtsam.solve.noise import estimate_noise
 from l2m_gtsam.solve.rank import RankOptions
 from l2m_gtsam.solve.robust import RobustOptions
-
-Progress = Callable[[str, float], None]
 
 DISTORTION = 12  # parameters of C and H
 # Readings of a sensor without which no step of the alternation is taken: five have 15 components.

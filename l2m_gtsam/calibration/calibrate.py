@@ -5,7 +5,6 @@ from importlib.metadata import version
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import Progress
 from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem, solve_moving
 from l2m_gtsam.calibration.named_priors import priors_of
@@ -27,6 +26,7 @@ from l2m_gtsam.data import (
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.joining import drive_at, own_ns
 from l2m_gtsam.recording.sync import stuck_readings
 from l2m_gtsam.records.calibration import (
@@ -67,7 +67,7 @@ def calibrate(
     field_map: QueryableMap,
     options: CalibrationOptions,
     map_source: SourceFile | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> CalibrationResult:
     """Find where every magnetometer sits on the lidar and how it distorts the field.
 
@@ -102,7 +102,7 @@ def calibrated(
     field_map: QueryableMap,
     options: CalibrationOptions,
     map_source: SourceFile | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Calibrated:
     """Calibrate as ``calibrate`` does, and keep what the result rests on, to judge it by."""
     synchronised = prepare(recording, options)
@@ -158,7 +158,7 @@ def _starts(
     field_map: QueryableMap,
     options: CalibrationOptions,
     priors: Priors,
-    progress: Progress | None,
+    progress: Progress,
 ) -> list[FoundStart | None]:
     """Look for the start of each sensor; none where it is given or none is found.
 
@@ -173,10 +173,9 @@ def _starts(
         raise CalibrationError(msg)
     if not len(readings) or set(options.start) == set(readings.sensors):
         return [None] * len(readings.sensors)
-    tell = progress or (lambda stage, fraction: None)
-    tell("global start", 0.0)
+    progress("global start", 0.0)
     found = find_starts(readings, field_map, np.zeros(3), options.search, priors)
-    tell("global start", 1.0)
+    progress("global start", 1.0)
     names = zip(readings.sensors, found, strict=True)
     return [None if name in options.start else each for name, each in names]
 

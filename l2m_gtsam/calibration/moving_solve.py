@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import OneKeyOptions, Progress
+from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.model_samples import explicable, model_samples, predicted
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
@@ -18,6 +18,7 @@ from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FieldSample, FloatArray, Readings, Trajectory
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.solve.model_comparison import ModelOptions, compare_models
 
@@ -77,7 +78,7 @@ class MovingProblem:
     field_map: QueryableMap
     options: OneKeyOptions
     models: ModelOptions
-    progress: Progress | None
+    progress: Progress
     trajectory: Trajectory | None
     priors: Priors = NO_PRIORS
 

@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import OneKeyOptions, Progress, alternate, start_estimate
+from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_estimate
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import (
@@ -34,6 +34,7 @@ from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
 from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings, Trajectory
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
@@ -95,7 +96,7 @@ def solve_one_key(
     field_map: QueryableMap,
     t_start: FloatArray,
     options: OneKeyOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
     trajectory: Trajectory | None = None,
     priors: Priors = NO_PRIORS,
 ) -> OneKeySolution:
@@ -119,10 +120,9 @@ def solve_one_key(
     priors
         What is known of the sensors beforehand.
     """
-    tell = progress or (lambda stage, fraction: None)
-    stage = partial(tell, "map uncertainty")
+    stage = partial(progress, "map uncertainty")
     finish = partial(solve_uncertain, progress=stage)
-    return _solved(readings, field_map, t_start, options, tell, trajectory, priors, finish)
+    return _solved(readings, field_map, t_start, options, progress, trajectory, priors, finish)
 
 
 def solve_part(
@@ -140,11 +140,7 @@ def solve_part(
     t_start
         Where the whole was found, metres, shape (S, 3).
     """
-
-    def tell(stage: str, fraction: float) -> None:
-        """Say nothing: a part takes a second."""
-
-    return _solved(readings, field_map, t_start, options, tell, None, NO_PRIORS, step_uncertain)
+    return _solved(readings, field_map, t_start, options, silent, None, NO_PRIORS, step_uncertain)
 
 
 class Finish(Protocol):

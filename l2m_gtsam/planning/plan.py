@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import Progress
 from l2m_gtsam.calibration.explanation import from_priors, undetermined
 from l2m_gtsam.calibration.forecast import Forecast, forecast
 from l2m_gtsam.calibration.joint import SensorSolution
@@ -36,6 +35,7 @@ from l2m_gtsam.planning.motion import (
     places_around,
     strongest,
 )
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.records.plan import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
@@ -93,7 +93,7 @@ def plan(
     field_map: QueryableMap,
     options: CalibrationOptions,
     planning: PlanOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> DrivePlan:
     """Say what a drive will determine, to what sigma, and which extra motion would help most.
 
@@ -118,16 +118,15 @@ def plan(
     CalibrationError
         The map does not cover the drive, or a place is given for an unknown sensor.
     """
-    tell = progress or (lambda stage, fraction: None)
     synchronised = prepare(recording, options)
     readings = synchronised.readings
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     noise = _noise(field_map, options, planning)
     priors = priors_of(options.priors, readings.sensors)
     task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)
-    tell("what the drive tells", 0.0)
+    progress("what the drive tells", 0.0)
     found = task.forecast(readings)
-    tell("what the drive tells", 1.0)
+    progress("what the drive tells", 1.0)
     if not found.view.inside.any():
         raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
     sensors = _sensor_plans(synchronised, recording.trajectory, found, task)
@@ -135,7 +134,7 @@ def plan(
     least = max(range(len(sensors)), key=lambda index: worsts[index].badness)
     # The other sensors are known better: what a motion does for them need not be asked.
     one, alone = task.of(least), only(readings, least)
-    motions = _with_motions(one, alone, _motions(readings, solver_map, planning), tell)
+    motions = _with_motions(one, alone, _motions(readings, solver_map, planning), progress)
     return DrivePlan(
         sensors=sensors,
         noise=noise,
@@ -147,14 +146,14 @@ def plan(
 
 
 def _with_motions(
-    task: Task, readings: Readings, motions: tuple[ExtraMotion, ...], tell: Progress
+    task: Task, readings: Readings, motions: tuple[ExtraMotion, ...], progress: Progress
 ) -> tuple[MotionPlan, ...]:
     """Return what each motion would leave of a sensor, the best first."""
     plans = []
     for index, motion in enumerate(motions):
-        tell("extra motions", index / len(motions))
+        progress("extra motions", index / len(motions))
         plans.append(MotionPlan(motion.name, task.worst(with_motion(readings, motion))))
-    tell("extra motions", 1.0)
+    progress("extra motions", 1.0)
     return tuple(sorted(plans, key=lambda each: each.worst.badness))
 
 

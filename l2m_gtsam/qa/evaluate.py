@@ -15,7 +15,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.parallel.threads import one_blas_thread
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.metrics.repeatability import (
@@ -39,7 +39,7 @@ def evaluate(
     calibrated: Calibrated,
     options: CalibrationOptions,
     qa: QaOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Metrics:
     """Return the metrics of a calibration.
 
@@ -56,21 +56,20 @@ def evaluate(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    tell = progress or (lambda stage, fraction: None)
     halves: dict[str, Halves] = {}
     drives: dict[str, Repeatability] = {}
     if qa.halves:
         stage = "drives by themselves" if recording.drives else "halves of the drive"
-        tell(stage, 0.0)
+        progress(stage, 0.0)
         if recording.drives:
             drives = compared_drives(calibrated, recording, options, qa.half_readings)
         else:
             halves = compared_halves(calibrated, options, qa.half_readings)
-        tell(stage, 1.0)
-    tell(FIGURES, 0.0)
+        progress(stage, 1.0)
+    progress(FIGURES, 0.0)
     evidence, maps = evidence_of(calibrated), maps_of(calibrated)
     metrics = metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
-    tell(FIGURES, 0.5)
+    progress(FIGURES, 0.5)
     return metrics
 
 

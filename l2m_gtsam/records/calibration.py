@@ -1,16 +1,64 @@
-"""What comes out of a solve: frozen records, with shapes and units.
+"""The result of a calibration: frozen records, which ``calibration.yaml`` holds.
 
 Frames and units are those of ``data``.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from types import GenericAlias
+from typing import Annotated, Any, get_args
 
 import numpy as np
+from pydantic import Field, GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
 
-from l2m_gtsam.data import Distortion, FloatArray, SourceFile, SyncCounts
+from l2m_gtsam.data import (
+    Distortion,
+    FloatArray,
+    InFile,
+    Matrix,
+    SourceFile,
+    SyncCounts,
+    Vector,
+)
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
+
+Row15 = Annotated[list[float], Field(min_length=15, max_length=15)]
+
+
+@dataclass(frozen=True)
+class KeyedBy:
+    """How pydantic reads and writes a tuple of records: as a mapping from one of their fields."""
+
+    name: str
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        entries_type = GenericAlias(dict, (str, get_args(source)[0]))
+        entries = core_schema.no_info_before_validator_function(
+            self._with_names, handler.generate_schema(entries_type)
+        )
+        return core_schema.no_info_after_validator_function(
+            lambda found: tuple(found.values()),
+            entries,
+            serialization=core_schema.wrap_serializer_function_ser_schema(
+                self._by_name, schema=handler.generate_schema(source)
+            ),
+        )
+
+    def _with_names(self, entries: Any) -> Any:
+        """Return entries with their names inside; what is no mapping is refused afterwards."""
+        if not isinstance(entries, dict):
+            return entries
+        return {
+            name: {**entry, self.name: name} if isinstance(entry, dict) else entry
+            for name, entry in entries.items()
+        }
+
+    def _by_name(self, records: Any, dump: Callable[[Any], list[dict[str, Any]]]) -> Any:
+        return {entry.pop(self.name): entry for entry in dump(records)}
 
 
 class SensorStatus(StrEnum):
@@ -42,7 +90,7 @@ class ResidualFigures:
     """
 
     readings: int
-    rms_axes: FloatArray
+    rms_axes: Vector
     rms: float
     median_norm: float
     p95_norm: float
@@ -66,9 +114,9 @@ class FoundStart:
         That place in the lidar frame in metres, shape (3,), if there is one.
     """
 
-    t_lidar_mag: FloatArray
+    t_lidar_mag: Vector
     margin: float
-    runner_up: FloatArray | None
+    runner_up: Vector | None
 
     def moved(self, by: FloatArray) -> "FoundStart":
         """Return the same for a place that is elsewhere by a vector in metres, shape (3,)."""
@@ -98,7 +146,7 @@ class TimeOffset:
 
     seconds: float
     sigma: float
-    cross_covariance: FloatArray
+    cross_covariance: Annotated[FloatArray, InFile(Row15)]
     held: str
 
     @property
@@ -142,8 +190,8 @@ class Disagreement:
     sensors: tuple[str, ...]
     start_ns: int
     end_ns: int
-    p_from: FloatArray
-    p_to: FloatArray
+    p_from: Vector
+    p_to: Vector
     length: float
     readings: int
     size: float
@@ -206,15 +254,15 @@ class SensorCalibration:
     sensor: str
     status: SensorStatus
     message: str
-    t_lidar_mag: FloatArray
+    t_lidar_mag: Vector
     distortion: Distortion
-    R_lidar_mag: FloatArray
-    covariance: FloatArray
-    rotation_covariance: FloatArray
+    R_lidar_mag: Matrix
+    covariance: Annotated[FloatArray, InFile(tuple[(Row15,) * 15])]
+    rotation_covariance: Matrix
     noise: float
     residuals: ResidualFigures | None
     undetermined: tuple[str, ...]
-    sync: SyncCounts
+    sync: Annotated[SyncCounts, Field(alias="readings")]
     outside_map: int
     start: FoundStart | None = None
     rejected: int = 0
@@ -222,7 +270,7 @@ class SensorCalibration:
     from_priors: tuple[str, ...] = ()
     models: ModelComparison | None = None
     not_compared: str = ""
-    moving: tuple[MovingField, ...] = ()
+    moving: Annotated[tuple[MovingField, ...], KeyedBy("name")] = ()
     missing_in: tuple[str, ...] = ()
 
     @property
@@ -278,7 +326,7 @@ class CalibrationResult:
         What is worth knowing of the drives, a sentence each.
     """
 
-    sensors: tuple[SensorCalibration, ...]
+    sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
     iterations: int
     uncertainty: Uncertainty
     doubts: tuple[str, ...]

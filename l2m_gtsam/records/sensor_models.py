@@ -13,11 +13,11 @@ by tau gives E = tau C: the last term holds a time offset, too.
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
-from typing import Self
+from typing import Annotated, Self
 
 import numpy as np
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, InFile, IntArray, Matrix, Row3, Vector
 
 ONE_DRIVE = (slice(None),)  # all rows
 
@@ -98,6 +98,11 @@ class Samples:
         return np.hstack([self.b, self.q, self.db_dt])
 
 
+def _rows(by_name: dict[str, Row3]) -> FloatArray:
+    """Return rows that a file has by name, shape (K, 3); K may be 0."""
+    return np.array(list(by_name.values())).reshape(-1, 3)
+
+
 @dataclass(frozen=True)
 class Coefficients:
     """What multiplies what, or a standard deviation of each.
@@ -114,10 +119,10 @@ class Coefficients:
         Of the eddy currents in seconds, shape (3, 3).
     """
 
-    C: FloatArray
-    H: FloatArray
-    h: FloatArray
-    E: FloatArray
+    C: Matrix
+    H: Vector
+    h: Annotated[FloatArray, InFile(dict[str, Row3], _rows)]
+    E: Matrix
 
     @classmethod
     def of_columns(cls, X: FloatArray, H: FloatArray) -> Self:
@@ -176,33 +181,29 @@ class ModelComparison:
 
     Attributes
     ----------
-    fits
-        One per model, from few parameters to many.
+    recommended, reason
+        The simplest adequate model, and a sentence why.
+    readings, independent
+        Number of readings used, and of independent ones that they are worth.
+    segments
+        Number of parts of the drive that were held out in turn.
     regressors
         Names of the recorded numbers.
-    readings
-        That were used.
-    independent
-        As how many independent ones they count.
-    segments
-        Parts of the drive that were held out.
-    recommended
-        The simplest adequate model.
-    reason
-        A sentence why.
+    fits
+        One per model, from few parameters to many.
     coefficients, sigma
         Of the recommended model with their standard deviations, the correlation of residuals taken
         into account; infinite for what the readings do not determine, zero for what the model
         fixes.
     """
 
-    fits: tuple[ModelFigures, ...]
-    regressors: tuple[str, ...]
+    recommended: Model
+    reason: str
     readings: int
     independent: float
     segments: int
-    recommended: Model
-    reason: str
+    regressors: tuple[str, ...]
+    fits: tuple[ModelFigures, ...]
     coefficients: Coefficients
     sigma: Coefficients
 
@@ -225,5 +226,5 @@ class MovingField:
     """
 
     name: str
-    h: FloatArray
-    sigma: FloatArray
+    h: Vector
+    sigma: Vector

@@ -1,13 +1,14 @@
 """What a vehicle's sensors record while it drives."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.progress import Progress
 from l2m_gtsam.simulate.drive import Motion
 from l2m_gtsam.simulate.lidar import SimulatedScans
 from l2m_gtsam.simulate.sensors import (
@@ -20,9 +21,6 @@ from l2m_gtsam.simulate.sensors import (
     sensor_points,
 )
 from l2m_gtsam.simulate.world import SteelWorld
-
-Progress = Callable[[str, float], None]
-"""Called with the name of a stage and the share of it that is done, 0 to 1."""
 
 
 @dataclass(frozen=True)

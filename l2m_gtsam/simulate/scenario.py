@@ -9,6 +9,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.options import Options
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.simulate.corridor import CorridorOptions
 from l2m_gtsam.simulate.drive import DriveOptions, drive
 from l2m_gtsam.simulate.earth import EarthOptions, earth_field
@@ -16,7 +17,7 @@ from l2m_gtsam.simulate.floor_plan import FloorPlan, FloorPlanOptions
 from l2m_gtsam.simulate.lidar import LidarOptions, RayCaster, SimulatedScans, scan_stamps
 from l2m_gtsam.simulate.odometry import OdometryOptions, drifting
 from l2m_gtsam.simulate.place import Place, RouteOptions, corridor, hall
-from l2m_gtsam.simulate.recorder import Progress, SimulatedDrive, Vehicle, record
+from l2m_gtsam.simulate.recorder import SimulatedDrive, Vehicle, record
 from l2m_gtsam.simulate.route import CalibrationRouteOptions, MappingRouteOptions
 from l2m_gtsam.simulate.sensors import (
     ArrayOptions,
@@ -120,7 +121,7 @@ class Scenario:
     truth: tuple[KnownSensor, ...]
 
 
-def simulate(options: ScenarioOptions, progress: Progress | None = None) -> Scenario:
+def simulate(options: ScenarioOptions, progress: Progress = silent) -> Scenario:
     """Return a scenario; the same options give the same arrays, bit for bit.
 
     Parameters
@@ -145,10 +146,9 @@ def simulate(options: ScenarioOptions, progress: Progress | None = None) -> Scen
         mapping_scans = np.random.default_rng([options.seed, options.survey_seed, 1])
     place = _place(options, steel)
     suite, truth = mapping_suite(options.suite), random_array(options.array, array)
-    report = progress or _ignore
     eye = None if options.lidar is None else RayCaster(place.solids)
-    mapped = record(_mapper(options, place, suite, mapping), place.world, mapping, report)
-    driven = record(_rover(options, place, truth, calibration), place.world, calibration, report)
+    mapped = record(_mapper(options, place, suite, mapping), place.world, mapping, progress)
+    driven = record(_rover(options, place, truth, calibration), place.world, calibration, progress)
     return Scenario(
         options=options,
         plan=place.plan,
@@ -221,7 +221,3 @@ def _scanned(
 def _stamp(day: dt.date, time: dt.time) -> int:
     """Return a time of day (UTC) in nanoseconds since 1970."""
     return int(dt.datetime.combine(day, time, tzinfo=dt.UTC).timestamp()) * NANOSECONDS
-
-
-def _ignore(stage: str, share: float) -> None:
-    """Report nothing."""

@@ -10,6 +10,7 @@ from rosbags.interfaces import Connection
 from l2m_gtsam.data import FieldSeries, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.geometry import moved
+from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import (
     MICROTESLA_PER,
     BagOptions,
@@ -30,7 +31,7 @@ from l2m_gtsam.storage.messages import (
     StampBuffer,
     header_ns,
 )
-from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
+from l2m_gtsam.storage.open_bag import Bag, Message, open_bag
 from l2m_gtsam.storage.selection import (
     select_fields,
     select_poses,
@@ -55,7 +56,7 @@ class Buffers:
     pose_times: dict[tuple[str, str], StampBuffer] = field(default_factory=dict)
 
 
-def read_recording(path: Path, options: BagOptions, progress: Progress | None = None) -> Recording:
+def read_recording(path: Path, options: BagOptions, progress: Count | None = None) -> Recording:
     """Read poses and readings in one pass; other topics are not decoded.
 
     Parameters
@@ -140,7 +141,7 @@ def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
 
 
 def _read(
-    bag: Bag, connections: list[Connection], options: BagOptions, progress: Progress | None
+    bag: Bag, connections: list[Connection], options: BagOptions, progress: Count | None
 ) -> Buffers:
     """Make one pass over the bag."""
     buffers = Buffers()

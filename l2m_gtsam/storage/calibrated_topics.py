@@ -10,6 +10,7 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import CorrectedField, FloatArray, IntArray
 from l2m_gtsam.errors import BagError, UnitsError
+from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_copy import BagCopy
 from l2m_gtsam.storage.bag_options import (
     MICROTESLA_PER,
@@ -20,7 +21,7 @@ from l2m_gtsam.storage.bag_options import (
     strength,
 )
 from l2m_gtsam.storage.messages import FIELD_TYPE, FieldBuffer, header_ns
-from l2m_gtsam.storage.open_bag import Bag, Codec, Progress, RawMessage
+from l2m_gtsam.storage.open_bag import Bag, Codec, RawMessage
 from l2m_gtsam.storage.selection import select_fields, sensor_names, several_frames
 
 Correct = Callable[[FloatArray, IntArray], CorrectedField]
@@ -56,9 +57,7 @@ class SensorTopic:
     sample: FloatArray
 
 
-def sensor_topics(
-    bag: Bag, options: BagOptions, progress: Progress | None
-) -> dict[Key, SensorTopic]:
+def sensor_topics(bag: Bag, options: BagOptions, progress: Count | None) -> dict[Key, SensorTopic]:
     """Return the magnetometers of a bag by topic and frame.
 
     Raises
@@ -132,7 +131,7 @@ class Calibrator:
     left_out: frozenset[str]
     _codecs: dict[int, Codec] = field(default_factory=dict)
 
-    def copy(self, into: BagCopy, progress: Progress | None) -> None:
+    def copy(self, into: BagCopy, progress: Count | None) -> None:
         """Write all messages of the source and, right after each reading, its correction.
 
         Raises

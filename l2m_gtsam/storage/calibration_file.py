@@ -1,34 +1,23 @@
 """``calibration.yaml``: everything about each sensor, with formulas and units inside."""
 
-from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion, FloatArray, RigidTransform, SourceFile, SyncCounts
-from l2m_gtsam.records.calibration import (
-    CalibrationResult,
-    Disagreement,
-    FoundStart,
-    ResidualFigures,
-    Return,
-    SensorCalibration,
-    SensorStatus,
-    TimeOffset,
-    Uncertainty,
-)
-from l2m_gtsam.records.sensor_models import (
-    Coefficients,
-    Model,
-    ModelComparison,
-    ModelFigures,
-    MovingField,
-)
-from l2m_gtsam.storage.yaml_file import Lenient, Matrix, Vector, read_model, write_yaml
+from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
+from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
+FORMAT = "l2m-calibration"
+VERSION = 1
+HEADER = """Calibration of magnetometers against a LiDAR, written by l2m_gtsam.
+Formulas, frames and units stand under `model`; each sensor has its own entry under `sensors`."""
+# What files of the first version lack; their sigmas are of this kind.
+FIRST_VERSION = {"uncertainty": Uncertainty.INDEPENDENT.value, "doubts": (), "disagreements": ()}
 UNCERTAINTY = {
     Uncertainty.FULL: (
         "sigmas carry the map's errors as they are: shared by readings near each other and by all "
@@ -75,9 +64,147 @@ MODEL = {
     ),
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
+SENSOR_KEYS = (
+    "status",
+    "message",
+    "t_lidar_mag",
+    "t_sigma",
+    "C",
+    "C_sigma",
+    "H",
+    "H_sigma",
+    "R_lidar_mag",
+    "rotation_sigma",
+    "rotation_covariance",
+    "transforms",
+    "noise",
+    "undetermined",
+    "from_priors",
+    "residuals",
+    "readings",
+    "outside_map",
+    "rejected",
+    "start",
+    "time_offset",
+    "moving",
+    "models",
+    "not_compared",
+    "missing_in",
+    "covariance",
+)
+"""In the order of the file: a matrix of 15 rows hides what follows it."""
 
 
-def transform_entry(T_lidar_mag: RigidTransform) -> dict[str, Any]:
+@dataclass(frozen=True)
+class _Head:
+    format: Literal["l2m-calibration"]
+    version: Literal[1]
+
+
+@dataclass(frozen=True)
+class _CalibrationFile(CalibrationResult, _Head):
+    """The head, and the fields of the result beside it; what is derived from them is not read."""
+
+
+_FILE = TypeAdapter(_CalibrationFile)
+_RESULT = TypeAdapter(CalibrationResult)
+_SENSOR = TypeAdapter(SensorCalibration)
+
+
+def write_calibration(path: Path, result: CalibrationResult) -> None:
+    """Write a calibration; `read_calibration` gives it back equal."""
+    plain = _RESULT.dump_python(result, exclude={"sensors"})
+    disagreements = [_without_empty(each, "bag") for each in plain["disagreements"]]
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
+        "uncertainty": plain["uncertainty"],
+        "doubts": plain["doubts"],
+        "notes": plain["notes"],
+        "disagreements": disagreements,
+        **source_entries(result),
+        "versions": plain["versions"],
+        "iterations": plain["iterations"],
+        "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
+        "options": plain["options"],
+    }
+    write_yaml(path, _without_empty(content, "notes"), HEADER)
+
+
+def read_calibration(path: Path) -> CalibrationResult:
+    """Return the calibration in a file.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing, damaged or something else.
+    """
+    found = read_checked(path, _FILE, _with_distortions, added=("distortion",))
+    return CalibrationResult(
+        **{each.name: getattr(found, each.name) for each in fields(CalibrationResult)}
+    )
+
+
+def _with_distortions(content: dict[str, Any]) -> dict[str, Any]:
+    """Return a file as its record has it: C and H of a sensor together as its distortion."""
+    sensors = content.get("sensors")
+    if isinstance(sensors, dict):
+        sensors = {
+            name: {**entry, "distortion": entry} if isinstance(entry, dict) else entry
+            for name, entry in sensors.items()
+        }
+    return {**FIRST_VERSION, **content, "sensors": sensors}
+
+
+def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
+    """Return all that is known of a sensor as plain values, derived ones too."""
+    plain = _SENSOR.dump_python(sensor, by_alias=True)
+    values = {
+        **plain,
+        **plain["distortion"],
+        "t_sigma": sensor.t_sigma.tolist(),
+        "C_sigma": sensor.C_sigma.tolist(),
+        "H_sigma": sensor.H_sigma.tolist(),
+        "rotation_sigma": np.sqrt(np.diag(sensor.rotation_covariance)).tolist(),
+        "transforms": _transforms(RigidTransform(sensor.R_lidar_mag, sensor.t_lidar_mag)),
+        "time_offset": _time_offset(plain["time_offset"], sensor),
+        "models": _models(plain["models"]),
+    }
+    return _without_empty({key: values[key] for key in SENSOR_KEYS}, "missing_in")
+
+
+def source_entries(result: CalibrationResult) -> dict[str, Any]:
+    """Return what was calibrated: one drive under `bag`, several under `bags`, and the map."""
+    plain = _RESULT.dump_python(result, include={"bag", "bags", "map"})
+    return _without_empty({name: plain[name] for name in ("bag", "bags", "map")}, "bags")
+
+
+def _without_empty(entry: dict[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if value or key != name}
+
+
+def _time_offset(plain: dict[str, Any] | None, sensor: SensorCalibration) -> dict[str, Any] | None:
+    if plain is None:
+        return None
+    correlation = {"correlation_with_t": sensor.offset_correlation.tolist()}
+    names = ("seconds", "sigma", "correlation_with_t", "held", "cross_covariance")
+    return {name: {**plain, **correlation}[name] for name in names}
+
+
+def _models(plain: dict[str, Any] | None) -> dict[str, Any] | None:
+    """Return a comparison with the rows of h under the names of their numbers."""
+    if plain is None:
+        return None
+    names = plain["regressors"]
+    tables = {
+        table: {**plain[table], "h": dict(zip(names, plain[table]["h"], strict=True))}
+        for table in ("coefficients", "sigma")
+    }
+    return {**plain, **tables}
+
+
+def _transforms(T_lidar_mag: RigidTransform) -> dict[str, Any]:
     """Return both directions and a point in both frames, so that no convention is left to guess."""
     p_mag = np.array([0.1, 0.2, 0.3])
     p_lidar = T_lidar_mag.R @ p_mag + T_lidar_mag.t
@@ -103,380 +230,3 @@ def _quaternion(R: FloatArray) -> list[float]:
     if not np.isfinite(R).all():
         return [float("nan")] * 4
     return [float(q) for q in Rotation.from_matrix(R).as_quat(canonical=True)]
-
-
-class MovingEntry(Lenient):
-    """What a recorded number adds to the readings."""
-
-    h: Vector
-    sigma: Vector
-
-
-class CoefficientsEntry(Lenient):
-    """Coefficients of a model, or their sigmas; h by the names of the numbers."""
-
-    C: Matrix
-    H: Vector
-    h: dict[str, Vector]
-    E: Matrix
-
-
-class FiguresEntry(Lenient):
-    """How one model does."""
-
-    model: Model
-    parameters: int
-    rms: float
-    held_out_rms: float
-    held_out_score: float
-    score_error: float
-    behind: float
-    behind_error: float
-    bic: float
-    bic_above: float
-
-
-class ModelsEntry(Lenient):
-    """All models side by side."""
-
-    recommended: Model
-    reason: str
-    readings: int
-    independent: float
-    segments: int
-    regressors: tuple[str, ...]
-    fits: tuple[FiguresEntry, ...]
-    coefficients: CoefficientsEntry
-    sigma: CoefficientsEntry
-
-
-def moving_entry(moving: tuple[MovingField, ...]) -> dict[str, Any]:
-    """Return what recorded numbers add as plain values, by their names."""
-    return {each.name: {"h": each.h.tolist(), "sigma": each.sigma.tolist()} for each in moving}
-
-
-def moving_of(entries: Mapping[str, MovingEntry]) -> tuple[MovingField, ...]:
-    """Return what recorded numbers add from its entry."""
-    return tuple(
-        MovingField(name, np.array(each.h), np.array(each.sigma)) for name, each in entries.items()
-    )
-
-
-def models_entry(comparison: ModelComparison) -> dict[str, Any]:
-    """Return a comparison as plain values."""
-    names = comparison.regressors
-    return {
-        "recommended": comparison.recommended.value,
-        "reason": comparison.reason,
-        "readings": comparison.readings,
-        "independent": comparison.independent,
-        "segments": comparison.segments,
-        "regressors": list(names),
-        "fits": [{**vars(each), "model": each.model.value} for each in comparison.fits],
-        "coefficients": _coefficients_entry(comparison.coefficients, names),
-        "sigma": _coefficients_entry(comparison.sigma, names),
-    }
-
-
-def models_of(entry: ModelsEntry) -> ModelComparison:
-    """Return a comparison from its entry."""
-    return ModelComparison(
-        fits=tuple(ModelFigures(**dict(each)) for each in entry.fits),
-        regressors=entry.regressors,
-        readings=entry.readings,
-        independent=entry.independent,
-        segments=entry.segments,
-        recommended=entry.recommended,
-        reason=entry.reason,
-        coefficients=_coefficients(entry.coefficients),
-        sigma=_coefficients(entry.sigma),
-    )
-
-
-def _coefficients_entry(found: Coefficients, names: tuple[str, ...]) -> dict[str, Any]:
-    h = {name: each.tolist() for name, each in zip(names, found.h, strict=True)}
-    return {"C": found.C.tolist(), "H": found.H.tolist(), "h": h, "E": found.E.tolist()}
-
-
-def _coefficients(entry: CoefficientsEntry) -> Coefficients:
-    h = np.array(list(entry.h.values())).reshape(-1, 3)
-    return Coefficients(np.array(entry.C), np.array(entry.H), h, np.array(entry.E))
-
-
-FORMAT = "l2m-calibration"
-VERSION = 1
-HEADER = """Calibration of magnetometers against a LiDAR, written by l2m_gtsam.
-Formulas, frames and units stand under `model`; each sensor has its own entry under `sensors`."""
-
-Row15 = Annotated[list[float], Field(min_length=15, max_length=15)]
-
-
-class _Residuals(Lenient):
-    readings: int
-    rms_axes: Vector
-    rms: float
-    median_norm: float
-    p95_norm: float
-    max_norm: float
-    chi2_per_dof: float
-
-
-class _Counts(Lenient):
-    received: int
-    not_finite: int
-    repeated: int
-    outside_trajectory: int
-    in_pose_gap: int
-    thinned: int
-    kept: int
-    without_regressor: int = 0
-
-
-class _Start(Lenient):
-    t_lidar_mag: Vector
-    margin: float
-    runner_up: Vector | None
-
-
-class _TimeOffset(Lenient):
-    seconds: float
-    sigma: float
-    cross_covariance: Row15
-    held: str
-
-
-class _Sensor(Lenient):
-    status: SensorStatus
-    message: str
-    t_lidar_mag: Vector
-    C: Matrix
-    H: Vector
-    R_lidar_mag: Matrix
-    covariance: Annotated[list[Row15], Field(min_length=15, max_length=15)]
-    rotation_covariance: Matrix
-    noise: float
-    residuals: _Residuals | None
-    undetermined: tuple[str, ...]
-    from_priors: tuple[str, ...] = ()
-    readings: _Counts
-    outside_map: int
-    start: _Start | None = None
-    rejected: int = 0
-    # Files of the first version do not speak of it.
-    time_offset: _TimeOffset | None = None
-    models: ModelsEntry | None = None
-    not_compared: str = ""
-    moving: dict[str, MovingEntry] = Field(default_factory=dict)
-    missing_in: tuple[str, ...] = ()
-
-
-class _Disagreement(Lenient):
-    sensors: tuple[str, ...]
-    start_ns: int
-    end_ns: int
-    p_from: Vector
-    p_to: Vector
-    length: float
-    readings: int
-    size: float
-    passed_again: Return
-    bag: str = ""
-
-
-class _Source(Lenient):
-    path: str
-    sha256: str
-
-
-class _CalibrationFile(Lenient):
-    format: Literal["l2m-calibration"]
-    version: Literal[1]
-    iterations: int
-    # Files of the first version do not say; their sigmas are of this kind.
-    uncertainty: Uncertainty = Uncertainty.INDEPENDENT
-    doubts: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    disagreements: tuple[_Disagreement, ...] = ()
-    bag: _Source | None
-    # Of several drives together; files of one do not have it.
-    bags: tuple[_Source, ...] = ()
-    map: _Source | None
-    options: dict[str, Any]
-    versions: dict[str, str]
-    sensors: dict[str, _Sensor]
-
-
-def write_calibration(path: Path, result: CalibrationResult) -> None:
-    """Write a calibration; `read_calibration` gives it back equal."""
-    content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
-        "uncertainty": str(result.uncertainty),
-        "doubts": list(result.doubts),
-        **({"notes": list(result.notes)} if result.notes else {}),
-        "disagreements": [_disagreement_entry(each) for each in result.disagreements],
-        **bag_entries(result),
-        "map": source_entry(result.map),
-        "versions": result.versions,
-        "iterations": result.iterations,
-        "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
-        "options": result.options,
-    }
-    write_yaml(path, content, HEADER)
-
-
-def read_calibration(path: Path) -> CalibrationResult:
-    """Return the calibration in a file.
-
-    Raises
-    ------
-    CalibrationError
-        The file is missing, damaged or something else.
-    """
-    parsed = read_model(path, _CalibrationFile)
-    return CalibrationResult(
-        sensors=tuple(_sensor(name, entry) for name, entry in parsed.sensors.items()),
-        iterations=parsed.iterations,
-        uncertainty=parsed.uncertainty,
-        doubts=parsed.doubts,
-        disagreements=tuple(_disagreement(each) for each in parsed.disagreements),
-        bag=SourceFile(parsed.bag.path, parsed.bag.sha256) if parsed.bag else None,
-        map=SourceFile(parsed.map.path, parsed.map.sha256) if parsed.map else None,
-        options=parsed.options,
-        versions=parsed.versions,
-        bags=tuple(SourceFile(each.path, each.sha256) for each in parsed.bags),
-        notes=parsed.notes,
-    )
-
-
-def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
-    """Return all that is known of a sensor as plain values."""
-    missing = {"missing_in": list(sensor.missing_in)} if sensor.missing_in else {}
-    return {
-        "status": sensor.status.value,
-        "message": sensor.message,
-        "t_lidar_mag": sensor.t_lidar_mag.tolist(),
-        "t_sigma": sensor.t_sigma.tolist(),
-        "C": sensor.distortion.C.tolist(),
-        "C_sigma": sensor.C_sigma.tolist(),
-        "H": sensor.distortion.H.tolist(),
-        "H_sigma": sensor.H_sigma.tolist(),
-        "R_lidar_mag": sensor.R_lidar_mag.tolist(),
-        "rotation_sigma": np.sqrt(np.diag(sensor.rotation_covariance)).tolist(),
-        "rotation_covariance": sensor.rotation_covariance.tolist(),
-        "transforms": transform_entry(RigidTransform(sensor.R_lidar_mag, sensor.t_lidar_mag)),
-        "noise": sensor.noise,
-        "undetermined": list(sensor.undetermined),
-        "from_priors": list(sensor.from_priors),
-        "residuals": _residuals_entry(sensor.residuals),
-        "readings": vars(sensor.sync).copy(),
-        "outside_map": sensor.outside_map,
-        "rejected": sensor.rejected,
-        "start": _start_entry(sensor.start),
-        "time_offset": _time_offset_entry(sensor),
-        "moving": moving_entry(sensor.moving),
-        "models": None if sensor.models is None else models_entry(sensor.models),
-        "not_compared": sensor.not_compared,
-        **missing,
-        "covariance": sensor.covariance.tolist(),
-    }
-
-
-def _time_offset_entry(sensor: SensorCalibration) -> dict[str, Any] | None:
-    offset = sensor.time_offset
-    if offset is None:
-        return None
-    return {
-        "seconds": offset.seconds,
-        "sigma": offset.sigma,
-        "correlation_with_t": sensor.offset_correlation.tolist(),
-        "held": offset.held,
-        "cross_covariance": offset.cross_covariance.tolist(),
-    }
-
-
-def _start_entry(start: FoundStart | None) -> dict[str, Any] | None:
-    if start is None:
-        return None
-    other = start.runner_up
-    return {
-        "t_lidar_mag": start.t_lidar_mag.tolist(),
-        "margin": start.margin,
-        "runner_up": None if other is None else other.tolist(),
-    }
-
-
-def _disagreement_entry(stretch: Disagreement) -> dict[str, Any]:
-    fields = {name: value for name, value in vars(stretch).items() if name != "bag" or value}
-    return {
-        **fields,
-        "sensors": list(stretch.sensors),
-        "p_from": stretch.p_from.tolist(),
-        "p_to": stretch.p_to.tolist(),
-        "passed_again": stretch.passed_again.value,
-    }
-
-
-def _disagreement(entry: _Disagreement) -> Disagreement:
-    places = {"p_from": np.array(entry.p_from), "p_to": np.array(entry.p_to)}
-    return Disagreement(**{**dict(entry), **places})
-
-
-def _residuals_entry(figures: ResidualFigures | None) -> dict[str, Any] | None:
-    if figures is None:
-        return None
-    return {**vars(figures), "rms_axes": figures.rms_axes.tolist()}
-
-
-def bag_entries(result: CalibrationResult) -> dict[str, Any]:
-    """Return which drives were calibrated: one under `bag`, several under `bags`."""
-    bag = {"bag": source_entry(result.bag)}
-    return bag | {"bags": [source_entry(each) for each in result.bags]} if result.bags else bag
-
-
-def source_entry(source: SourceFile | None) -> dict[str, str] | None:
-    """Return where data came from as plain values."""
-    return None if source is None else {"path": source.path, "sha256": source.sha256}
-
-
-def _start(entry: _Start | None) -> FoundStart | None:
-    if entry is None:
-        return None
-    other = None if entry.runner_up is None else np.array(entry.runner_up)
-    return FoundStart(np.array(entry.t_lidar_mag), entry.margin, other)
-
-
-def _time_offset(entry: _TimeOffset | None) -> TimeOffset | None:
-    if entry is None:
-        return None
-    return TimeOffset(**{**dict(entry), "cross_covariance": np.array(entry.cross_covariance)})
-
-
-def _sensor(name: str, entry: _Sensor) -> SensorCalibration:
-    figures = entry.residuals
-    return SensorCalibration(
-        sensor=name,
-        status=entry.status,
-        message=entry.message,
-        t_lidar_mag=np.array(entry.t_lidar_mag),
-        distortion=Distortion(np.array(entry.C), np.array(entry.H)),
-        R_lidar_mag=np.array(entry.R_lidar_mag),
-        covariance=np.array(entry.covariance),
-        rotation_covariance=np.array(entry.rotation_covariance),
-        noise=entry.noise,
-        residuals=None
-        if figures is None
-        else ResidualFigures(**{**dict(figures), "rms_axes": np.array(figures.rms_axes)}),
-        undetermined=entry.undetermined,
-        from_priors=entry.from_priors,
-        sync=SyncCounts(**dict(entry.readings)),
-        outside_map=entry.outside_map,
-        start=_start(entry.start),
-        rejected=entry.rejected,
-        time_offset=_time_offset(entry.time_offset),
-        models=None if entry.models is None else models_of(entry.models),
-        not_compared=entry.not_compared,
-        moving=moving_of(entry.moving),
-        missing_in=entry.missing_in,
-    )

@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.options import Options
+from l2m_gtsam.progress import Count
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import VoxelMeans, located
 from l2m_gtsam.storage.messages import header_ns
-from l2m_gtsam.storage.open_bag import Message, Progress, open_bag
+from l2m_gtsam.storage.open_bag import Message, open_bag
 from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of, times_of
 from l2m_gtsam.storage.point_table import MAX_POINTS
 from l2m_gtsam.storage.tf import Link
@@ -66,7 +67,7 @@ def read_cloud_topic(
     trajectory: Trajectory,
     options: CloudTopicOptions,
     stamps: Stamps = Stamps.HEADER,
-    progress: Progress | None = None,
+    progress: Count | None = None,
 ) -> TopicCloud:
     """Return what all scans of a topic saw, in the map frame.
 

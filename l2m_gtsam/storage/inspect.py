@@ -9,6 +9,7 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import L2MError
+from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import (
     MICROTESLA_PER,
     BagOptions,
@@ -27,7 +28,7 @@ from l2m_gtsam.storage.messages import (
     StampBuffer,
     header_ns,
 )
-from l2m_gtsam.storage.open_bag import Bag, Progress, open_bag
+from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
 
@@ -93,7 +94,7 @@ class _Collected:
     covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
 
 
-def inspect_bag(path: Path, options: BagOptions, progress: Progress | None = None) -> BagReport:
+def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) -> BagReport:
     """Look at every topic; only those that could be used are decoded.
 
     Parameters

@@ -4,36 +4,36 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
 
-from l2m_gtsam.data import Distortion, KnownSensor
+from l2m_gtsam.data import Distortion, KnownSensor, Matrix, Vector
 from l2m_gtsam.records.calibration import SensorStatus
-from l2m_gtsam.storage.yaml_file import Lenient, Matrix, Vector, read_model, write_yaml
+from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
 
-class _Clock(Lenient):
+class _Finite(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
+
+class _Clock(_Finite):
     seconds: float = Field(default=0.0, ge=-10, le=10)
 
 
-class _Known(Lenient):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
-
+class _Known(_Finite):
     t_lidar_mag: Vector
-    C: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    H: Vector = (0.0, 0.0, 0.0)
+    C: Matrix = Field(default_factory=lambda: np.eye(3))
+    H: Vector = Field(default_factory=lambda: np.zeros(3))
     time_offset: _Clock | None = None
 
     @field_validator("C")
     @classmethod
     def _invertible(cls, C: Matrix) -> Matrix:
-        if np.linalg.cond(np.array(C)) > 1e6:  # gains a million apart are no magnetometer's
+        if np.linalg.cond(C) > 1e6:  # gains a million apart are no magnetometer's
             raise ValueError("C cannot be inverted, so that its readings say nothing of the field")
         return C
 
 
-class _KnownFile(Lenient):
+class _KnownFile(_Finite):
     sensors: dict[str, _Known] = Field(min_length=1)
 
     @field_validator("sensors", mode="before")
@@ -48,6 +48,9 @@ class _KnownFile(Lenient):
             for name, entry in sensors.items()
             if not isinstance(entry, dict) or entry.get("status", solved) == solved
         }
+
+
+_FILE = TypeAdapter(_KnownFile)
 
 
 def write_known_sensors(
@@ -89,12 +92,10 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     CalibrationError
         The file is missing or is not of this form.
     """
-    return {
-        name: _known(name, entry) for name, entry in read_model(path, _KnownFile).sensors.items()
-    }
+    found = read_checked(path, _FILE)
+    return {name: _known(name, entry) for name, entry in found.sensors.items()}
 
 
 def _known(name: str, entry: _Known) -> KnownSensor:
-    distortion = Distortion(np.array(entry.C), np.array(entry.H))
     seconds = 0.0 if entry.time_offset is None else entry.time_offset.seconds
-    return KnownSensor(name, np.array(entry.t_lidar_mag), distortion, seconds)
+    return KnownSensor(name, entry.t_lidar_mag, Distortion(entry.C, entry.H), seconds)

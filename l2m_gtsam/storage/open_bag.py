@@ -5,7 +5,7 @@ bag when one of them is odd, and uses default types only when no topic carries a
 only the types that are read are parsed, each from the bag's own definition where it has one.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -19,14 +19,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from l2m_gtsam.errors import BagError
+from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
 
 ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3 or an .mcap file"
 # mcap counts nanoseconds unsigned, everything else in 63 bits.
 LATEST_NS = (1 << 63) - 1
 PROGRESS_EVERY = 2000
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ class Bag:
         return self._reader
 
     def messages(
-        self, connections: Sequence[Connection], progress: Progress | None = None
+        self, connections: Sequence[Connection], progress: Count | None = None
     ) -> Iterator[Message]:
         """Yield the messages of these connections in order of record time.
 
@@ -126,7 +125,7 @@ class Bag:
             yield Message(raw.connection, raw.record_ns, codecs[raw.connection.id].decode(raw.data))
 
     def raw_messages(
-        self, connections: Sequence[Connection], progress: Progress | None = None
+        self, connections: Sequence[Connection], progress: Count | None = None
     ) -> Iterator[RawMessage]:
         """Yield the messages of these connections as ``messages`` does, but not decoded."""
         if not connections:

@@ -11,10 +11,11 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.errors import BagError
+from l2m_gtsam.progress import Count
 from l2m_gtsam.records.scans import Scan, ScanOptions
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.messages import header_ns
-from l2m_gtsam.storage.open_bag import Bag, Progress, open_bag
+from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.point_table import stacked
 from l2m_gtsam.storage.selection import listed
 
@@ -172,7 +173,7 @@ class ScanTopic:
     topic: str | None
     options: ScanOptions
     stamps: Stamps = Stamps.HEADER
-    progress: Progress | None = None
+    progress: Count | None = None
 
     def __iter__(self) -> Iterator[Scan]:
         """Yield the scans in order of time; one that is not later than all before is left out.

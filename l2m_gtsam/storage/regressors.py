@@ -11,9 +11,10 @@ import numpy as np
 
 from l2m_gtsam.data import ScalarSeries
 from l2m_gtsam.errors import BagError
+from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import RegressorTopic, Stamps
 from l2m_gtsam.storage.messages import header_ns
-from l2m_gtsam.storage.open_bag import Bag, Message, Progress, open_bag
+from l2m_gtsam.storage.open_bag import Bag, Message, open_bag
 from l2m_gtsam.storage.selection import listed
 
 STEP = re.compile(r"(\w+)(?:\[(\d+)\])?", re.ASCII)
@@ -45,7 +46,7 @@ def read_scalars(
     path: Path,
     options: Mapping[str, RegressorTopic],
     stamps: Stamps = Stamps.HEADER,
-    progress: Progress | None = None,
+    progress: Count | None = None,
 ) -> tuple[ScalarSeries, ...]:
     """Read the numbers that options name, in one pass; other topics are not decoded.
 

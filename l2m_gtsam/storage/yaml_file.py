@@ -1,18 +1,30 @@
 """YAML in and out, with plain values only, and checked against a model."""
 
+from collections.abc import Callable
+from enum import StrEnum
 from io import StringIO
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.representer import SafeRepresenter
 
 from l2m_gtsam.errors import CalibrationError, L2MError
 from l2m_gtsam.storage.files import atomic_path
 
 # A calibration of a hundred sensors is under 1 MB; more than this is not ours.
 MAX_BYTES = 50_000_000
+
+Content = TypeVar("Content")
+
+
+class _Representer(SafeRepresenter):
+    """Plain values, and enumerations as their text."""
+
+
+_Representer.add_multi_representer(StrEnum, lambda writer, each: writer.represent_str(each.value))
 
 
 def read_yaml(path: Path, error: type[L2MError]) -> Any:
@@ -55,6 +67,7 @@ def write_yaml(path: Path, content: dict[str, Any], header: str) -> None:
 def yaml_text(content: dict[str, Any], header: str) -> str:
     """Return plain content as YAML, with a comment on top."""
     yaml: Any = YAML(typ="safe", pure=True)
+    yaml.Representer = _Representer
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False
     yaml.width = 4096
@@ -64,21 +77,24 @@ def yaml_text(content: dict[str, Any], header: str) -> str:
     return stream.getvalue()
 
 
-Vector = tuple[float, float, float]
-Matrix = tuple[Vector, Vector, Vector]
+def read_checked(
+    path: Path,
+    adapter: TypeAdapter[Content],
+    prepare: Callable[[Any], Any] = lambda content: content,
+    added: tuple[str, ...] = (),
+) -> Content:
+    """Return the content of a YAML file about sensors as a type.
 
-
-class Lenient(BaseModel):
-    """A part of a file; what is derived from the rest is ignored when read."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
-
-
-FileModel = TypeVar("FileModel", bound=BaseModel)
-
-
-def read_model(path: Path, model: type[FileModel]) -> FileModel:
-    """Return the content of a YAML file as its model.
+    Parameters
+    ----------
+    path
+        The file.
+    adapter
+        Of the type.
+    prepare
+        Brings the plain content into the form of the type, if it is a mapping.
+    added
+        Levels that ``prepare`` adds: they are left out of messages.
 
     Raises
     ------
@@ -87,9 +103,9 @@ def read_model(path: Path, model: type[FileModel]) -> FileModel:
     """
     content = read_yaml(path, CalibrationError)
     try:
-        return model.model_validate(content)
+        return adapter.validate_python(prepare(content) if isinstance(content, dict) else content)
     except ValidationError as error:
         fault = error.errors()[0]
-        key = ".".join(str(part) for part in fault["loc"]) or "the file"
+        key = ".".join(str(part) for part in fault["loc"] if part not in added) or "the file"
         msg = f"{path}: not a calibration file of this program: {key}: {fault['msg']}"
         raise CalibrationError(msg) from error

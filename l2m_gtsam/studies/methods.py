@@ -6,6 +6,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_es
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.progress import silent
 from l2m_gtsam.solve.closed_form import (
     MIN_READINGS,
     ClosedFormOptions,
@@ -36,7 +37,7 @@ def two_step(
     """
     options = OneKeyOptions(closed_form=closed_form, alternation_readings=len(readings))
     start = start_estimate(t_start[None], options)
-    return alternate(readings, field_map, start, options, lambda *_: None).estimate
+    return alternate(readings, field_map, start, options, silent).estimate
 
 
 def published(

@@ -12,6 +12,7 @@ from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
+from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.sync import SyncOptions, synchronise
 from l2m_gtsam.simulate.drive import drive
 from l2m_gtsam.simulate.floor_plan import FloorPlan
@@ -116,7 +117,7 @@ def random_drive(
     vehicle = Vehicle(
         "calibration", (sensor,), motion, scenario.calibration_sampling, scenario.noise
     )
-    simulated = record(vehicle, site.world, rng, lambda stage, share: None)
+    simulated = record(vehicle, site.world, rng, silent)
     return SiteDrive(sensor, synchronise(simulated.recording, options.sync).readings)
 
 

@@ -12,7 +12,7 @@ from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, same_con
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
 from l2m_gtsam.qa.metrics.changes import is_calibrated
 from l2m_gtsam.qa.metrics.coverage import drive_metrics
@@ -49,7 +49,7 @@ def validate(
     options: CalibrationOptions,
     chance: float,
     map_source: SourceFile | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> DriveValidation:
     """Compare the readings of a drive with what map and calibration predict.
 
@@ -79,7 +79,6 @@ def validate(
     SyncError
         Readings and poses do not overlap.
     """
-    tell = progress or (lambda stage, fraction: None)
     missing = missing_sensors(recording, calibration)
     here = {each.sensor for each in recording.series}
     known = [each for each in calibration.sensors if each.sensor in here and is_sound(each)]
@@ -88,9 +87,9 @@ def validate(
     test = _test_of(recording, field_map, known, options, chance)
     found: list[ValidatedSensor | NotValidated] = []
     for index, sensor in enumerate(known):
-        tell("validating", index / len(known))
+        progress("validating", index / len(known))
         found.append(_tested(test, sensor))
-    tell("validating", 1.0)
+    progress("validating", 1.0)
     places = np.concatenate([_places(test.readings, each) for each in known])
     doubts, notes = doubts_and_notes(recording, field_map, calibration, map_source)
     return DriveValidation(

@@ -23,6 +23,7 @@ from l2m_gtsam.maps.harmonic.visits import Visit
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.progress import Count
 
 KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out
@@ -141,7 +142,7 @@ class HarmonicMap:
         """Return the map that keeps its tiles in a store, and takes from it those that it has."""
         return replace(self, tiles=Tiles(self.learnt, self.tiles.solved, store))
 
-    def make_tiles(self, told: Callable[[int, int], None]) -> int:
+    def make_tiles(self, told: Count) -> int:
         """Have all tiles in the store, as far as it takes them; see ``make_all``."""
         return make_all(CompiledTiles.of(self), told)
 

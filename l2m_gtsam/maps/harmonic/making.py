@@ -1,14 +1,14 @@
 """All tiles of a map, made ahead of their first use."""
 
-from collections.abc import Callable
 from threading import Lock
 
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.entries import compiled_entry, solved_entry
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.progress import Count
 
 
-def make_all(compiled: CompiledTiles, told: Callable[[int, int], None]) -> int:
+def make_all(compiled: CompiledTiles, told: Count) -> int:
     """Have all tiles of a map in its store, solved and compiled, and nothing else.
 
     A store that is full ends it: the other tiles are made when they are needed. None is held in

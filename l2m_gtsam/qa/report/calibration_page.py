@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import matplotlib as mpl
 import numpy as np
 
-from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.progress import Progress, counter, silent
 from l2m_gtsam.qa.options import QaOptions, thresholds
 from l2m_gtsam.qa.report import words
 from l2m_gtsam.qa.report.figures import map as map_figures
@@ -63,7 +63,7 @@ def calibration_page(
     result: CalibrationResult,
     metrics: Metrics,
     options: QaOptions,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> str:
     """Return the report on a calibration as HTML.
 
@@ -80,7 +80,7 @@ def calibration_page(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    tell = counter(STAGE, progress or (lambda stage, fraction: None))
+    tell = counter(STAGE, progress)
     steps = len(result.sensors) + 2
     tell(0, steps)
     verdict, sections = judge(result, metrics, options), []

@@ -13,9 +13,8 @@ from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.storage.calibration_file import (
     MODEL,
     UNCERTAINTY,
-    bag_entries,
     sensor_entry,
-    source_entry,
+    source_entries,
 )
 from l2m_gtsam.storage.exports.bias_scale import bias_scale_notes, bias_scale_text, not_reducible
 from l2m_gtsam.storage.exports.export import Export, ExportedSensor, Fault, not_mounted
@@ -36,8 +35,7 @@ def json_text(export: Export) -> str:
         "version": 1,
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL, "infinite": UNKNOWN},
         "lidar_frame": export.lidar_frame,
-        **bag_entries(result),
-        "map": source_entry(result.map),
+        **source_entries(result),
         "versions": result.versions,
         "doubts": list(result.doubts),
         "left_out": dict(export.left_out),

@@ -90,7 +90,7 @@ def stated_by(
         drive = disturbed.drive
         start = start_near(drive, place.seed, number, options.start)
         solution = solve_one_key(
-            drive.readings, place.field_map, start, solve, None, drive.trajectory
+            drive.readings, place.field_map, start, solve, trajectory=drive.trajectory
         )
         for found in solution.solved:
             vector = np.append(solution.estimate.vector(0), solution.estimate.offset[0])

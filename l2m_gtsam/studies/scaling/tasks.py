@@ -12,6 +12,7 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.training import ThinningOptions, TrainingSet
+from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.sync import synchronise
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.drive import drive
@@ -79,7 +80,7 @@ def mapped_drive(options: ScalingOptions, site: Surveyed, sensors: int, rate: fl
     motion = drive(scenario.calibration_drive, route, 0, rng)
     sampling = scenario.calibration_sampling.model_copy(update={"field_rate": rate})
     vehicle = Vehicle("calibration", known, motion, sampling, scenario.noise)
-    simulated = record(vehicle, site.world, rng, lambda stage, share: None)
+    simulated = record(vehicle, site.world, rng, silent)
     readings = synchronise(simulated.recording, options.site.sync).readings
     part = around(site, readings.p_map_lidar, options.around)
     t_true = np.array([sensor.t_lidar_mag for sensor in known])
