@@ -11,8 +11,9 @@ import l2m_factors
 from tests.support.repository import REPOSITORY
 
 DOCS = REPOSITORY / "docs"
+TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "factors/README.md")
 PAGES = [
-    *(REPOSITORY / each for each in ("README.md", "CONTRIBUTING.md", "factors/README.md")),
+    *(REPOSITORY / each for each in TOP),
     *sorted(DOCS.rglob("*.md")),
 ]
 LEAST = {"architecture.md": 100, "glossary.md": 50}
