@@ -15,7 +15,7 @@ from rich.table import Table
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.belief import kalman_gain
-from l2m_gtsam.slam.solver import colamd_ordering, descended, joint_covariance
+from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt
 from l2m_gtsam.slam.unknown_field.field_memory import JointGaussian, prior_factors
 from tests.reference.dense_newton import newton
 
@@ -91,7 +91,7 @@ def open_section(tiles: int, weights: int) -> list[str]:
         whole = gtsam.NonlinearFactorGraph(given.graph)
         for factor in priors:
             whole.add(factor)
-        found = descended(whole, given.start, colamd_ordering(whole), STEPS, 0.0)
+        found = levenberg_marquardt(whole, given.start, colamd_ordering(whole), STEPS, 0.0)
         joint_covariance(whole.linearize(found.values), [last])
 
     dense = seconds(lambda: newton(given.graph, given.known, given.start, given.sizes, STEPS), 3)

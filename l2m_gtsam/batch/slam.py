@@ -11,7 +11,7 @@ from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.reports import REPORT_FILE, SLAM_FILE, write_slam_report
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow, scan_start
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import LidarMap, Recording, RigidTransform, SourceFile
+from l2m_gtsam.data import LidarMap, Recording, RigidTransform
 from l2m_gtsam.errors import LidarError, MapError, OutputError
 from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.loop_closures import find_loop_closures
@@ -30,11 +30,11 @@ from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.records.verdict import Verdict
 from l2m_gtsam.slam.exploration import explore
-from l2m_gtsam.slam.localisation import NO_SCANS, Sources, localise, start_pose
+from l2m_gtsam.slam.localisation import NO_SCANS, localise, start_pose
 from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.options import Usage
 from l2m_gtsam.slam.pose_graph import write_g2o
-from l2m_gtsam.slam.record import Told, localisation_record
+from l2m_gtsam.slam.record import RecordContext, localisation_record
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.files import atomic_path, source_file
@@ -99,8 +99,8 @@ def read_evidence(
 def _loops(bag: Path, recording: Recording, config: Config, progress: Progress) -> ScanEvidence:
     options, scans = config.lidar.loops, bag_scans(bag, config, progress)
     edge = options.registration.edge
-    mended = without_jumps(recording.trajectory, config.slam.jumps)
-    steps = scan_odometry(scans, mended, edge, config.slam)
+    repaired = without_jumps(recording.trajectory, config.slam.jumps)
+    steps = scan_odometry(scans, repaired, edge, config.slam)
     return ScanEvidence(loops=find_loop_closures(steps, options).loops)
 
 
@@ -109,8 +109,8 @@ def _fixes(
 ) -> ScanEvidence:
     options, scans = _localisation(config), bag_scans(bag, config, progress)
     edge = options.registration.edge
-    mended = without_jumps(recording.trajectory, config.slam.jumps)
-    steps = scan_odometry(scans, mended, edge, config.slam)
+    repaired = without_jumps(recording.trajectory, config.slam.jumps)
+    steps = scan_odometry(scans, repaired, edge, config.slam)
     first = next(steps, None)
     if first is None:
         raise LidarError("no scan has points enough, at a time that has odometry")
@@ -231,18 +231,18 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     gap = config.slam.max_pose_gap_s
     if truth is not None:
         check_truth(truth, recording.trajectory, gap, str(given.truth))
-    source = source_file(given.calibration)
+    map_source = None if saved is None else source_file(saved.path)
+    calibration_source = source_file(given.calibration)
     if saved is None:
-        found = _explored(recording, calibration, source, scanned.evidence, config, progress)
+        found = _explored(recording, calibration, scanned.evidence, config, progress)
     else:
-        found = _localised(
-            recording, calibration, source, saved, scanned.evidence, config, progress
-        )
+        found = _localised(recording, calibration, saved, scanned.evidence, config, progress)
     notes = (*scanned.notes, *found.result.notes)
-    found = replace(found, result=replace(found.result, notes=notes))
+    result = replace(found.result, map=map_source, calibration_source=calibration_source)
+    found = replace(found, result=replace(result, notes=notes))
     options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})
     truth_source = None if given.truth is None else source_file(given.truth)
-    told = Told(calibration, found.field_map, options, gap, truth, truth_source)
+    told = RecordContext(calibration, found.field_map, options, gap, truth, truth_source)
     record = localisation_record(found.result, found.solution, told)
     ensure_folder(out)
     _write(found, record, config, out)
@@ -255,7 +255,6 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
 def _localised(
     recording: Recording,
     calibration: CalibrationResult,
-    source: SourceFile,
     saved: SavedMap,
     evidence: ScanEvidence,
     config: Config,
@@ -265,8 +264,7 @@ def _localised(
     # A start that is given, or found, puts odometry of any frame into the map.
     is_given = start.position is not None and start.quaternion_xyzw is not None
     field_map = saved.open(progress, [] if start.anywhere or is_given else [recording])
-    sources = Sources(source_file(saved.path), source)
-    found = localise(recording, field_map, calibration, config.slam, progress, sources, evidence)
+    found = localise(recording, field_map, calibration, config.slam, progress, evidence)
     if found.result.status in NOWHERE:
         told = "; ".join((found.result.message, *found.result.notes))
         raise MapError(f"{recording.source.path} in {saved.path}: {told}")
@@ -276,12 +274,11 @@ def _localised(
 def _explored(
     recording: Recording,
     calibration: CalibrationResult,
-    source: SourceFile,
     evidence: ScanEvidence,
     config: Config,
     progress: Progress,
 ) -> _Found:
-    found = explore(recording, calibration, config.slam, progress, source, evidence)
+    found = explore(recording, calibration, config.slam, progress, evidence)
     progress("building the map", 0.0)
     field_map = build_map(found.points, found.field, config.mapping.model)
     progress("building the map", 1.0)

@@ -35,6 +35,10 @@ from l2m_gtsam.lidar.surface import Surface, library
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import Scan, taken_at_once
 
+FRAME, CHILD_FRAME = "odom", "lidar"
+# A scan of fewer is of nothing, or broken.
+LEAST_POINTS = 100
+
 
 class KissOdometry:
     """Follows a lidar by KISS-ICP.
@@ -68,11 +72,6 @@ class KissOdometry:
         self._kiss.last_delta = as_matrix(expected)
         self._kiss.register_frame(points, np.zeros(0))
         return from_matrix(np.asarray(self._kiss.last_delta))
-
-
-FRAME, CHILD_FRAME = "odom", "lidar"
-# A scan of fewer is of nothing, or broken.
-LEAST_POINTS = 100
 
 
 class OdometryOptions(Options):

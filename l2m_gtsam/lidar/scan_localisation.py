@@ -25,6 +25,9 @@ from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import PoseFix
 
+# Points of the scan that rank the candidates.
+FEW_POINTS = 400
+
 
 class ScanStartOptions(Options):
     """Where the lidar is at the first scan."""
@@ -210,10 +213,6 @@ def _not_at_start(
         f"{found.directions} of 6 directions); say with `lidar.start` where the drive begins, or "
         "is it another place?"
     )
-
-
-# Points of the scan that rank the candidates.
-FEW_POINTS = 400
 
 
 class SearchOptions(Options):

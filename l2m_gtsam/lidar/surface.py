@@ -20,6 +20,23 @@ from scipy.linalg import eigh
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform
 from l2m_gtsam.errors import LidarError
 
+# 1 is expected where nothing but noise speaks; the estimate of N itself is good to a factor.
+NOISE_TIMES = 3.0
+# Neighbourhoods thicker than this share of their width are no planes: edges, bushes, people.
+FLAT = 0.35
+# Nor are those narrower than this share of it: a post, or one ring of a lidar, is a line, and any
+# plane fits it.
+NARROW = 0.3
+# Neighbours further apart are of different things: rings of a lidar far down a corridor make planes
+# across it, which move with the lidar and seem to hold it.
+WIDEST_M = 0.8
+# Of the largest information: what is smaller is rounding.
+ROUNDING = 1e-12
+# Points that are smoothed at once.
+PIECE_POINTS = 50_000
+# Neighbours that a plane or a covariance is fitted to.
+NEIGHBOURS = 15
+
 
 def library(name: str) -> Any:
     """Return a module of the extra.
@@ -36,20 +53,6 @@ def library(name: str) -> Any:
         raise LidarError(
             f"poses from point clouds need {package}: pip install 'l2m_gtsam[lidar]'"
         ) from error
-
-
-# 1 is expected where nothing but noise speaks; the estimate of N itself is good to a factor.
-NOISE_TIMES = 3.0
-# Neighbourhoods thicker than this share of their width are no planes: edges, bushes, people.
-FLAT = 0.35
-# Nor are those narrower than this share of it: a post, or one ring of a lidar, is a line, and any
-# plane fits it.
-NARROW = 0.3
-# Neighbours further apart are of different things: rings of a lidar far down a corridor make planes
-# across it, which move with the lidar and seem to hold it.
-WIDEST_M = 0.8
-# Of the largest information: what is smaller is rounding.
-ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -176,12 +179,6 @@ def tempered(information: FloatArray, least: FloatArray) -> FloatArray:
     """
     weaker = np.linalg.solve(np.eye(6) + information @ least, information)
     return np.asarray((weaker + weaker.T) / 2)
-
-
-# Points that are smoothed at once.
-PIECE_POINTS = 50_000
-# Neighbours that a plane or a covariance is fitted to.
-NEIGHBOURS = 15
 
 
 class Surface:

@@ -35,6 +35,10 @@ from l2m_gtsam.maps.training import TrainingSet, merged, training_set
 from l2m_gtsam.options import Options
 from l2m_gtsam.recording.sync import SyncOptions
 
+SIZE = 16  # t, C row by row, H, time offset
+T, C, H, TAU = slice(0, 3), slice(3, 12), slice(12, 15), 15
+STEP_M = 1e-4  # of a central difference: features bend over centimetres
+
 
 class SuiteOptions(Options):
     """How the sensors of a mapping suite are calibrated from their own drive."""
@@ -60,11 +64,6 @@ class SuiteOptions(Options):
     """How often strength and depth of the field's sources are learnt anew, at the most."""
     steps: int = Field(default=10, ge=1)
     """The most steps of the solve in one round."""
-
-
-SIZE = 16  # t, C row by row, H, time offset
-T, C, H, TAU = slice(0, 3), slice(3, 12), slice(12, 15), 15
-STEP_M = 1e-4  # of a central difference: features bend over centimetres
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ class MaskedRecording:
     notes: tuple[str, ...]
 
 
-def heard(recording: Recording) -> MaskedRecording:
+def mask_dropouts(recording: Recording) -> MaskedRecording:
     """Take readings for missing that a sensor repeats while the vehicle moves."""
     trajectory = recording.trajectory
     series = tuple(_alive(each, trajectory) for each in recording.series)

@@ -16,40 +16,42 @@ from scipy.stats import chi2
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 
+AXES = 3
+ROUNDS = 5  # limit of removing changed stretches and solving again
+WINDOW = 9  # key poses that are tested together
+CHANCE = 1e-6  # false alarms of the test per drive
+MOST_REJECTED = 0.5  # of every sensor's readings in a window
+# A dipole's field falls with the third power of the distance: a quarter of what is detected acts
+# 1.6 times as far, from a source at this distance from the path.
+FURTHER, BESIDE_M = 1.6, 1.0
+LEAST_LEFT = 0.5  # share of the readings; with fewer it is another place, not a changed one
+SLIP_CHANCE = 1e-4  # false alarms per drive of an odometry that is as good as it states
+FREEDOM = 6
+MAX_REPORTED = 3  # the largest slips; the others are counted
+
 
 def runs(marked: BoolArray) -> list[tuple[int, int]]:
-    """Return first and past-the-last row of each run of marked rows."""
+    """Return the first and the past-the-end row of each run of marked rows."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]])))
     return [(int(first), int(last)) for first, last in ends.reshape(-1, 2)]
 
 
-AXES = 3
-ROUNDS = 5  # of leaving out and looking again
-WINDOW = 9  # key poses that are judged together
-CHANCE = 1e-6  # that noise alone leaves so much in a window
-MOST_REJECTED = 0.5  # of every sensor's readings in a window
-# A dipole's field falls with the third power of the distance: a quarter of what is noticed is felt
-# 1.6 times as far, from a source that stands so far beside the way.
-FURTHER, BESIDE_M = 1.6, 1.0
-LEAST_LEFT = 0.5  # of the readings: where fewer are right it is not a place that has changed
-
-
 @dataclass(frozen=True)
-class Fit:
-    """How N readings of a drive of K key poses fit.
+class ReadingFits:
+    """Residuals of N readings of a drive of K key poses.
 
     Attributes
     ----------
     key_pose, sensor
-        Of each, shape (N,).
+        Numbers of each one's key pose and sensor, shape (N,).
     inside
-        Whether anything is known of the field there, shape (N,).
+        Whether the map has data there, shape (N,).
     used
         Whether it counts, shape (N,).
     squared
         Squared length of its whitened residual, shape (N,).
     p
-        Key poses in metres, shape (K, 3).
+        Positions of the key poses in metres, shape (K, 3).
     """
 
     key_pose: IntArray
@@ -65,8 +67,8 @@ class Fit:
         return np.asarray(uniform_filter1d(sums, WINDOW, mode="constant") * WINDOW)
 
 
-def changed(fit: Fit) -> BoolArray:
-    """Return the key poses in and about stretches whose readings do not fit, shape (K,)."""
+def changed(fit: ReadingFits) -> BoolArray:
+    """Return which key poses are in or near stretches whose readings do not fit, shape (K,)."""
     wrong = _misfitting(fit) | _rejected(fit)
     about = np.zeros_like(wrong)
     for first, last in runs(wrong):
@@ -74,17 +76,17 @@ def changed(fit: Fit) -> BoolArray:
     return about
 
 
-def _misfitting(fit: Fit) -> BoolArray:
-    """Return where readings that count leave more than noise, together, shape (K,)."""
+def _misfitting(fit: ReadingFits) -> BoolArray:
+    """Return where readings that count leave more than noise, by a chi-square test, shape (K,)."""
     freedom = AXES * np.round(fit.per_key_pose(fit.used.astype(np.float64)))
     left = fit.per_key_pose(np.where(fit.used, fit.squared, 0.0))
     there = freedom > 0
-    # Where all of a map errs a little, a window is held against the others.
+    # Where all of a map is slightly wrong, a window is compared with the others.
     scale = max(1.0, float(np.median(left[there] / freedom[there]))) if there.any() else 1.0
     return there & (left > scale * chi2.isf(CHANCE / len(fit.p), np.maximum(freedom, 1)))
 
 
-def _rejected(fit: Fit) -> BoolArray:
+def _rejected(fit: ReadingFits) -> BoolArray:
     """Return where most readings of every sensor were rejected, shape (K,)."""
     least, some = np.ones(len(fit.p), dtype=np.bool_), np.zeros(len(fit.p), dtype=np.bool_)
     for sensor in np.unique(fit.sensor):
@@ -97,7 +99,7 @@ def _rejected(fit: Fit) -> BoolArray:
 
 
 def _reach(p: FloatArray, first: int, last: int) -> slice:
-    """Return the key poses before and after a stretch that are as near as a change is felt."""
+    """Return the key poses before and after a stretch that are within reach of the change."""
     middle = p[first:last].mean(axis=0)
     away = np.linalg.norm(p - middle, axis=1)
     radius = FURTHER * np.hypot(away[first:last].max(), BESIDE_M)
@@ -108,23 +110,18 @@ def _reach(p: FloatArray, first: int, last: int) -> slice:
     return slice(start, end)
 
 
-SLIP_CHANCE = 1e-4  # that a step of an odometry that is as good as it states is told
-FREEDOM = 6
-TOLD = 3  # slips that are told one by one, the largest
-
-
 @dataclass(frozen=True)
 class Slip:
-    """Steps in a row at which poses and odometry part.
+    """Consecutive steps at which poses and odometry differ.
 
     Attributes
     ----------
     start_s, end_s
-        From and to when, since the first key pose.
+        Its time since the first key pose.
     distance_m, angle_deg
-        By what the poses moved further than odometry says, or less.
+        Difference between the poses' motion and odometry's.
     times
-        So many times what odometry's covariance lets expect, as a ratio of lengths.
+        Its ratio to the standard deviation that odometry states.
     """
 
     start_s: float
@@ -135,9 +132,9 @@ class Slip:
 
     def __str__(self) -> str:
         return (
-            f"from {self.start_s:.1f} to {self.end_s:.1f} s poses move on by "
-            f"{self.distance_m:.2f} m and {self.angle_deg:.1f} deg other than odometry has it, "
-            f"{self.times:.1f} times what its variance allows: it slipped there, or a clock was set"
+            f"from {self.start_s:.1f} to {self.end_s:.1f} s the poses differ from odometry by "
+            f"{self.distance_m:.2f} m and {self.angle_deg:.1f} deg, {self.times:.1f} times its "
+            "standard deviation: it slipped there, or a clock was set"
         )
 
 
@@ -147,20 +144,20 @@ def slip_notes(drive: Drive, poses: list[gtsam.Pose3], scale_error: float = 0.0)
     Parameters
     ----------
     drive
-        With odometry's steps.
+        K key poses with odometry.
     poses
-        Key poses as they were found.
+        Their estimates.
     scale_error
         Relative error of odometry's lengths.
     """
     found = sorted(slips(drive, poses, scale_error), key=lambda each: -each.times)
-    told = [str(each) for each in sorted(found[:TOLD], key=lambda each: each.start_s)]
-    more = [f"the same is true of {len(found) - TOLD} more stretches"]
-    return (*told, *(more if len(found) > TOLD else []))
+    largest = sorted(found[:MAX_REPORTED], key=lambda each: each.start_s)
+    more = [f"odometry slipped in {len(found) - MAX_REPORTED} more stretches"]
+    return (*map(str, largest), *(more if len(found) > MAX_REPORTED else []))
 
 
 def slips(drive: Drive, poses: list[gtsam.Pose3], scale_error: float = 0.0) -> Iterator[Slip]:
-    """Yield where poses and odometry part, in order of time; arguments as above."""
+    """Yield where poses and odometry differ, in order of time; arguments as above."""
     if not len(drive.steps):
         return
     errors = np.array(

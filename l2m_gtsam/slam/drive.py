@@ -15,6 +15,8 @@ from l2m_gtsam.slam.odometry import OdometrySteps, drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 
 MAP = -1  # in place of a key pose: the frame of the map
+ARM_M = 1.0  # lever arm that converts a rotation into a distance
+CREEP_M_S = 1e-6  # makes the progress of a parked vehicle increase with time
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,6 @@ def _between(one: Trajectory, i: int, other: Trajectory, k: int) -> RigidTransfo
     """Return a pose of the other trajectory in the frame of a pose of the first."""
     first, second = (RigidTransform(each.R[n], each.p[n]) for each, n in ((one, i), (other, k)))
     return between(first, second)
-
-
-ARM_M = 1.0  # lever arm that converts a rotation into a distance
-CREEP_M_S = 1e-6  # makes the progress of a parked vehicle increase with time
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,10 @@
-"""Recording + calibration -> poses and the field along them, without a map. Pure."""
+"""Estimate poses and field of a recording together, without a map. Pure: no files."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, Recording, SourceFile
+from l2m_gtsam.data import FloatArray, Recording
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
@@ -20,13 +20,13 @@ from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 
-NO_REVISITS = "no place was come to twice: readings of an unknown field take out little drift then"
+NO_REVISITS = "no place was revisited: readings of an unknown field remove little drift then"
 NO_FIELD = (
     "no field explains the readings at poses that odometry allows: is the calibration that of "
     "these sensors, and does the odometry jump?"
 )
-# Of the first pose, rad^2 and m^2, where nothing is said of it: it is what poses are told from.
-HERE = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
+# Of the first pose, rad^2 and m^2, where no start is given: it defines the frame of the poses.
+EXACT_START = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
 
 
 @dataclass(frozen=True)
@@ -36,11 +36,11 @@ class Exploration:
     Attributes
     ----------
     result
-        The poses, and what else is told.
+        Poses, verdict and figures; the calibration's file is to be filled in.
     solution
-        Of the graph.
+        Solution of the graph.
     points, field
-        Where readings that count were taken, in metres, and the field there in uT, in the map,
+        Positions in metres and field in uT of the N readings that count, in the frame of the poses,
         shapes (N, 3).
     """
 
@@ -56,10 +56,9 @@ def explore(
     calibration: CalibrationResult,
     options: SlamOptions,
     progress: Progress,
-    calibration_source: SourceFile | None = None,
     evidence: ScanEvidence = NO_SCANS,
 ) -> Exploration:
-    """Find where a vehicle was and what the field is there, from where its odometry begins.
+    """Estimate the poses of a drive and the field along it, from where its odometry begins.
 
     Parameters
     ----------
@@ -68,14 +67,12 @@ def explore(
     calibration
         Of the sensors.
     options
-        Key poses, odometry, start, tiles, and what becomes of the calibration. Where no start is
-        given, poses and their sigmas are those from the first pose on.
+        Key poses, odometry, start, tiles, and whether the calibration is refined. Where no start is
+        given, poses and their sigmas are relative to the first pose.
     progress
         Called with a stage and the fraction of it that is done.
-    calibration_source
-        For the record.
-    seen
-        Loops that the drive's scans close.
+    evidence
+        Loop closures by the drive's scans.
 
     Raises
     ------
@@ -86,13 +83,13 @@ def explore(
     MapError
         There are too few readings to learn a prior of the field from.
     ConfigError
-        The start is to be looked for, in no map.
+        The start is to be searched for, without a map.
     """
     if options.start.anywhere:
         raise ConfigError("`slam.start.anywhere` looks for the start in a map: give one with --map")
     drive, notes = prepared(recording, calibration, options, evidence)
     if options.start.position is None and options.start.quaternion_xyzw is None:
-        drive = replace(drive, start=replace(drive.start, covariance=HERE))
+        drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
     progress("learning the field's prior", 0.0)
     scaled = drive.with_scale_as_drift(options.drift.over_m)
     by_scans = solve_pose_graph(scaled, options.robust.confidence)
@@ -105,18 +102,17 @@ def explore(
     result = localisation_result(drive, mapped.solution, by_scans, kept)
     explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
     result = replace(
-        told(result, explored),
+        explored_result(result, explored),
         notes=(*notes, *result.notes, *([] if explored.returned else [NO_REVISITS])),
         bag=recording.source,
-        calibration_source=calibration_source,
         explored=explored,
     )
-    points, field = surveyed(mapped.solution.drive, mapped.solution)
+    points, field = field_samples(mapped.solution.drive, mapped.solution)
     return Exploration(result, mapped.solution, points, field)
 
 
-def told(result: LocalisationResult, explored: Explored) -> LocalisationResult:
-    """Return a result that says of the field that was met what it says of a map."""
+def explored_result(result: LocalisationResult, explored: Explored) -> LocalisationResult:
+    """Return a result whose messages are about the estimated field instead of a map."""
     if result.status is LocalisationStatus.LOCALISED:
         message = (
             f"{explored.tiles} tiles of field; {explored.returned:.0%} of the key poses lie where "
@@ -128,8 +124,8 @@ def told(result: LocalisationResult, explored: Explored) -> LocalisationResult:
     return replace(result, status=LocalisationStatus.NOT_CONVERGED, message=NO_FIELD)
 
 
-def surveyed(drive: Drive, solution: DriveSolution) -> tuple[FloatArray, FloatArray]:
-    """Return places in metres and the field there in uT of the readings that count, (N, 3)."""
+def field_samples(drive: Drive, solution: DriveSolution) -> tuple[FloatArray, FloatArray]:
+    """Return positions in metres and field in uT of the readings that count, shapes (N, 3)."""
     rows = np.flatnonzero(solution.used)
     where = solution.prediction.placed
     return where.x[rows], where.field(drive.sensors)[rows]

@@ -1,4 +1,4 @@
-"""Recording + map + calibration -> poses in the map. Pure: no files, no terminal."""
+"""Localise a recording in a map with calibrated sensors. Pure: no files, no terminal."""
 
 from dataclasses import dataclass, replace
 
@@ -11,13 +11,12 @@ from l2m_gtsam.data import (
     Readings,
     Recording,
     RigidTransform,
-    SourceFile,
     Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError, SyncError
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.recording.dropouts import heard, is_dead
+from l2m_gtsam.recording.dropouts import is_dead, mask_dropouts
 from l2m_gtsam.recording.odometry_jumps import without_jumps
 from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
@@ -46,23 +45,15 @@ DEAD = "it has no readings, or repeats one value"
 
 
 @dataclass(frozen=True)
-class Sources:
-    """Where map and calibration came from, for the record."""
-
-    map: SourceFile | None = None
-    calibration: SourceFile | None = None
-
-
-@dataclass(frozen=True)
 class Localisation:
-    """A localisation with what it rests on.
+    """A localisation and the solution behind it.
 
     Attributes
     ----------
     result
-        The poses, and what else is told.
+        Poses, verdict and figures; the files of map and calibration are to be filled in.
     solution
-        Of the graph.
+        Solution of the graph.
     """
 
     result: LocalisationResult
@@ -76,27 +67,24 @@ def localise(
     calibration: CalibrationResult,
     options: SlamOptions,
     progress: Progress,
-    sources: Sources | None = None,
     evidence: ScanEvidence = NO_SCANS,
 ) -> Localisation:
-    """Find where a vehicle was in a magnetic map.
+    """Estimate the poses of a drive in a magnetic map.
 
     Parameters
     ----------
     recording
         A drive; its poses are odometry, whose first is in the map unless the options give another.
     field_map
-        The magnetic map.
+        Map that is queried for field, gradient and variance.
     calibration
         Of the sensors.
     options
-        Key poses, odometry, start, and what becomes of the calibration.
+        Key poses, odometry, start, and whether the calibration is refined.
     progress
         Called with a stage and the fraction of it that is done.
-    sources
-        Of map and calibration.
     evidence
-        What the drive's scans say of its poses.
+        Registrations of the drive's scans.
 
     Raises
     ------
@@ -105,7 +93,7 @@ def localise(
     SyncError
         Readings and poses do not overlap, or there are fewer than two poses.
     MapError
-        The start was looked for, and is not the only one that fits, or none does.
+        The start was searched for, and several places of the map fit or none.
     """
     drive, notes = prepared(recording, calibration, options, evidence)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
@@ -117,18 +105,15 @@ def localise(
     by_scans = solve_pose_graph(scaled, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
     solution = localise_drive(drive, solver_map, options, progress)
-    others = decoy_maps(drive, solver_map) if needs_misfit_test(solution) else ()
-    wrong = [localise_drive(drive, each, options, progress) for each in others]
+    maps = decoy_maps(drive, solver_map) if needs_misfit_test(solution) else ()
+    decoys = [localise_drive(drive, each, options, progress) for each in maps]
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
-    result = localisation_result(drive, solution, by_scans, kept, wrong)
-    sources = sources or Sources()
+    result = localisation_result(drive, solution, by_scans, kept, decoys)
     result = replace(
         result,
         notes=(*notes, *result.notes),
         bag=recording.source,
-        map=sources.map,
-        calibration_source=sources.calibration,
         start=search,
     )
     return Localisation(result, solution)
@@ -140,7 +125,7 @@ def prepared(
     options: SlamOptions,
     evidence: ScanEvidence = NO_SCANS,
 ) -> tuple[Drive, tuple[str, ...]]:
-    """Return a recording as a drive of its calibrated sensors, and what is worth a warning.
+    """Return a recording as a drive of its calibrated sensors, and warnings.
 
     Parameters
     ----------
@@ -156,24 +141,24 @@ def prepared(
     """
     if len(recording.trajectory) < 2:
         raise SyncError(f"{recording.source.path}: odometry of one pose; two or more are needed")
-    mended = without_jumps(recording.trajectory, options.jumps)
-    odometry = mended.trajectory
-    alive = heard(replace(recording, trajectory=odometry))
-    calibrated, left_out = usable_sensors(alive.recording, calibration)
-    readings = drive_readings(alive.recording, calibrated, options)
-    rows = np.union1d(key_pose_rows(odometry, options.key_poses), mended.rows)
+    repaired = without_jumps(recording.trajectory, options.jumps)
+    odometry = repaired.trajectory
+    masked = mask_dropouts(replace(recording, trajectory=odometry))
+    calibrated, left_out = usable_sensors(masked.recording, calibration)
+    readings = drive_readings(masked.recording, calibrated, options)
+    rows = np.union1d(key_pose_rows(odometry, options.key_poses), repaired.rows)
     if len(evidence):
         rows = with_rows_at(rows, odometry, link_stamps(evidence))
     drive = Drive(
         stamp_ns=odometry.stamp_ns[rows],
-        steps=odometry_steps(odometry, rows, options.drift, mended.jumps),
+        steps=odometry_steps(odometry, rows, options.drift, repaired.jumps),
         readings=key_pose_readings(readings, odometry, rows, options.key_poses.readings),
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
         links=key_pose_links(evidence, odometry, rows, options.drift),
     )
     recorded = (note for part in recording.parts for note in part.notes)
-    return drive, (*recorded, *mended.notes(), *left_out, *alive.notes)
+    return drive, (*recorded, *repaired.notes(), *left_out, *masked.notes)
 
 
 def usable_sensors(
@@ -216,7 +201,7 @@ def usable_sensors(
 
 
 def is_determined(sensor: SensorCalibration) -> bool:
-    """Return whether all 15 parameters of a sensor are known, how well, and its noise."""
+    """Return whether all 15 parameters of a sensor, their covariance and its noise are finite."""
     values = np.append(sensor.distortion.vector(), [*sensor.t_lidar_mag, sensor.noise])
     return bool(np.isfinite(values).all() and np.isfinite(sensor.covariance).all())
 
@@ -244,8 +229,7 @@ def drive_readings(
 ) -> Readings:
     """Return the readings of calibrated sensors with poses of odometry.
 
-    All are kept, also where the vehicle comes again: what is thinned out of a calibration is what
-    closes a loop.
+    All are kept: readings of a revisited place, which a calibration thins, close loops here.
     """
     names, offset = [each.sensor for each in calibrated], clock_offsets(calibrated)
     chosen = tuple(each for each in recording.series if each.sensor in names)

@@ -15,17 +15,25 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.solution import DriveSolution
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+AXES = 3
+LARGEST = 21.0  # limit of a whitened residual's square: by noise 1 of 10,000 is larger
+LEAST_PATH_M = 10.0  # over shorter drives, poses bend to the right map and to decoys alike
+DOUBTFUL = 1.25  # times the variance of noise, above which the test is made
+# Of what the decoy leaves. Measured: maps of other places 0.8 to 1.3, the right one 0.3.
+MUCH = 0.7
+LEAST_INSIDE = 0.5  # share of the readings inside the map that must be inside the decoy, too
 
 
 class DecoyMap:
-    """The field of a map as it is on the other side of a vertical axis, in the map's own axes.
+    """A map turned by 180 degrees about a vertical axis: the null hypothesis of the misfit test.
 
-    How strong it is, how it changes along a way and how well it is known stay about the same.
+    Strength, gradients and uncertainty of the field stay about the same; the field's vectors are
+    those of the other side of the axis, in the map's own axes.
 
     Parameters
     ----------
     field_map
-        The map.
+        The map that is tested.
     middle
         A point on the axis in metres, shape (3,).
     """
@@ -34,36 +42,28 @@ class DecoyMap:
         self._map, self._middle = field_map, middle
 
     def query(self, points: FloatArray) -> FieldSample:
-        """Return the field there, points in metres of shape (N, 3)."""
+        """Return field, gradient and variance at points in metres, shape (N, 3)."""
         there = self._map.query((points - self._middle) @ HALF_TURN + self._middle)
+        # Chain rule: positions are turned, the field's vectors are not.
         return FieldSample(there.field, there.gradient @ HALF_TURN, there.variance, there.inside)
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m there."""
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
         sample = self.query(points)
         return sample.field, sample.gradient
 
 
-LARGEST = 21.0  # squared length of a whitened residual, of 10,000 with noise alone one is larger
-AXES = 3
-LEAST_WAY_M = 10.0  # over less, poses bend to the right map and to wrong ones alike
-DOUBTFUL = 1.25  # times the variance of noise, above which a map is held against a wrong one
-# Of what the wrong map leaves. Measured: maps of other places 0.8 to 1.3, the right one 0.3.
-MUCH = 0.7
-LEAST = 0.5  # of the readings inside the map have to be inside the wrong one, too
-
-
 def misfits(solution: DriveSolution) -> FloatArray:
-    """Return mean squares of the sensors' whitened residuals, those rejected among them, (S,).
+    """Return each sensor's mean square of whitened residuals, rejected ones included, (S,).
 
-    What is far off counts as the least that is rejected, what was read near a change not at all.
-    Infinite where a sensor has no reading.
+    Squares are limited to ``LARGEST``; readings near a change of the field are left out. Infinite
+    where a sensor has no reading.
     """
     return _misfits(solution, solution.prediction.inside & ~solution.near_changes)
 
 
 def _misfits(solution: DriveSolution, judged: BoolArray) -> FloatArray:
-    """Return those by some of the readings, (N,)."""
+    """Return the same by some of the N readings."""
     left = np.full(len(solution.drive.sensors.names), np.inf)
     for sensor in range(len(left)):
         own = judged & (solution.drive.readings.sensor == sensor)
@@ -73,34 +73,34 @@ def _misfits(solution: DriveSolution, judged: BoolArray) -> FloatArray:
 
 
 def needs_misfit_test(solution: DriveSolution) -> bool:
-    """Return whether a drive is long enough to tell, and no sensor is explained down to noise."""
-    least, way = misfits(solution).min(), np.linalg.norm(solution.drive.steps.p, axis=1).sum()
-    return bool(way >= LEAST_WAY_M and np.isfinite(least) and least > DOUBTFUL)
+    """Return whether a drive is long enough for the test, and no sensor fits down to its noise."""
+    least, path = misfits(solution).min(), np.linalg.norm(solution.drive.steps.p, axis=1).sum()
+    return bool(path >= LEAST_PATH_M and np.isfinite(least) and least > DOUBTFUL)
 
 
 def decoy_maps(drive: Drive, field_map: QueryableMap) -> tuple[DecoyMap, ...]:
-    """Return the map half turned about the middle of a drive, and about a place beside it."""
+    """Return decoys turned about the centre of a drive, and about a point beside it."""
     p = np.stack([pose.translation() for pose in drive.dead_reckoning()])
     middle, extent = p.mean(axis=0), np.ptp(p, axis=0)
     beside = np.where(np.arange(AXES) == np.argmax(extent[:2]), extent / 6, 0.0)
     return DecoyMap(field_map, middle), DecoyMap(field_map, middle + beside)
 
 
-def fits_decoy_as_well(solution: DriveSolution, wrong: Sequence[DriveSolution]) -> bool:
-    """Return whether a drive fits a map hardly better than one of some that are wrong."""
+def fits_decoy_as_well(solution: DriveSolution, decoys: Sequence[DriveSolution]) -> bool:
+    """Return whether a drive fits its map hardly better than one of the decoys."""
     inside, best = solution.prediction.inside.sum(), int(np.argmin(misfits(solution)))
-    others = [each for each in wrong if each.prediction.inside.sum() >= LEAST * inside]
-    return any(_fits_no_better(solution, each, best) for each in others)
+    tested = [each for each in decoys if each.prediction.inside.sum() >= LEAST_INSIDE * inside]
+    return any(_fits_as_well(solution, each, best) for each in tested)
 
 
-def _fits_no_better(solution: DriveSolution, wrong: DriveSolution, sensor: int) -> bool:
-    """Return whether the readings of a sensor fit hardly better than in a wrong map.
+def _fits_as_well(solution: DriveSolution, decoy: DriveSolution, sensor: int) -> bool:
+    """Return whether a sensor's readings fit a decoy nearly as well as the map.
 
-    Those that neither map explains, as beside a door, tell nothing of which of them is right.
+    Readings that neither explains, as beside a door, do not discriminate between the two.
     """
-    told = solution.used | wrong.used
+    explained = solution.used | decoy.used
     left, other = (
-        _misfits(each, each.prediction.inside & ~each.near_changes & told)[sensor]
-        for each in (solution, wrong)
+        _misfits(each, each.prediction.inside & ~each.near_changes & explained)[sensor]
+        for each in (solution, decoy)
     )
     return bool(left > MUCH * other)

@@ -21,6 +21,7 @@ from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, SlamOptions, Us
 
 # Rounding and interpolation may make eigenvalues of a step's covariance slightly negative.
 ROUNDING = 1e-6
+NEIGHBOURHOOD_NS = 1_000_000_000  # of odometry before and after a scan, for its motion
 
 
 @dataclass(frozen=True)
@@ -161,9 +162,6 @@ def _minimum(options: DriftOptions) -> FloatArray:
     """Return what is added to every step's covariance, shape (6, 6)."""
     sigma = np.repeat([np.deg2rad(options.least_deg), options.least_m], 3)
     return np.diag(sigma**2)
-
-
-NEIGHBOURHOOD_NS = 1_000_000_000  # of odometry before and after a scan, for its motion
 
 
 def scan_odometry(

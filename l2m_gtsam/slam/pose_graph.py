@@ -20,6 +20,7 @@ from l2m_gtsam.solve.linear_algebra import information_root
 
 EXACT = 1e-9  # m, uT, or of an entry of C: what no reading can tell from nothing
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
+HALF = 0.5  # a link that weighs more is believed; in the end weights are nearly 0 or 1
 
 
 def start_factor(start: StartPose) -> gtsam.NonlinearFactor:
@@ -113,9 +114,6 @@ def scale_values(drive: Drive) -> gtsam.Values:
     if drive.steps.scale:
         values.insert(G(), 0.0)
     return values
-
-
-HALF = 0.5  # a link that weighs more is believed; in the end weights are nearly 0 or 1
 
 
 @dataclass(frozen=True)

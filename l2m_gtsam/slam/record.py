@@ -1,4 +1,4 @@
-"""A localisation -> the record that slam.json holds and a report is drawn from. Pure."""
+"""From a localisation to the record in slam.json that reports are drawn from. Pure."""
 
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -40,26 +40,26 @@ from l2m_gtsam.solve.noise import map_covariance
 from l2m_gtsam.solve.rank import PARAMETERS
 
 NO_TRUTH = "no key pose lies between two true ones that are near enough: nothing is compared"
-SPANS = 60  # of a timeline, at most
-POSES = 3  # key poses in a span, at least in the mean
+SPANS = 60  # limit of intervals in a timeline
+POSES = 3  # least mean number of key poses in an interval
 BAND = np.array([0.025, 0.975])
 DIGITS = 9
 
 
 @dataclass(frozen=True)
-class Told:
-    """What a record tells beside a localisation.
+class RecordContext:
+    """What a record contains beside the localisation.
 
     Attributes
     ----------
     calibration
-        Of the sensors, as it was before.
+        Of the sensors, before the drive.
     field_map
-        The map.
+        The map in which the drive was localised, or which was made of it.
     options
-        That it was computed with, as plain values.
+        Configuration as plain values.
     max_pose_gap_s
-        No true pose is interpolated over more.
+        Longest gap in seconds over which true poses are interpolated.
     truth, truth_source
         Poses of the lidar in the map and their file, if they are known.
     """
@@ -74,7 +74,7 @@ class Told:
 
 @one_blas_thread()
 def localisation_record(
-    result: LocalisationResult, solution: DriveSolution, told: Told
+    result: LocalisationResult, solution: DriveSolution, context: RecordContext
 ) -> LocalisationRecord:
     """Return what is kept of a localisation.
 
@@ -83,44 +83,44 @@ def localisation_record(
     result
         The localisation.
     solution
-        Of its graph.
-    told
+        Solution of its graph.
+    context
         What it was made from.
     """
     truth = None
-    if told.truth is not None:
-        ways = ComparedTrajectories(result.trajectory, result.odometry, result.by_scans)
-        truth = truth_record(told.truth, ways, told.max_pose_gap_s)
-    now = result.calibration or told.calibration
+    if context.truth is not None:
+        compared = ComparedTrajectories(result.trajectory, result.odometry, result.by_scans)
+        truth = truth_record(context.truth, compared, context.max_pose_gap_s)
+    now = result.calibration or context.calibration
     return LocalisationRecord(
         status=result.status,
         message=result.message,
-        notes=(*result.notes, *([] if told.truth is None or truth else [NO_TRUTH])),
+        notes=(*result.notes, *([] if context.truth is None or truth else [NO_TRUTH])),
         drift=result.drift,
-        steps=solution.bent,
+        steps=solution.odometry_chi2,
         scale=result.scale,
-        map_errors_shared=isinstance(told.field_map, UncertainMap),
+        map_errors_shared=isinstance(context.field_map, UncertainMap),
         sensors=tuple(_sensor(solution, now[use.sensor], use) for use in result.sensors),
-        refined=_refined(told.calibration, result),
+        refined=_refined(context.calibration, result),
         poses=_poses(result.trajectory),
         odometry=_odometry(solution.drive, result.odometry),
         start=None if result.start is None else _start(result.start),
         explored=result.explored,
         scans=result.scans,
         truth=truth,
-        picture=map_picture(told.field_map, result.trajectory.p),
-        sources=_sources(result, told),
+        picture=map_picture(context.field_map, result.trajectory.p),
+        sources=_sources(result, context),
         versions={name: version(name) for name in VERSIONED},
-        options=told.options,
+        options=context.options,
     )
 
 
-def _sources(result: LocalisationResult, told: Told) -> tuple[NamedSource, ...]:
+def _sources(result: LocalisationResult, context: RecordContext) -> tuple[NamedSource, ...]:
     files = {
         "drive": result.bag,
         "map": result.map,
         "calibration": result.calibration_source,
-        "truth": told.truth_source,
+        "truth": context.truth_source,
     }
     return tuple(
         NamedSource(role, each.path, each.sha256)
@@ -172,10 +172,10 @@ def _odometry(drive: Drive, at: Trajectory) -> tuple[OdometryRecord, ...]:
 
 
 def odometry_covariance(drive: Drive) -> FloatArray:
-    """Return how sure odometry alone is of each key pose, shape (K, 6, 6).
+    """Return the covariance of each key pose by odometry alone, shape (K, 6, 6).
 
-    Of right perturbations, rotation (rad) before translation (m): the start's, carried along, what
-    each step adds, and what a wrong scale does.
+    Of right perturbations, rotation (rad) before translation (m): the start's, propagated, with
+    each step's and that of a wrong scale.
     """
     covariance, steps = [drive.start.covariance], drive.steps
     for R, p, more in zip(steps.R, steps.p, steps.covariance, strict=True):
@@ -185,7 +185,7 @@ def odometry_covariance(drive: Drive) -> FloatArray:
 
 
 def _moved_by_scale(poses: list[gtsam.Pose3]) -> FloatArray:
-    """Return the right perturbations of K poses by longer ways, (K, 6): each leaves the first."""
+    """Return right perturbations of K poses by a relative error of all lengths, shape (K, 6)."""
     p0 = poses[0].translation()
     shift = [each.rotation().matrix().T @ (each.translation() - p0) for each in poses]
     return np.hstack([np.zeros((len(poses), 3)), np.stack(shift)])
@@ -232,7 +232,7 @@ def _sensor(solution: DriveSolution, sensor: SensorCalibration, use: SensorUse) 
 
 
 def sensor_evidence(solution: DriveSolution, inside: IntArray) -> SensorEvidence:
-    """Return readings of one sensor, by their rows, beside what map and calibration make of them.
+    """Return one sensor's readings, by their rows, with predictions and residuals.
 
     Each has the time of its key pose.
     """
@@ -264,7 +264,7 @@ def sensor_evidence(solution: DriveSolution, inside: IntArray) -> SensorEvidence
 
 
 def _timeline(solution: DriveSolution, own: IntArray) -> Timeline:
-    """Return when readings of a sensor, by their rows, counted."""
+    """Return how many readings of a sensor, by their rows, counted over time."""
     drive, prediction = solution.drive, solution.prediction
     at = 1e-9 * (drive.stamp_ns - drive.stamp_ns[0])
     edges = np.linspace(0.0, at[-1], min(SPANS, max(len(drive) // POSES, 1)) + 1)

@@ -1,4 +1,4 @@
-"""A solved drive as a result: figures, verdict, refined calibration."""
+"""From a solved drive to its result: figures, verdict, refined calibration."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,13 +24,13 @@ from l2m_gtsam.slam.pose_graph import PoseGraph
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.rotation import polar_rotation
 
-# A drive of which less lies in the map is not localised by it.
+# Share of the readings inside the map below which a drive is not localised by it.
 LEAST_INSIDE = 0.1
-# A map that explains less than this share of the readings is another place's: of those in a place
-# that has been changed here and there more fit.
+# A map that explains a smaller share of the readings is that of another place: in one that was
+# changed here and there more of them fit.
 LEAST_EXPLAINED = 0.5
-# Mean square of whitened components, of readings and of odometry: poses can be bent until readings
-# fit the map of another place.
+# Of mean squares of whitened components, of readings and of odometry: with free poses readings may
+# fit the map of another place, at steps that odometry rules out.
 LARGEST_CHI2 = 4.0
 
 
@@ -39,25 +39,25 @@ def localisation_result(
     solution: DriveSolution,
     by_scans: PoseGraph,
     refine: CalibrationResult | None,
-    wrong: Sequence[DriveSolution] = (),
+    decoys: Sequence[DriveSolution] = (),
 ) -> LocalisationResult:
-    """Return what is told of a drive.
+    """Return the result of a localisation.
 
     Parameters
     ----------
     drive
-        As it was before.
+        The drive before it was solved.
     solution
-        Of the graph.
+        Solution of its graph.
     by_scans
-        Of odometry and scans alone.
+        Solution of odometry and scans alone.
     refine
-        The calibration that was refined; none if it was fixed.
-    wrong
-        The drive in maps that are wrong for certain, if this one was held against such.
+        The calibration that was refined; None if it was fixed.
+    decoys
+        Solutions in decoys of the map, if the misfit test was made.
     """
     alone = drive.dead_reckoning()
-    status, message = _verdict(solution, wrong)
+    status, message = _verdict(solution, decoys)
     odometry = _trajectory(drive, alone)
     trajectory = replace(_trajectory(drive, solution.poses), covariance=solution.pose_covariance)
     return LocalisationResult(
@@ -79,7 +79,7 @@ def localisation_result(
 
 
 def scan_use(solution: DriveSolution, by_scans: PoseGraph) -> ScanUse | None:
-    """Return what scans were worth; None where there were none."""
+    """Return how many scans were used and how they fit; None where there were none."""
     if not len(by_scans.believed):
         return None
     links, r2 = solution.drive.links, solution.link_squared
@@ -92,7 +92,7 @@ def scan_use(solution: DriveSolution, by_scans: PoseGraph) -> ScanUse | None:
 
 
 def drift_figures(localised: Trajectory, odometry: Trajectory) -> DriftFigures:
-    """Return how far odometry had drifted at the same key poses."""
+    """Return the drift of odometry at the same key poses."""
     apart = np.linalg.norm(odometry.p - localised.p, axis=1)
     turned = Rotation.from_matrix(localised.R[-1].T @ odometry.R[-1]).magnitude()
     return DriftFigures(
@@ -120,7 +120,7 @@ def _refined(entry: SensorCalibration, solution: DriveSolution, i: int) -> Senso
     rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
     clock = entry.time_offset
     if clock is not None:
-        # It took no part: what it had in common with the estimate before says nothing now.
+        # The clock was no variable: its correlation with the previous estimate does not hold now.
         clock = replace(clock, cross_covariance=np.zeros(15))
     return replace(
         entry,
@@ -135,37 +135,37 @@ def _refined(entry: SensorCalibration, solution: DriveSolution, i: int) -> Senso
 
 
 def _verdict(
-    solution: DriveSolution, wrong: Sequence[DriveSolution]
+    solution: DriveSolution, decoys: Sequence[DriveSolution]
 ) -> tuple[LocalisationStatus, str]:
     inside, used = solution.prediction.inside, solution.used
     share = float(inside.mean())
     explained = float(used.sum() / max(inside.sum(), 1))
-    # What was read near a change says nothing for or against the rest of the map.
+    # Readings near a change are no evidence about the rest of the map.
     judged = float(used.sum() / max((inside & ~solution.near_changes).sum(), 1))
     chi2 = float(solution.squared[used].mean() / 3) if used.any() else np.inf
-    told = f"the map explains {explained:.0%} of the readings"
+    explains = f"the map explains {explained:.0%} of the readings"
     if share < LEAST_INSIDE:
         message = (
             f"the map has data for {share:.0%} of the readings: the drive is not in this map, or "
-            "does not begin where it is said to"
+            "does not begin at the given start"
         )
         return LocalisationStatus.OUTSIDE_MAP, message
-    if judged < LEAST_EXPLAINED or max(chi2, solution.bent) > LARGEST_CHI2:
+    if judged < LEAST_EXPLAINED or max(chi2, solution.odometry_chi2) > LARGEST_CHI2:
         message = (
-            f"{told}, leaves {chi2:.1f} times the variance of their noise, and needs steps that "
-            f"miss odometry by {solution.bent:.1f} times its variance: another place, a wrong "
-            "start, or a wrong calibration"
+            f"{explains}, leaves {chi2:.1f} times the variance of their noise, and needs steps "
+            f"that differ from odometry by {solution.odometry_chi2:.1f} times its variance: "
+            "another place, a wrong start, or a wrong calibration"
         )
         return LocalisationStatus.NOT_HERE, message
-    if fits_decoy_as_well(solution, wrong):
+    if fits_decoy_as_well(solution, decoys):
         message = (
-            f"{told}, hardly more than it does half turned, which is wrong for certain: another "
-            "place, a wrong start, or a wrong calibration"
+            f"{explains}, hardly more than when turned by 180 degrees: another place, a wrong "
+            "start, or a wrong calibration"
         )
         return LocalisationStatus.NOT_HERE, message
     if solution.ending is not Ending.TOLERANCE:
         return LocalisationStatus.NOT_CONVERGED, solution.ending.value
-    return LocalisationStatus.LOCALISED, told
+    return LocalisationStatus.LOCALISED, explains
 
 
 def _use(solution: DriveSolution, sensor: int) -> SensorUse:

@@ -15,7 +15,7 @@ from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, Fit, changed
+from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, ReadingFits, changed
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import (
     MapPrediction,
@@ -36,21 +36,24 @@ from l2m_gtsam.slam.pose_graph import (
     scale_values,
 )
 from l2m_gtsam.slam.relative_motion import RelativeMotions
-from l2m_gtsam.slam.solution import NOTHING, DriveSolution
+from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
     colamd_ordering,
-    descended,
+    levenberg_marquardt,
     odometry_scale,
     pose_covariances,
     sensor_covariances,
 )
 from l2m_gtsam.solve.robust import WEIGHTS
 
+# Stages of graduated non-convexity: the drive was followed, so that good readings are near already.
+GRADUATION = (1.0, 10.0, float("inf"), float("inf"))
+
 
 @dataclass(frozen=True)
 class SmoothingRound:
-    """A round: variables, how far each reading counted, and how the optimiser ended."""
+    """The solution of one round: variables, weights of N readings, why the optimiser stopped."""
 
     values: gtsam.Values
     weights: FloatArray
@@ -63,10 +66,10 @@ class DrivePrediction:
 
     Attributes
     ----------
-    ways
-        Between the key poses.
+    motions
+        Relative motions between the key poses.
     prediction
-        What the map says where they lead to.
+        The map at the readings.
     """
 
     motions: RelativeMotions
@@ -74,21 +77,21 @@ class DrivePrediction:
 
     @property
     def interpolation_covariance(self) -> FloatArray:
-        """What errors of the ways contribute to the covariance of residuals, (N, 3, 3)."""
+        """Covariance of residuals by odometry's errors between key poses, uT^2, (N, 3, 3)."""
         return self.motions.interpolation_covariance(
             np.arange(len(self.prediction.inside)), self.prediction.by_lidar
         )
 
     def squared(self, noise: FloatArray) -> FloatArray:
-        """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
+        """Return squared Mahalanobis distances of the residuals, each alone, shape (N,)."""
         return self.prediction.squared(
             self.prediction.whitening(noise, extra=self.interpolation_covariance)
         )
 
     def independent(self, noise: FloatArray, used: BoolArray) -> FloatArray:
-        """Return squared lengths of residuals without what those of a step have in common, (N,).
+        """Return the same of residuals that are decorrelated within each step, shape (N,).
 
-        Zero for those that are not used or outside of the map.
+        Zero for readings that are not used or outside of the map.
         """
         prediction, squared = self.prediction, np.zeros(len(used))
         own = prediction.whitening(noise)
@@ -101,17 +104,17 @@ class DrivePrediction:
         return squared
 
 
-class Problem:
-    """The graph of a drive.
+class SmoothingProblem:
+    """The factor graph of a whole drive in a map.
 
     Parameters
     ----------
     drive
-        The drive.
+        K key poses with odometry, N readings and L scan links.
     field_map
-        The map.
+        Map that is queried for field, gradient and variance.
     options
-        How to solve.
+        Loss, calibration's use, and limit of iterations.
     """
 
     def __init__(self, drive: Drive, field_map: QueryableMap, options: SlamOptions) -> None:
@@ -124,57 +127,61 @@ class Problem:
         return self._options.calibration is CalibrationUse.REFINED
 
     def sensors(self, values: gtsam.Values) -> KnownSensors:
-        """Return the sensors as values have them."""
+        """Return the sensors with the calibrations in values."""
         return sensors_in(values, self._drive.sensors)
 
     def predict(self, values: gtsam.Values) -> DrivePrediction:
-        """Ask the map where values put the readings."""
+        """Query the map at the readings' places by these values."""
         sensors, poses = self.sensors(values), poses_in(values, len(self._drive))
         motions = RelativeMotions.along(self._drive, list(poses.values()))
         return DrivePrediction(
             motions, predict(self._map, place_readings(motions.readings, poses, sensors), sensors)
         )
 
-    def weights(self, seen: DrivePrediction, mu: float) -> FloatArray:
-        """Return how far each reading counts at a stage of the graduation, shape (N,)."""
-        robust, r2 = self._options.robust, seen.squared(self._drive.sensors.noise)
-        return np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu) * seen.prediction.inside)
+    def weights(self, predicted: DrivePrediction, mu: float) -> FloatArray:
+        """Return each reading's robust weight at a stage of the graduation, shape (N,)."""
+        robust, r2 = self._options.robust, predicted.squared(self._drive.sensors.noise)
+        return np.asarray(
+            WEIGHTS[robust.loss](r2, robust.largest, mu) * predicted.prediction.inside
+        )
 
     def solved(self, values: gtsam.Values, counts: BoolArray, mu: float) -> SmoothingRound:
-        """Solve for everything, with readings weighted as they fit now.
+        """Solve for all variables, with the readings' weights at the initial values.
 
         Parameters
         ----------
         values
-            Where to start.
+            Initial values.
         counts
             Which readings may count, shape (N,).
         mu
             Stage of the graduation.
         """
-        seen = self.predict(values)
-        weights = self.weights(seen, mu) * counts
-        graph = self.graph(seen, weights, seen.prediction.map_variance, None)
-        end = descended(graph, values, colamd_ordering(graph), self._options.max_iterations)
+        predicted = self.predict(values)
+        weights = self.weights(predicted, mu) * counts
+        graph = self.graph(predicted, weights, predicted.prediction.map_variance, None)
+        end = levenberg_marquardt(
+            graph, values, colamd_ordering(graph), self._options.max_iterations
+        )
         return SmoothingRound(end.values, weights, end.ending)
 
-    def fit(self, solved: SmoothingRound, counts: BoolArray) -> Fit:
-        """Return how the readings that may count fit."""
-        seen, readings = self.predict(solved.values), self._drive.readings
+    def fit(self, solved: SmoothingRound, counts: BoolArray) -> ReadingFits:
+        """Return the residuals of the readings that may count."""
+        predicted, readings = self.predict(solved.values), self._drive.readings
         poses = poses_in(solved.values, len(self._drive)).values()
-        used = solved.weights > NOTHING
-        return Fit(
+        used = solved.weights > REJECTED_WEIGHT
+        return ReadingFits(
             readings.key_pose,
             readings.sensor,
-            seen.prediction.inside & counts,
+            predicted.prediction.inside & counts,
             used,
-            seen.independent(self.sensors(solved.values).noise, used),
+            predicted.independent(self.sensors(solved.values).noise, used),
             np.stack([pose.translation() for pose in poses]),
         )
 
     def graph(
         self,
-        seen: DrivePrediction,
+        predicted: DrivePrediction,
         weights: FloatArray,
         map_variance: FloatArray,
         shared: SharedMapErrors | None,
@@ -184,83 +191,75 @@ class Problem:
         Parameters
         ----------
         seen
-            The N readings where they are taken to be.
+            The N readings at an estimate.
         weights
-            How far they count, shape (N,).
+            Robust weights, shape (N,).
         map_variance
-            Of the map per axis that counts as noise of each reading in uT^2, shape (N, 3).
+            The map's variance that counts as independent noise, per axis in uT^2, shape (N, 3).
         shared
-            The map's errors that do not.
+            The map's errors that are variables, if any.
         """
         drive, graph = self._drive, gtsam.NonlinearFactorGraph()
         graph.push_back(self._odometry)
         graph.push_back(self._links)
         if self.free:
             graph.push_back(calibration_graph(drive.sensors))
-        rows = np.flatnonzero(weights > NOTHING)
+        rows = np.flatnonzero(weights > REJECTED_WEIGHT)
         if not len(rows):
             return graph
-        W = seen.prediction.whitening(drive.sensors.noise, map_variance)
+        W = predicted.prediction.whitening(drive.sensors.noise, map_variance)
         W = W * np.sqrt(weights)[:, None, None]
         fixed = None if self.free else drive.sensors.fixed()
-        batch = MapBatch(self._map, seen.motions.readings[rows], fixed)
+        batch = MapBatch(self._map, predicted.motions.readings[rows], fixed)
         for k in batch.key_poses:
             own = rows[batch.rows_of(k)]
             errors = () if shared is None else shared.of(own)
-            by_lidar = seen.prediction.by_lidar[own]
-            white = seen.motions.whitening(own, W[own], by_lidar)
-            step = seen.motions.step_error(own, by_lidar)
+            by_lidar = predicted.prediction.by_lidar[own]
+            white = predicted.motions.whitening(own, W[own], by_lidar)
+            step = predicted.motions.step_error(own, by_lidar)
             graph.add(key_pose_factor(batch, k, white, errors, step))
         if shared is not None:
             graph.add(shared.prior())
         return graph
 
     def finished(self, solved: SmoothingRound) -> DriveSolution:
-        """Solve once more with the map's errors as variables, and take the covariances."""
+        """Solve once more with the map's errors as variables, and return covariances, too."""
         values, ending = solved.values, solved.ending
-        seen = self.predict(values)
-        weights = solved.weights * seen.prediction.inside
+        predicted = self.predict(values)
+        weights = solved.weights * predicted.prediction.inside
         shared = None
-        if (weights > NOTHING).any():
-            shared = SharedMapErrors.over(errors_of(self._map), seen.prediction)
+        if (weights > REJECTED_WEIGHT).any():
+            shared = SharedMapErrors.over(errors_of(self._map), predicted.prediction)
             values.insert(shared.values())
-        rest = seen.prediction.map_variance if shared is None else shared.rest
-        graph = self.graph(seen, weights, rest, shared)
+        rest = predicted.prediction.map_variance if shared is None else shared.rest
+        graph = self.graph(predicted, weights, rest, shared)
         order = colamd_ordering(graph)
-        optimised = descended(graph, values, order, self._options.max_iterations)
+        optimised = levenberg_marquardt(graph, values, order, self._options.max_iterations)
         values, sensors = optimised.values, self.sensors(optimised.values)
         marginals = Marginals(graph.linearize(values), order)
-        seen = self.predict(values)
+        predicted = self.predict(values)
         return DriveSolution(
             drive=replace(self._drive, sensors=sensors),
             poses=list(poses_in(values, len(self._drive)).values()),
             pose_covariance=pose_covariances(marginals, len(self._drive)),
-            calibration_covariance=(
-                sensor_covariances(marginals, len(sensors.names))
-                if self.free
-                else sensors.covariance
-            ),
-            prediction=seen.prediction,
-            interpolation_covariance=seen.interpolation_covariance,
-            squared=seen.squared(sensors.noise),
-            weights=weights * seen.prediction.inside,
+            calibration_covariance=sensor_covariances(marginals, values, sensors),
+            prediction=predicted.prediction,
+            interpolation_covariance=predicted.interpolation_covariance,
+            squared=predicted.squared(sensors.noise),
+            weights=weights * predicted.prediction.inside,
             near_changes=np.zeros(len(weights), dtype=np.bool_),
-            bent=2 * self._odometry.error(values) / (6 * len(self._drive)),
+            odometry_chi2=2 * self._odometry.error(values) / (6 * len(self._drive)),
             scale=odometry_scale(marginals, values),
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
         )
 
 
-# Stages of the graduation: the drive was followed, so that no good reading is far off any more.
-GRADUATION = (1.0, 10.0, float("inf"), float("inf"))
-
-
 def localise_drive(
     drive: Drive, field_map: QueryableMap, options: SlamOptions, progress: Progress
 ) -> DriveSolution:
-    """Find the poses of a drive, and its sensors' calibration if that is to be refined."""
-    problem = Problem(drive, field_map, options)
+    """Estimate the poses of a drive, and its calibrations if these are to be refined."""
+    problem = SmoothingProblem(drive, field_map, options)
     followed = drive.with_scale_as_drift(options.drift.over_m)
     follower = Follower(followed, field_map, options.robust, free=problem.free)
     values = follow(follower, len(drive), progress)
@@ -276,7 +275,7 @@ def localise_drive(
         if not (left_out & counts).any():
             break
         counts = counts & ~left_out
-        if np.mean(counts) < LEAST_LEFT:  # this is no change of a place, but another one
+        if np.mean(counts) < LEAST_LEFT:  # another place, not a changed one
             solved, counts = whole, np.ones_like(counts)
             break
         solved = problem.solved(solved.values, counts, np.inf)

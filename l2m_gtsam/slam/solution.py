@@ -1,4 +1,4 @@
-"""A drive in the map: what a localisation comes to."""
+"""A solved drive: poses, calibrations and residuals with their covariances."""
 
 from dataclasses import dataclass
 
@@ -11,43 +11,42 @@ from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import MapPrediction
 
-NOTHING = 1e-6  # a weight that is as good as none
+REJECTED_WEIGHT = 1e-6  # below this a reading counts as rejected
 
 
 @dataclass(frozen=True)
 class DriveSolution:
-    """A drive in the map.
+    """A solved drive.
 
     Attributes
     ----------
     drive
-        With its sensors as they came out.
+        The drive with the estimates of its sensors.
     poses
-        Key poses, K of them.
+        Estimates of the K key poses in the map.
     pose_covariance
-        Of right perturbations of them, rotation (rad) before translation (m), shape (K, 6, 6).
+        Of right perturbations of the poses, rotation (rad) before translation (m), shape (K, 6, 6).
     calibration_covariance
         Of (t, C row by row, H) in m and uT, shape (S, 15, 15); as given where it was fixed.
     prediction
-        What the map says at the readings.
+        The map at the N readings.
     interpolation_covariance
-        What odometry's errors on the ways between key poses contribute to the covariance of their
-        residuals, uT^2, shape (N, 3, 3).
+        Covariance of residuals by odometry's errors between key poses, uT^2, shape (N, 3, 3).
     squared
-        Squared lengths of their whitened residuals, shape (N,).
+        Squared lengths of the whitened residuals, shape (N,).
     weights
-        How far each reading counts, shape (N,); zero outside of the map.
+        Robust weight of each reading, 0 to 1, shape (N,); zero outside of the map.
     near_changes
-        Which do not because of where they are: others about them do not fit, shape (N,).
+        Which readings are left out because others near them do not fit, shape (N,).
     bent
         Mean square of the whitened components by which the steps between the poses differ from
         odometry's; 1 is consistent.
     scale
-        Of odometry; absent where it is no variable.
+        Scale of odometry; None where it is no variable.
     link_squared
-        Squared lengths of the whitened residuals of what scans say, shape (L,).
+        Squared lengths of the scan links' whitened residuals, shape (L,).
     ending
-        How the last optimisation ended.
+        Why the last optimisation stopped.
     """
 
     drive: Drive
@@ -59,7 +58,7 @@ class DriveSolution:
     squared: FloatArray
     weights: FloatArray
     near_changes: BoolArray
-    bent: float
+    odometry_chi2: float
     scale: OdometryScale | None
     link_squared: FloatArray
     ending: Ending
@@ -72,4 +71,4 @@ class DriveSolution:
     @property
     def used(self) -> BoolArray:
         """Which readings count, shape (N,)."""
-        return np.asarray(self.weights > NOTHING)
+        return np.asarray(self.weights > REJECTED_WEIGHT)

@@ -1,4 +1,4 @@
-"""How GTSAM solves the graphs of SLAM: solver and ordering, chosen by measurement.
+"""GTSAM's solvers for the graphs of SLAM, chosen by measurement, and covariances of solutions.
 
 Processor seconds of one elimination, one thread; in brackets how many components:
 
@@ -12,10 +12,10 @@ no map, fixed (2,460; 12 tiles)    0.026, 0.36         0.041, 0.42         0.017
 no map, refined (2,190; 12 tiles)  0.21, 8.1           0.037, 0.19         0.032, 0.14
 =================================  ==================  ==================  ====================
 
-In a map the errors of all tiles have one prior, so that eliminating them first ties all poses
-together. Without one a tile's weights tie no more than the poses in it; COLAMD, which counts
-variables and not their sizes, leaves them to the end where calibrations are on all factors. METIS
-ended the process with a segmentation fault in a section of 27 variables (GTSAM 4.3.0).
+In a map the errors of all tiles have one prior, so that eliminating them first connects all poses.
+Without one a tile's weights connect no more than the poses in it; COLAMD, which counts variables
+and not their sizes, leaves them to the end where calibrations are on all factors. METIS ended the
+process with a segmentation fault in a section of 27 variables (GTSAM 4.3.0).
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -32,54 +32,57 @@ from l2m_gtsam.calibration.optimise import TOLERANCE, Ending, LinearSolver, Opti
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale
+from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
 
+TOGETHER = 200  # poses: the covariance of so many is 11 MB
 
-def descended(
+
+def levenberg_marquardt(
     graph: gtsam.NonlinearFactorGraph,
     start: gtsam.Values,
     ordering: gtsam.Ordering,
     max_iterations: int,
     close: float = TOLERANCE,
 ) -> Optimised:
-    """Minimise a graph's error by Levenberg-Marquardt, with at most so many linearisations.
+    """Minimise a graph's error by Levenberg-Marquardt.
 
-    A linear system that GTSAM's Cholesky refuses is damped by its optimiser as if the step had led
-    astray, without a word. So where there is more damping in the end than there was, QR goes on.
+    Where Cholesky fails on a linear system GTSAM's optimiser silently increases the damping, as if
+    the step had increased the error. So where the damping has grown in the end, QR continues.
 
     Parameters
     ----------
     graph, start
-        Factors, and where to start.
+        Factors and initial values.
     ordering
-        In which variables are eliminated.
+        Elimination order of the variables.
     max_iterations
-        The most linearisations.
+        Limit of linearisations.
     close
-        Decrease of the error that does not count any more.
+        Decrease of the error below which it has converged.
     """
-    first = _engine(graph, start, ordering, max_iterations, close, LinearSolver.CHOLESKY)
+    first = _optimizer(graph, start, ordering, max_iterations, close, LinearSolver.CHOLESKY)
     before, values = first.lambda_(), first.optimize()
     left = max_iterations - first.iterations()
     if first.lambda_() > before and left > 0:
-        second = _engine(graph, values, ordering, left, close, LinearSolver.QR)
+        second = _optimizer(graph, values, ordering, left, close, LinearSolver.QR)
         values = second.optimize()
         left -= second.iterations()
     return Optimised(values, Ending.TOLERANCE if left > 0 else Ending.ITERATION_LIMIT)
 
 
 def colamd_ordering(graph: gtsam.NonlinearFactorGraph) -> gtsam.Ordering:
-    """Return the order by minimum degree."""
+    """Return the minimum-degree ordering."""
     return gtsam.Ordering.ColamdNonlinearFactorGraph(graph)
 
 
 def weights_first(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Ordering:
-    """Return the order by minimum degree in which tiles' weights go first."""
+    """Return the minimum-degree ordering that eliminates tiles' weights first."""
     weights = [key for key in values.keys() if gtsam.symbolChr(key) == ord("M")]  # noqa: SIM118
     return gtsam.Ordering.ColamdConstrainedFirstNonlinearFactorGraph(graph, weights, False)
 
 
-def _engine(
+def _optimizer(
     graph: gtsam.NonlinearFactorGraph,
     start: gtsam.Values,
     ordering: gtsam.Ordering,
@@ -96,20 +99,18 @@ def _engine(
     return gtsam.LevenbergMarquardtOptimizer(graph, start, params)
 
 
-TOGETHER = 200  # poses: the covariance of so many is 11 MB
-
-Found = TypeVar("Found")
+Result = TypeVar("Result")
 
 
 @contextmanager
 def reported_ill_conditioning() -> Iterator[None]:
-    """Say in one line why GTSAM cannot solve what is done inside.
+    """Raise a CalibrationError in one line where GTSAM cannot factor what is done inside.
 
     Raises
     ------
     CalibrationError
-        GTSAM cannot factor it. Every variable has a prior or hangs on one, so that this is a matter
-        of scale.
+        A system is indeterminate. A prior determines every variable at least indirectly, so that
+        the cause is bad scaling.
     """
     try:
         yield
@@ -123,36 +124,42 @@ def reported_ill_conditioning() -> Iterator[None]:
 
 
 class Marginals:
-    """Covariances of a linear graph's variables, by Cholesky, and by QR where that is refused.
+    """Covariances of a linear graph's variables, by Cholesky, or by QR where that fails.
 
-    GTSAM's Cholesky gives up on directions 4,000 times weaker than others; QR does not mind.
+    GTSAM's Cholesky fails on directions 4,000 times weaker than others; QR does not.
 
     Parameters
     ----------
     linear
-        The graph, linearised where it was solved.
+        The graph, linearised at its solution.
     ordering
-        In which its variables are eliminated.
+        Elimination order of its variables.
     """
 
     def __init__(self, linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> None:
         self._linear, self._ordering = linear, ordering
 
     def of(self, key: int) -> FloatArray:
-        """Return that of a variable by itself."""
+        """Return the covariance of one variable."""
         tree = self._cholesky
-        found = None if tree is None else unless_indeterminate(lambda: tree.marginalCovariance(key))
-        if found is None:
-            found = covariance_of(self._qr.marginalFactor(key, gtsam.EliminateQR).jacobian()[0])
-        return found
+        covariance = (
+            None if tree is None else unless_indeterminate(lambda: tree.marginalCovariance(key))
+        )
+        if covariance is None:
+            covariance = covariance_of(
+                self._qr.marginalFactor(key, gtsam.EliminateQR).jacobian()[0]
+            )
+        return covariance
 
     def joint(self, keys: Sequence[int]) -> FloatArray:
-        """Return that of some variables, in this order."""
+        """Return the joint covariance of some variables, in this order."""
         tree, own = self._cholesky, list(keys)
         if tree is not None:
-            found = unless_indeterminate(lambda: tree.jointMarginalCovariance(own).fullMatrix())
-            if found is not None:
-                return np.asarray(found)
+            covariance = unless_indeterminate(
+                lambda: tree.jointMarginalCovariance(own).fullMatrix()
+            )
+            if covariance is not None:
+                return np.asarray(covariance)
         left = self._qr.joint(own, gtsam.EliminateQR)
         net = left.eliminateSequential(ordered(keys), gtsam.EliminateQR)
         return covariance_of(net.matrix()[0])
@@ -167,9 +174,9 @@ class Marginals:
 
 
 def joint_covariance(linear: gtsam.GaussianFactorGraph, keys: Sequence[int]) -> FloatArray:
-    """Return that of some variables, in this order, by eliminating the rest for them alone.
+    """Return the joint covariance of some variables, in this order, by eliminating the others.
 
-    For who asks once: of one pose of a section 0.03 s, where a tree of all takes 0.11 s.
+    For a single query: 0.03 s for one pose of a section, where a tree of all takes 0.11 s.
     """
     own, last = list(keys), ordered(keys)
 
@@ -177,23 +184,23 @@ def joint_covariance(linear: gtsam.GaussianFactorGraph, keys: Sequence[int]) -> 
         tree = linear.marginal(own).eliminateMultifrontal(last)
         return np.asarray(tree.jointMarginalCovariance(own).fullMatrix())
 
-    found = unless_indeterminate(by_cholesky)
-    if found is None:
+    covariance = unless_indeterminate(by_cholesky)
+    if covariance is None:
         net = linear.marginalMultifrontalBayesNet(last, gtsam.EliminateQR)
-        found = covariance_of(net.matrix()[0])
-    return found
+        covariance = covariance_of(net.matrix()[0])
+    return covariance
 
 
 def ordered(keys: Sequence[int]) -> gtsam.Ordering:
-    """Return keys as an order of elimination."""
+    """Return keys as an elimination order."""
     ordering = gtsam.Ordering()
     for key in keys:
         ordering.push_back(key)
     return ordering
 
 
-def unless_indeterminate(work: Callable[[], Found]) -> Found | None:
-    """Return what GTSAM computes; none where it cannot factor a linear system."""
+def unless_indeterminate(work: Callable[[], Result]) -> Result | None:
+    """Return what GTSAM computes; None where a linear system is indeterminate to it."""
     try:
         return work()
     except RuntimeError as error:
@@ -205,16 +212,17 @@ def unless_indeterminate(work: Callable[[], Found]) -> Found | None:
 def covariance_of(root: FloatArray) -> FloatArray:
     """Return ``(R^T R)^-1`` of an upper triangle R.
 
-    GTSAM would invert ``R^T R`` by Cholesky: what QR has gained would be lost.
+    GTSAM would invert ``R^T R`` by Cholesky, which squares the condition number again.
     """
     half = solve_triangular(root, np.eye(len(root)))
     return np.asarray(half @ half.T)
 
 
 def pose_covariances(marginals: Marginals, count: int) -> FloatArray:
-    """Return those of right perturbations of so many key poses, shape (K, 6, 6).
+    """Return covariances of the first ``count`` key poses, shape (K, 6, 6).
 
-    One by one, along the elimination tree, each at the same cost however long the drive is.
+    One by one along the elimination tree, at a cost that does not grow with the drive. Of right
+    perturbations, rotation (rad) before translation (m).
     """
     with reported_ill_conditioning():
         return np.stack([marginals.of(X(k)) for k in range(count)])
@@ -223,7 +231,7 @@ def pose_covariances(marginals: Marginals, count: int) -> FloatArray:
 def pose_covariances_together(marginals: Marginals, count: int) -> FloatArray:
     """Return the same from joint covariances of many poses.
 
-    For graphs in which each way through the elimination tree leads through nearly all of it:
+    For graphs in which each path to the root of the elimination tree contains nearly all of it:
     without a map 0.1 s instead of 3 s for 116 poses, with calibrations that are refined.
     """
     blocks: list[FloatArray] = []
@@ -236,7 +244,7 @@ def pose_covariances_together(marginals: Marginals, count: int) -> FloatArray:
 
 
 def odometry_scale(marginals: Marginals, values: gtsam.Values) -> OdometryScale | None:
-    """Return odometry's scale as it came out; None where it is no variable."""
+    """Return the estimate of odometry's scale; None where it is no variable."""
     if not values.exists(G()):
         return None
     with reported_ill_conditioning():
@@ -244,7 +252,14 @@ def odometry_scale(marginals: Marginals, values: gtsam.Values) -> OdometryScale 
     return OdometryScale(values.atDouble(G()), float(np.sqrt(variance)))
 
 
-def sensor_covariances(marginals: Marginals, count: int) -> FloatArray:
-    """Return those of (t, C row by row, H) of so many sensors in m and uT, shape (S, 15, 15)."""
+def sensor_covariances(
+    marginals: Marginals, values: gtsam.Values, known: KnownSensors
+) -> FloatArray:
+    """Return covariances of (t, C row by row, H) of the sensors in m and uT, shape (S, 15, 15).
+
+    The known ones where calibrations are no variables.
+    """
+    if not values.exists(T(0)):
+        return known.covariance
     with reported_ill_conditioning():
-        return np.stack([marginals.joint([T(i), D(i)]) for i in range(count)])
+        return np.stack([marginals.joint([T(i), D(i)]) for i in range(len(known.names))])

@@ -8,7 +8,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.exploration import HERE, Exploration, explore
+from l2m_gtsam.slam.exploration import EXACT_START, Exploration, explore
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import SlamOptions
@@ -74,7 +74,7 @@ def prepared_drive(
     drive, _ = prepared(recorded.recording, known, options)
     rows = np.searchsorted(truth.stamp_ns, drive.stamp_ns)
     true = [gtsam.Pose3(gtsam.Rot3(truth.R[row]), truth.p[row]) for row in rows]
-    return replace(drive, start=replace(drive.start, covariance=HERE)), true
+    return replace(drive, start=replace(drive.start, covariance=EXACT_START)), true
 
 
 def explored(drive: SlamDrive, sensors: tuple[KnownSensor, ...], **options: object) -> Exploration:

@@ -8,9 +8,9 @@ import numpy as np
 from l2m_gtsam.data import Recording, SourceFile
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.slam.localisation import Localisation, Sources, localise
+from l2m_gtsam.slam.localisation import Localisation, localise
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.record import Told, localisation_record
+from l2m_gtsam.slam.record import RecordContext, localisation_record
 from tests.drives.slam import SlamDrive, calibrated, rounds, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -37,8 +37,13 @@ def driven() -> tuple[SlamDrive, CalibrationResult]:
 
 def found(recording: Recording, known: CalibrationResult) -> Localisation:
     """Return a drive localised, its calibration refined."""
-    sources = Sources(SourceFile("map.npz", "cd" * 32), SourceFile("calibration.yaml", "ef" * 32))
-    return localise(recording, WORLD, known, OPTIONS, lambda stage, share: None, sources)
+    done = localise(recording, WORLD, known, OPTIONS, lambda stage, share: None)
+    result = replace(
+        done.result,
+        map=SourceFile("map.npz", "cd" * 32),
+        calibration_source=SourceFile("calibration.yaml", "ef" * 32),
+    )
+    return replace(done, result=result)
 
 
 @cache
@@ -54,5 +59,5 @@ def record() -> LocalisationRecord:
     drive, known = driven()
     options = {"slam": OPTIONS.model_dump(mode="json")}
     truth = SourceFile("truth.tum", "01" * 32)
-    done, told = localised(), Told(known, WORLD, options, 0.5, drive.truth, truth)
+    done, told = localised(), RecordContext(known, WORLD, options, 0.5, drive.truth, truth)
     return localisation_record(done.result, done.solution, told)

@@ -38,6 +38,10 @@ from l2m_gtsam.solve.linear_algebra import covariance_root, inverse
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance
 
 UNKNOWN = np.repeat([10.0, 1e3], 3)  # rad and m: sigmas of what nothing is known of
+ROUNDING = 1e-12  # of a variance in m^2 or uT^2: as good as none
+ROUNDS = 3  # with covariances of their own
+STEPS = 4  # in each
+LONGEST = np.repeat([0.2, 0.3], 3)  # of a step: rad and m
 
 
 @dataclass(frozen=True)
@@ -78,9 +82,6 @@ class StartPrior:
         return float(0.5 * e @ e), J.T @ e, J.T @ J + np.diag(UNKNOWN**-2)
 
 
-ROUNDING = 1e-12  # of a variance in m^2 or uT^2: as good as none
-
-
 def steps_root(window: Window) -> FloatArray:
     """Return what a unit of each step's errors moves the first frame by, shape (K - 1, 6, 6).
 
@@ -116,11 +117,6 @@ def diagonal_blocks(S: FloatArray) -> FloatArray:
     """Return the blocks of three rows on the diagonal, shape (N, 3, 3)."""
     N = len(S) // 3
     return np.asarray(S.reshape(N, 3, N, 3)[np.arange(N), :, np.arange(N)])
-
-
-ROUNDS = 3  # with covariances of their own
-STEPS = 4  # in each
-LONGEST = np.repeat([0.2, 0.3], 3)  # of a step: rad and m
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,12 @@ MOST_BOX = 10_000_000  # nodes; those that the map has data for take 150 bytes e
 NEAR = 1.0  # metres from a reading of the survey: further off no map is asked
 AXES = 3
 FURTHEST = np.sqrt(AXES) / 2  # steps from a place to its nearest node
+LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
+MEAN = 3.0  # of it, by noise
+MOST_KEPT = 20_000  # places that are looked at further, the best
+COARSEST = np.deg2rad(10.0)  # between headings
+SIGMAS = 4.0  # of their sum
+GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 @dataclass(frozen=True)
@@ -153,10 +159,6 @@ def remainder(
     return most
 
 
-LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
-MEAN = 3.0  # of it, by noise
-
-
 class Heading(NamedTuple):
     """A pattern of N readings with a heading, in the map's axes.
 
@@ -270,12 +272,6 @@ def row_of(rows: IntArray, at: IntArray, node: IntArray) -> int:
     if i >= rows.shape[0] or j >= rows.shape[1] or k >= rows.shape[2]:
         return -1
     return int(rows[i, j, k])
-
-
-MOST_KEPT = 20_000  # places that are looked at further, the best
-COARSEST = np.deg2rad(10.0)  # between headings
-SIGMAS = 4.0  # of their sum
-GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 @dataclass(frozen=True)

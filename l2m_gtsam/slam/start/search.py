@@ -28,6 +28,12 @@ MOST_NAMED = 4  # candidates in a message
 REMEDY = (
     "a longer drive, one that turns, or `slam.start.position` and `quaternion_xyzw` tell them apart"
 )
+STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not followed
+SMALLEST = 0.5  # metres: of the circle of headings
+FIRST_STEPS, LAST_STEPS = 4, 12  # of all descents, and of those that go on
+GO_ON = 5  # of them for each candidate
+GROWTH = 2.0  # of a window
+SIGMAS = 3.0  # of a start that was found: its readings are going to be used once more
 
 
 def judged(
@@ -133,14 +139,6 @@ def named(candidate: StartCandidate) -> str:
     """Return where a candidate is."""
     x, y, z = candidate.T_map_lidar.t
     return f"({x:.2f}, {y:.2f}, {z:.2f}) m heading {candidate.yaw_deg:.0f} deg"
-
-
-STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not followed
-SMALLEST = 0.5  # metres: of the circle of headings
-FIRST_STEPS, LAST_STEPS = 4, 12  # of all descents, and of those that go on
-GO_ON = 5  # of them for each candidate
-GROWTH = 2.0  # of a window
-SIGMAS = 3.0  # of a start that was found: its readings are going to be used once more
 
 
 def find_start(

@@ -13,8 +13,8 @@ from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_r
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import step_factor
-from l2m_gtsam.slam.solution import NOTHING
-from l2m_gtsam.slam.solver import colamd_ordering, descended, joint_covariance
+from l2m_gtsam.slam.solution import REJECTED_WEIGHT
+from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt
 from l2m_gtsam.slam.unknown_field.field_memory import (
     FieldMemory,
     JointGaussian,
@@ -26,6 +26,13 @@ from l2m_gtsam.slam.unknown_field.field_memory import (
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
+
+# How many times their noise new readings may be off, stage by stage: where the vehicle was just
+# before, and where it comes to a tile of an earlier section, as far off as odometry has drifted.
+ONWARDS = (4.0, 1.0)
+AGAIN = (16.0, 4.0, 1.0)
+CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
+SOFT = 1.0  # how sharply good ones among them are told from wrong ones, mu of ``solve.robust``
 
 
 @dataclass(frozen=True)
@@ -76,7 +83,7 @@ class TileReadings:
         for stage in np.unique(mu):
             own = mu == stage
             weights[own] = WEIGHTS[robust.loss](r2[own], robust.largest, stage)
-        chosen = np.flatnonzero(weights > NOTHING)
+        chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         W = W[chosen] * np.sqrt(weights[chosen])[:, None, None]
         variance = noise[:, None] ** 2 + laid.field.unresolved(laid.placed.x)
         return cls(laid, chosen, W, variance[chosen] / weights[chosen, None])
@@ -108,14 +115,6 @@ class TileReadings:
         return TileBatch(
             self.laid.number, self.laid.anchor, self.laid.field, readings, drive.sensors.fixed()
         )
-
-
-# How many times their noise new readings may be off, stage by stage: where the vehicle was just
-# before, and where it comes to a tile of an earlier section, as far off as odometry has drifted.
-ONWARDS = (4.0, 1.0)
-AGAIN = (16.0, 4.0, 1.0)
-CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
-SOFT = 1.0  # how sharply good ones among them are told from wrong ones, mu of ``solve.robust``
 
 
 class OpenSection:
@@ -277,7 +276,7 @@ class OpenSection:
                 self._prior.add(factor)
         graph.push_back(self._prior)
         self._graph = graph
-        found = descended(graph, self._values, colamd_ordering(graph), most, CLOSE)
+        found = levenberg_marquardt(graph, self._values, colamd_ordering(graph), most, CLOSE)
         self._values = found.values
 
     def _kept(self) -> list[int]:

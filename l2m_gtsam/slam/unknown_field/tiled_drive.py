@@ -18,7 +18,7 @@ from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings, predict
 from l2m_gtsam.slam.relative_motion import RelativeMotions
-from l2m_gtsam.slam.solution import NOTHING
+from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field.tiles import (
     AXES,
     Anchoring,
@@ -160,7 +160,7 @@ class TiledDrive:
             Squared lengths of their residuals, whitened by noise and what waves left out hold,
             shape (N,).
         """
-        chosen = np.flatnonzero(weights > NOTHING)
+        chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         whole = [tile.doubt(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
         freedom = AXES * weights.sum() - sum(each.parameters for each in whole)
         share = weights @ squared / freedom if freedom > 0 else 1.0

@@ -31,10 +31,10 @@ from l2m_gtsam.slam.pose_graph import (
     scale_values,
 )
 from l2m_gtsam.slam.relative_motion import RelativeMotions
-from l2m_gtsam.slam.solution import NOTHING, DriveSolution
+from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
-    descended,
+    levenberg_marquardt,
     odometry_scale,
     pose_covariances_together,
     sensor_covariances,
@@ -186,7 +186,7 @@ class TiledProblem:
         robust = self._options.robust
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
         doubts = tiled.doubts(noise, weights, self._own_squared(tiled, predictions, whitenings))
-        chosen = np.flatnonzero(weights > NOTHING)
+        chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         fixed = None if self._free else self._drive.sensors.fixed()
         W = W * np.sqrt(weights)[:, None, None]
         by_lidar = self._gathered(tiled, [prediction.by_lidar for prediction in predictions])
@@ -197,7 +197,7 @@ class TiledProblem:
             graph.push_back(calibration_graph(self._drive.sensors))
             values.insert(calibration_values(sensors))
         order = weights_first(graph, values)
-        end = descended(graph, values, order, self._options.max_iterations)
+        end = levenberg_marquardt(graph, values, order, self._options.max_iterations)
         found = list(poses_in(end.values, len(poses)).values())
         after = sensors_in(end.values, sensors)
         return TiledRound(tiled, graph, weights, end.values, found, after, end.ending)
@@ -214,11 +214,7 @@ class TiledProblem:
             drive=replace(drive, sensors=sensors),
             poses=solved.poses,
             pose_covariance=pose_covariances_together(marginals, len(drive)),
-            calibration_covariance=(
-                sensor_covariances(marginals, len(sensors.names))
-                if self._free
-                else sensors.covariance
-            ),
+            calibration_covariance=sensor_covariances(marginals, solved.values, sensors),
             prediction=self._prediction(solved, motions, tiled, predictions),
             interpolation_covariance=self._gathered(
                 tiled, interpolation_covariances(tiled, motions, predictions)
@@ -226,7 +222,7 @@ class TiledProblem:
             squared=self._squared(tiled, motions, predictions, sensors.noise),
             weights=solved.weights,
             near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
-            bent=2 * self._odometry.error(solved.values) / (6 * len(drive)),
+            odometry_chi2=2 * self._odometry.error(solved.values) / (6 * len(drive)),
             scale=odometry_scale(marginals, solved.values),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,

@@ -24,6 +24,15 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.options import TileOptions
 
+# Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
+# with more of it passed for a lower one, by 0.1-0.4 m with sigmas of 0.04 m. The pull falls with
+# the square of this; what is lost is small, for readings are dense along the way.
+WIDER = 10.0
+REWEIGHTINGS = 15
+AXES = 3
+SIDE_M = 1e-3  # of a finite difference
+LARGE = 2.0  # length of a whitened residual beyond which a reading counts for less
+
 
 @dataclass(frozen=True)
 class FieldPrior:
@@ -86,16 +95,6 @@ def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) ->
         readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
     )
     return field_prior(where.x, where.field(drive.sensors), options)
-
-
-# Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
-# with more of it passed for a lower one, by 0.1-0.4 m with sigmas of 0.04 m. The pull falls with
-# the square of this; what is lost is small, for readings are dense along the way.
-WIDER = 10.0
-REWEIGHTINGS = 15
-AXES = 3
-SIDE_M = 1e-3  # of a finite difference
-LARGE = 2.0  # length of a whitened residual beyond which a reading counts for less
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def test_where_no_place_is_come_to_again_it_is_said() -> None:
     """Less than a lap: little can be taken out, and sigmas say so."""
     sensors, drive = drive_in(2, laps(24))
     found = explored(drive, sensors)
-    assert any("no place was come to twice" in note for note in found.result.notes)
+    assert any("no place was revisited" in note for note in found.result.notes)
     trajectory = found.result.trajectory
     assert pose_nees(drive.truth, trajectory).mean() < 12
     assert trajectory.covariance is not None

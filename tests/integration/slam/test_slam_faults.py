@@ -14,7 +14,7 @@ from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatu
 from l2m_gtsam.records.scans import PoseFix, ScanEvidence
 from l2m_gtsam.slam.localisation import Localisation, localise
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.record import Told, localisation_record
+from l2m_gtsam.slam.record import RecordContext, localisation_record
 from tests.drives.faults import jumped, opened, shift, with_steel
 from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, quiet, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
@@ -271,7 +271,7 @@ def test_a_door_that_opens_is_told_and_does_not_pull(three: tuple[KnownSensor, .
     assert np.quantile(away, 0.9) < 4.0
     late = solution.drive.stamp_ns[solution.drive.readings.key_pose[lost]]
     assert np.mean(late - truth.stamp_ns[0] > 20e9) > 0.95
-    told = localisation_record(done.result, solution, Told(known, WORLD, {}, 0.5))
+    told = localisation_record(done.result, solution, RecordContext(known, WORLD, {}, 0.5))
     texts = [each.text for each in judge_localisation(told, QaOptions()).reasons]
     assert any("the place has changed since it was mapped" in each for each in texts)
 

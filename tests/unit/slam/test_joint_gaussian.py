@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.solver import colamd_ordering, descended, joint_covariance, ordered
+from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt, ordered
 from l2m_gtsam.slam.unknown_field.field_memory import (
     JointGaussian,
     conditioned,
@@ -81,7 +81,7 @@ def solved(
     for factor in prior_factors(of):
         whole.add(factor)
     for _ in range(3):  # to the last digit
-        values = descended(whole, values, colamd_ordering(whole), 50, 0.0).values
+        values = levenberg_marquardt(whole, values, colamd_ordering(whole), 50, 0.0).values
     covariance = joint_covariance(whole.linearize(values), list(sizes))
     return values, JointGaussian(values, sizes, covariance)
 

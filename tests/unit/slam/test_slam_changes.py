@@ -7,19 +7,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_gtsam.slam.disturbances import Fit, changed
+from l2m_gtsam.slam.disturbances import ReadingFits, changed
 from l2m_gtsam.slam.misfit import DecoyMap
 from tests.worlds.exact import dipole_world
 
 KEY_POSES, SENSORS, READINGS = 200, 3, 3
 
 
-def noise(seed: int, scale: float = 1.0) -> Fit:
+def noise(seed: int, scale: float = 1.0) -> ReadingFits:
     """Return the fit of readings with nothing but noise, along 40 m."""
     rng = np.random.default_rng(seed)
     key = np.repeat(np.arange(KEY_POSES), SENSORS * READINGS)
     every = np.ones(len(key), dtype=np.bool_)
-    return Fit(
+    return ReadingFits(
         key_pose=key,
         sensor=np.tile(np.repeat(np.arange(SENSORS), READINGS), KEY_POSES),
         inside=every,

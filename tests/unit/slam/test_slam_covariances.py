@@ -10,8 +10,8 @@ from l2m_gtsam.slam.solver import (
     TOGETHER,
     Marginals,
     colamd_ordering,
-    descended,
     joint_covariance,
+    levenberg_marquardt,
     pose_covariances,
     pose_covariances_together,
     reported_ill_conditioning,
@@ -73,7 +73,7 @@ def test_where_cholesky_is_refused_descents_go_on_by_qr(
     rng, begin = np.random.default_rng(2), gtsam.Values()
     for key in values.keys():  # noqa: SIM118
         begin.insert(key, values.atPose3(key).retract(0.1 * rng.normal(size=6)))
-    found = descended(graph, begin, colamd_ordering(graph), 50).values
+    found = levenberg_marquardt(graph, begin, colamd_ordering(graph), 50).values
     assert graph.error(found) < 1e-3
 
 

@@ -16,7 +16,7 @@ from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.measurements import CELL_M, CachedVariance
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import calibration_values, odometry_graph
-from l2m_gtsam.slam.smoother import Problem
+from l2m_gtsam.slam.smoother import SmoothingProblem
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds
@@ -84,7 +84,7 @@ def apart(one: Belief, other: Belief) -> float:
 
 def solved_at_once(drive: Drive) -> Belief:
     """Return what the whole graph says of the last key pose and the sensors."""
-    problem = Problem(drive, WORLD, SlamOptions(calibration=CalibrationUse.REFINED))
+    problem = SmoothingProblem(drive, WORLD, SlamOptions(calibration=CalibrationUse.REFINED))
     values, all_of_them = calibration_values(drive.sensors), np.ones(len(drive.readings))
     for k, pose in enumerate(drive.dead_reckoning()):
         values.insert(X(k), pose)

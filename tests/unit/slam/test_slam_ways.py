@@ -14,7 +14,7 @@ from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
-from l2m_gtsam.slam.smoother import Problem, localise_drive
+from l2m_gtsam.slam.smoother import SmoothingProblem, localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive, moved, perturbations
 from tests.drives.slam import rounds
@@ -167,7 +167,7 @@ def test_on_line_key_poses_far_apart_know_as_much_too() -> None:
 def test_what_a_way_contributes_is_what_whitening_knows() -> None:
     """Of one reading the share in its covariance, of all the slow sum over pairs of them."""
     given_drive = drive(4).drive
-    problem = Problem(given_drive, WORLD, SlamOptions())
+    problem = SmoothingProblem(given_drive, WORLD, SlamOptions())
     values = gtsam.Values()
     for k, pose in enumerate(given_drive.dead_reckoning()):
         values.insert(X(k), pose)
