@@ -48,6 +48,13 @@ class PlacedReadings:
     x: FloatArray
     C: FloatArray
 
+    @classmethod
+    def of(cls, readings: MagneticReadings, sensors: KnownSensors) -> "PlacedReadings":
+        """Return readings with their sensors' positions and distortions."""
+        lever = np.einsum("nij,nj->ni", readings.R_map_lidar, sensors.t[readings.sensor])
+        C = sensors.distortion[:, :9].reshape(-1, 3, 3)[readings.sensor]
+        return cls(readings, lever + readings.p_map_lidar, C)
+
     def field(self, sensors: KnownSensors) -> FloatArray:
         """Return the measured field in the map's frame, distortion undone, uT, shape (N, 3)."""
         at = self.readings
@@ -143,9 +150,7 @@ def place_readings(
     R = np.stack([pose.rotation().matrix() for pose in own])[slot]
     p = np.stack([pose.translation() for pose in own])[slot]
     at = readings.placed(R, p)
-    x = np.einsum("nij,nj->ni", at.R_map_lidar, sensors.t[at.sensor]) + at.p_map_lidar
-    C = sensors.distortion[:, :9].reshape(-1, 3, 3)[at.sensor]
-    return PlacedReadings(at, x, C)
+    return PlacedReadings.of(at, sensors)
 
 
 def predict(field_map: QueryableMap, where: PlacedReadings, sensors: KnownSensors) -> MapPrediction:

@@ -1,18 +1,18 @@
-r"""How likely a window of a drive is where it is thought to be: all that is uncertain together.
+r"""Likelihood of a window of a drive at a pose in a map, with all uncertainties marginalised.
 
 The residuals of all readings are normal numbers of mean J x and covariance
 
 .. math::
     S = D + A Q A^T + K P K^T + F M F^T
 
-x: a perturbation of the first key pose, of which little but up is known beforehand; D: noise; Q:
+x: a perturbation of the first key pose, of which little but the vertical is known; D: noise; Q:
 odometry's steps; P: the sensors' calibrations; M: the map's errors. A reading that the others do
-not predict within its covariance has the variance of the map's whole field on top: it says next to
-nothing, like one that the map knows nothing of, and the likelihoods of all places stay those of the
-same readings.
+not predict within its covariance gets the variance of the map's whole field in addition, like one
+outside of the map: it is nearly ignored, and the likelihoods of all poses remain those of the same
+readings.
 
-All residuals are correlated: a graph would be one dense factor, linearised anew at each place. What
-is asked for is likelihoods; the drive from the best place is solved by GTSAM.
+All residuals are correlated: a graph would be one dense factor, relinearised at each pose. Only
+likelihoods are needed; GTSAM solves the drive from the best pose.
 """
 
 from dataclasses import dataclass
@@ -33,20 +33,20 @@ from l2m_gtsam.slam.map_prediction import (
     errors_of,
     predict,
 )
-from l2m_gtsam.slam.start.window import Window
+from l2m_gtsam.slam.start.window import DriveWindow
 from l2m_gtsam.solve.linear_algebra import covariance_root, inverse
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance
 
-UNKNOWN = np.repeat([10.0, 1e3], 3)  # rad and m: sigmas of what nothing is known of
-ROUNDING = 1e-12  # of a variance in m^2 or uT^2: as good as none
-ROUNDS = 3  # with covariances of their own
-STEPS = 4  # in each
-LONGEST = np.repeat([0.2, 0.3], 3)  # of a step: rad and m
+UNKNOWN = np.repeat([10.0, 1e3], 3)  # rad and m: sigmas of an uninformative prior
+ROUNDING = 1e-12  # least variance of a calibration in m^2 or uT^2
+ROUNDS = 3  # updates of the covariance
+STEPS = 4  # Gauss-Newton steps in each
+LONGEST = np.repeat([0.2, 0.3], 3)  # limit of a step: rad and m
 
 
 @dataclass(frozen=True)
 class StartPrior:
-    """What is known before readings are looked at.
+    """Prior of the first key pose, and of readings that the map does not explain.
 
     Attributes
     ----------
@@ -57,9 +57,9 @@ class StartPrior:
     height, height_m
         Of the first key pose in the map, and its standard deviation, metres.
     spread
-        Standard deviation per axis of the map's field from place to place, uT.
+        Standard deviation of the map's field over its places, per axis, uT.
     largest
-        Largest squared length of a whitened residual that passes for noise.
+        Gate: limit of a whitened residual's squared length.
     """
 
     up: FloatArray
@@ -69,30 +69,29 @@ class StartPrior:
     spread: float
     largest: float
 
-    def said(self, at: RigidTransform) -> tuple[float, FloatArray, FloatArray]:
-        """Return half the squared error in sigmas of a pose, with its derivatives (6,) and (6, 6).
+    def cost(self, at: RigidTransform) -> tuple[float, FloatArray, FloatArray]:
+        """Return the negative log density of a pose, its gradient (6,) and Hessian (6, 6).
 
-        By a right perturbation, rotation before translation.
+        By a right perturbation, rotation before translation, and but for a constant.
         """
-        leans = at.R[2] - self.up
-        rises = at.t[2] - self.height
+        tilt, rise = at.R[2] - self.up, at.t[2] - self.height
         J = np.zeros((4, 6))
         J[:3, :3], J[3, 3:] = skew(at.R[2:])[0] / self.tilt, at.R[2] / self.height_m
-        e = np.append(leans / self.tilt, rises / self.height_m)
+        e = np.append(tilt / self.tilt, rise / self.height_m)
         return float(0.5 * e @ e), J.T @ e, J.T @ J + np.diag(UNKNOWN**-2)
 
 
-def steps_root(window: Window) -> FloatArray:
-    """Return what a unit of each step's errors moves the first frame by, shape (K - 1, 6, 6).
+def steps_root(window: DriveWindow) -> FloatArray:
+    """Return roots of the steps' covariances as perturbations of the first frame, (K - 1, 6, 6).
 
-    As seen from what comes after the step.
+    A perturbation of a step moves all that comes after it as if the first key pose had moved.
     """
     back = carried_back(window.R[1:], window.p[1:])
     return np.asarray(np.linalg.solve(back, np.linalg.cholesky(window.covariance)))
 
 
 def map_root(errors: SharedMapErrors, C: FloatArray) -> FloatArray:
-    """Return a root of what the map's errors add to S, shape (3N, K)."""
+    """Return a root of the map's share of S, shape (3N, K)."""
     columns = []
     for tile, size in errors.sizes.items():
         F = np.zeros((len(C), 3, size))
@@ -120,7 +119,7 @@ def diagonal_blocks(S: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class WindowResiduals:
     """Residuals of N readings at a pose of the first key pose.
 
     Attributes
@@ -128,7 +127,7 @@ class Linearisation:
     e
         Shape (3N,), uT.
     by_pose, by_calibration
-        Derivatives, shapes (N, 3, 6) and (N, 3, 15).
+        Derivatives by the first key pose, shape (N, 3, 6), and the calibration, (N, 3, 15).
     """
 
     e: FloatArray
@@ -137,76 +136,78 @@ class Linearisation:
 
 
 class WindowFit:
-    """Fits a window to places of a map.
+    """Fits a window at poses in a map.
 
     Parameters
     ----------
     window
-        The window.
+        K key poses and N readings.
     field_map
-        The map.
-    beforehand
-        What else is known.
+        Map that is queried for field, gradient and variance.
+    prior
+        Of the first key pose.
     """
 
-    def __init__(self, window: Window, field_map: QueryableMap, beforehand: StartPrior) -> None:
-        self._window, self._map, self._known = window, field_map, beforehand
+    def __init__(self, window: DriveWindow, field_map: QueryableMap, prior: StartPrior) -> None:
+        self._window, self._map, self._prior = window, field_map, prior
         self._back = carried_back(window.R, window.p)[window.readings.key_pose]
         self._steps = steps_root(window)
 
     def at(self, T_map_lidar: RigidTransform) -> StartCandidate:
-        """Return the fit that a first key pose leads to."""
+        """Return the fit from an initial first key pose."""
         pose = T_map_lidar
         trusted = self._plausible(pose)
         for round_ in range(ROUNDS):
-            seen, prediction = self._linearised(pose), self._prediction(pose)
-            S = self._covariance(seen, prediction, shared=round_ == ROUNDS - 1)
-            trusted = prediction.inside & self._predicted(seen.e, S, trusted)
-            P = inverse(self._doubted(S, trusted))
+            residuals, prediction = self._linearised(pose), self._prediction(pose)
+            S = self._covariance(residuals, prediction, shared=round_ == ROUNDS - 1)
+            trusted = prediction.inside & self._predicted(residuals.e, S, trusted)
+            P = inverse(self._inflated(S, trusted))
             for _ in range(STEPS):
-                pose = self._stepped(pose, seen, P)
-                seen = self._linearised(pose)
-        return self._told(pose, seen, P, trusted, prediction.inside)
+                pose = self._stepped(pose, residuals, P)
+                residuals = self._linearised(pose)
+        return self._candidate(pose, residuals, P, trusted, prediction.inside)
 
-    def _told(
+    def _candidate(
         self,
         pose: RigidTransform,
-        seen: Linearisation,
+        residuals: WindowResiduals,
         P: FloatArray,
         trusted: BoolArray,
         inside: BoolArray,
     ) -> StartCandidate:
-        prior, _, curvature = self._known.said(pose)
-        squared = float(seen.e @ P @ seen.e)
+        prior, _, curvature = self._prior.cost(pose)
+        squared = float(residuals.e @ P @ residuals.e)
         _, log_det = np.linalg.slogdet(P)
-        J = seen.by_pose.reshape(-1, 6)
-        likelihood = 0.5 * (log_det - squared - len(seen.e) * np.log(2 * np.pi)) - prior
+        J = residuals.by_pose.reshape(-1, 6)
+        likelihood = 0.5 * (log_det - squared - len(residuals.e) * np.log(2 * np.pi)) - prior
         return StartCandidate(
             T_map_lidar=pose,
             covariance=inverse(J.T @ P @ J + curvature),
             log_likelihood=float(likelihood),
             inside=float(inside.mean()),
             explained=float(trusted.sum() / max(inside.sum(), 1)),
-            chi2_per_dof=squared / max(len(seen.e) - 6, 1),
+            chi2_per_dof=squared / max(len(residuals.e) - 6, 1),
         )
 
-    def _stepped(self, pose: RigidTransform, seen: Linearisation, P: FloatArray) -> RigidTransform:
+    def _stepped(
+        self, pose: RigidTransform, residuals: WindowResiduals, P: FloatArray
+    ) -> RigidTransform:
         """Return the pose after a Gauss-Newton step."""
-        _, g, H = self._known.said(pose)
-        J = seen.by_pose.reshape(-1, 6)
-        step = -np.linalg.solve(J.T @ P @ J + H, J.T @ (P @ seen.e) + g)
+        _, g, H = self._prior.cost(pose)
+        J = residuals.by_pose.reshape(-1, 6)
+        step = -np.linalg.solve(J.T @ P @ J + H, J.T @ (P @ residuals.e) + g)
         step /= max(float(np.max(np.abs(step) / LONGEST)), 1.0)
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         return RigidTransform(pose.R @ turn, pose.t + pose.R @ step[3:])
 
-    def _linearised(self, pose: RigidTransform) -> Linearisation:
+    def _linearised(self, pose: RigidTransform) -> WindowResiduals:
         window, sensors = self._window, self._window.sensors
         R, p = self._key_poses(pose)
-        seen = key_pose_residuals(window.readings, self._map, R, p, sensors.fixed())
-        reading = seen.reading
-        return Linearisation(
+        residuals = key_pose_residuals(window.readings, self._map, R, p, sensors.fixed())
+        reading = residuals.reading
+        return WindowResiduals(
             reading.residual.ravel(),
-            seen.de_dX @ self._back,
+            residuals.de_dX @ self._back,
             np.concatenate([reading.de_dt, reading.de_dD], axis=2),
         )
 
@@ -216,20 +217,18 @@ class WindowFit:
         return pose.R @ self._window.R[key], self._window.p[key] @ pose.R.T + pose.t
 
     def _prediction(self, pose: RigidTransform) -> MapPrediction:
-        """Ask the map where it has data, and how uncertain it is."""
+        """Query the map at the readings."""
         sensors = self._window.sensors
         at = self._window.readings.placed(*self._key_poses(pose))
-        x = np.einsum("nij,nj->ni", at.R_map_lidar, sensors.t[at.sensor]) + at.p_map_lidar
-        C = sensors.distortion[:, :9].reshape(-1, 3, 3)[at.sensor]
-        return predict(self._map, PlacedReadings(at, x, C), sensors)
+        return predict(self._map, PlacedReadings.of(at, sensors), sensors)
 
     def _covariance(
-        self, seen: Linearisation, prediction: MapPrediction, *, shared: bool
+        self, residuals: WindowResiduals, prediction: MapPrediction, *, shared: bool
     ) -> FloatArray:
         """Return S, shape (3N, 3N)."""
         window, where = self._window, prediction.placed
-        variance, roots = prediction.map_variance, [self._odometry_root(seen)]
-        roots += [self._calibration_root(seen, i) for i in range(len(window.sensors.names))]
+        variance, roots = prediction.map_variance, [self._odometry_root(residuals)]
+        roots += [self._calibration_root(residuals, i) for i in range(len(window.sensors.names))]
         if shared and prediction.inside.any():
             errors = SharedMapErrors.over(errors_of(self._map), prediction)
             variance, roots = errors.rest, [*roots, map_root(errors, where.C)]
@@ -240,40 +239,42 @@ class WindowFit:
         root = np.concatenate(roots, axis=1)
         return np.asarray(S + root @ root.T)
 
-    def _odometry_root(self, seen: Linearisation) -> FloatArray:
-        """Return a root of what odometry's steps add to S: those before a reading move it."""
+    def _odometry_root(self, residuals: WindowResiduals) -> FloatArray:
+        """Return a root of odometry's share of S: all steps before a reading move it."""
         later = self._window.readings.key_pose[:, None] > np.arange(len(self._steps))
-        A = np.einsum("nab,kbc->nakc", seen.by_pose, self._steps)
-        return np.asarray((A * later[:, None, :, None]).reshape(len(seen.e), -1))
+        A = np.einsum("nab,kbc->nakc", residuals.by_pose, self._steps)
+        return np.asarray((A * later[:, None, :, None]).reshape(len(residuals.e), -1))
 
-    def _calibration_root(self, seen: Linearisation, sensor: int) -> FloatArray:
-        """Return a root of what a sensor's calibration adds to S."""
+    def _calibration_root(self, residuals: WindowResiduals, sensor: int) -> FloatArray:
+        """Return a root of the share of S of a sensor's calibration."""
         own = (self._window.readings.sensor == sensor)[:, None, None]
-        K = np.where(own, seen.by_calibration, 0.0)
+        K = np.where(own, residuals.by_calibration, 0.0)
         P = self._window.sensors.covariance[sensor]
         sigma = np.sqrt(np.maximum(np.diag(P), ROUNDING))
         return np.asarray((K @ covariance_root(P, sigma)).reshape(-1, 15))
 
     def _plausible(self, pose: RigidTransform) -> BoolArray:
-        """Return which readings are within their own covariances, shape (N,)."""
-        seen, prediction = self._linearised(pose), self._prediction(pose)
-        blocks = diagonal_blocks(self._covariance(seen, prediction, shared=False))
-        return prediction.inside & self._passes(seen.e.reshape(-1, 3), inverse(blocks))
+        """Return which readings pass the gate of their own covariances, shape (N,)."""
+        residuals, prediction = self._linearised(pose), self._prediction(pose)
+        blocks = diagonal_blocks(self._covariance(residuals, prediction, shared=False))
+        return prediction.inside & self._passes(residuals.e.reshape(-1, 3), inverse(blocks))
 
     def _predicted(self, e: FloatArray, S: FloatArray, trusted: BoolArray) -> BoolArray:
-        """Return which readings those of the others that are trusted predict, shape (N,)."""
-        P = inverse(self._doubted(S, trusted))
+        """Return which readings the trusted others predict, shape (N,)."""
+        # Leave-one-out prediction: with P = S^-1 the error of reading n is P_nn^-1 (P e)_n, of
+        # covariance P_nn^-1 (O. Dubrule, Mathematical Geology 15, 1983).
+        P = inverse(self._inflated(S, trusted))
         left_out = inverse(diagonal_blocks(P))
         missed = np.einsum("nij,nj->ni", left_out, (P @ e).reshape(-1, 3))
-        own = left_out - self._doubt(trusted)[:, None, None] * np.eye(3)
+        own = left_out - self._field_variance(trusted)[:, None, None] * np.eye(3)
         return self._passes(missed, inverse(own))
 
     def _passes(self, e: FloatArray, information: FloatArray) -> BoolArray:
-        return np.asarray(np.einsum("ni,nij,nj->n", e, information, e) <= self._known.largest)
+        return np.asarray(np.einsum("ni,nij,nj->n", e, information, e) <= self._prior.largest)
 
-    def _doubt(self, trusted: BoolArray) -> FloatArray:
-        return np.where(trusted, 0.0, self._known.spread**2)
+    def _field_variance(self, trusted: BoolArray) -> FloatArray:
+        return np.where(trusted, 0.0, self._prior.spread**2)
 
-    def _doubted(self, S: FloatArray, trusted: BoolArray) -> FloatArray:
-        """Return S with the variance of readings that are not trusted."""
-        return np.asarray(S + np.diag(np.repeat(self._doubt(trusted), 3)))
+    def _inflated(self, S: FloatArray, trusted: BoolArray) -> FloatArray:
+        """Return S with the field's variance added for readings that are not trusted."""
+        return np.asarray(S + np.diag(np.repeat(self._field_variance(trusted), 3)))

@@ -1,16 +1,16 @@
-r"""Which places and headings of a lattice can be where a pattern of fields was read.
+r"""Screening by a bound: the positions and headings of a lattice that readings do not rule out.
 
-Within half a step of the truth a reading's residual is that of the truth, e, and at most a
-tolerance more: slope times displacement, what half a heading turns the field by, and what the
-tangent leaves. By Cauchy and Schwarz
+Within half a step of the truth a reading's residual is that of the truth, e, plus at most a
+tolerance: slope times displacement, the field's rotation by half a heading step, and the remainder
+of the tangent. By the Cauchy-Schwarz inequality
 
 .. math::
     (|e| + \tau)^2 \le (\sigma^2 + \tau^2) \, (|e|^2 / \sigma^2 + 1)
 
-so that with the tolerance as a further variance the truth's node scores no more than the truth
-itself, and one for each reading. The tilt of the pattern is common to all readings and solved for
-on the way, which only lowers a score. Nodes beyond what noise and outliers leave are given up as
-soon as a part of the readings says so: most of them after a few.
+so that with the tolerance as a further variance the node at the truth scores no more than the truth
+itself plus one per reading. The tilt of the pattern is common to all readings and eliminated in
+closed form, which only lowers a score. A node is rejected as soon as its partial sum exceeds what
+noise and outliers allow: most of them after a few readings.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ AXES = 3
 FURTHEST = np.sqrt(AXES) / 2  # steps from a place to its nearest node
 LARGEST = 16.0  # of a squared residual in sigmas: passed once in a thousand readings by noise
 MEAN = 3.0  # of it, by noise
-MOST_KEPT = 20_000  # places that are looked at further, the best
+MOST_KEPT = 20_000  # limit of hypotheses that are kept, the best
 COARSEST = np.deg2rad(10.0)  # between headings
 SIGMAS = 4.0  # of their sum
 GOLDEN = (np.sqrt(5) - 1) / 2
@@ -71,7 +71,7 @@ class FieldLattice:
     field: FloatArray
     gradient: FloatArray
     slope: FloatArray
-    bend: FloatArray
+    curvature: FloatArray
     variance: FloatArray
 
     def __len__(self) -> int:
@@ -120,9 +120,11 @@ def lattice_over(field_map: QueryableMap, survey: TrainingSet, step: float) -> F
     rows[tuple(at.T)] = np.arange(len(at))
     field, gradient = sample.field[sample.inside], sample.gradient[sample.inside]
     slope = np.asarray(np.linalg.svd(gradient, compute_uv=False)[:, 0])
-    bend = FURTHEST**2 * remainder(rows, at, field, gradient, step)
+    curvature = FURTHEST**2 * remainder(rows, at, field, gradient, step)
     variance = sample.variance[sample.inside].mean(axis=1)
-    return FieldLattice(step, lowest, rows, at, field, gradient, slope, np.asarray(bend), variance)
+    return FieldLattice(
+        step, lowest, rows, at, field, gradient, slope, np.asarray(curvature), variance
+    )
 
 
 def nodes_near(survey: TrainingSet, step: float) -> tuple[IntArray, BoolArray]:
@@ -186,7 +188,7 @@ class Heading(NamedTuple):
     variance: FloatArray
     drift2: FloatArray
     moved: FloatArray
-    swung: FloatArray
+    turned: FloatArray
 
 
 class Rules(NamedTuple):
@@ -207,7 +209,7 @@ class Nodes(NamedTuple):
     field: FloatArray
     gradient: FloatArray
     slope: FloatArray
-    bend: FloatArray
+    curvature: FloatArray
     variance: FloatArray
 
 
@@ -243,12 +245,12 @@ def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> floa
                     r[axis] -= nodes.gradient[row, axis, along] * pattern.rest[n, along]
                 r2 += r[axis] ** 2
             slope = nodes.slope[row]
-            tolerance = slope * pattern.moved[n] + pattern.swung[n] + nodes.bend[row]
+            tolerance = slope * pattern.moved[n] + pattern.turned[n] + nodes.curvature[row]
             s2 = pattern.variance[n] + nodes.variance[row] + slope**2 * pattern.drift2[n]
             s2 += tolerance**2
             x, y, z = pattern.field[n, 0], pattern.field[n, 1], pattern.field[n, 2]
-            leaning = rules.tilt2 * (x * x + y * y + 2 * z * z)
-            if r2 > (LARGEST + 1) * (s2 + leaning):
+            tilt_variance = rules.tilt2 * (x * x + y * y + 2 * z * z)
+            if r2 > (LARGEST + 1) * (s2 + tilt_variance):
                 total += LARGEST + 1
             else:
                 total += r2 / s2
@@ -257,10 +259,10 @@ def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> floa
                 c += (z * z + x * x) / s2
                 g += (y * r[2] - z * r[1]) / s2
                 h += (z * r[0] - x * r[2]) / s2
-        taken = (c * g * g - 2 * b * g * h + a * h * h) / (a * c - b * b)
-        if total - taken > rules.limit or unknown > rules.most_unknown:
+        by_tilt = (c * g * g - 2 * b * g * h + a * h * h) / (a * c - b * b)
+        if total - by_tilt > rules.limit or unknown > rules.most_unknown:
             return np.inf
-    return total - taken
+    return total - by_tilt
 
 
 @njit(cache=True, nogil=True)
@@ -275,7 +277,7 @@ def row_of(rows: IntArray, at: IntArray, node: IntArray) -> int:
 
 
 @dataclass(frozen=True)
-class Places:
+class StartHypotheses:
     """N hypotheses of where a pattern lies in a map.
 
     Attributes
@@ -295,15 +297,15 @@ class Places:
     def __len__(self) -> int:
         return len(self.yaw)
 
-    def __getitem__(self, rows: IntArray) -> "Places":
-        return Places(self.p[rows], self.yaw[rows], self.score[rows])
+    def __getitem__(self, rows: IntArray) -> "StartHypotheses":
+        return StartHypotheses(self.p[rows], self.yaw[rows], self.score[rows])
 
 
 @dataclass(frozen=True)
 class ScreeningResult:
     """The places that readings do not rule out, the best first, and how many were looked at."""
 
-    places: Places
+    places: StartHypotheses
     looked_at: int
 
 
@@ -326,13 +328,13 @@ def screen(
     turn = heading_step(pattern.radius, lattice.step)
     headings = turn * np.arange(round(2 * np.pi / turn))
     pattern = in_turn(pattern)
-    rules, told, at = rules_of(pattern, options), nodes_of(lattice), lattice.at[nodes]
+    rules, arrays, at = rules_of(pattern, options), nodes_of(lattice), lattice.at[nodes]
 
-    def look(yaw: float) -> Places:
+    def look(yaw: float) -> StartHypotheses:
         score = np.empty(len(nodes))
-        write_scores(at, told, heading(pattern, lattice.step, yaw, turn), rules, score)
+        write_scores(at, arrays, heading(pattern, lattice.step, yaw, turn), rules, score)
         kept = np.flatnonzero(np.isfinite(score))
-        return Places(lattice.places(nodes[kept]), np.full(len(kept), yaw), score[kept])
+        return StartHypotheses(lattice.places(nodes[kept]), np.full(len(kept), yaw), score[kept])
 
     return ScreeningResult(best_of(in_threads(look, headings)), len(headings) * len(nodes))
 
@@ -378,7 +380,7 @@ def heading(pattern: Pattern, step: float, yaw: float, turn: float) -> Heading:
         variance=pattern.variance,
         drift2=pattern.drift_m**2,
         moved=0.5 * (np.sqrt(3) * step + turn * np.linalg.norm(x[:, :2], axis=1)),
-        swung=0.5 * turn * np.linalg.norm(field[:, :2], axis=1),
+        turned=0.5 * turn * np.linalg.norm(field[:, :2], axis=1),
     )
 
 
@@ -388,9 +390,9 @@ def about_z(yaw: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def best_of(parts: list[Places]) -> Places:
+def best_of(parts: list[StartHypotheses]) -> StartHypotheses:
     """Return the places with the least scores, the best first."""
     p = np.concatenate([part.p for part in parts])
     yaw = np.concatenate([part.yaw for part in parts])
     score = np.concatenate([part.score for part in parts])
-    return Places(p, yaw, score)[np.argsort(score, kind="stable")[:MOST_KEPT]]
+    return StartHypotheses(p, yaw, score)[np.argsort(score, kind="stable")[:MOST_KEPT]]

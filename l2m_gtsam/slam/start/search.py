@@ -1,8 +1,8 @@
-"""Where a drive begins, without a guess: its first metres are laid over the whole map.
+"""Global search for the start of a drive in a map, from its first metres alone.
 
-All places and headings of a lattice are screened; those that readings do not rule out are followed
-to their minima, and the likelihoods of the best of these are compared. As long as two of them, or
-none, explain the readings, more of the drive is looked at.
+All positions and headings of a lattice are screened; those that readings do not rule out are
+refined to local minima, and the likelihoods of the best of these are compared. While several of
+them explain the readings, or none, the window is made longer.
 """
 
 from collections.abc import Sequence
@@ -20,48 +20,47 @@ from l2m_gtsam.records.localisation import StartCandidate, StartSearch, StartVer
 from l2m_gtsam.slam.drive import Drive, StartPose
 from l2m_gtsam.slam.options import SlamOptions, StartPoseOptions, StartSearchOptions
 from l2m_gtsam.slam.start.likelihood import StartPrior, WindowFit
-from l2m_gtsam.slam.start.refinement import PatternPoses, descended
-from l2m_gtsam.slam.start.screening import FieldLattice, Places, lattice_over, screen
-from l2m_gtsam.slam.start.window import Pattern, Window, window_of
+from l2m_gtsam.slam.start.refinement import PatternPoses, refined_poses
+from l2m_gtsam.slam.start.screening import FieldLattice, StartHypotheses, lattice_over, screen
+from l2m_gtsam.slam.start.window import DriveWindow, Pattern, window_of
 
 MOST_NAMED = 4  # candidates in a message
-REMEDY = (
-    "a longer drive, one that turns, or `slam.start.position` and `quaternion_xyzw` tell them apart"
-)
+REMEDY = "a longer drive, one that turns, or `slam.start.position` and `quaternion_xyzw` settle it"
 STRIDE = 1.5  # steps of the lattice: places nearer to a better one are not followed
-SMALLEST = 0.5  # metres: of the circle of headings
-FIRST_STEPS, LAST_STEPS = 4, 12  # of all descents, and of those that go on
-GO_ON = 5  # of them for each candidate
+SMALLEST = 0.5  # metres: least radius of the circle of headings
+FIRST_STEPS, LAST_STEPS = 4, 12  # iterations of all, and of those that are continued
+GO_ON = 5  # continued ones for each candidate
 GROWTH = 2.0  # of a window
-SIGMAS = 3.0  # of a start that was found: its readings are going to be used once more
+SIGMAS = 3.0  # inflation of the start's covariance: its readings are used again for the drive
 
 
-def judged(
+def search_result(
     candidates: tuple[StartCandidate, ...],
-    window: Window,
+    window: DriveWindow,
     looked_at: int,
     options: StartSearchOptions,
 ) -> StartSearch:
-    """Return what candidates, the likeliest first, come to.
+    """Return the result of a search from its candidates, the likeliest first.
 
     Parameters
     ----------
     candidates
-        Places that are apart.
+        Distinct poses.
     window
-        What was looked at.
+        N readings that were compared.
     looked_at
-        Places of the lattice.
+        Number of hypotheses that were screened.
     options
-        What is asked of a unique one.
+        Conditions of a unique start.
     """
     margin = margin_of(candidates)
     verdict, message = verdict_of(candidates, margin, options)
     if verdict is StartVerdict.UNIQUE and len(window) < options.least_readings:
         verdict = StartVerdict.AMBIGUOUS
-        message = f"{len(window)} readings tell no place, {options.least_readings} may: {REMEDY}"
-    told = f"over the first {window.way_m:.1f} m of the drive {message}"
-    return StartSearch(verdict, told, candidates, margin, window.way_m, len(window), looked_at)
+        least = options.least_readings
+        message = f"{len(window)} readings do not determine a place, {least} may: {REMEDY}"
+    summary = f"over the first {window.path_m:.1f} m of the drive {message}"
+    return StartSearch(verdict, summary, candidates, margin, window.path_m, len(window), looked_at)
 
 
 def verdict_of(
@@ -82,7 +81,7 @@ def verdict_of(
         rivals = [each for each in candidates if likelier(best, each) < options.clear]
         message = (
             f"{len(rivals)} places of the map or more explain the readings: {listed(rivals)}; the "
-            f"first is likelier by exp({margin:.1f}), exp({options.clear:g}) is asked for: {REMEDY}"
+            f"first is likelier by exp({margin:.1f}), exp({options.clear:g}) is required: {REMEDY}"
         )
         return StartVerdict.AMBIGUOUS, message
     away, turn = sigmas(best)
@@ -96,26 +95,26 @@ def verdict_of(
 
 
 def elsewhere() -> str:
-    """Return what may be the reason that nothing fits."""
+    """Return possible reasons that nothing fits."""
     return "another place, a start outside of the map, or a wrong calibration"
 
 
 def explains(candidate: StartCandidate, options: StartSearchOptions) -> bool:
-    """Return whether a candidate can be where the drive was."""
+    """Return whether a candidate explains the readings."""
     fits = candidate.chi2_per_dof <= options.largest_chi2
     inside = candidate.inside >= options.least_inside
     return fits and inside and candidate.explained >= options.least_explained
 
 
 def margin_of(candidates: tuple[StartCandidate, ...]) -> float:
-    """Return by what natural logarithm the first is likelier than the second."""
+    """Return the log-likelihood ratio of the first two candidates."""
     if len(candidates) < 2:
         return float("inf")
     return likelier(candidates[0], candidates[1])
 
 
 def likelier(best: StartCandidate, other: StartCandidate) -> float:
-    """Return by what logarithm one is likelier: less where it leaves more than noise."""
+    """Return the log-likelihood ratio, over the best one's chi-square where that is above 1."""
     return (best.log_likelihood - other.log_likelihood) / max(best.chi2_per_dof, 1.0)
 
 
@@ -144,34 +143,34 @@ def named(candidate: StartCandidate) -> str:
 def find_start(
     drive: Drive, field_map: QueryableMap, options: SlamOptions, progress: Progress
 ) -> StartSearch:
-    """Look all over a map for where a drive begins.
+    """Search a whole map for the start of a drive.
 
     Parameters
     ----------
     drive
-        The drive; of its start only what is up counts.
+        K key poses with odometry; of its start only the vertical counts.
     field_map
-        The map.
+        Map with the readings that it was made of.
     options
-        How to look.
+        Those of `start` and `robust`.
     progress
         Called with a stage and the fraction of it that is done.
 
     Raises
     ------
     MapError
-        The map does not tell where it was surveyed, or is too large for the lattice.
+        The map has no survey, or is too large for the lattice.
     """
     if not isinstance(field_map, Surveyed):
-        raise MapError("the map does not tell where it has data: give the start of the drive")
+        raise MapError("the map does not state where it has data: give the start of the drive")
     search = options.start.search
-    progress("looking for the start", 0.0)
+    progress("searching for the start", 0.0)
     lattice = lattice_over(field_map, field_map.readings, search.step_m)
     window_m = min(search.window_m, search.longest_m)
     while True:
         window = window_of(drive, window_m, search.readings)
         found = search_window(window, lattice, field_map, options)
-        progress("looking for the start", min(window_m / search.longest_m, 1.0))
+        progress("searching for the start", min(window_m / search.longest_m, 1.0))
         last = window_m >= search.longest_m or len(window.p) == len(drive)
         if last or found.verdict is StartVerdict.UNIQUE:
             return found
@@ -184,7 +183,7 @@ def start_found(found: StartSearch, options: StartPoseOptions) -> StartPose:
     Raises
     ------
     MapError
-        It is not the only one, or there is none.
+        Several places fit, or none.
     """
     if found.verdict is not StartVerdict.UNIQUE:
         raise MapError(found.message)
@@ -194,23 +193,23 @@ def start_found(found: StartSearch, options: StartPoseOptions) -> StartPose:
 
 
 def search_window(
-    window: Window, lattice: FieldLattice, field_map: QueryableMap, options: SlamOptions
+    window: DriveWindow, lattice: FieldLattice, field_map: QueryableMap, options: SlamOptions
 ) -> StartSearch:
-    """Return where in a map a window of a drive fits."""
-    search, known = options.start.search, beforehand(window, lattice, options)
+    """Return the candidates of one window of a drive, with a verdict."""
+    search, known = options.start.search, start_prior(window, lattice, options)
     pattern = window.pattern(known.tilt)
     rises = pattern.origin[2] - window.p_odom_lidar[2] + known.height
     slack = SIGMAS * known.height_m
     nodes = lattice.between(rises - slack, rises + slack)
-    screened = screen(pattern, lattice, nodes, search)
-    ends = followed(screened.places, pattern, field_map, search)
+    screening = screen(pattern, lattice, nodes, search)
+    ends = refined_minima(screening.places, pattern, field_map, search)
     fit = WindowFit(window, field_map, known)
     fits = [fit.at(pose) for pose in poses_of(ends, pattern, window)]
-    return judged(distinct(fits, search), window, screened.looked_at, search)
+    return search_result(distinct(fits, search), window, screening.looked_at, search)
 
 
-def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> StartPrior:
-    """Return what is known of the start without readings."""
+def start_prior(window: DriveWindow, lattice: FieldLattice, options: SlamOptions) -> StartPrior:
+    """Return the prior of the first key pose."""
     start, height = options.start, options.start.search.height_m
     z = lattice.places(np.arange(len(lattice)))[:, 2]
     anywhere = float(np.ptp(z)) + 2.0 * lattice.step
@@ -224,42 +223,42 @@ def beforehand(window: Window, lattice: FieldLattice, options: SlamOptions) -> S
     )
 
 
-def followed(
-    places: Places, pattern: Pattern, field_map: QueryableMap, options: StartSearchOptions
+def refined_minima(
+    places: StartHypotheses, pattern: Pattern, field_map: QueryableMap, options: StartSearchOptions
 ) -> PatternPoses:
-    """Return the best minima that places lead to."""
+    """Return the best local minima that hypotheses lead to."""
     seeds, step = PatternPoses.upright(places), options.step_m
     if not len(seeds):
         return seeds
-    seeds = apart(seeds, pattern, STRIDE * step, options.seeds)
-    some = descended(seeds, pattern, field_map, step, FIRST_STEPS)
-    # Descents into one basin, which come in dozens, must not crowd out its rivals.
-    some = apart(some, pattern, options.apart_m, GO_ON * options.candidates)
-    ends = descended(some, pattern, field_map, step, LAST_STEPS)
-    return apart(ends, pattern, options.apart_m, options.candidates)
+    seeds = keep_distinct(seeds, pattern, STRIDE * step, options.seeds)
+    some = refined_poses(seeds, pattern, field_map, step, FIRST_STEPS)
+    # Dozens of descents end in one basin: they must not crowd out its rivals.
+    some = keep_distinct(some, pattern, options.apart_m, GO_ON * options.candidates)
+    ends = refined_poses(some, pattern, field_map, step, LAST_STEPS)
+    return keep_distinct(ends, pattern, options.apart_m, options.candidates)
 
 
-def apart(laid: PatternPoses, pattern: Pattern, metres: float, most: int) -> PatternPoses:
-    """Return the first poses that keep a distance from those before."""
-    return laid[np.array(spread_out(drawn(laid, pattern), metres, most), dtype=np.int64)]
+def keep_distinct(poses: PatternPoses, pattern: Pattern, metres: float, most: int) -> PatternPoses:
+    """Return the first poses that are at least so far from all kept before."""
+    return poses[np.array(spread_out(as_points(poses, pattern), metres, most), dtype=np.int64)]
 
 
-def drawn(laid: PatternPoses, pattern: Pattern) -> FloatArray:
-    """Return poses as points in metres, shape (S, 5): headings lie on a circle of the pattern."""
-    return np.hstack([laid.p, max(pattern.radius, SMALLEST) * laid.R[:, :2, 0]])
+def as_points(poses: PatternPoses, pattern: Pattern) -> FloatArray:
+    """Return poses as points in metres, shape (S, 5): headings lie on the pattern's circle."""
+    return np.hstack([poses.p, max(pattern.radius, SMALLEST) * poses.R[:, :2, 0]])
 
 
-def poses_of(laid: PatternPoses, pattern: Pattern, window: Window) -> list[RigidTransform]:
-    """Return where the first key pose is if the pattern lies at these poses."""
+def poses_of(poses: PatternPoses, pattern: Pattern, window: DriveWindow) -> list[RigidTransform]:
+    """Return the first key pose in the map for poses of the pattern."""
     lever = window.p_odom_lidar - pattern.origin
-    R, p = laid.R @ window.R_odom_lidar, laid.R @ lever + laid.p
+    R, p = poses.R @ window.R_odom_lidar, poses.R @ lever + poses.p
     return [RigidTransform(*each) for each in zip(R, p, strict=True)]
 
 
 def distinct(
     fits: Sequence[StartCandidate], options: StartSearchOptions
 ) -> tuple[StartCandidate, ...]:
-    """Return candidates that are apart, the likeliest first."""
+    """Return distinct candidates, the likeliest first."""
     kept: list[StartCandidate] = []
     for fit in sorted(fits, key=lambda each: -each.log_likelihood):
         if all(are_apart(fit, other, options) for other in kept):
@@ -268,7 +267,7 @@ def distinct(
 
 
 def are_apart(one: StartCandidate, other: StartCandidate, options: StartSearchOptions) -> bool:
-    """Return whether two candidates are two places."""
+    """Return whether two candidates are distinct."""
     a, b = one.T_map_lidar, other.T_map_lidar
     turn = np.rad2deg(Rotation.from_matrix(a.R.T @ b.R).magnitude())
     return bool(np.linalg.norm(a.t - b.t) > options.apart_m or turn > options.apart_deg)

@@ -1,4 +1,4 @@
-"""The first metres of a drive as one rigid pattern of fields, to be laid over a map."""
+"""The first metres of a drive as one rigid pattern of fields, to be matched with a map."""
 
 from dataclasses import dataclass, replace
 
@@ -13,20 +13,20 @@ AXES = 3
 
 @dataclass(frozen=True)
 class Pattern:
-    """Fields of N readings in the levelled frame of odometry, its origin at one of the readings.
+    """Fields of N readings in the levelled frame of odometry, with its origin at one of them.
 
     Attributes
     ----------
     x
-        Where each was read, metres, shape (N, 3).
+        Positions in metres, shape (N, 3).
     field
         With distortions undone, uT, shape (N, 3).
     variance
-        Of each axis of that without the map's share, uT^2, shape (N,).
+        Of the field per axis without the map's share, uT^2, shape (N,).
     drift_m
-        Standard deviation per axis of ``x`` by odometry's errors, metres, shape (N,).
+        Standard deviation of ``x`` per axis by odometry's drift, metres, shape (N,).
     tilt
-        Standard deviation of what is up, about each axis, rad.
+        Standard deviation of the vertical about each axis, rad.
     origin
         The frame's origin in the frame of odometry, metres, shape (3,).
     """
@@ -54,28 +54,28 @@ class Pattern:
 
 
 @dataclass(frozen=True)
-class Window:
+class DriveWindow:
     """The first K key poses of a drive and N readings on them.
 
     Attributes
     ----------
-    way_m
-        Length of the way in metres.
+    path_m
+        Length of the path in metres.
     R, p
         Key poses in the frame of the first, shapes (K, 3, 3) and (K, 3), metres.
     covariance
         Of odometry's steps between them, shape (K - 1, 6, 6).
     readings
-        On them.
+        N readings relative to them.
     sensors
-        That read.
+        Calibrations of the S sensors.
     R_odom_lidar
         Rotation of the first key pose in the frame of odometry, whose z axis is up, shape (3, 3).
     p_odom_lidar
         Its position there, metres, shape (3,).
     """
 
-    way_m: float
+    path_m: float
     R: FloatArray
     p: FloatArray
     covariance: FloatArray
@@ -117,7 +117,7 @@ class Window:
     def _drift(self, key: int) -> FloatArray:
         """Return variances of rotation (rad^2) and position (m^2) per axis from a key pose, (K, 2).
 
-        A turn that is wrong moves what comes after it, in both directions from the key pose.
+        A rotation error moves all beyond it, in both directions from the key pose.
         """
         K, variance = len(self.p), np.zeros((len(self.p), 2))
         turn, shift = (
@@ -138,29 +138,29 @@ def central(x: FloatArray) -> int:
     return int(apart.max(axis=1).argmin())
 
 
-def window_of(drive: Drive, way_m: float, most: int) -> Window:
+def window_of(drive: Drive, path_m: float, most: int) -> DriveWindow:
     """Return the first metres of a drive.
 
     Parameters
     ----------
     drive
-        The drive; its start is odometry's own.
-    way_m
-        Metres of way.
+        K key poses in the frame of odometry.
+    path_m
+        Limit of the path in metres.
     most
-        Readings.
+        Limit of readings.
     """
     poses = drive.dead_reckoning()
     p = np.stack([pose.translation() for pose in poses])
     R = np.stack([pose.rotation().matrix() for pose in poses])
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1)))
-    count = max(int(np.searchsorted(way, way_m, side="right")), min(2, len(way)))
+    path = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1)))
+    count = max(int(np.searchsorted(path, path_m, side="right")), min(2, len(path)))
     own = drive.readings[np.flatnonzero(drive.readings.key_pose < count)]
-    return Window(
-        way_m=float(way[count - 1]),
+    return DriveWindow(
+        path_m=float(path[count - 1]),
         R=R[0].T @ R[:count],
         p=(p[:count] - p[0]) @ R[0],
-        covariance=drive.steps.with_scale_as_drift(way_m).covariance[: count - 1],
+        covariance=drive.steps.with_scale_as_drift(path_m).covariance[: count - 1],
         readings=own[thinned(own, most)],
         sensors=drive.sensors,
         R_odom_lidar=R[0],

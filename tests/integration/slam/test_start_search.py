@@ -167,7 +167,7 @@ def test_a_longer_window_decides() -> None:
 
 def test_a_map_that_does_not_tell_its_places_is_refused() -> None:
     sensors, drive = lost_drive(dipole_world(1), 1, seconds=3)
-    with pytest.raises(MapError, match="does not tell where it has data"):
+    with pytest.raises(MapError, match="does not state where it has data"):
         localise(drive.recording, dipole_world(1), calibrated(sensors), searching(), quiet)
 
 

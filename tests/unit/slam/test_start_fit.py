@@ -10,13 +10,13 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.likelihood import StartPrior, WindowFit, steps_root
-from l2m_gtsam.slam.start.window import Window, window_of
+from l2m_gtsam.slam.start.window import DriveWindow, window_of
 from tests.drives.slam import SlamDrive, calibrated, slam_drive
 from tests.worlds.exact import random_sensors
 from tests.worlds.surveyed import SurveyedWorld, strange_hall, surveyed, wandering
 
 
-def known_of(window: Window, spread: float = 8.0) -> StartPrior:
+def known_of(window: DriveWindow, spread: float = 8.0) -> StartPrior:
     return StartPrior(window.R_odom_lidar[2], 0.03, 0.5, 1.0, spread, 21.1)
 
 

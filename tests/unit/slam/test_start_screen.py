@@ -102,7 +102,7 @@ def test_a_score_is_the_least_over_the_tilt(lattice: FieldLattice, seed: int) ->
             total += 4.0
             continue
         b = lattice.field[row] + lattice.gradient[row] @ laid.rest[n]
-        tau = lattice.slope[row] * laid.moved[n] + laid.swung[n] + lattice.bend[row]
+        tau = lattice.slope[row] * laid.moved[n] + laid.turned[n] + lattice.curvature[row]
         s2 = 1.0 + lattice.variance[row] + lattice.slope[row] ** 2 * 0.01 + tau**2
         f = laid.field[n]
         if np.sum((f - b) ** 2) > (LARGEST + 1) * (s2 + TILT**2 * (f @ f + f[2] ** 2)):
@@ -160,7 +160,7 @@ def test_a_lattice_knows_the_field_about_its_nodes(
     tangent = lattice.field[nodes] + np.einsum("nij,nj->ni", lattice.gradient[nodes], off)
     missed = np.linalg.norm(field - tangent, axis=1)
     # Neighbours are six directions; between them a field may bend a little more.
-    assert np.mean(missed <= lattice.bend[nodes]) > 0.98
+    assert np.mean(missed <= lattice.curvature[nodes]) > 0.98
 
 
 def test_a_map_that_is_too_large_is_refused(hall: SurveyedWorld) -> None:
