@@ -58,8 +58,8 @@ class FieldLattice:
         Of the map, uT and uT/m, shapes (M, 3) and (M, 3, 3).
     slope
         Largest change of the field per metre, its gradient's largest singular value, shape (M,).
-    bend
-        How far the field may be from the tangent within a node's cell, uT, shape (M,).
+    curvature
+        Largest deviation of the field from its tangent within a node's cell, uT, shape (M,).
     variance
         Of the map, mean of the axes, uT^2, shape (M,).
     """
@@ -78,11 +78,11 @@ class FieldLattice:
         return len(self.at)
 
     def places(self, nodes: IntArray) -> FloatArray:
-        """Return where nodes are in the map, metres, shape (N, 3)."""
+        """Return the positions of nodes in the map, metres, shape (N, 3)."""
         return np.asarray(self.step * (self.lowest + self.at[nodes]))
 
     def between(self, low: float, high: float) -> IntArray:
-        """Return the nodes at some heights in metres, and no further off than half a step."""
+        """Return the nodes between two heights in metres, or within half a step of them."""
         z = self.step * (self.lowest[2] + self.at[:, 2])
         half = 0.5 * self.step
         return np.flatnonzero((z >= low - half) & (z <= high + half))
@@ -94,16 +94,16 @@ class FieldLattice:
 
 
 def lattice_over(field_map: QueryableMap, survey: TrainingSet, step: float) -> FieldLattice:
-    """Ask a map at the nodes of a lattice.
+    """Query a map at the nodes of a lattice.
 
     Parameters
     ----------
     field_map
-        The map.
+        Map that is queried for field, gradient and variance.
     survey
-        What it was made of.
+        The readings that it was made of.
     step
-        Metres.
+        Distance of nodes in metres.
 
     Raises
     ------
@@ -147,15 +147,15 @@ def nodes_near(survey: TrainingSet, step: float) -> tuple[IntArray, BoolArray]:
 def remainder(
     rows: IntArray, at: IntArray, field: FloatArray, gradient: FloatArray, step: float
 ) -> FloatArray:
-    """Return how far the field of neighbours is from a node's tangent at most, uT, shape (M,)."""
+    """Return the largest deviation of neighbours' fields from a node's tangent, uT, shape (M,)."""
     padded = np.pad(rows, 1, constant_values=-1)
     most = np.zeros(len(at))
     for axis in range(AXES):
-        for way in (-1, 1):
+        for side in (-1, 1):
             beside = at + 1
-            beside[:, axis] += way
+            beside[:, axis] += side
             neighbour = padded[tuple(beside.T)]
-            off = field[neighbour] - field - way * step * gradient[:, :, axis]
+            off = field[neighbour] - field - side * step * gradient[:, :, axis]
             away = np.where(neighbour >= 0, np.linalg.norm(off, axis=1), 0.0)
             most = np.maximum(most, away)
     return most
@@ -169,17 +169,17 @@ class Heading(NamedTuple):
     node
         The node nearest to each reading, in steps from that of the origin, shape (N, 3).
     rest
-        The way from there, metres, shape (N, 3).
+        The position relative to that node, metres, shape (N, 3).
     field
-        What was read, uT, shape (N, 3).
+        Measured field, uT, shape (N, 3).
     variance
-        Of it without the map's, uT^2, shape (N,).
+        Of the field without the map's share, uT^2, shape (N,).
     drift2
-        Of its place by odometry, m^2, shape (N,).
+        Variance of the position by odometry, m^2, shape (N,).
     moved
-        The largest displacement within half a cell and half a heading, metres, shape (N,).
-    swung
-        What half a heading turns the field by, uT, shape (N,).
+        The largest displacement within half a cell and half a heading step, metres, shape (N,).
+    turned
+        Change of the field by half a heading step, uT, shape (N,).
     """
 
     node: IntArray
@@ -192,7 +192,7 @@ class Heading(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What rules a place out: its score, or how many readings are where the map has no data.
+    """Limits of a hypothesis: its score, and the number of readings outside of the map.
 
     ``tilt2`` is the variance of the pattern's tilt about each axis, rad^2.
     """
@@ -203,7 +203,7 @@ class Rules(NamedTuple):
 
 
 class Nodes(NamedTuple):
-    """A lattice as the kernel takes it; see ``FieldLattice``."""
+    """The arrays of a ``FieldLattice``, for the compiled kernel."""
 
     rows: IntArray
     field: FloatArray
@@ -217,17 +217,17 @@ class Nodes(NamedTuple):
 def write_scores(
     at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules, score: FloatArray
 ) -> None:
-    """Write the score of each node, shape (M, 3), as the pattern's place."""
+    """Write the score of each node, shape (M, 3), as the pattern's position."""
     for m in range(len(at)):
         score[m] = score_at(at[m], nodes, pattern, rules)
 
 
 @njit(cache=True, nogil=True)
 def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> float:
-    """Return the score of a node, shape (3,), as the pattern's place; infinite beyond the limit.
+    """Return the score of a node, shape (3,), as the pattern's position; infinite beyond the limit.
 
-    It is the least over the tilt (u, v) about the x and y axes of the squared residuals in sigmas,
-    which turn by (v fz, -u fz, u fy - v fx), and the squared tilt in its own.
+    The minimum over the tilt (u, v) about the x and y axes of the squared residuals in sigmas,
+    which change by (v fz, -u fz, u fy - v fx), plus the squared tilt in its sigmas.
     """
     total, unknown, per_tilt2 = 0.0, 0, 1 / rules.tilt2
     a, b, c, g, h = per_tilt2, 0.0, per_tilt2, 0.0, 0.0  # [[a, b], [b, c]] (u, v) = (g, h)
@@ -278,7 +278,7 @@ def row_of(rows: IntArray, at: IntArray, node: IntArray) -> int:
 
 @dataclass(frozen=True)
 class StartHypotheses:
-    """N hypotheses of where a pattern lies in a map.
+    """N hypotheses of a pattern's pose in a map.
 
     Attributes
     ----------
@@ -287,7 +287,7 @@ class StartHypotheses:
     yaw
         Heading of its x axis, rad, shape (N,).
     score
-        The lower the better, shape (N,).
+        Lower is better, shape (N,).
     """
 
     p: FloatArray
@@ -303,7 +303,7 @@ class StartHypotheses:
 
 @dataclass(frozen=True)
 class ScreeningResult:
-    """The places that readings do not rule out, the best first, and how many were looked at."""
+    """The hypotheses that readings do not rule out, the best first, and how many were screened."""
 
     places: StartHypotheses
     looked_at: int
@@ -312,31 +312,31 @@ class ScreeningResult:
 def screen(
     pattern: Pattern, lattice: FieldLattice, nodes: IntArray, options: StartSearchOptions
 ) -> ScreeningResult:
-    """Return the places that readings do not rule out, at most ``MOST_KEPT``.
+    """Return the hypotheses that readings do not rule out, at most ``MOST_KEPT``.
 
     Parameters
     ----------
     pattern
-        What was read.
+        N readings.
     lattice
-        What the map says.
+        The map on nodes.
     nodes
-        Where on it the pattern's origin may be, indices of shape (M,).
+        Nodes where the pattern's origin may be, shape (M,).
     options
-        What rules a place out.
+        Share of outliers, and of readings outside of the map.
     """
     turn = heading_step(pattern.radius, lattice.step)
     headings = turn * np.arange(round(2 * np.pi / turn))
     pattern = in_turn(pattern)
     rules, arrays, at = rules_of(pattern, options), nodes_of(lattice), lattice.at[nodes]
 
-    def look(yaw: float) -> StartHypotheses:
+    def at_heading(yaw: float) -> StartHypotheses:
         score = np.empty(len(nodes))
         write_scores(at, arrays, heading(pattern, lattice.step, yaw, turn), rules, score)
         kept = np.flatnonzero(np.isfinite(score))
         return StartHypotheses(lattice.places(nodes[kept]), np.full(len(kept), yaw), score[kept])
 
-    return ScreeningResult(best_of(in_threads(look, headings)), len(headings) * len(nodes))
+    return ScreeningResult(best_of(in_threads(at_heading, headings)), len(headings) * len(nodes))
 
 
 def heading_step(radius: float, step: float) -> float:
@@ -349,7 +349,7 @@ def heading_step(radius: float, step: float) -> float:
 
 
 def rules_of(pattern: Pattern, options: StartSearchOptions) -> Rules:
-    """Return what noise and outliers leave at most."""
+    """Return the limits of what noise and outliers leave."""
     N = len(pattern.x)
     wrong = options.outliers * N
     noise = (N - wrong) * (MEAN + 1) + SIGMAS * np.sqrt(2 * MEAN * N) + LARGEST
@@ -359,12 +359,12 @@ def rules_of(pattern: Pattern, options: StartSearchOptions) -> Rules:
 
 
 def in_turn(pattern: Pattern) -> Pattern:
-    """Return the readings in an order in which neighbours come late: the first ones tell most."""
+    """Return the readings in an order that spreads the first ones: nodes are rejected early."""
     return pattern[np.argsort(GOLDEN * np.arange(len(pattern.x)) % 1, kind="stable")]
 
 
 def nodes_of(lattice: FieldLattice) -> Nodes:
-    """Return a lattice as the kernel takes it."""
+    """Return the arrays of a lattice."""
     return Nodes(*(getattr(lattice, name) for name in Nodes._fields))
 
 
@@ -391,7 +391,7 @@ def about_z(yaw: float) -> FloatArray:
 
 
 def best_of(parts: list[StartHypotheses]) -> StartHypotheses:
-    """Return the places with the least scores, the best first."""
+    """Return the hypotheses with the lowest scores, the best first."""
     p = np.concatenate([part.p for part in parts])
     yaw = np.concatenate([part.yaw for part in parts])
     score = np.concatenate([part.score for part in parts])

@@ -1,12 +1,12 @@
-"""Poses and field of a drive through an unknown place, key pose by key pose.
+"""On-line SLAM in an unknown field, key pose by key pose.
 
-What is remembered is one Gaussian: of the field's weights, tile by tile, of the key poses that
-tiles are fixed to, and of the last one. The last stretch of the way is solved again as it grows,
-with what is remembered as its prior; at its end what was learnt goes over to all of the memory, and
-its other poses are let go. So both cost and memory grow with the building and not with the drive.
+The memory is one Gaussian over the field's weights, tile by tile, the key poses that anchor tiles,
+and the last key pose. The last stretch of the path is solved again as it grows, with the memory as
+its prior; at its end the memory is updated, and the stretch's other poses are marginalised. So both
+cost and memory grow with the building and not with the drive.
 
-That the errors of tiles hang together is what matters: tiles that are taken for independent, or
-for known, drift as odometry does, and sigmas do not tell.
+The correlations between tiles are essential: tiles that count as independent, or as exactly known,
+drift as odometry does, and the sigmas do not show it.
 """
 
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory
 from l2m_gtsam.slam.unknown_field.open_section import OpenSection
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior
 
-GROUP, SECTION = 20, 100  # key poses that are as good as these ways, for a vehicle that turns
+GROUP, SECTION = 20, 100  # limits in key poses instead of metres, for a vehicle that turns
 
 
 class ExploringOptions(Options):
-    """How an unknown field is followed on line; lengths in metres of way."""
+    """How an unknown field is explored on line; lengths in metres of path."""
 
     group_m: float = Field(default=2.0, gt=0)
     """After so much way what has come is solved; until then poses are carried on by odometry. Half
@@ -41,29 +41,28 @@ class ExploringOptions(Options):
 
 @dataclass(frozen=True)
 class MarginalizedPose:
-    """A key pose that is no variable any more: where it was in the frame of its tile's anchor."""
+    """A marginalised key pose, kept relative to the anchor of its tile."""
 
     anchor: int
     T_anchor_key: gtsam.Pose3
 
 
 class Explorer:
-    """A drive as far as it was followed through a place without a map.
+    """Estimates poses and field on line: its state after the key poses added so far.
 
-    Calibrations are as they are given, and scans do not take part. How high sensors sit is told by
-    what all readings of a tile determine together: those that were let go cannot be asked again.
+    Calibrations are fixed, and scans are not used. All readings of a tile determine the sensors'
+    heights together; those of marginalised poses cannot be linearised again.
 
     Parameters
     ----------
     drive
-        The drive.
+        K key poses with odometry and readings.
     options
-        How to solve. Fewer `tiles.modes` take far less time.
+        As of a localisation. Fewer `tiles.modes` take far less time.
     prior
-        Of the field; without it, it is learnt as the options say over the first metres, during
-        which poses are those of odometry.
+        Of the field; if not given it is learnt over the first metres, by poses of odometry.
     pace
-        How often, and how much together.
+        How often is solved, and how much together.
 
     Raises
     ------
@@ -87,24 +86,24 @@ class Explorer:
         self._drive, self._options = drive, options
         self._pace = ExploringOptions() if pace is None else pace
         self._memory = FieldMemory.at_start(drive)
-        self._way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+        self._path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
         self._first = self._solved = 0
         self._past: list[MarginalizedPose] = []
-        self._belief = self._at_start()
+        self._belief = self._prior()
         self._section = None if prior is None else self._opened(prior)
 
     @property
     def memory(self) -> FieldMemory:
-        """What is remembered of all but the last stretch."""
+        """The memory, without the last stretch."""
         return self._memory
 
     def step(self, number: int) -> Belief:
-        """Add a key pose, and return what is known of it then; they come in order.
+        """Add the next key pose, and return its posterior.
 
         Raises
         ------
         CalibrationError
-            What is known is too many orders of magnitude apart.
+            The system is too badly scaled to be solved.
         MapError
             There are too few readings to learn a prior of the field from.
         """
@@ -112,24 +111,24 @@ class Explorer:
         if self._section is None and self._is_learnt_by(number):
             part = self._drive.until(number + 1)
             prior = drive_prior(part, part.dead_reckoning(), self._options.tiles)
-            self._section, self._belief = self._opened(prior), self._at_start()
+            self._section, self._belief = self._opened(prior), self._prior()
             pending = range(number + 1)
         for k in pending:
-            self._carry(k)
+            self._dead_reckon(k)
             if self._section is not None and self._is_due(k):
                 with reported_ill_conditioning():
-                    self._settle(self._section, k)
+                    self._solve(self._section, k)
         return self._belief
 
     def poses(self) -> list[gtsam.Pose3]:
-        """Return all key poses that were solved, where the anchors of their tiles are by now."""
+        """Return all solved key poses, past ones relative to their anchors' current estimates."""
         if self._section is None:
             return []
         now = self._section
         past = [now.pose(each.anchor).compose(each.T_anchor_key) for each in self._past]
         return [*past, *(now.pose(k) for k in range(len(past), self._solved + 1))]
 
-    def _at_start(self) -> Belief:
+    def _prior(self) -> Belief:
         start = as_pose(self._drive.start.T_map_lidar)
         return Belief(start, self._drive.sensors, self._memory.known.covariance)
 
@@ -137,26 +136,26 @@ class Explorer:
         return OpenSection(self._drive, prior, self._options, self._memory, 0)
 
     def _is_learnt_by(self, number: int) -> bool:
-        """Return whether the prior can be learnt, or has to be, for nothing more will come."""
-        far = self._way[number] >= self._options.tiles.learn_over_m
+        """Return whether the prior can be learnt, or must be because the drive ends."""
+        far = self._path[number] >= self._options.tiles.learn_over_m
         return bool(far or number == len(self._drive) - 1)
 
     def _is_due(self, number: int) -> bool:
-        way, count = self._way[number] - self._way[self._solved], number - self._solved
-        return bool(way >= self._pace.group_m or count >= GROUP or number == len(self._drive) - 1)
+        path, count = self._path[number] - self._path[self._solved], number - self._solved
+        return bool(path >= self._pace.group_m or count >= GROUP or number == len(self._drive) - 1)
 
-    def _carry(self, number: int) -> None:
-        """Carry on by odometry what is known."""
+    def _dead_reckon(self, number: int) -> None:
+        """Predict the belief by odometry."""
         if number > 0:
             drift = self._drive.steps.covariance[number - 1]
             predicted = self._belief.predicted(self._drive.step(number - 1), drift)
             self._belief = predicted.marginalize_previous()
 
-    def _settle(self, section: OpenSection, number: int) -> None:
-        """Solve the last stretch up to a key pose, and begin another one if it is long."""
+    def _solve(self, section: OpenSection, number: int) -> None:
+        """Solve the last stretch up to a key pose, and begin another if it is long."""
         self._belief, self._solved = section.extend(number), number
-        way, count = self._way[number] - self._way[self._first], number - self._first
-        if way >= self._pace.section_m or count >= SECTION:
+        path, count = self._path[number] - self._path[self._first], number - self._first
+        if path >= self._pace.section_m or count >= SECTION:
             self._hand_over(section, number)
 
     def _hand_over(self, section: OpenSection, last: int) -> None:

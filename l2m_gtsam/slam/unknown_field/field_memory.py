@@ -29,7 +29,7 @@ ROUNDING = 1e-12  # of a correlation
 
 @dataclass(frozen=True)
 class Conditioned:
-    """What a Gaussian says of its other components once some of them are known better.
+    """The other components of a Gaussian after some of them were updated.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Conditioned:
     covariance
         Of the others, shape (r, r).
     cross
-        Between the others and what is known now, shape (r, q).
+        Covariance of the others with the updated components, shape (r, q).
     """
 
     shift: FloatArray
@@ -49,22 +49,23 @@ class Conditioned:
 def conditioned(
     P: FloatArray, s: IntArray, shift: FloatArray, after: FloatArray, cross: FloatArray
 ) -> Conditioned:
-    """Carry what was learnt of k components of a Gaussian over to the r others, in their order.
+    """Propagate an update of k components of a Gaussian to the r others, in their order.
 
-    Given the first, the others know nothing of what was seen: that conditional stays.
+    Given the first, the others are independent of the measurements: the conditional p(others |
+    first) stays, as in the Rauch-Tung-Striebel smoother.
 
     Parameters
     ----------
     P
         Covariance before, shape (k + r, k + r).
     s
-        Components that were learnt about, shape (k,).
+        Updated components, shape (k,).
     shift
-        Of their mean, shape (k,).
+        Change of their mean, shape (k,).
     after
         Their covariance afterwards, shape (k, k).
     cross
-        Between them and whatever is known afterwards, shape (k, q).
+        Their covariance with all that is estimated afterwards, shape (k, q).
     """
     r = np.setdiff1d(np.arange(len(P)), s)
     sigma = np.sqrt(np.diag(P)[s])
@@ -83,12 +84,12 @@ def conditioned(
 
 @dataclass(frozen=True)
 class JointGaussian:
-    """A Gaussian over variables.
+    """A joint Gaussian over variables of a graph.
 
     Attributes
     ----------
     values
-        Its mean.
+        Mean.
     sizes
         Components of each variable, in order.
     covariance
@@ -109,23 +110,23 @@ class JointGaussian:
         return columns_of(self.slices, keys)
 
     def marginal(self, keys: Sequence[int]) -> "JointGaussian":
-        """Return what is known of some variables, in this order."""
+        """Return the marginal of some variables, in this order."""
         at, sizes = self.columns(keys), {key: self.sizes[key] for key in keys}
         return JointGaussian(part_of(self.values, keys), sizes, self.covariance[np.ix_(at, at)])
 
-    def told(self, after: "JointGaussian") -> "JointGaussian":
-        """Return what is known once some variables are known better and others are new.
+    def updated(self, after: "JointGaussian") -> "JointGaussian":
+        """Return the Gaussian after an update of some variables that adds others.
 
         Parameters
         ----------
         after
-            What is known of these and those. Nothing else was seen.
+            Joint posterior of the updated and the new variables.
         """
         shared = {key: size for key, size in self.sizes.items() if key in after.sizes}
         rest = {key: size for key, size in self.sizes.items() if key not in after.sizes}
         s, now = self.columns(shared), after.columns(shared)
         shift = local(part_of(self.values, list(shared)), after.values, shared)
-        # A perturbation of a pose where it is now is another one where it was before.
+        # A right perturbation at the posterior pose, expressed at the prior pose.
         was = gtsam.Pose3.LogmapDerivative
         cross = turned(after.covariance[now], shared, shift, was)
         own = turned(cross[:, now].T, shared, shift, was)
@@ -142,7 +143,7 @@ class JointGaussian:
 
 
 def slices_of(sizes: Mapping[int, int]) -> dict[int, slice]:
-    """Return the components of variables that stand one after the other."""
+    """Return each variable's components in a stacked vector."""
     ends = np.cumsum(list(sizes.values())).tolist()
     return {key: slice(end - sizes[key], end) for key, end in zip(sizes, ends, strict=True)}
 
@@ -159,7 +160,7 @@ def part_of(values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:
 
 
 def local(origin: gtsam.Values, there: gtsam.Values, sizes: Mapping[int, int]) -> FloatArray:
-    """Return what leads from one mean to another, both of which have these variables, (n,)."""
+    """Return the local coordinates of one mean at another, shape (n,)."""
     if not sizes:
         return np.empty(0)
     by_key = origin.localCoordinates(part_of(there, list(sizes)))
@@ -180,7 +181,7 @@ def turned(
     shift: FloatArray,
     derivative: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """Return rows (n, q) for n components, those of poses times a derivative at their shift."""
+    """Return rows (n, q) of n components; those of poses are multiplied by a derivative."""
     found = rows.copy()
     for own in poses_among(sizes):
         found[own] = derivative(shift[own]) @ rows[own]
@@ -198,7 +199,7 @@ def is_pose(key: int) -> bool:
 
 
 def prior_factors(known: JointGaussian) -> Iterator[gtsam.NonlinearFactor]:
-    """Yield what is known of some variables; the information of their covariance.
+    """Yield the prior factors of a joint Gaussian.
 
     Raises
     ------
@@ -256,16 +257,16 @@ def whitened_difference(known: JointGaussian, W: FloatArray) -> gtsam.CustomFact
 
 @dataclass(frozen=True)
 class RememberedTile:
-    """A tile of the field as it is remembered.
+    """A tile of the field in the memory.
 
     Attributes
     ----------
     number, anchor
-        Its own, and of the key pose that it is fixed to.
+        Its own number, and that of the key pose that anchors it.
     field
-        What its m weights mean.
+        Basis of its m weights.
     taught
-        Information about them of readings that were let go, shape (m, m).
+        Information about the weights by readings of marginalised poses, shape (m, m).
     """
 
     number: int
@@ -275,20 +276,20 @@ class RememberedTile:
 
     @classmethod
     def new(cls, number: int, anchor: int, field: WaveTile) -> "RememberedTile":
-        """Return a tile that nothing is known of."""
+        """Return a tile without readings."""
         return cls(number, anchor, field, np.zeros((len(field), len(field))))
 
 
 @dataclass(frozen=True)
 class FieldMemory:
-    """What is remembered.
+    """The memory of a drive.
 
     Attributes
     ----------
     known
-        Of the last key pose, the tiles' anchors and weights.
+        Joint Gaussian of the last key pose, the tiles' anchors and weights.
     tiles
-        By number.
+        B tiles by number.
     """
 
     known: JointGaussian
@@ -296,14 +297,14 @@ class FieldMemory:
 
     @classmethod
     def at_start(cls, drive: Drive) -> "FieldMemory":
-        """Return what is known before a drive."""
+        """Return the memory before a drive."""
         values = gtsam.Values()
         values.insert(X(0), as_pose(drive.start.T_map_lidar))
         return cls(JointGaussian(values, {X(0): POSE}, drive.start.covariance))
 
 
 def tile_of(pose: gtsam.Pose3, anchors: list[gtsam.Pose3], core: float) -> int:
-    """Return the number of the tile that a pose lies in; the next one if it lies in none."""
+    """Return the number of the tile that contains a pose; the next number if none does."""
     if not anchors:
         return 0
     axes = level_axes(np.stack([anchor.rotation().matrix() for anchor in anchors]))

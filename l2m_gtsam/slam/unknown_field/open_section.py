@@ -27,28 +27,28 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
-# How many times their noise new readings may be off, stage by stage: where the vehicle was just
-# before, and where it comes to a tile of an earlier section, as far off as odometry has drifted.
+# Noise of new readings, stage by stage, as a multiple of the true: in a tile of this section, and
+# where the vehicle enters a tile of an earlier one, as far off as odometry has drifted.
 ONWARDS = (4.0, 1.0)
 AGAIN = (16.0, 4.0, 1.0)
 CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
-SOFT = 1.0  # how sharply good ones among them are told from wrong ones, mu of ``solve.robust``
+SOFT = 1.0  # convexity of the loss for new readings, mu of ``solve.robust``
 
 
 @dataclass(frozen=True)
 class TileReadings:
-    """Those of n readings that count.
+    """The readings of a tile that count, of n.
 
     Attributes
     ----------
     laid
-        The tile with all of them.
+        The tile with all n readings.
     chosen
-        Which count, shape (c,).
+        Rows of those that count, shape (c,).
     whitening
         Of these, times the roots of their weights, 1/uT, shape (c, 3, 3).
     variance
-        Of their noise per axis with what the tile leaves out, over their weights, uT^2, (c, 3).
+        Per axis of noise and unresolved waves, over their weights, uT^2, shape (c, 3).
     """
 
     laid: OccupiedTile
@@ -65,18 +65,18 @@ class TileReadings:
         mu: FloatArray,
         robust: RobustOptions,
     ) -> "TileReadings":
-        """Weigh readings by what a tile says of them.
+        """Return the robust weights of readings by a tile's prediction.
 
         Parameters
         ----------
         laid, prediction
-            The tile and what it says.
+            The tile and its prediction.
         noise
-            Of each reading in uT, shape (n,).
+            Standard deviation of each reading in uT, shape (n,).
         mu
-            How sharply good ones are told from wrong ones, see ``solve.robust``, shape (n,).
+            Convexity of the loss for each reading, see ``solve.robust``, shape (n,).
         robust
-            How readings are treated that nothing explains.
+            Loss and confidence.
         """
         W = prediction.whitening_of(noise)
         r2, weights = prediction.squared(W), np.empty(len(mu))
@@ -89,14 +89,14 @@ class TileReadings:
         return cls(laid, chosen, W, variance[chosen] / weights[chosen, None])
 
     def factors(self, drive: Drive) -> Iterator[gtsam.NonlinearFactor]:
-        """Yield what they say of poses and weights."""
+        """Yield the readings' factors of poses and weights."""
         batch = self._batch(drive)
         for k in batch.key_poses:
             white = Whitening.independent(self.whitening[batch.rows_of(k)])
             yield tile_factor(batch, k, white)
 
     def doubts(self, drive: Drive, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
-        """Yield what keeps poses from where the tile would take up more noise."""
+        """Yield the penalties of the parameters that the readings determine (Mallows' C_p)."""
         if not len(self.chosen):
             return
         batch, x = self._batch(drive), self.laid.placed.x[self.chosen]
@@ -107,7 +107,7 @@ class TileReadings:
                 yield factor
 
     def information(self) -> FloatArray:
-        """Return what they tell of the tile's m weights, shape (m, m)."""
+        """Return the readings' information about the tile's m weights, shape (m, m)."""
         return self.laid.field.information(self.laid.placed.x[self.chosen], self.variance)
 
     def _batch(self, drive: Drive) -> TileBatch:
@@ -118,17 +118,17 @@ class TileReadings:
 
 
 class OpenSection:
-    """A stretch of a drive, and what was known where it began.
+    """The last stretch of a drive, with the memory at its beginning as the prior.
 
     Parameters
     ----------
     drive, prior, options
         The drive, the prior of its field, how to solve.
     memory
-        What is known of ``X(first)`` and all that is remembered.
+        Joint Gaussian of ``X(first)`` and the tiles.
     first
         Its first key pose. Readings on it count if it is that of the drive; otherwise they have
-        counted already, as the last of another section.
+        counted in the section before.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class OpenSection:
         self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
 
     def extend(self, last: int) -> Belief:
-        """Take the key poses up to one, and return what is known of it then."""
+        """Add the key poses up to one, solve, and return its posterior."""
         new = np.arange(self._last + 1, last + 1)
         self._predict(new, last)
         entered = [self._enter(k) for k in new.tolist()]
@@ -162,8 +162,8 @@ class OpenSection:
         return self._belief()
 
     def closed(self) -> FieldMemory:
-        """Return what is known at its end."""
-        known = self._memory.known.told(self._known(self._kept()))
+        """Return the memory updated by the section."""
+        known = self._memory.known.updated(self._known(self._kept()))
         tiles = list(self._tiles)
         for each in self._counted:
             tile = tiles[each.laid.number]
@@ -173,20 +173,20 @@ class OpenSection:
         return FieldMemory(known.marginal(kept), tuple(tiles))
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
-        """Return a section that begins with a key pose and what is known there."""
+        """Return a new section from a key pose on."""
         return OpenSection(self._drive, self._field_prior, self._options, memory, first)
 
     def pose(self, number: int) -> gtsam.Pose3:
-        """Return a key pose of the section, or one that is remembered, as its values are now."""
+        """Return the estimate of a key pose of the section, or of the memory."""
         known = self._memory.known.values
         return (self._values if self._values.exists(X(number)) else known).atPose3(X(number))
 
     def tile(self, number: int) -> RememberedTile:
-        """Return the tile that a key pose of the section lies in."""
+        """Return the tile of a key pose of the section."""
         return self._tiles[self._tile_of[number]]
 
     def _predict(self, new: IntArray, last: int) -> None:
-        """Put new key poses where odometry leads."""
+        """Initialise new key poses by odometry."""
         for k in new.tolist():
             if k > self._first:
                 there = self.pose(k - 1).compose(self._drive.step(k - 1))
@@ -199,7 +199,7 @@ class OpenSection:
         return np.arange(self._begin, end)
 
     def _enter(self, k: int) -> bool:
-        """Lay a key pose on its tile; return whether that is new here, and known from earlier."""
+        """Assign a key pose to its tile; return whether the section enters a tile of the memory."""
         anchors = [self.pose(tile.anchor) for tile in self._tiles]
         number = tile_of(self.pose(k), anchors, self._field_prior.options.core)
         self._tile_of[k] = number
@@ -218,7 +218,7 @@ class OpenSection:
         return True
 
     def _waves(self, anchor: int) -> WaveTile:
-        """Return the waves of a tile about a key pose; sensors and readings tell their heights."""
+        """Return the waves of a new tile at a key pose; sensors and readings bound its height."""
         R, rows = self.pose(anchor).rotation().matrix(), self._rows()
         level, options = R.T @ level_axes(R[None])[0], self._field_prior.options
         x = self._drive.sensors.t
@@ -254,14 +254,14 @@ class OpenSection:
     def _weighed(
         self, tile: RememberedTile, rows: IntArray, new: int, scale: float
     ) -> TileReadings:
-        """Return the readings of a tile with their weights, by what it says of them by now."""
+        """Return the readings of a tile with weights by its current prediction."""
         sensors, readings = self._drive.sensors, self._drive.readings
         laid = OccupiedTile(
             tile.number, tile.anchor, rows, tile.field, self._place(rows, tile.anchor)
         )
         recent = readings.key_pose[rows] >= new
         if not self._values.atVector(M(tile.number)).any():
-            likely = laid.likely_weights(sensors, scale * sensors.noise)
+            likely = laid.robust_weights(sensors, scale * sensors.noise)
             self._values.update(M(tile.number), likely)
         prediction = laid.prediction(self._values.atVector(M(tile.number)), sensors)
         noise = sensors.noise[readings.sensor[rows]] * np.where(recent, scale, 1.0)
@@ -269,7 +269,7 @@ class OpenSection:
         return TileReadings.weighed(laid, prediction, noise, mu, self._options.robust)
 
     def _solve(self, graph: gtsam.NonlinearFactorGraph, most: int) -> None:
-        """Solve for all variables of the section, in so many steps at most."""
+        """Solve for all variables of the section, with a limit of steps."""
         if self._prior is None:
             self._prior = gtsam.NonlinearFactorGraph()
             for factor in prior_factors(self._memory.known.marginal(self._shared)):
@@ -280,7 +280,7 @@ class OpenSection:
         self._values = found.values
 
     def _kept(self) -> list[int]:
-        """Return the variables that outlive the section or began it, the last pose at the end."""
+        """Return the variables that the memory keeps or shares, the last pose at the end."""
         tiles = [self._tiles[number] for number in sorted(set(self._tile_of.values()))]
         last = X(self._last)
         own = dict.fromkeys([X(self._first), *(X(tile.anchor) for tile in tiles)])
@@ -293,7 +293,7 @@ class OpenSection:
         return POSE
 
     def _known(self, keys: list[int]) -> JointGaussian:
-        """Return what is known of some variables now."""
+        """Return the joint posterior of some variables."""
         sizes = {key: self._size(key) for key in keys}
         covariance = joint_covariance(self._graph.linearize(self._values), keys)
         return JointGaussian(part_of(self._values, keys), sizes, covariance)

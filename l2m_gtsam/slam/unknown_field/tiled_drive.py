@@ -1,4 +1,4 @@
-"""A drive whose readings are laid out on tiles of an unknown field, at an estimate of its poses."""
+"""A drive's readings partitioned into tiles of an unknown field, at an estimate of its poses."""
 
 from dataclasses import dataclass, replace
 
@@ -24,7 +24,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
     FieldPrior,
     WaveTile,
-    anchored,
+    anchor_tiles,
     level_axes,
 )
 
@@ -36,13 +36,13 @@ class OccupiedTile:
     Attributes
     ----------
     number, anchor
-        Its own, and of the key pose that it is fixed to.
+        Its own number, and that of the key pose that anchors it.
     rows
-        Readings of the drive that lie in it, shape (n,).
+        Rows of its readings in the drive, shape (n,).
     field
-        What its weights mean.
+        Basis of its m weights.
     placed
-        Where the readings are in the anchor's frame.
+        The readings in the anchor's frame.
     """
 
     number: int
@@ -51,27 +51,27 @@ class OccupiedTile:
     field: WaveTile
     placed: PlacedReadings
 
-    def likely_weights(self, sensors: KnownSensors, noise: FloatArray) -> FloatArray:
-        """Return the weights that the readings make most likely where they are taken to be."""
+    def robust_weights(self, sensors: KnownSensors, noise: FloatArray) -> FloatArray:
+        """Return a robust estimate of the weights from the readings at their current places."""
         own = noise[self.placed.readings.sensor, None] ** 2
         variance = own + self.field.unresolved(self.placed.x)
         b = self.placed.field(sensors)
-        return self.field.likely_weights(self.placed.x, b, variance)
+        return self.field.robust_weights(self.placed.x, b, variance)
 
     def doubt(self, rows: IntArray, noise: FloatArray) -> FieldDoubt:
-        """Return what these of the tile's readings, which teach it, count for; see there."""
+        """Return the penalty of the parameters that some of its readings determine."""
         own = np.searchsorted(self.rows, rows)
         x = self.placed.x[own]
         variance = noise[self.placed.readings.sensor[own], None] ** 2 + self.field.unresolved(x)
         return self.field.doubt(x, variance)
 
     def prediction(self, weights: FloatArray, sensors: KnownSensors) -> MapPrediction:
-        """Return what the tile says of its readings, in the anchor's frame."""
+        """Return the tile's prediction of its readings, in the anchor's frame."""
         return predict(_TileMap(self.field, weights), self.placed, sensors)
 
 
 class _TileMap:
-    """A tile with weights that are given, as a map in the anchor's frame."""
+    """A tile with known weights, as a map in the anchor's frame."""
 
     def __init__(self, tile: WaveTile, weights: FloatArray) -> None:
         self._tile, self._weights = tile, weights
@@ -92,26 +92,26 @@ class TiledDrive:
     Attributes
     ----------
     anchoring
-        Which key pose lies in which.
+        The tile of each key pose.
     tiles
-        Those with readings.
+        Tiles with readings.
     """
 
     anchoring: Anchoring
     tiles: tuple[OccupiedTile, ...]
 
     @classmethod
-    def lay(
+    def partition(
         cls,
         motions: RelativeMotions,
         poses: list[gtsam.Pose3],
         sensors: KnownSensors,
         prior: FieldPrior,
     ) -> "TiledDrive":
-        """Lay a drive out on tiles, with ways, key poses and sensors taken for these."""
+        """Return the tiles of a drive at an estimate of its motions, key poses and sensors."""
         R = np.stack([pose.rotation().matrix() for pose in poses])
         p = np.stack([pose.translation() for pose in poses])
-        anchoring = anchored(R, p, prior.options.core)
+        anchoring = anchor_tiles(R, p, prior.options.core)
         axes = level_axes(R)
         owner = anchoring.tile[motions.readings.key_pose]
         tiles = []
@@ -126,7 +126,7 @@ class TiledDrive:
     def moved(
         self, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors
     ) -> "TiledDrive":
-        """Return the same tiles with their readings where these poses and sensors put them."""
+        """Return the same tiles with their readings at another estimate."""
         own = motions.readings
         tiles = (
             replace(tile, placed=_relative_place(own[tile.rows], poses, tile.anchor, sensors))
@@ -135,36 +135,35 @@ class TiledDrive:
         return TiledDrive(self.anchoring, tuple(tiles))
 
     def weights(self, sensors: KnownSensors, noise: FloatArray) -> gtsam.Values:
-        """Return the most likely weights of all tiles."""
+        """Return robust estimates of the weights of all tiles."""
         values = gtsam.Values()
         for tile in self.tiles:
-            values.insert(M(tile.number), tile.likely_weights(sensors, noise))
+            values.insert(M(tile.number), tile.robust_weights(sensors, noise))
         return values
 
     def predictions(self, values: gtsam.Values, sensors: KnownSensors) -> list[MapPrediction]:
-        """Return what each tile says of its readings."""
+        """Return each tile's prediction of its readings."""
         return [tile.prediction(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
 
     def doubts(
         self, noise: FloatArray, weights: FloatArray, squared: FloatArray
     ) -> tuple[FieldDoubt, ...]:
-        """Return what readings that count teach each tile, with noise as large as they show.
+        """Return each tile's penalty by the readings that count, with the noise that they show.
 
         Parameters
         ----------
         noise
             Standard deviation of each sensor's noise in uT, shape (S,).
         weights
-            How far each of all N readings counts, shape (N,).
+            Robust weights of all N readings, shape (N,).
         squared
-            Squared lengths of their residuals, whitened by noise and what waves left out hold,
-            shape (N,).
+            Squared lengths of their residuals, whitened by noise and unresolved waves, shape (N,).
         """
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         whole = [tile.doubt(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
         freedom = AXES * weights.sum() - sum(each.parameters for each in whole)
         share = weights @ squared / freedom if freedom > 0 else 1.0
-        # More than the noise is what poses that are still off leave.
+        # A share above 1 is due to poses that have not converged, not to noise.
         return tuple(each.share(min(share, 1.0)) for each in whole)
 
     def graph(
@@ -180,18 +179,18 @@ class TiledDrive:
 
         Parameters
         ----------
-        ways
-            Of the drive that was laid out, when it was.
+        motions
+            Relative motions when the drive was partitioned.
         doubts
-            What readings that count teach each tile.
+            Penalty of each tile.
         whitening
-            Of the residuals of all its N readings but for errors of the ways, 1/uT, (N, 3, 3).
+            Of the residuals of all N readings, without odometry's errors, 1/uT, (N, 3, 3).
         by_lidar
             Their derivatives by a right perturbation of the lidar's pose, shape (N, 3, 6).
         chosen
-            Readings that count.
+            Rows of the readings that count.
         fixed
-            Calibrations that are no variables; without them all are.
+            Calibrations where they are constants; None where they are variables.
         """
         graph = gtsam.NonlinearFactorGraph()
         for tile, doubt in zip(self.tiles, doubts, strict=True):

@@ -1,13 +1,13 @@
-"""A drive through a place whose field is not known: poses and field together, off line.
+"""Batch SLAM in an unknown field: all poses and the field of a drive, estimated together.
 
-The field is laid out on tiles that are fixed to key poses. All poses and the tiles' weights are
-solved together by Levenberg-Marquardt, in stages: at first readings count as if their noise were
-many times what it is, so that only the field's long waves speak, and a place that is come to again
-is recognised from as far off as odometry has drifted; then more finely. At each stage tiles are
-laid anew where the poses are by then, and readings that no tile explains lose their weight.
+The field is described by tiles that are anchored to key poses. All poses and the tiles' weights are
+solved together by Levenberg-Marquardt, in stages: first the noise of readings is scaled up, so that
+only the field's long waves matter, and a revisited place is recognised from as far off as odometry
+has drifted; then it is reduced. At each stage tiles are laid out anew at the current poses, and
+readings that no tile explains lose their weight.
 
-Odometry drifts out of the reach of the longest waves, too. So the drive is first solved coarsely
-piece by piece: each begins where the one before has come out.
+Odometry drifts out of the reach of the longest waves, too. So the drive is first solved coarsely,
+piece by piece: each is initialised by the one before.
 """
 
 from dataclasses import dataclass, replace
@@ -44,11 +44,10 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from l2m_gtsam.solve.robust import WEIGHTS
 
-# How many times its noise a reading may be off, stage by stage, and how sharply good readings are
-# told from wrong ones (mu of ``solve.robust``).
+# Factor of the readings' noise and convexity of the loss (mu of ``solve.robust``), stage by stage.
 STAGES = ((16.0, 1.0), (4.0, 1.0), (1.0, 1.0), (1.0, np.inf), (1.0, np.inf))
-PIECE_M = 30.0  # of way: over it odometry drifts less than the longest waves are long
-AWAY_M = 5.0  # of way after which a tile that is entered again closes a loop
+PIECE_M = 30.0  # path length over which odometry drifts less than the longest waves
+AWAY_M = 5.0  # path length after which entering a tile again closes a loop
 
 
 @dataclass(frozen=True)
@@ -58,11 +57,11 @@ class FieldSolution:
     Attributes
     ----------
     solution
-        Poses, sensors, and what the tiles say of the readings.
+        Poses, sensors, and the tiles' predictions of the readings.
     tiles
-        That the drive was laid out on.
+        Number of tiles with readings.
     returns
-        Key poses in tiles that had been left before.
+        Numbers of the key poses that revisit a tile.
     """
 
     solution: DriveSolution
@@ -72,19 +71,19 @@ class FieldSolution:
 
 def map_drive(
     drive: Drive,
-    begin: list[gtsam.Pose3],
+    initial: list[gtsam.Pose3],
     prior: FieldPrior,
     options: SlamOptions,
     progress: Progress,
 ) -> FieldSolution:
-    """Find the poses of a drive and the field along it.
+    """Estimate the poses of a drive and the field along it.
 
     Parameters
     ----------
     drive
         The drive.
-    begin
-        Its key poses by odometry and scans.
+    initial
+        K key poses by odometry and scans.
     prior
         Of the field.
     options
@@ -92,7 +91,7 @@ def map_drive(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    poses, sensors = incremental_poses(drive, begin, prior, options, progress), drive.sensors
+    poses, sensors = incremental_poses(drive, initial, prior, options, progress), drive.sensors
     problem = TiledProblem(drive, prior, options)
     for stage, (scale, mu) in enumerate(STAGES[:-1]):
         progress("solving poses and field", stage / len(STAGES))
@@ -106,20 +105,17 @@ def map_drive(
 
 def incremental_poses(
     drive: Drive,
-    begin: list[gtsam.Pose3],
+    initial: list[gtsam.Pose3],
     prior: FieldPrior,
     options: SlamOptions,
     progress: Progress,
 ) -> list[gtsam.Pose3]:
-    """Return the poses of a drive as far as they are found piece by piece.
-
-    The last piece is at the poses that follow from the one before it.
-    """
-    way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
-    poses = begin
-    for end in np.arange(PIECE_M, way[-1], PIECE_M):
-        progress("following the drive", float(end / way[-1]))
-        count = int(np.searchsorted(way, end))
+    """Return the poses of a drive solved piece by piece, the last piece by odometry."""
+    path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    poses = initial
+    for end in np.arange(PIECE_M, path[-1], PIECE_M):
+        progress("following the drive", float(end / path[-1]))
+        count = int(np.searchsorted(path, end))
         part = TiledProblem(drive.until(count), prior, options)
         solved = part.solved(poses[:count], drive.sensors, *STAGES[0])
         shift = solved.poses[-1].compose(poses[count - 1].inverse())
@@ -129,7 +125,7 @@ def incremental_poses(
 
 @dataclass(frozen=True)
 class TiledRound:
-    """A stage: tiles as they were laid, the graph and where it led."""
+    """The solution of one stage, with its tiles and graph."""
 
     tiled: TiledDrive
     graph: gtsam.NonlinearFactorGraph
@@ -141,16 +137,16 @@ class TiledRound:
 
 
 class TiledProblem:
-    """The graph of a drive in an unknown field.
+    """The factor graph of a whole drive in an unknown field.
 
     Parameters
     ----------
     drive
-        The drive.
+        K key poses with odometry, N readings and L scan links.
     prior
-        Of the field.
+        Of every tile of the field.
     options
-        How to solve.
+        Loss, calibration's use, and limit of iterations.
     """
 
     def __init__(self, drive: Drive, prior: FieldPrior, options: SlamOptions) -> None:
@@ -161,19 +157,19 @@ class TiledProblem:
     def solved(
         self, poses: list[gtsam.Pose3], sensors: KnownSensors, scale: float, mu: float
     ) -> TiledRound:
-        """Lay tiles at these poses and solve for poses and weights.
+        """Partition the drive into tiles at these poses, and solve for poses and weights.
 
         Parameters
         ----------
         poses, sensors
-            Where to start.
+            Initial values.
         scale
-            How many times its noise a reading may be off.
+            Factor of the readings' noise.
         mu
-            Stage of the graduation of the readings' weights.
+            Convexity of the loss.
         """
         motions = RelativeMotions.along(self._drive, poses)
-        tiled = TiledDrive.lay(motions, poses, sensors, self._prior)
+        tiled = TiledDrive.partition(motions, poses, sensors, self._prior)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
         values.insert(scale_values(self._drive))
@@ -227,12 +223,12 @@ class TiledProblem:
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
         )
-        way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
-        returns = tiled.anchoring.returns(way, AWAY_M)
+        path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+        returns = tiled.anchoring.returns(path, AWAY_M)
         return FieldSolution(solution, len(tiled.tiles), returns)
 
     def _gathered(self, tiled: TiledDrive, parts: list[FloatArray]) -> FloatArray:
-        """Return what tiles say of their readings in the order of the drive's."""
+        """Return arrays of all tiles' readings in the order of the drive's, shape (N, ...)."""
         whole = np.zeros((len(self._drive.readings), *parts[0].shape[1:]))
         for tile, part in zip(tiled.tiles, parts, strict=True):
             whole[tile.rows] = part
@@ -245,7 +241,7 @@ class TiledProblem:
         predictions: list[MapPrediction],
         noise: FloatArray,
     ) -> FloatArray:
-        """Return squared lengths of residuals, each whitened by all that it may be off, (N,)."""
+        """Return squared Mahalanobis distances of the residuals, each alone, shape (N,)."""
         pairs = zip(
             predictions, interpolation_covariances(tiled, motions, predictions), strict=True
         )
@@ -258,7 +254,7 @@ class TiledProblem:
     def _own_squared(
         self, tiled: TiledDrive, predictions: list[MapPrediction], whitenings: list[FloatArray]
     ) -> FloatArray:
-        """Return squared lengths of residuals as these make them white, without the ways, (N,)."""
+        """Return squared lengths of residuals by these whitening matrices, shape (N,)."""
         pairs = zip(predictions, whitenings, strict=True)
         return self._gathered(tiled, [prediction.squared(white) for prediction, white in pairs])
 
@@ -269,7 +265,7 @@ class TiledProblem:
         tiled: TiledDrive,
         predictions: list[MapPrediction],
     ) -> MapPrediction:
-        """Return what the tiles say, with places and axes of the map."""
+        """Return the tiles' predictions with positions and axes of the map."""
         where = place_readings(motions.readings, dict(enumerate(solved.poses)), solved.sensors)
         anchors = [solved.poses[tile.anchor].rotation().matrix() for tile in tiled.tiles]
         pairs = zip(predictions, anchors, strict=True)
@@ -282,7 +278,7 @@ class TiledProblem:
 def interpolation_covariances(
     tiled: TiledDrive, motions: RelativeMotions, predictions: list[MapPrediction]
 ) -> list[FloatArray]:
-    """Return of each tile what errors of the ways contribute to its residuals, (n, 3, 3)."""
+    """Return the covariances of each tile's residuals by odometry's errors, (n, 3, 3)."""
     pairs = zip(tiled.tiles, predictions, strict=True)
     return [
         motions.interpolation_covariance(tile.rows, prediction.by_lidar)

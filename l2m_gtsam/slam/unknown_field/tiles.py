@@ -25,13 +25,13 @@ from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.options import TileOptions
 
 # Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
-# with more of it passed for a lower one, by 0.1-0.4 m with sigmas of 0.04 m. The pull falls with
-# the square of this; what is lost is small, for readings are dense along the way.
+# with more of it was estimated too low, by 0.1-0.4 m with sigmas of 0.04 m. The bias falls with the
+# square of this factor; the loss is small, for readings are dense along the path.
 WIDER = 10.0
 REWEIGHTINGS = 15
 AXES = 3
 SIDE_M = 1e-3  # of a finite difference
-LARGE = 2.0  # length of a whitened residual beyond which a reading counts for less
+LARGE = 2.0  # length of a whitened residual beyond which a reading is downweighted
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ class FieldPrior:
 
 
 def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> FieldPrior:
-    """Learn the prior from readings at places that are known well enough.
+    """Learn the prior from readings at known places.
 
     Parameters
     ----------
     points, field
         Places in metres and the field there in uT, in one frame, shapes (N, 3).
     options
-        Of the tiles.
+        Size of tiles, limit of waves, hyperparameters if they are known.
 
     Raises
     ------
@@ -81,15 +81,15 @@ def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> 
 
 
 def within_budget(resolution: Resolution, options: TileOptions) -> Resolution:
-    """Return the resolution, coarser where a tile would have more waves than allowed."""
+    """Return the resolution, reduced where a tile would exceed the limit of waves."""
     over = float(np.sqrt(max(resolution.modes(options.edge) / options.modes, 1.0)))
     return Resolution(resolution.floor / over, resolution.ceiling / over)
 
 
 def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:
-    """Learn the prior of the field from the first part of a drive, at poses by odometry."""
-    way = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
-    early = np.flatnonzero(way[drive.readings.key_pose] <= options.learn_over_m)
+    """Learn the prior of the field from the first metres of a drive, at poses by odometry."""
+    path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    early = np.flatnonzero(path[drive.readings.key_pose] <= options.learn_over_m)
     readings = drive.readings[early]
     where = place_readings(
         readings, {int(k): poses[int(k)] for k in np.unique(readings.key_pose)}, drive.sensors
@@ -104,11 +104,11 @@ class WaveTile:
     Attributes
     ----------
     basis
-        Waves.
+        m basis functions.
     scale
         Prior standard deviation of each one's weight, shape (m,).
     prior
-        They follow from.
+        From which they follow.
     """
 
     basis: Basis
@@ -154,22 +154,22 @@ class WaveTile:
         return self.basis.field_and_gradient(points, self.scale * weights)
 
     def unresolved(self, points: FloatArray) -> FloatArray:
-        """Return the variance per axis that waves left out hold, uT^2, shape (N, 3)."""
+        """Return the variance per axis of unresolved waves, uT^2, shape (N, 3)."""
         h, kept = self.prior.hyperparameters, self.prior.resolution
         z = self.basis.frame.localise(points)[:, 2]
         over = self.basis.frame.height - z
-        # Nearer to the sources than half their depth the tile says nothing any more.
+        # The series diverges towards the sources: nearer than half their depth it is held constant.
         z, over = np.maximum(z, -0.5 * h.floor_depth), np.maximum(over, -0.5 * h.ceiling_depth)
         vertical = left_out(h.floor_scale, h.floor_depth, kept.floor, z)
         vertical = vertical + left_out(h.ceiling_scale, h.ceiling_depth, kept.ceiling, over)
         return np.asarray(vertical[:, None] * np.array([0.5, 0.5, 1.0]))
 
-    def likely_weights(
+    def robust_weights(
         self, points: FloatArray, field: FloatArray, variance: FloatArray
     ) -> FloatArray:
-        """Return weights that readings make likely, wrong ones among them, shape (m,).
+        """Return a robust estimate of the weights from readings with outliers, shape (m,).
 
-        By reweighted least squares, each reading as in least absolute deviations beyond its noise.
+        Iteratively reweighted least squares with Huber weights.
 
         Parameters
         ----------
@@ -191,14 +191,14 @@ class WaveTile:
         return weights
 
     def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
-        """Return what readings say of the weights, shape (m, m); the parameters are ``doubt``'s."""
+        """Return the readings' information about the weights, (m, m); arguments as of ``doubt``."""
         F = (self.features(points) / np.sqrt(variance)[:, :, None]).reshape(-1, len(self))
         return np.asarray(F.T @ F)
 
     def doubt(
         self, points: FloatArray, variance: FloatArray, taught: FloatArray | None = None
     ) -> FieldDoubt:
-        """Return what readings contribute to the number of parameters that they determine.
+        """Return each reading's share of the effective number of parameters (Mallows' C_p).
 
         Parameters
         ----------
@@ -207,7 +207,7 @@ class WaveTile:
         variance
             Of each reading's noise per axis in uT^2, shape (N, 3).
         taught
-            Information of others about the weights, shape (m, m).
+            Information of other readings about the weights, shape (m, m).
         """
         known = np.eye(len(self)) + self.information(points, variance)
         lower = cholesky(known if taught is None else known + taught, lower=True)
@@ -227,14 +227,14 @@ class WaveTile:
 
 @dataclass(frozen=True)
 class Anchoring:
-    """Which tile each key pose lies in.
+    """The tile of each key pose.
 
     Attributes
     ----------
     anchor
-        The key pose that each of B tiles is fixed to, shape (B,).
+        Number of the key pose that anchors each of B tiles, shape (B,).
     tile
-        Of each of K key poses, shape (K,).
+        Number of each key pose's tile, shape (K,).
     """
 
     anchor: IntArray
@@ -243,36 +243,36 @@ class Anchoring:
     def __len__(self) -> int:
         return len(self.anchor)
 
-    def returns(self, way: FloatArray, least_m: float) -> IntArray:
-        """Return the key poses of visits to tiles that were left at least so far ago on the way.
+    def returns(self, path: FloatArray, least_m: float) -> IntArray:
+        """Return the key poses in tiles that are revisited after a path of ``least_m``.
 
         Parameters
         ----------
-        way
-            From the start to each key pose in metres, shape (K,).
+        path
+            Path length from the start to each key pose in metres, shape (K,).
         least_m
-                What counts as having been away.
+            Path length away from a tile in metres.
         """
         left_at = np.full(len(self), np.nan)
         found, returned = [], False
         for k, (before, tile) in enumerate(zip([-1, *self.tile[:-1]], self.tile, strict=True)):
             if tile != before:
-                left_at[before] = way[k - 1]
-                returned = bool(way[k] - left_at[tile] >= least_m)
+                left_at[before] = path[k - 1]
+                returned = bool(path[k] - left_at[tile] >= least_m)
             if returned:
                 found.append(k)
         return np.array(found, dtype=np.int64)
 
 
-def anchored(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
-    """Lay tiles where the vehicle goes: a new one wherever it is in the core of none.
+def anchor_tiles(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
+    """Return tiles along a path: a new one wherever the vehicle is in the core of none.
 
     Parameters
     ----------
     R, p
         Key poses in the map, shapes (K, 3, 3) and (K, 3), metres.
     core
-        Of a tile in metres.
+        Edge of a tile's core in metres.
     """
     anchors, tile, axes = [0], np.zeros(len(p), dtype=np.int64), level_axes(R)
     for k in range(1, len(p)):
@@ -284,7 +284,7 @@ def anchored(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
 
 
 def tile_about(p: FloatArray, axes: FloatArray, anchors: FloatArray, core: float) -> int:
-    """Return the tile of B whose anchor is nearest; B where a place is in the core of none.
+    """Return the number of the nearest of B tiles; B where a place is in the core of none.
 
     Parameters
     ----------
@@ -302,6 +302,6 @@ def tile_about(p: FloatArray, axes: FloatArray, anchors: FloatArray, core: float
 
 
 def level_axes(R: FloatArray) -> FloatArray:
-    """Return axes in the map that turn about its vertical with the vehicle, (K, 3, 3)."""
+    """Return level axes in the map with the vehicle's heading, shape (K, 3, 3)."""
     yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
     return np.asarray(Rotation.from_euler("z", yaw[:, None]).as_matrix())

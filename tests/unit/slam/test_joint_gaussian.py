@@ -112,7 +112,7 @@ def test_what_some_variables_tell_the_others_is_what_all_together_say(
     graph = seen(rng, before.values, step)
     values, whole = solved(graph, before)
     _, part = solved(graph, before.marginal([X(3), M(1), X(7)]))
-    after = before.told(part)
+    after = before.updated(part)
     assert set(after.sizes) == set(whole.sizes)
     whole = whole.marginal(list(after.sizes))
     apart = local(after.values, values, after.sizes)
@@ -125,7 +125,7 @@ def test_what_some_variables_tell_the_others_is_what_all_together_say(
 def test_nothing_learnt_changes_nothing() -> None:
     rng = np.random.default_rng(5)
     before = known(rng, 0.01)
-    after = before.told(before.marginal([M(0), X(7)]))
+    after = before.updated(before.marginal([M(0), X(7)]))
     there = after.marginal(list(before.sizes))
     np.testing.assert_allclose(there.covariance, before.covariance, atol=1e-10)
     assert np.abs(local(before.values, there.values, before.sizes)).max() < 1e-12

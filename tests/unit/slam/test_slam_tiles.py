@@ -15,7 +15,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
     FieldPrior,
     WaveTile,
-    anchored,
+    anchor_tiles,
     field_prior,
     within_budget,
 )
@@ -49,7 +49,7 @@ def places(seed: int, count: int = 200) -> FloatArray:
 @settings(deadline=None, max_examples=30)
 def test_every_key_pose_lies_in_the_core_of_its_tile(seed: int, core: float) -> None:
     R, p = walk(seed)
-    laid = anchored(R, p, core)
+    laid = anchor_tiles(R, p, core)
     anchor = laid.anchor[laid.tile]
     yaw = np.arctan2(R[anchor, 1, 0], R[anchor, 0, 0])
     level = Rotation.from_euler("z", yaw[:, None]).as_matrix()
@@ -101,7 +101,7 @@ def test_the_likely_weights_predict_what_was_not_read() -> None:
     prior = field_prior(read, field, OPTIONS)
     tile = WaveTile.about(prior, np.eye(3), read)
     variance = noise**2 + tile.unresolved(read)
-    weights = tile.likely_weights(read, field, variance)
+    weights = tile.robust_weights(read, field, variance)
     error = tile.field_and_gradient(held, weights)[0] - world.field_and_gradient(held)[0]
     assert np.sqrt(np.mean(error**2)) < 2 * noise
     assert np.std(world.field_and_gradient(held)[0], axis=0).max() > 5 * noise
