@@ -215,7 +215,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class PoseMotion:
+class LidarMotion:
     """How the lidar moves at N readings, and when their poses were taken.
 
     Attributes
@@ -229,8 +229,8 @@ class PoseMotion:
     twist_lidar: FloatArray
     offset: FloatArray
 
-    def __getitem__(self, rows: IntArray) -> "PoseMotion":
-        return PoseMotion(self.twist_lidar[rows], self.offset[rows])
+    def __getitem__(self, rows: IntArray) -> "LidarMotion":
+        return LidarMotion(self.twist_lidar[rows], self.offset[rows])
 
 
 @dataclass(frozen=True)
@@ -269,7 +269,7 @@ class Readings:
     R_map_lidar: FloatArray
     p_map_lidar: FloatArray
     field: FloatArray
-    motion: PoseMotion | None = None
+    motion: LidarMotion | None = None
     pose_root: FloatArray | None = None
     regressors: FloatArray | None = None
     drive: IntArray | None = None

@@ -22,7 +22,7 @@ from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import BagError, ConfigError, L2MError, OutputError
 from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.fleet import sensor_rows
-from l2m_gtsam.records.fleet import DATE, DriveOutcome, Made, RowKey
+from l2m_gtsam.records.fleet import DATE, Computation, DriveOutcome, RowKey
 from l2m_gtsam.storage.drive_lists import (
     FILES,
     ManifestEntry,
@@ -336,6 +336,6 @@ def _duration(recording: Recording) -> float:
     return round(float(stamps[-1] - stamps[0]) / NANOSECONDS, 3)
 
 
-def _made(begun: float) -> Made:
+def _made(begun: float) -> Computation:
     now = datetime.now(UTC).strftime(DATE)
-    return Made(now, round(perf_counter() - begun, 3))
+    return Computation(now, round(perf_counter() - begun, 3))

@@ -38,7 +38,7 @@ MAX_PLACES = 1000
 
 
 @dataclass(frozen=True)
-class Structure:
+class StructureCloud:
     """A structure cloud in the map frame in metres, shape (M, 3), and where it came from."""
 
     points: FloatArray
@@ -54,7 +54,7 @@ class ScannedPlace:
 
 
 @dataclass(frozen=True)
-class Survey:
+class MappingDrives:
     """Mapping bags and what was given with them.
 
     Attributes
@@ -69,7 +69,7 @@ class Survey:
 
     recordings: list[Recording]
     suite: dict[str, KnownSensor] | None
-    structure: Structure | None
+    structure: StructureCloud | None
 
     @property
     def cloud(self) -> FloatArray | None:
@@ -83,7 +83,7 @@ def read_survey(
     suite: Path | None,
     structure: str | None,
     progress: Progress,
-) -> Survey:
+) -> MappingDrives:
     """Return everything that a map is made of; files before bags, which take longer."""
     known = None if suite is None else read_known_sensors(suite)
     options = config.mapping.structure
@@ -92,7 +92,7 @@ def read_survey(
     recordings = [read_drive_or_follow(bag, config, progress) for bag in bags]
     if structure is not None and not is_file:
         cloud = _structure_topic(structure, bags, recordings, config, progress)
-    return Survey(recordings, known, cloud)
+    return MappingDrives(recordings, known, cloud)
 
 
 def _names_file(structure: str) -> bool:
@@ -100,8 +100,8 @@ def _names_file(structure: str) -> bool:
     return Path(structure).suffix != "" or Path(structure).is_file()
 
 
-def _structure_file(path: Path, options: CloudTopicOptions) -> Structure:
-    return Structure(read_cloud(path, options.edge), vars(source_file(path)))
+def _structure_file(path: Path, options: CloudTopicOptions) -> StructureCloud:
+    return StructureCloud(read_cloud(path, options.edge), vars(source_file(path)))
 
 
 def _structure_topic(
@@ -110,12 +110,12 @@ def _structure_topic(
     recordings: Sequence[Recording],
     config: Config,
     progress: Progress,
-) -> Structure:
+) -> StructureCloud:
     """Return what the scans of all bags saw, placed by their poses."""
     topics = [topic] * len(bags)
     clouds = _clouds(topics, bags, recordings, config.mapping.structure, config, progress)
     points = np.concatenate([cloud.points for cloud in clouds])
-    return Structure(points, {"topic": topic, **_counts(clouds)})
+    return StructureCloud(points, {"topic": topic, **_counts(clouds)})
 
 
 def scanned_place(

@@ -16,7 +16,7 @@ from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
-    PoseMotion,
+    LidarMotion,
     Readings,
     Recording,
     SourceFile,
@@ -180,7 +180,7 @@ def with_motion(readings: Readings, motion: ExtraMotion) -> Readings:
     later = BREAK_NS + np.round(NANOSECONDS * motion.seconds).astype(np.int64)
     if readings.motion is not None:
         twist = np.concatenate([readings.motion.twist_lidar, np.tile(motion.twist, (S, 1))])
-        moving = PoseMotion(twist, np.zeros(len(twist)))
+        moving = LidarMotion(twist, np.zeros(len(twist)))
     sensor = np.concatenate([readings.sensor, np.repeat(np.arange(S), K)])
     joined = Readings(
         readings.sensors,

@@ -16,7 +16,7 @@ from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
     IntArray,
-    PoseMotion,
+    LidarMotion,
     Readings,
     Recording,
     ScalarSeries,
@@ -251,16 +251,16 @@ def _source(drives: Sequence[Recording]) -> SourceFile:
     return SourceFile(paths, hashlib.sha256(digests.encode()).hexdigest())
 
 
-def _motion(readings: Sequence[Readings]) -> PoseMotion | None:
+def _motion(readings: Sequence[Readings]) -> LidarMotion | None:
     if all(each.motion is None for each in readings):
         return None
     motions = [
-        PoseMotion(np.zeros((len(each), 6)), np.zeros(len(each)))
+        LidarMotion(np.zeros((len(each), 6)), np.zeros(len(each)))
         if each.motion is None
         else each.motion
         for each in readings
     ]
-    return PoseMotion(
+    return LidarMotion(
         np.concatenate([each.twist_lidar for each in motions]),
         np.concatenate([each.offset for each in motions]),
     )

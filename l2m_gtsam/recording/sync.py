@@ -11,7 +11,7 @@ from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
     IntArray,
-    PoseMotion,
+    LidarMotion,
     Readings,
     Recording,
     SyncCounts,
@@ -171,13 +171,13 @@ def with_offsets(readings: Readings, trajectory: Trajectory, offset: FloatArray)
     """
     own = offset[readings.sensor]
     if not len(readings):
-        motion = PoseMotion(np.empty((0, 6)), own)
+        motion = LidarMotion(np.empty((0, 6)), own)
         return replace(
             readings, R_map_lidar=np.empty((0, 3, 3)), p_map_lidar=np.empty((0, 3)), motion=motion
         )
     at = 1e-9 * (readings.stamp_ns - trajectory.stamp_ns[0]) + own
     R, p = _poses_at(trajectory, at)
-    motion = PoseMotion(_twist_at(trajectory, at, R), own)
+    motion = LidarMotion(_twist_at(trajectory, at, R), own)
     return replace(readings, R_map_lidar=R, p_map_lidar=p, motion=motion)
 
 
@@ -245,7 +245,7 @@ def _concatenate(recording: Recording, parts: list[Readings]) -> Readings:
         R_map_lidar=np.concatenate([part.R_map_lidar for part in parts]),
         p_map_lidar=np.concatenate([part.p_map_lidar for part in parts]),
         field=np.concatenate([part.field for part in parts]),
-        motion=PoseMotion(
+        motion=LidarMotion(
             np.concatenate([motion.twist_lidar for motion in motions]),
             np.concatenate([motion.offset for motion in motions]),
         ),

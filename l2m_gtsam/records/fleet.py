@@ -89,7 +89,7 @@ class SensorRow(Record):
 
 
 @dataclass(frozen=True)
-class Made(Record):
+class Computation(Record):
     """When an outcome was computed (UTC, ISO 8601), and how long that took."""
 
     date: str
@@ -124,7 +124,7 @@ class DriveOutcome(Record):
     sensors: tuple[SensorRow, ...]
     error: str
     lasting: bool
-    made: Made
+    made: Computation
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from l2m_gtsam.records.localisation import (
     SensorUse,
     StartVerdict,
 )
-from l2m_gtsam.records.metrics import Fit, MapPicture, Normalised, Record, Row, Rows, Series
+from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Record, Row, Rows, Series
 from l2m_gtsam.records.validation import ChiSquare, NamedSource
 
 POSE_FREEDOM = 6
@@ -95,7 +95,7 @@ class SensorRecord(Record):
 
     use: SensorUse
     timeline: Timeline
-    fit: Fit | None
+    fit: FitFigures | None
     normalised: Normalised | None
     series: Series | None
 

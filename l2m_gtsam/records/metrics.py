@@ -5,10 +5,19 @@ does not exist is NaN. Rows of axes are in the order x, y, z.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
-from l2m_gtsam.records.record import Record as Record
-from l2m_gtsam.records.record import Row as Row
-from l2m_gtsam.records.record import Rows as Rows
+from pydantic import ConfigDict
+
+Row = tuple[float, ...]
+Rows = tuple[Row, ...]
+
+
+@dataclass(frozen=True)
+class Record:
+    """A part of a file in JSON; numbers that are not finite are text there."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(ser_json_inf_nan="strings")
 
 
 @dataclass(frozen=True)
@@ -154,7 +163,7 @@ class Mounting(Record):
 
 
 @dataclass(frozen=True)
-class Fit(Record):
+class FitFigures(Record):
     """How well one sensor's readings fit, and what its sigmas rest on.
 
     Attributes
@@ -320,7 +329,7 @@ class SensorMetrics(Record):
 
     sensor: str
     mounting: Mounting
-    fit: Fit
+    fit: FitFigures
     normalised: Normalised
     autocorrelation: Autocorrelation
     directions: Directions

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import AliasChoices, Field
 
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.metrics import Record
 
 
 class Level(StrEnum):

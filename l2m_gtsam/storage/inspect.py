@@ -87,7 +87,7 @@ class BagReport:
 
 
 @dataclass
-class _Collected:
+class _TopicBuffers:
     stamps: StampBuffer = field(default_factory=StampBuffer)
     frames: set[str] = field(default_factory=set)
     readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
@@ -115,9 +115,9 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         fields, no_fields = _selected(select_fields, bag, options)
         poses, no_poses = _selected(select_poses, bag, options)
         usable = [c for c in bag.connections if _is_usable(c)]
-        collected: dict[str, _Collected] = {}
+        collected: dict[str, _TopicBuffers] = {}
         for message in bag.messages(usable, progress):
-            into = collected.setdefault(message.connection.topic, _Collected())
+            into = collected.setdefault(message.connection.topic, _TopicBuffers())
             _collect(into, message.content, message.connection.msgtype, message.record_ns)
         uses = {c.topic: "magnetic readings" for c in fields}
         uses |= {c.topic: f"poses ({_why_poses(options)})" for c in poses}
@@ -185,7 +185,7 @@ def _by_topic(bag: Bag) -> dict[str, list[Connection]]:
     return topics
 
 
-def _collect(into: _Collected, content: Any, msgtype: str, record_ns: int) -> None:
+def _collect(into: _TopicBuffers, content: Any, msgtype: str, record_ns: int) -> None:
     for stamped in content.transforms if msgtype in TF_TYPES else (content,):
         into.stamps.add(header_ns(stamped), record_ns)
         into.frames.add(stamped.header.frame_id)
@@ -198,13 +198,13 @@ def _collect(into: _Collected, content: Any, msgtype: str, record_ns: int) -> No
 def _report(
     topic: str,
     connections: list[Connection],
-    found: _Collected | None,
+    found: _TopicBuffers | None,
     use: str | None,
     duration_s: float,
     options: BagOptions,
 ) -> TopicReport:
     msgtype = connections[0].msgtype
-    found = found or _Collected()
+    found = found or _TopicBuffers()
     if use and len(found.covariances.row):
         use = f"{use}, {found.covariances.account()}"
     header, record = found.stamps.header(), found.stamps.record()

@@ -32,7 +32,7 @@ class _Step:
 
 
 @dataclass
-class _Collected:
+class _NumberBuffer:
     """The numbers of one regressor as they come."""
 
     name: str
@@ -71,7 +71,7 @@ def read_scalars(
     """
     if not options:
         return ()
-    collected = [_Collected(name, each, _steps(each.field)) for name, each in options.items()]
+    collected = [_NumberBuffer(name, each, _steps(each.field)) for name, each in options.items()]
     with open_bag(path) as bag:
         topics = {_topic(bag, each) for each in collected}
         connections = [c for c in bag.connections if c.topic.lstrip("/") in topics]
@@ -92,7 +92,7 @@ def _plain(topic: str) -> str:
     return topic.lstrip("/")
 
 
-def _topic(bag: Bag, wanted: _Collected) -> str:
+def _topic(bag: Bag, wanted: _NumberBuffer) -> str:
     """Return a regressor's topic without its leading slash; the bag must have it."""
     topic = _plain(wanted.options.topic)
     if all(_plain(c.topic) != topic for c in bag.connections):
@@ -110,7 +110,7 @@ def _stamp(message: Message, stamps: Stamps) -> int:
     return header_ns(message.content)
 
 
-def _add(path: Path, into: _Collected, stamp_ns: int, message: Message) -> None:
+def _add(path: Path, into: _NumberBuffer, stamp_ns: int, message: Message) -> None:
     """Append the number of one message."""
     try:
         value = _number(message.content, into.steps)
@@ -165,7 +165,7 @@ def _described(value: Any) -> str:
     return "is a text" if isinstance(value, str) else "is a single number"
 
 
-def _series(path: Path, found: _Collected) -> ScalarSeries:
+def _series(path: Path, found: _NumberBuffer) -> ScalarSeries:
     """Return the finite numbers in order of time, the first of each stamp."""
     value = np.array(found.values, dtype=np.float64) * found.options.scale
     stamp_ns = np.array(found.stamp_ns, dtype=np.int64)

@@ -111,4 +111,4 @@ def test_the_loop_is_read_in_few_files() -> None:
 def test_a_name_that_does_not_exist_is_noticed() -> None:
     for name in ("l2m_gtsam/nothing.py", "l2m_gtsam.nothing", "l2m_gtsam.data.Nothing"):
         assert not exists(name)
-    assert exists("l2m_gtsam.records.metrics.Fit.rms")
+    assert exists("l2m_gtsam.records.metrics.FitFigures.rms")

@@ -8,7 +8,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.metrics.evidence import SensorEvidence
 from l2m_gtsam.qa.metrics.plain import evenly, row, rows
 from l2m_gtsam.records.calibration import SensorCalibration
-from l2m_gtsam.records.metrics import Autocorrelation, CurveErrors, Fit, Normalised, Series
+from l2m_gtsam.records.metrics import Autocorrelation, CurveErrors, FitFigures, Normalised, Series
 from l2m_gtsam.records.validation import FieldError
 from l2m_gtsam.solve.chi_square import quantile
 
@@ -16,12 +16,12 @@ BINS = 24
 LAGS = 40
 
 
-def fit_figures(evidence: SensorEvidence, noise: float) -> Fit:
+def fit_figures(evidence: SensorEvidence, noise: float) -> FitFigures:
     """Return residuals, and what sensor, map and poses contribute to them."""
     used = evidence.used
     e, B = evidence.residual[used], evidence.B_map[used]
     poses = np.einsum("nii->n", evidence.pose_share[used]) / 3
-    return Fit(
+    return FitFigures(
         readings=int(used.sum()),
         sensor_noise=noise,
         map_noise=float(np.sqrt(evidence.map_variance[used].mean())),

@@ -90,7 +90,7 @@ TAG_END = re.compile(rb"""[^"'>]*(?:"[^"]*"[^"'>]*|'[^']*'[^"'>]*)*>""")
 
 
 @dataclass
-class Joint:
+class UrdfJoint:
     """A joint between two links, and the bytes it takes."""
 
     name: str
@@ -121,7 +121,7 @@ class UrdfFile:
     name: str
     data: bytes
     links: list[str] = field(default_factory=list)
-    joints: list[Joint] = field(default_factory=list)
+    joints: list[UrdfJoint] = field(default_factory=list)
     end: int = -1
 
     @classmethod
@@ -143,7 +143,7 @@ class UrdfFile:
             raise ConfigError(f"{name}: not valid XML: {error}") from error
         return found
 
-    def joint_of(self, link: str) -> Joint | None:
+    def joint_of(self, link: str) -> UrdfJoint | None:
         """Return the joint whose child is a link, if there is one."""
         return next((joint for joint in self.joints if joint.child == link), None)
 
@@ -162,7 +162,7 @@ class _Reader:
 
     def __init__(self, found: UrdfFile) -> None:
         self._found, self._depth = found, 0
-        self._joint: Joint | None = None
+        self._joint: UrdfJoint | None = None
         self._parser: Any = expat.ParserCreate()
         self._parser.XmlDeclHandler = self._declaration
         self._parser.StartDoctypeDeclHandler = self._doctype
@@ -190,7 +190,7 @@ class _Reader:
         if self._depth == 1 and tag == "link":
             self._found.links.append(attributes.get("name", ""))
         elif self._depth == 1 and tag == "joint":
-            self._joint = Joint(attributes.get("name", ""), self._parser.CurrentByteIndex)
+            self._joint = UrdfJoint(attributes.get("name", ""), self._parser.CurrentByteIndex)
         elif self._depth == 2 and self._joint is not None and tag in ("parent", "child"):
             setattr(self._joint, tag, attributes.get("link", ""))
         self._depth += 1
@@ -237,7 +237,7 @@ def edited_urdf(export: Export, name: str, data: bytes) -> bytes:
     urdf = UrdfFile.parse(name, data)
     _check(urdf, export)
     added: list[str] = []
-    spans: list[tuple[Joint, bytes]] = []
+    spans: list[tuple[UrdfJoint, bytes]] = []
     for sensor in export.sensors:
         joint = urdf.joint_of(sensor.frame)
         if sensor.frame not in urdf.links:
@@ -269,7 +269,9 @@ def _check(urdf: UrdfFile, export: Export) -> None:
         )
 
 
-def _replacement(urdf: UrdfFile, joint: Joint, sensor: ExportedSensor, lidar_frame: str) -> bytes:
+def _replacement(
+    urdf: UrdfFile, joint: UrdfJoint, sensor: ExportedSensor, lidar_frame: str
+) -> bytes:
     """Return a joint in the place of another, with its name, indented and broken as it was."""
     line = urdf.data.rfind(b"\n", 0, joint.start) + 1
     before = urdf.data[line : joint.start]
@@ -278,7 +280,7 @@ def _replacement(urdf: UrdfFile, joint: Joint, sensor: ExportedSensor, lidar_fra
     return text.replace("\n", _newline(urdf)).encode()
 
 
-def _spliced(urdf: UrdfFile, spans: list[tuple[Joint, bytes]], added: list[str]) -> bytes:
+def _spliced(urdf: UrdfFile, spans: list[tuple[UrdfJoint, bytes]], added: list[str]) -> bytes:
     """Return the file with joints replaced and lines added before its end."""
     newline = _newline(urdf)
     inserted = "".join(f"  {text}\n" for text in added).replace("\n", newline)

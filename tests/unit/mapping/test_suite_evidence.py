@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from l2m_gtsam.data import FloatArray, PoseMotion, Readings
+from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.mapping.suite_likelihood import SIZE, SuiteWindow, scored, undistorted
 from tests.worlds.harmonic import GIVEN, TILTED, basis, places
 
@@ -24,7 +24,7 @@ def window(count: int = 40) -> SuiteWindow:
     field = np.einsum("nji,nj->ni", R, model.features(p) @ w)
     field += GIVEN.noise * rng.normal(size=field.shape)
     sensor = np.sort(np.arange(count) % SENSORS)
-    motion = PoseMotion(rng.normal(0, 0.5, (count, 6)), np.zeros(count))
+    motion = LidarMotion(rng.normal(0, 0.5, (count, 6)), np.zeros(count))
     stamps = np.arange(count) * 50_000_000
     readings = Readings(("a", "b"), sensor, stamps, R, p, field, motion)
     return SuiteWindow(model, p.mean(axis=0), readings)

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.qa.fleet import DIGITS
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.records.fleet import VERDICTS, DriveOutcome, Made, RowKey
+from l2m_gtsam.records.fleet import VERDICTS, Computation, DriveOutcome, RowKey
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.record_files import read_outcome, write_outcome
 from tests.drives.fleet_rows import sensor_row
 
 KEY = RowKey("0" * 64, "1" * 64, "2" * 64, "1.0")
-MADE = Made("2026-05-01T09:00:00Z", 3.0)
+MADE = Computation("2026-05-01T09:00:00Z", 3.0)
 CALIBRATED = DriveOutcome(KEY, "2026-05-01T08:00:00Z", 60.0, (sensor_row(),), "", True, MADE)
 NO_ROTATION = (math.nan,) * 4
 FAILED = DriveOutcome(KEY, "", 0.0, (), "b.bag: truncated", True, MADE)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, KnownSensor, PoseMotion, Readings
+from l2m_gtsam.data import FloatArray, KnownSensor, LidarMotion, Readings
 from l2m_gtsam.errors import MapError, PeerError
 from l2m_gtsam.studies.peers.estimate import soft_iron
 from l2m_gtsam.studies.peers.magyc import ChipDrive, magyc_peer, magyc_python
@@ -55,7 +55,7 @@ def turning(seed: int, sensor: KnownSensor, rate: float = 20.0) -> ChipDrive:
         R,
         np.zeros((count, 3)),
         field + rng.normal(0, NOISE, field.shape),
-        PoseMotion(np.column_stack([turn_rate, np.zeros((count, 3))]), np.zeros(count)),
+        LidarMotion(np.column_stack([turn_rate, np.zeros((count, 3))]), np.zeros(count)),
     )
     return ChipDrive(readings, polar(sensor.distortion.C)[0])
 
