@@ -8,6 +8,7 @@ import numpy as np
 
 from l2m_factors import BatchedReadings
 from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.cluster_robust import unmodelled
 from l2m_gtsam.calibration.contradictions import Contradiction, contradictions
 from l2m_gtsam.calibration.determined import determinacies
 from l2m_gtsam.calibration.factor_graph import (
@@ -17,14 +18,15 @@ from l2m_gtsam.calibration.factor_graph import (
     reading_graph,
     whitened_jacobian,
 )
+from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.calibration.marginals import covariance_by_qr, joint_covariance
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import Ending, optimise, polish
 from l2m_gtsam.calibration.pose_errors import error_of_poses
-from l2m_gtsam.calibration.sensor_columns import keys_of
+from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.records.calibration import ResidualFigures
+from l2m_gtsam.records.calibration import EXPLAINED, ResidualFigures, Unmodelled
 from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.noise import (
     HALF,
@@ -37,6 +39,7 @@ from l2m_gtsam.solve.rank import Determinacy
 
 # Of each round; two rounds at least are made, and each step shortens what remains fourfold.
 POLISHING_STEPS = 2
+OWN = np.arange(SENSOR)  # where a sensor that shares no error stands among its variables
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,8 @@ class SensorSolution:
         This sensor's rows, t, C row by row and H, of a root of the covariance of all sensors,
         shape (15, K): two of them have the covariance ``root_a @ root_b.T`` in common, by errors
         of map and poses. Absent where errors are not shared.
+    unmodelled
+        How far the covariance exceeds that of the model.
     """
 
     sensor: int
@@ -75,6 +80,17 @@ class SensorSolution:
     contradictions: tuple[Contradiction, ...] = ()
     moving: Correction | None = None
     shared_root: FloatArray | None = None
+    unmodelled: Unmodelled = EXPLAINED
+
+    def widened(self, excess: Unmodelled) -> "SensorSolution":
+        """Return the same with larger covariances; correlations stay."""
+        scale, root = excess.scale, self.shared_root
+        return replace(
+            self,
+            joint_covariance=self.joint_covariance * np.outer(scale, scale),
+            shared_root=None if root is None else scale[:-1, None] * root,
+            unmodelled=excess,
+        )
 
     @property
     def covariance(self) -> FloatArray:
@@ -186,6 +202,11 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         residual = problem.batch.residuals(values, s).residual[rows]
         covariance = among((s,))
         gradient = np.concatenate([gradients.at(key) for key in keys_of(s)])
+        white = (W[rows] @ residual[:, :, None]).ravel()
+        own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
+        excess = unmodelled(
+            problem.view.readings, [own], OWN, covariance, len(problem.view.sensors)
+        )
         solutions.append(
             SensorSolution(
                 sensor=s,
@@ -194,7 +215,7 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
                 determinacy=test,
                 remaining_sigmas=float(np.sqrt(gradient @ covariance @ gradient)),
                 contradictions=tuple(each for each in missed if s in each.sensors),
-            )
+            ).widened(excess)
         )
     return tuple(solutions)
 

@@ -15,7 +15,7 @@ and Cholesky factors what GTSAM's test of neighbouring pivots refuses; QR does t
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import gtsam
@@ -28,6 +28,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
 
 SHARED = -1  # of rows that are no one sensor's
+NO_READINGS = np.empty(0, dtype=np.int64)
 ROUNDING = 1e-14  # of the largest pivot: a smaller one is nothing
 
 
@@ -43,12 +44,15 @@ class Rows:
         Which of all variables they touch, shape (k,).
     jacobian, residual
         J, shape (m, k), and e, shape (m,).
+    readings
+        Of the view that they are of, three rows each, shape (m / 3,); none for a prior.
     """
 
     sensor: int
     columns: IntArray
     jacobian: FloatArray
     residual: FloatArray
+    readings: IntArray
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,20 @@ class JointInformation:
         at, scale = columns_at(self.columns, keys), self.scale
         low, high = np.minimum.outer(at, at), np.maximum.outer(at, at)
         return np.asarray(self.half[high, low] * scale[at] * scale[at, None])
+
+    @property
+    def full(self) -> FloatArray:
+        """Covariance of all variables, shape (n, n)."""
+        lower = np.tril(self.half)
+        symmetric = lower + np.tril(lower, -1).T
+        symmetric *= self.scale
+        symmetric *= self.scale[:, None]
+        return symmetric
+
+    def after_step(self, rows: Rows) -> Rows:
+        """Return rows with the residual after the step."""
+        residual = rows.residual + rows.jacobian @ self.step[rows.columns]
+        return replace(rows, residual=residual)
 
     def among(self, sensors: tuple[int, ...]) -> FloatArray:
         """Return the covariance of all parameters of some sensors, shape (16 n, 16 n)."""
@@ -219,5 +237,5 @@ def rows_of_factors(
         keys = list(linear.at(index).keys())
         owners = {owner[key] for key in keys if key in owner}
         sensor = owners.pop() if len(owners) == 1 else SHARED
-        found.append(Rows(sensor, columns_at(columns, keys), jacobian, -b))
+        found.append(Rows(sensor, columns_at(columns, keys), jacobian, -b, NO_READINGS))
     return found

@@ -12,7 +12,7 @@ solve took 0.54 s of a processor so, 0.70 s with sensors last, 0.76 s and more w
 METIS was as fast, but GTSAM 4.3 can crash in it. QR is for graphs that Cholesky refuses.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -26,6 +26,7 @@ from l2m_factors import (
     uncertain_reading_factor,
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.cluster_robust import unmodelled
 from l2m_gtsam.calibration.contradictions import contradictions
 from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
@@ -122,7 +123,7 @@ def solve_uncertain(
         found = settle(drive, near, values, tests, options, solver, progress)
         if found.ending is not Ending.SINGULAR:
             break
-    solved = found.problem.solutions(found.joint, found.values)
+    solved = found.problem.robust(found.joint, found.problem.solutions(found.joint, found.values))
     progress(1.0)
     return UncertainSolution(found.estimate, solved, found.ending, found.settled)
 
@@ -406,8 +407,9 @@ class UncertainProblem:
                 columns_at(columns, each.keys),
                 found.jacobian,
                 found.residual,
+                group.rows,
             )
-            for each in self._groups
+            for each, group in zip(self._groups, self._prior.coverage.groups, strict=True)
             if (found := each.linearised(values))
         ]
         owner = {key: s for s in self._view.sensors for key in keys_of(s)}
@@ -453,6 +455,24 @@ class UncertainProblem:
                 )
             )
         return tuple(solutions)
+
+    def robust(
+        self, joint: JointInformation, solved: Sequence[SensorSolution]
+    ) -> tuple[SensorSolution, ...]:
+        """Return solutions whose covariances hold what the scatter of parts of the drive shows."""
+        covariance = joint.full
+        widened = []
+        for found in solved:
+            s = found.sensor
+            rows = [
+                joint.after_step(each)
+                for each in joint.rows
+                if each.sensor == s and len(each.readings)
+            ]
+            own = columns_at(joint.columns, keys_of(s))
+            excess = unmodelled(self._view.readings, rows, own, covariance, len(solved))
+            widened.append(found.widened(excess))
+        return tuple(widened)
 
     def _correction(
         self, sensor: int, joint: JointInformation, values: gtsam.Values

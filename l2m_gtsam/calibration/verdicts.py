@@ -223,6 +223,7 @@ def _solved(
         outside_map=outside,
         time_offset=_time_offset(told, solution),
         from_priors=told.from_priors,
+        unmodelled=found.unmodelled,
     )
 
 

@@ -200,6 +200,38 @@ class Disagreement:
 
 
 @dataclass(frozen=True)
+class Unmodelled:
+    """How many times larger variances are than noise, map and poses explain.
+
+    Found from the scatter of parts of the drive; the covariances that are reported hold it. One
+    where the scatter is what is expected, or differs from it by no more than chance.
+
+    Attributes
+    ----------
+    t, C, H, offset
+        Mean over the parameters of each, in their own sigmas.
+    """
+
+    t: float = 1.0
+    C: float = 1.0
+    H: float = 1.0
+    offset: float = 1.0
+
+    @property
+    def largest(self) -> float:
+        """The largest of them."""
+        return max(self.t, self.C, self.H, self.offset)
+
+    @property
+    def scale(self) -> FloatArray:
+        """Factor of each sigma, t, C row by row, H, time offset, shape (16,)."""
+        return np.asarray(np.sqrt(np.repeat([self.t, self.C, self.H, self.offset], (3, 9, 3, 1))))
+
+
+EXPLAINED = Unmodelled()
+
+
+@dataclass(frozen=True)
 class SensorCalibration:
     """The calibration of one magnetometer and how far to trust it.
 
@@ -249,6 +281,8 @@ class SensorCalibration:
         sensor to which no model with them is recommended.
     missing_in
         Paths of those of several drives in which nothing usable was read.
+    unmodelled
+        How far the covariance exceeds what noise, map and poses explain.
     """
 
     sensor: str
@@ -272,6 +306,7 @@ class SensorCalibration:
     not_compared: str = ""
     moving: Annotated[tuple[MovingField, ...], KeyedBy("name")] = ()
     missing_in: tuple[str, ...] = ()
+    unmodelled: Unmodelled = EXPLAINED
 
     @property
     def offset_correlation(self) -> FloatArray:
