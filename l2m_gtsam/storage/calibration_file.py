@@ -9,7 +9,12 @@ from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform
-from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
+from l2m_gtsam.records.calibration import (
+    EXPLAINED,
+    CalibrationResult,
+    SensorCalibration,
+    Uncertainty,
+)
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
 FORMAT = "l2m-calibration"
@@ -62,6 +67,10 @@ MODEL = {
         "what the readings leave open and only `calibration.priors` determine, or mostly (sigmas "
         "without them would be more than twice as large): parameters, and what was known of them"
     ),
+    "unmodelled": (
+        "how many times larger variances are than noise, map and poses explain, from the scatter "
+        "of parts of the drive; covariance and sigmas hold it; absent where nothing is"
+    ),
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
 SENSOR_KEYS = (
@@ -90,6 +99,7 @@ SENSOR_KEYS = (
     "models",
     "not_compared",
     "missing_in",
+    "unmodelled",
     "covariance",
 )
 """In the order of the file: a matrix of 15 rows hides what follows it."""
@@ -171,7 +181,10 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
         "time_offset": _time_offset(plain["time_offset"], sensor),
         "models": _models(plain["models"]),
     }
-    return _without_empty({key: values[key] for key in SENSOR_KEYS}, "missing_in")
+    if sensor.unmodelled == EXPLAINED:
+        values["unmodelled"] = None
+    entry = _without_empty({key: values[key] for key in SENSOR_KEYS}, "missing_in")
+    return _without_empty(entry, "unmodelled")
 
 
 def source_entries(result: CalibrationResult) -> dict[str, Any]:

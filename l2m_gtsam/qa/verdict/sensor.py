@@ -183,7 +183,7 @@ def precision(case: Case) -> list[Reason]:
         *options.position_sigma_m.reasons(t, place),
         *options.rotation_sigma_deg.reasons(angle, rotation),
         *options.hard_iron_sigma_ut.reasons(H, f"Its offset H is only known to ± {H:.2g} µT."),
-        *_correlated(case),
+        *(_unmodelled(case) or _correlated(case)),
         *(
             Reason(Level.PASS, f"Not from this drive but from what was known beforehand: {each}.")
             for each in sensor.from_priors
@@ -194,6 +194,21 @@ def precision(case: Case) -> list[Reason]:
 def _largest(sigmas: FloatArray) -> float:
     """Return the largest finite sigma; undetermined parameters are reported by ``ending``."""
     return float(max(sigmas[np.isfinite(sigmas)], default=0.0))
+
+
+def _unmodelled(case: Case) -> list[Reason]:
+    excess = case.sensor.unmodelled
+    times = {"t": excess.t, "C": excess.C, "H": excess.H, "the clock": excess.offset}
+    named = [f"of {name} {ratio**0.5:.1f} times" for name, ratio in times.items() if ratio > 1]
+    if not named:
+        return []
+    text = (
+        "Parts of the drive disagree by more than noise, map and poses explain: its sigmas are "
+        f"larger by what is unmodelled ({', '.join(named)}). Errors of poses that the bag does not "
+        "state, a map frame that is warped, an offset H that drifts or a mapping suite that is not "
+        "calibrated do that."
+    )
+    return [Reason(Level.WARN, text)]
 
 
 def _correlated(case: Case) -> list[Reason]:

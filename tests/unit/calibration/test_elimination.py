@@ -114,11 +114,16 @@ def test_all_variables_together_give_what_elimination_does(
     assert joint.among(tuple(SENSORS))[:16, :16] == pytest.approx(joint.among((SENSORS[0],)))
 
 
+NONE = joint_rows.NO_READINGS
+
+
 def test_what_cholesky_cannot_factor_qr_does() -> None:
     """Rows known to 1e-9 and to 1: squared, nothing is left of the second; exact by hand."""
     rows = [
-        joint_rows.Rows(0, np.array([1, 2]), np.array([[1e9, 1e9], [0.0, 1.0]]), np.array([0, 2])),
-        joint_rows.Rows(0, np.array([1]), np.array([[1e-3]]), np.zeros(1)),
+        joint_rows.Rows(
+            0, np.array([1, 2]), np.array([[1e9, 1e9], [0.0, 1.0]]), np.array([0, 2]), NONE
+        ),
+        joint_rows.Rows(0, np.array([1]), np.array([[1e-3]]), np.zeros(1), NONE),
     ]
     columns = {M(0): slice(0, 1), T(0): slice(1, 2), S(0): slice(2, 3)}
     joint = joint_information(columns, rows, np.eye(1), np.zeros(1))
@@ -128,7 +133,7 @@ def test_what_cholesky_cannot_factor_qr_does() -> None:
 
 def test_a_singular_system_is_one_clear_error() -> None:
     """Two columns that are the same, known to no end."""
-    rows = [joint_rows.Rows(0, np.array([1, 2]), np.array([[1e9, 1e9]]), np.zeros(1))]
+    rows = [joint_rows.Rows(0, np.array([1, 2]), np.array([[1e9, 1e9]]), np.zeros(1), NONE)]
     columns = {M(0): slice(0, 1), T(0): slice(1, 2), S(0): slice(2, 3)}
     with pytest.raises(CalibrationError, match="orders of magnitude apart"):
         joint_information(columns, rows, np.eye(1), np.zeros(1))
