@@ -36,7 +36,7 @@ from l2m_gtsam.records.calibration import Unmodelled
 from l2m_gtsam.solve.chi_square import quantile
 
 HALVINGS = 4  # into sixteen parts; eight are pairs of them
-FALSE_ALARMS = 0.01  # of calibrations whose errors are as modelled
+FALSE_ALARMS = 0.002  # of calibrations whose errors are as modelled
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15), "offset": slice(15, 16)}
 TESTS = 4 * len(BLOCKS)  # of a sensor: parts by time and by place, of two sizes
 

@@ -94,8 +94,8 @@ def test_scores_add_up_to_nothing_at_the_optimum() -> None:
 def test_what_the_model_explains_is_left_alone() -> None:
     rng = np.random.default_rng(3)
     flagged = sum(fitted(rng).unmodelled() != EXPLAINED for _ in range(150))
-    # One of a hundred is allowed; of 150, more than six come by chance once in a thousand.
-    assert flagged <= 6
+    # Two of a thousand are allowed; of 150, more than three come by chance once in 3,000.
+    assert flagged <= 3
 
 
 def test_an_error_that_lasts_is_found_and_counted() -> None:
