@@ -79,8 +79,8 @@ def read_drive_or_follow(bag: Path, config: Config, progress: Progress) -> Recor
 
 def bag_scans(bag: Path, config: Config, progress: Progress) -> ScanTopic:
     """Return the scans of a bag, to be read one by one."""
-    told = counter(f"following scans of {bag.name}", progress)
-    return ScanTopic(bag, config.lidar.topic, config.lidar.scan, config.bag.stamps, told)
+    count = counter(f"following scans of {bag.name}", progress)
+    return ScanTopic(bag, config.lidar.topic, config.lidar.scan, config.bag.stamps, count)
 
 
 def _by_clouds(bag: Path, config: Config) -> bool:
