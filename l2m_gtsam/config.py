@@ -7,7 +7,7 @@ from pydantic import BaseModel, ValidationError
 
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.lidar.options import LidarOptions
+from l2m_gtsam.lidar.options import PointCloudOptions
 from l2m_gtsam.mapping.map_building import MappingOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.planning.motion import PlanOptions
@@ -31,7 +31,7 @@ class Config(Options):
     """`l2m calibrate`, and `l2m plan` before it."""
     plan: PlanOptions = PlanOptions()
     """`l2m plan`."""
-    lidar: LidarOptions = LidarOptions()
+    lidar: PointCloudOptions = PointCloudOptions()
     """Poses from point clouds."""
     slam: SlamOptions = SlamOptions()
     """`l2m slam`."""

@@ -31,6 +31,11 @@ def to_ros(covariance: FloatArray, R: FloatArray) -> FloatArray:
     return _exchanged(covariance, R)
 
 
+def isotropic_covariance(rotation_deg: float, position_m: float) -> FloatArray:
+    """Return the covariance of a pose with equal sigmas of all axes, rotation first, (6, 6)."""
+    return np.diag(np.repeat([np.deg2rad(rotation_deg), position_m], 3) ** 2)
+
+
 def moved(covariance: FloatArray, T_body_other: RigidTransform) -> FloatArray:
     """Return the covariances of another body that is fixed to the first.
 

@@ -143,7 +143,7 @@ class Reading:
         Raises
         ------
         CalibrationError
-            It does not say it in a way that is understood.
+            Its options are not understood.
         """
         return cls(
             saved_options(path, result.options, BagOptions, "bag"),
@@ -189,8 +189,8 @@ def corrections_of(
             "say in --config where it is recorded"
         )
     topics = {name: reading.bag.regressors[name] for name in names}
-    told = counter(f"reading numbers of {bag.name}", progress)
-    scalars = read_scalars(bag, topics, reading.bag.stamps, told)
+    count = counter(f"reading numbers of {bag.name}", progress)
+    scalars = read_scalars(bag, topics, reading.bag.stamps, count)
     series = {each.name: each for each in scalars}
     return {
         sensor.sensor: _correction(sensor, [series[m.name] for m in sensor.moving], reading)
@@ -321,7 +321,7 @@ def _calibrated_topics(
 
 
 def _unmatched(result: CalibrationResult, found: Mapping[Key, SensorTopic]) -> tuple[str, ...]:
-    """Return which sensors stand in the calibration alone or in the bag alone, a sentence each."""
+    """Return which sensors are in the calibration alone or in the bag alone, a sentence each."""
     calibrated = [sensor.sensor for sensor in result.sensors]
     there = [each.sensor for each in found.values()]
     return (

@@ -13,7 +13,7 @@ from l2m_gtsam.errors import BagError, CalibrationError, MapError, OutputError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.tile_store import TileStore
-from l2m_gtsam.options import Options
+from l2m_gtsam.options import Options, first_fault
 from l2m_gtsam.progress import Count, Progress, counter
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.map_file import load_map
@@ -39,8 +39,9 @@ def ensure_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        msg = f"{folder}: cannot be made as a folder for results: {error.strerror}"
-        raise OutputError(msg) from error
+        raise OutputError(
+            f"{folder}: cannot be made as a folder for results: {error.strerror}"
+        ) from error
 
 
 @runtime_checkable
@@ -51,7 +52,7 @@ class Tiled(Protocol):
         """Return the map that keeps its tiles in a store."""
         ...
 
-    def make_tiles(self, told: Count) -> int:
+    def make_tiles(self, count: Count) -> int:
         """Have all tiles in the store, and return how many there are."""
         ...
 
@@ -89,8 +90,8 @@ def read_drive_and_numbers(bag: Path, config: Config, progress: Progress) -> Rec
 
 def read_numbers(bag: Path, config: Config, progress: Progress) -> tuple[ScalarSeries, ...]:
     """Return the numbers of a bag that the configuration names."""
-    told = counter(f"reading numbers of {bag.name}", progress)
-    return read_scalars(bag, config.bag.regressors, config.bag.stamps, told)
+    count = counter(f"reading numbers of {bag.name}", progress)
+    return read_scalars(bag, config.bag.regressors, config.bag.stamps, count)
 
 
 def check_bags(bags: Sequence[Path]) -> None:
@@ -169,12 +170,11 @@ class SavedMap:
         """Raise a MapError for a drive that is said to be in another frame."""
         frame = self.state.provenance.get("frame")
         if frame not in (None, drive.trajectory.frame):
-            msg = (
+            raise MapError(
                 f"{self.path} is in frame {frame!r}, the poses of {drive.source.path} are in "
                 f"{drive.trajectory.frame!r}; if both mean the same, say so with "
                 f"`bag.frame: {frame}`"
             )
-            raise MapError(msg)
 
     def _list_of(self, name: str) -> list[Any]:
         entries = self.state.provenance.get(name)
@@ -188,6 +188,4 @@ def saved_options(path: Path, options: Any, model: type[SavedOptions], *names: s
     try:
         return model.model_validate(options)
     except ValidationError as error:
-        fault = error.errors()[0]
-        key = ".".join(str(part) for part in ("options", *names, *fault["loc"]))
-        raise CalibrationError(f"{path}: {key}: {fault['msg']}") from error
+        raise CalibrationError(f"{path}: {first_fault(error, 'options', *names)}") from error

@@ -73,7 +73,7 @@ def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) ->
     cluster
         Who computes; all must see the same files.
     progress
-        Told the share of the drives that is there.
+        Called with the stage "fleet" and the share of drives that are done.
 
     Raises
     ------
@@ -86,17 +86,17 @@ def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) ->
     check_outputs(*(out / name for name in (PAGE_FILE, CSV_FILE, PARQUET_FILE)))
     fleet_options = load_config(order.config).fleet
     tasks = fleet_tasks(drives, out)
-    tell = counter("fleet", progress)
+    count = counter("fleet", progress)
     outcomes: dict[str, DriveOutcome] = {}
     for task in tasks:
         if (there := _there(task)) is not None:
             outcomes[task.drive.folder] = there
-            tell(len(outcomes), len(tasks))
+            count(len(outcomes), len(tasks))
     missing = [task for task in tasks if task.drive.folder not in outcomes]
     ensure_folder(out)
     for task, outcome in computed(WORK, missing, cluster):
         outcomes[task.drive.folder] = outcome
-        tell(len(outcomes), len(tasks))
+        count(len(outcomes), len(tasks))
     rows = [row for task in tasks for row in _rows(task.drive, outcomes[task.drive.folder])]
     return _publish(out, rows, fleet_options, Fleet((), len(tasks), len(missing), ()))
 

@@ -68,8 +68,8 @@ class FleetDrive:
     vehicle
         Name.
     listed
-        What tells it from any other drive, wherever all of them are moved to: paths as seen from
-        the folder or the manifest.
+        What identifies it, wherever all drives are moved to: paths as seen from the folder or the
+        manifest.
     date
         When it was, UTC, ISO 8601, where the stamps are not to be asked; else empty.
     folder
@@ -302,8 +302,8 @@ def _failed(task: FleetTask, reason: str, begun: float, digest: str = "") -> Dri
 
 def _unexpected(path: Path, error: Exception) -> str:
     """Return the reason of a row for what was caused by a file, and should not have happened."""
-    told = " ".join(str(error).split())[:300]
-    return f"{path}: unexpected {type(error).__name__}: {told}; `l2m --debug calibrate` shows where"
+    text = " ".join(str(error).split())[:300]
+    return f"{path}: unexpected {type(error).__name__}: {text}; `l2m --debug calibrate` shows where"
 
 
 def _clear(folder: Path) -> None:

@@ -12,6 +12,7 @@ from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, Appraised
 from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
+from l2m_gtsam.options import first_fault
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
@@ -91,16 +92,16 @@ def print_page(page: Path, pdf: Path) -> None:
     """
     browser = find_browser()
     if browser is None:
-        msg = (
+        raise OutputError(
             f"{pdf}: a PDF is printed by Chromium, Chrome or Edge, and none was found: install "
             f"chromium, name one in {NAMED}, or print {page.name} from any browser"
         )
-        raise OutputError(msg)
     with tempfile.TemporaryDirectory() as profile, atomic_path(pdf) as temporary:
         run = _run(browser, profile, page, temporary)
         if run or not temporary.stat().st_size:
-            msg = f"{pdf}: {browser} could not print {page.name}{run}; print it from any browser"
-            raise OutputError(msg)
+            raise OutputError(
+                f"{pdf}: {browser} could not print {page.name}{run}; print it from any browser"
+            )
 
 
 def _run(browser: str, profile: str, page: Path, pdf: Path) -> str:
@@ -240,7 +241,7 @@ def _saved(result: CalibrationResult) -> QaOptions:
     try:
         return QaOptions.model_validate(result.options.get("qa", {}))
     except ValidationError as error:
-        fault = error.errors()[0]
-        key = ".".join(str(part) for part in ("qa", *fault["loc"]))
-        msg = f"{CALIBRATION_FILE}: options: {key}: {fault['msg']}; give thresholds with --config"
-        raise ConfigError(msg) from error
+        fault = first_fault(error, "qa")
+        raise ConfigError(
+            f"{CALIBRATION_FILE}: options: {fault}; give thresholds with --config"
+        ) from error

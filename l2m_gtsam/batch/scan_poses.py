@@ -15,7 +15,7 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import BagError, LidarError
 from l2m_gtsam.lidar.odometry import ScanStep, follow, odometry
-from l2m_gtsam.lidar.options import LidarOptions, PoseSource
+from l2m_gtsam.lidar.options import PointCloudOptions, PoseSource
 from l2m_gtsam.lidar.registration import PoseEstimate, unseen_covariance
 from l2m_gtsam.lidar.scan_localisation import ScanLocalisation, find_start, localise_scans
 from l2m_gtsam.lidar.surface import Surface
@@ -79,8 +79,8 @@ def read_drive_or_follow(bag: Path, config: Config, progress: Progress) -> Recor
 
 def bag_scans(bag: Path, config: Config, progress: Progress) -> ScanTopic:
     """Return the scans of a bag, to be read one by one."""
-    told = counter(f"following scans of {bag.name}", progress)
-    return ScanTopic(bag, config.lidar.topic, config.lidar.scan, config.bag.stamps, told)
+    count = counter(f"following scans of {bag.name}", progress)
+    return ScanTopic(bag, config.lidar.topic, config.lidar.scan, config.bag.stamps, count)
 
 
 def _by_clouds(bag: Path, config: Config) -> bool:
@@ -110,7 +110,7 @@ def _localised(saved: SavedMap, bag: Path, config: Config, progress: Progress) -
 
 
 def scan_start(
-    first: ScanStep, cloud: Surface, mapped: LidarMap, options: LidarOptions
+    first: ScanStep, cloud: Surface, mapped: LidarMap, options: PointCloudOptions
 ) -> PoseEstimate:
     """Return where a drive begins: as it is said, else as the first scan fits."""
     registration = options.localisation.registration

@@ -242,8 +242,8 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     found = replace(found, result=replace(result, notes=notes))
     options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})
     truth_source = None if given.truth is None else source_file(given.truth)
-    told = RecordContext(calibration, found.field_map, options, gap, truth, truth_source)
-    record = localisation_record(found.result, found.solution, told)
+    context = RecordContext(calibration, found.field_map, options, gap, truth, truth_source)
+    record = localisation_record(found.result, found.solution, context)
     ensure_folder(out)
     _write(found, record, config, out)
     if saved is None:
@@ -266,8 +266,8 @@ def _localised(
     field_map = saved.open(progress, [] if start.anywhere or is_given else [recording])
     found = localise(recording, field_map, calibration, config.slam, progress, evidence)
     if found.result.status in NOWHERE:
-        told = "; ".join((found.result.message, *found.result.notes))
-        raise MapError(f"{recording.source.path} in {saved.path}: {told}")
+        reasons = "; ".join((found.result.message, *found.result.notes))
+        raise MapError(f"{recording.source.path} in {saved.path}: {reasons}")
     return _Found(recording, found.result, found.solution, field_map)
 
 

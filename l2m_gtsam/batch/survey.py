@@ -177,7 +177,7 @@ def _counts(clouds: Sequence[TopicCloud]) -> dict[str, int]:
 
 
 def _along(trajectories: Sequence[Trajectory]) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (K, 3, 3) and positions (K, 3) of drives, some way apart."""
+    """Return rotations (K, 3, 3) and positions (K, 3) of drives, some distance apart."""
     rows = [_spaced(each.p) for each in trajectories]
     R = np.concatenate([each.R[row] for each, row in zip(trajectories, rows, strict=True)])
     p = np.concatenate([each.p[row] for each, row in zip(trajectories, rows, strict=True)])
@@ -186,9 +186,9 @@ def _along(trajectories: Sequence[Trajectory]) -> tuple[FloatArray, FloatArray]:
 
 
 def _spaced(p: FloatArray) -> IntArray:
-    """Return the rows of positions, shape (N, 3), after each `PLACES_M` of way."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
-    _, rows = np.unique(np.floor(way / PLACES_M), return_index=True)
+    """Return the rows of positions, shape (N, 3), after each `PLACES_M` of path."""
+    path = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+    _, rows = np.unique(np.floor(path / PLACES_M), return_index=True)
     return np.asarray(rows)
 
 

@@ -150,8 +150,8 @@ def _unsound(sensor: SensorCalibration) -> str:
     offset = sensor.time_offset
     if offset is None:
         return ""
-    told = offset.sigma if offset.estimated else 0.0
-    numbers = [offset.seconds, told, *offset.cross_covariance]
+    sigma = offset.sigma if offset.estimated else 0.0
+    numbers = [offset.seconds, sigma, *offset.cross_covariance]
     return "" if np.isfinite(numbers).all() else "time_offset: must be finite"
 
 

@@ -1,4 +1,4 @@
-"""Loops: scans of places that odometry returns to, registered on those of the first visit."""
+"""Loop closures: scans of revisited places, registered on those of earlier visits."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -17,7 +17,7 @@ from l2m_gtsam.records.scans import LoopClosure
 
 
 class LoopOptions(Options):
-    """Where loops are looked for, and which are believed."""
+    """Where loop closures are searched for, and which are believed."""
 
     key_distance_m: float = Field(default=1.0, gt=0)
     """A scan is kept after so much way; loops are between scans that were kept."""
@@ -37,7 +37,7 @@ class LoopOptions(Options):
 
 @dataclass(frozen=True)
 class LoopClosureSearch:
-    """Loops of a drive.
+    """Loop closures of a drive.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class _Kept:
 
 
 def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopClosureSearch:
-    """Look for loops in a drive.
+    """Search a drive for loop closures.
 
     Memory grows with the way, by about 0.1 MB for each scan that is kept.
 
@@ -74,7 +74,7 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
     steps
         Scans with odometry, in order of time.
     options
-        Where to look, and what to believe.
+        Where to search, and what to believe.
     """
     kept, loops, refused = list[_Kept](), list[LoopClosure](), Counter[Refusal]()
     way, last = 0.0, None
@@ -106,7 +106,7 @@ def _candidates(kept: list[_Kept], here: _Kept, options: LoopOptions) -> list[_K
 def _closed(
     earlier: _Kept, here: _Kept, scan: Surface, options: RegistrationOptions
 ) -> LoopClosure | Refusal:
-    """Return the loop between two scans, or why there is none."""
+    """Return the loop closure between two scans, or why there is none."""
     first, guess = earlier.surface(), between(earlier.T, here.T)
     found = register(scan, first, guess, options)
     back = register(first, scan, found.T.inverse(), options)

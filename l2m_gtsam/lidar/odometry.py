@@ -36,7 +36,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import Scan, taken_at_once
 
 FRAME, CHILD_FRAME = "odom", "lidar"
-# A scan of fewer is of nothing, or broken.
+# Scans with fewer points are empty or broken.
 LEAST_POINTS = 100
 
 
@@ -74,7 +74,7 @@ class KissOdometry:
         return from_matrix(np.asarray(self._kiss.last_delta))
 
 
-class OdometryOptions(Options):
+class ScanOdometryOptions(Options):
     """How a lidar is followed from scan to scan."""
 
     voxel_m: float = Field(default=0.5, ge=0.05)
@@ -120,7 +120,7 @@ class ScanStep:
     believed: bool
 
 
-def follow(scans: Iterable[Scan], options: OdometryOptions) -> Iterator[ScanStep]:
+def follow(scans: Iterable[Scan], options: ScanOdometryOptions) -> Iterator[ScanStep]:
     """Yield the scans that have points enough, each with its pose.
 
     Parameters
@@ -145,7 +145,7 @@ def follow(scans: Iterable[Scan], options: OdometryOptions) -> Iterator[ScanStep
         yield follower.add(scan)
 
 
-def odometry(scans: Iterable[Scan], options: OdometryOptions) -> Trajectory:
+def odometry(scans: Iterable[Scan], options: ScanOdometryOptions) -> Trajectory:
     """Return the poses that ``follow`` gives, with covariances that accumulate.
 
     The frame is that of the first scan. Errors of steps count as independent. Those of scans on one
@@ -184,7 +184,7 @@ class _Placed:
 class _Follower:
     """The state between two scans."""
 
-    def __init__(self, scan: Scan, twist: FloatArray, options: OdometryOptions) -> None:
+    def __init__(self, scan: Scan, twist: FloatArray, options: ScanOdometryOptions) -> None:
         points = taken_at_once(scan, twist)
         surface, exact = Surface(points, options.registration.edge), np.zeros((6, 6))
         self.first = ScanStep(scan.stamp_ns, IDENTITY, IDENTITY, exact, surface, True)
@@ -242,7 +242,7 @@ class _Follower:
             self._key = self._last = replace(placed, covariance=np.zeros((6, 6)))
 
 
-def _first_twist(first: Scan, second: Scan | None, options: OdometryOptions) -> FloatArray:
+def _first_twist(first: Scan, second: Scan | None, options: ScanOdometryOptions) -> FloatArray:
     """Return how the lidar moves at first, shape (6,): motion distorts both scans alike."""
     if second is None or first.time_s is None:
         return np.zeros(6)

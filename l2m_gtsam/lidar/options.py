@@ -3,11 +3,11 @@
 from enum import StrEnum
 
 from l2m_gtsam.lidar.loop_closures import LoopOptions
-from l2m_gtsam.lidar.odometry import OdometryOptions
+from l2m_gtsam.lidar.odometry import ScanOdometryOptions
 from l2m_gtsam.lidar.scan_localisation import (
     ScanLocalisationOptions,
+    ScanSearchOptions,
     ScanStartOptions,
-    SearchOptions,
 )
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import ScanOptions
@@ -20,7 +20,7 @@ class PoseSource(StrEnum):
     CLOUDS = "clouds"
 
 
-class LidarOptions(Options):
+class PointCloudOptions(Options):
     """How poses come from point clouds."""
 
     poses: PoseSource = PoseSource.AUTO
@@ -31,11 +31,11 @@ class LidarOptions(Options):
     the frame of the lidar."""
     scan: ScanOptions = ScanOptions()
     """What is taken of each scan."""
-    odometry: OdometryOptions = OdometryOptions()
+    odometry: ScanOdometryOptions = ScanOdometryOptions()
     """How the lidar is followed from scan to scan."""
     start: ScanStartOptions | None = None
     """Where the drive begins in the map; looked for along the mapping drives if it is not given."""
-    search: SearchOptions = SearchOptions()
+    search: ScanSearchOptions = ScanSearchOptions()
     """How it is looked for."""
     localisation: ScanLocalisationOptions = ScanLocalisationOptions()
     """How scans are localised on the map's cloud."""

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.data import FloatArray, RigidTransform
-from l2m_gtsam.geometry import as_matrix, difference, from_matrix, perturbed
+from l2m_gtsam.geometry import as_matrix, difference, from_matrix, isotropic_covariance, perturbed
 from l2m_gtsam.lidar.surface import (
     Planes,
     Surface,
@@ -147,7 +147,7 @@ def combined(
 
     The scan decides along what it shows, the expectation along the rest.
     """
-    seen = tempered(found.information, _floor(options))
+    seen = tempered(found.information, isotropic_covariance(options.floor_deg, options.floor_m))
     # Around the registered pose, in whose axes the information is.
     turn = np.kron(np.eye(2), found.T.R.T @ expected.T.R)
     known = np.linalg.inv(turn @ expected.covariance @ turn.T)
@@ -166,13 +166,7 @@ def by_scan(
 
 def unseen_covariance(options: RegistrationOptions) -> FloatArray:
     """Return the covariance of a pose of which a scan says nothing, shape (6, 6)."""
-    sigma = np.repeat([np.deg2rad(options.unseen_deg), options.unseen_m], 3)
-    return np.diag(sigma**2)
-
-
-def _floor(options: RegistrationOptions) -> FloatArray:
-    sigma = np.repeat([np.deg2rad(options.floor_deg), options.floor_m], 3)
-    return np.diag(sigma**2)
+    return isotropic_covariance(options.unseen_deg, options.unseen_m)
 
 
 def _aligned(

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, LidarMap, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError
-from l2m_gtsam.geometry import compose, difference, moved
+from l2m_gtsam.geometry import compose, difference, isotropic_covariance, moved
 from l2m_gtsam.lidar.odometry import CHILD_FRAME, ScanStep
 from l2m_gtsam.lidar.registration import (
     PoseEstimate,
@@ -64,7 +64,7 @@ class ScanLocalisationOptions(Options):
 
     def of_cloud(self) -> FloatArray:
         """Return the covariance that the cloud's errors add to a pose, shape (6, 6)."""
-        return np.diag(np.repeat([np.deg2rad(self.cloud_deg), self.cloud_m], 3) ** 2)
+        return isotropic_covariance(self.cloud_deg, self.cloud_m)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def _not_at_start(
     )
 
 
-class SearchOptions(Options):
+class ScanSearchOptions(Options):
     """How the first scan is found on a cloud."""
 
     headings: int = Field(default=12, ge=1, le=360)
@@ -235,7 +235,7 @@ def find_start(
     scan: Surface,
     cloud: Surface,
     mapped: LidarMap,
-    options: SearchOptions,
+    options: ScanSearchOptions,
     registration: RegistrationOptions,
 ) -> RigidTransform:
     """Return where a scan was taken, near any place that the mapping drives passed.
@@ -280,7 +280,7 @@ def find_start(
     return best.T
 
 
-def _candidates(mapped: LidarMap, options: SearchOptions) -> list[RigidTransform]:
+def _candidates(mapped: LidarMap, options: ScanSearchOptions) -> list[RigidTransform]:
     """Return the mapped poses, each turned about the vertical."""
     angles = 2 * np.pi * np.arange(options.headings) / options.headings
     turns = Rotation.from_rotvec(np.outer(angles, [0.0, 0.0, 1.0])).as_matrix()
@@ -289,7 +289,7 @@ def _candidates(mapped: LidarMap, options: SearchOptions) -> list[RigidTransform
 
 
 def _best(
-    scan: Surface, cloud: Surface, candidates: list[RigidTransform], options: SearchOptions
+    scan: Surface, cloud: Surface, candidates: list[RigidTransform], options: ScanSearchOptions
 ) -> list[RigidTransform]:
     """Return the candidates whose points are nearest to the cloud."""
     if not (scan.usable and cloud.usable):
@@ -305,7 +305,7 @@ def _away(points: FloatArray, cloud: Surface, T: RigidTransform) -> float:
     return float(np.minimum(distance, 1.0).mean())
 
 
-def _is_elsewhere(T: RigidTransform, other: RigidTransform, options: SearchOptions) -> bool:
+def _is_elsewhere(T: RigidTransform, other: RigidTransform, options: ScanSearchOptions) -> bool:
     off = difference(T, other)
     turned = np.rad2deg(np.linalg.norm(off[:3])) > options.apart_deg
     return bool(np.linalg.norm(off[3:]) > options.apart_m or turned)

@@ -1,4 +1,4 @@
-r"""Clouds with planes through their points: how well matched planes determine a pose.
+r"""Clouds with planes through their points, and the information of matched planes about a pose.
 
 Points p of a scan lie on planes with normals n through q: ``e = n . (T p - q)``. A right
 perturbation (w, v) of T changes e by ``J (w, v)`` with ``J = [p x m, m]`` and ``m = R^T n``. With

@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
+from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
@@ -31,7 +31,7 @@ class MappingOptions(Options):
     """How scans become the cloud that is saved with the map; their topic is `lidar.topic`."""
     compare: CompareOptions = CompareOptions()
     """How `l2m map compare` holds readings out."""
-    suite: SuiteOptions = SuiteOptions()
+    suite: SuiteCalibrationOptions = SuiteCalibrationOptions()
     """How `l2m map suite` calibrates the sensors that map."""
 
 

@@ -15,7 +15,7 @@ from l2m_gtsam.data import (
     SyncCounts,
 )
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteOptions
+from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_solver import SuiteSolution, solve_suite
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
@@ -58,7 +58,7 @@ class SuiteDrive:
 def calibrate_suite(
     recordings: Sequence[Recording],
     assumed: Mapping[str, KnownSensor] | None,
-    options: SuiteOptions,
+    options: SuiteCalibrationOptions,
     progress: Progress,
 ) -> CalibrationResult:
     """Calibrate the sensors of a mapping suite from its own drives.
@@ -91,7 +91,7 @@ def calibrate_suite(
     return _result(drive, solution, options)
 
 
-def suite_drive(recordings: Sequence[Recording], options: SuiteOptions) -> SuiteDrive:
+def suite_drive(recordings: Sequence[Recording], options: SuiteCalibrationOptions) -> SuiteDrive:
     """Return drives of a suite as one, with readings that have poses whatever their clocks."""
     recording = joined(recordings)
     reach = REACH * options.clock_s
@@ -109,7 +109,9 @@ def _parameters(sensor: KnownSensor) -> FloatArray:
     return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector(), [0.0]])
 
 
-def _result(drive: SuiteDrive, solution: SuiteSolution, options: SuiteOptions) -> CalibrationResult:
+def _result(
+    drive: SuiteDrive, solution: SuiteSolution, options: SuiteCalibrationOptions
+) -> CalibrationResult:
     """Return a solution as a calibration."""
     sensors = tuple(_sensor(drive, solution, i) for i in range(len(drive.readings.sensors)))
     recording = drive.recording
@@ -167,7 +169,7 @@ def _ending(solution: SuiteSolution) -> tuple[SensorStatus, str]:
 
 
 def _doubts(
-    names: Sequence[str], solution: SuiteSolution, options: SuiteOptions
+    names: Sequence[str], solution: SuiteSolution, options: SuiteCalibrationOptions
 ) -> tuple[str, ...]:
     """Return which parameters the drive told little of, a sentence for each sensor."""
     sigma = np.sqrt(np.diag(solution.covariance)).reshape(len(names), SIZE)

@@ -40,7 +40,7 @@ T, C, H, TAU = slice(0, 3), slice(3, 12), slice(12, 15), 15
 STEP_M = 1e-4  # of a central difference: features bend over centimetres
 
 
-class SuiteOptions(Options):
+class SuiteCalibrationOptions(Options):
     """How the sensors of a mapping suite are calibrated from their own drive."""
 
     sync: SyncOptions = SyncOptions(thin_distance_m=0.03, thin_angle_deg=5.0)
@@ -87,7 +87,7 @@ class SuiteWindow:
 
 
 @dataclass(frozen=True)
-class Scored:
+class SuiteLikelihood:
     """A log likelihood, its slope and the expected information about the S sensors.
 
     Attributes
@@ -107,8 +107,8 @@ class Scored:
     information: FloatArray
     residuals: tuple[FloatArray, ...]
 
-    def __add__(self, other: "Scored") -> "Scored":
-        return Scored(
+    def __add__(self, other: "SuiteLikelihood") -> "SuiteLikelihood":
+        return SuiteLikelihood(
             self.value + other.value,
             self.slope + other.slope,
             self.information + other.information,
@@ -152,7 +152,9 @@ def undistorted(readings: Readings, sensors: FloatArray) -> Undistorted:
     return Undistorted(points, b, field, R @ inverse, lever)
 
 
-def scored(window: SuiteWindow, sensors: FloatArray, prior: Hyperparameters) -> Scored:
+def suite_likelihood(
+    window: SuiteWindow, sensors: FloatArray, prior: Hyperparameters
+) -> SuiteLikelihood:
     """Return how likely a window's readings are.
 
     Parameters
@@ -170,19 +172,19 @@ def scored(window: SuiteWindow, sensors: FloatArray, prior: Hyperparameters) -> 
     log_variance = basis.prior(prior).log_variance
     normal = normal_of(basis, TrainingSet(points, seen.field, np.ones(len(readings))))
     found, D = evidence(normal, log_variance, noise), np.exp(0.5 * log_variance)
-    said, gradient = basis.field_and_gradient(points, D * found.mean)
-    r = seen.field - said
+    predicted, gradient = basis.field_and_gradient(points, D * found.mean)
+    r = seen.field - predicted
     places = _wide(_place_slopes(readings, seen), readings.sensor, len(sensors))
     places -= places.mean(axis=0)
     J = _wide(_field_slopes(readings, seen), readings.sensor, len(sensors)) - gradient @ places
-    doubt = _doubt_slopes(basis, points, D, found, noise)
-    slope = -np.einsum("ni,nij->j", r, J) / noise**2 - np.einsum("ni,nij->j", doubt, places)
-    turned, price = _price(readings, sensors)
+    complexity = _complexity_slopes(basis, points, D, found, noise)
+    slope = -np.einsum("ni,nij->j", r, J) / noise**2 - np.einsum("ni,nij->j", complexity, places)
+    turned, volume = _volume_change(readings, sensors)
     information = _information(basis, points, D, found, J, noise)
-    return Scored(found.value - price, slope - turned, information, (r,))
+    return SuiteLikelihood(found.value - volume, slope - turned, information, (r,))
 
 
-def _price(readings: Readings, sensors: FloatArray) -> tuple[FloatArray, float]:
+def _volume_change(readings: Readings, sensors: FloatArray) -> tuple[FloatArray, float]:
     """Return the sum of all ``log |det C|`` by the sensors' parameters, (16 S,), and itself."""
     slope, count = np.zeros(sensors.shape), np.bincount(readings.sensor, minlength=len(sensors))
     matrices = sensors[:, C].reshape(-1, 3, 3)
@@ -222,7 +224,7 @@ def _field_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
     return J
 
 
-def _doubt_slopes(
+def _complexity_slopes(
     basis: Basis, points: FloatArray, D: FloatArray, found: Evidence, noise: float
 ) -> FloatArray:
     """Return derivatives of half the log determinant by the readings' places, shape (N, 3).
@@ -275,7 +277,9 @@ class SuiteWindows:
     prior: Hyperparameters
 
 
-def windows_over(readings: Readings, sensors: FloatArray, options: SuiteOptions) -> SuiteWindows:
+def windows_over(
+    readings: Readings, sensors: FloatArray, options: SuiteCalibrationOptions
+) -> SuiteWindows:
     """Learn the prior of the field where sensors with these parameters saw it, and lay windows.
 
     Parameters
@@ -312,7 +316,9 @@ def windows_over(readings: Readings, sensors: FloatArray, options: SuiteOptions)
     return SuiteWindows(tuple(parts), tuple(of), prior)
 
 
-def _dealt(tiling: Tiling, points: FloatArray, options: SuiteOptions) -> list[tuple[int, IntArray]]:
+def _dealt(
+    tiling: Tiling, points: FloatArray, options: SuiteCalibrationOptions
+) -> list[tuple[int, IntArray]]:
     """Return tiles spread over a survey, with readings of which none belongs to two of them."""
     members = tiling.grid.members(points, tiling.overlap)
     tiles = spread_tiles(tiling, [len(rows) for rows in members], options.windows)

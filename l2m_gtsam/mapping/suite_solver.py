@@ -17,10 +17,10 @@ from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.mapping.suite_likelihood import (
     SIZE,
     C,
-    Scored,
-    SuiteOptions,
+    SuiteCalibrationOptions,
+    SuiteLikelihood,
     SuiteWindows,
-    scored,
+    suite_likelihood,
     windows_over,
 )
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
@@ -71,7 +71,10 @@ class SuiteSolution:
 
 
 def solve_suite(
-    readings_at: ReadingsAt, assumed: FloatArray, options: SuiteOptions, progress: Progress
+    readings_at: ReadingsAt,
+    assumed: FloatArray,
+    options: SuiteCalibrationOptions,
+    progress: Progress,
 ) -> SuiteSolution:
     """Find the sensors of a suite.
 
@@ -112,7 +115,7 @@ def solve_suite(
 
 
 @dataclass(frozen=True)
-class Found:
+class SuiteRound:
     """Where a round led."""
 
     sensors: FloatArray
@@ -153,11 +156,13 @@ class SuiteProblem:
         How sure that is.
     """
 
-    def __init__(self, readings_at: ReadingsAt, assumed: FloatArray, options: SuiteOptions) -> None:
+    def __init__(
+        self, readings_at: ReadingsAt, assumed: FloatArray, options: SuiteCalibrationOptions
+    ) -> None:
         self._readings_at, self._assumed, self._options = readings_at, assumed, options
         self._information = prior_information(len(assumed), options)
 
-    def solved(self, sensors: FloatArray) -> Found:
+    def solved(self, sensors: FloatArray) -> SuiteRound:
         """Lay windows for these sensors and find those that make the readings most likely."""
         readings = self._readings_at(sensors[:, -1])
         windows = windows_over(readings, sensors, self._options)
@@ -175,15 +180,15 @@ class SuiteProblem:
         alike = likeness(windows, score)
         count = sum(len(rows) for rows in windows.rows)
         covariance = self._covariance(score, alike)
-        return Found(sensors, windows, score.residuals, count / alike, covariance, settled)
+        return SuiteRound(sensors, windows, score.residuals, count / alike, covariance, settled)
 
-    def _covariance(self, score: Scored, alike: float) -> FloatArray:
+    def _covariance(self, score: SuiteLikelihood, alike: float) -> FloatArray:
         """Return the covariance where so many readings count as one, shape (16 S, 16 S)."""
         return np.asarray(np.linalg.inv(score.information / alike + self._information))
 
     def _along(
-        self, windows: SuiteWindows, sensors: FloatArray, score: Scored, step: FloatArray
-    ) -> tuple[FloatArray, Scored] | None:
+        self, windows: SuiteWindows, sensors: FloatArray, score: SuiteLikelihood, step: FloatArray
+    ) -> tuple[FloatArray, SuiteLikelihood] | None:
         """Return sensors along a step that make the readings more likely, if there are any."""
         share = 1.0
         while share >= SMALLEST:
@@ -194,17 +199,17 @@ class SuiteProblem:
             share /= 2
         return None
 
-    def _scored(self, windows: SuiteWindows, sensors: FloatArray) -> Scored:
+    def _scored(self, windows: SuiteWindows, sensors: FloatArray) -> SuiteLikelihood:
         """Return the posterior: slope and value with what is assumed, information without."""
         readings = self._readings_at(sensors[:, -1])
         parts = [
-            scored(replace(part, readings=readings[rows]), sensors, windows.prior)
+            suite_likelihood(replace(part, readings=readings[rows]), sensors, windows.prior)
             for part, rows in zip(windows.parts, windows.rows, strict=True)
         ]
         total = reduce(add, parts)
         off = (sensors - self._assumed).ravel()
         pull = self._information @ off
-        return Scored(
+        return SuiteLikelihood(
             total.value - 0.5 * float(off @ pull),
             total.slope - pull,
             total.information,
@@ -212,7 +217,7 @@ class SuiteProblem:
         )
 
 
-def likeness(windows: SuiteWindows, score: Scored) -> float:
+def likeness(windows: SuiteWindows, score: SuiteLikelihood) -> float:
     """Return how many readings count as one, from how residuals go together in time.
 
     Poses of a tracking system, the clock between two of its samples and waves that are left out err
@@ -229,7 +234,7 @@ def likeness(windows: SuiteWindows, score: Scored) -> float:
     return max(2 * float(correlation_of(np.concatenate(parts), rows).sum()) - 1, 1.0)
 
 
-def prior_information(count: int, options: SuiteOptions) -> FloatArray:
+def prior_information(count: int, options: SuiteCalibrationOptions) -> FloatArray:
     """Return the information about so many sensors that is assumed, shape (16 S, 16 S)."""
     sigma = np.concatenate(
         [

@@ -1,4 +1,4 @@
-"""Magnetometers that are dead for a part of a drive: they repeat a value, or say nothing. Pure."""
+"""Dropouts: times in which a magnetometer repeats one value or sends nothing. Pure."""
 
 from dataclasses import dataclass, replace
 
@@ -7,24 +7,24 @@ import numpy as np
 from l2m_gtsam.data import BoolArray, FieldSeries, FloatArray, IntArray, Recording, Trajectory
 from l2m_gtsam.recording.sync import STUCK_UT, interpolated
 
-# Readings that are the same to the last digit while the vehicle moves so far, or turns so much.
+# So many readings that are identical while the vehicle moves so far, or turns so much.
 LEAST_SAME = 10
 MOVED_M, TURNED_DEG = 0.3, 10.0
-LOOKED_AT = 50  # poses of such a stretch
-TOLD_S = 5.0  # without a reading, from which on it is told
-USUAL = 20.0  # times what usually lies between two readings
+LOOKED_AT = 50  # limit of poses that are compared in such a run
+REPORTED_S = 5.0  # gaps between readings are reported if they exceed this
+USUAL = 20.0  # and this multiple of the median gap
 
 
 @dataclass(frozen=True)
 class MaskedRecording:
-    """A recording of what its sensors read while they were alive.
+    """A recording with its dropouts masked.
 
     Attributes
     ----------
     recording
         Its readings, NaN where a sensor repeats one value.
     notes
-        On each sensor that was dead for a while.
+        One sentence for each sensor with dropouts.
     """
 
     recording: Recording
@@ -32,7 +32,7 @@ class MaskedRecording:
 
 
 def mask_dropouts(recording: Recording) -> MaskedRecording:
-    """Take readings for missing that a sensor repeats while the vehicle moves."""
+    """Mask readings that a sensor repeats while the vehicle moves, as NaN."""
     trajectory = recording.trajectory
     series = tuple(_alive(each, trajectory) for each in recording.series)
     notes = [_note(each, trajectory) for each in series]
@@ -79,7 +79,7 @@ def _moves(trajectory: Trajectory, stamp_ns: IntArray) -> bool:
 
 
 def _note(series: FieldSeries, trajectory: Trajectory) -> str:
-    """Return for how much of a drive a sensor is dead, and when longest; empty where it lives."""
+    """Return the share of a drive that a sensor is dead, and the longest gap; empty for none."""
     rows = np.isfinite(series.field).all(axis=1)
     first, last = trajectory.stamp_ns[[0, -1]]
     read = series.stamp_ns[rows & (series.stamp_ns >= first) & (series.stamp_ns <= last)]
@@ -87,7 +87,7 @@ def _note(series: FieldSeries, trajectory: Trajectory) -> str:
         return ""
     stamps = np.concatenate([[first], read, [last]])
     between = 1e-9 * np.diff(stamps)
-    dead = between > max(TOLD_S, USUAL * float(np.median(between)))
+    dead = between > max(REPORTED_S, USUAL * float(np.median(between)))
     if not dead.any():
         return ""
     longest = int(np.argmax(between))
@@ -95,5 +95,5 @@ def _note(series: FieldSeries, trajectory: Trajectory) -> str:
     share = between[dead].sum() / between.sum()
     return (
         f"{series.sensor} is dead for {share:.0%} of the drive, longest from {start:.1f} to "
-        f"{end:.1f} s after its start: it repeats one value there, or reads nothing"
+        f"{end:.1f} s after its start: it repeats one value there, or sends nothing"
     )

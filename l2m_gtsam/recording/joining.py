@@ -1,8 +1,8 @@
 """Several drives of one vehicle as one recording.
 
-Each drive keeps its own time; beside it stands a time in which drives follow each other, a minute
-apart. Whatever belongs to a stretch of time (poses, their errors, runs of rejected readings) then
-ends where a drive ends, and no clock has to run on from one drive to the next.
+Each drive keeps its own time; on a second time axis drives follow each other a minute apart. So
+intervals of time (poses, their errors, runs of rejected readings) end where a drive ends, and
+clocks need not be continuous from one drive to the next.
 """
 
 import hashlib

@@ -1,9 +1,9 @@
-"""Jumps of odometry: steps that no vehicle makes, found and taken out. Pure arrays.
+"""Jumps of odometry: steps that no vehicle makes, detected and removed. Pure arrays.
 
-From one pose to the next a vehicle moves as it did just before and does just after, but for what
-it can accelerate meanwhile. A wheel that slips, a scan match that snaps to another place or an
-origin that is set anew makes a step that differs by more. Such a step says nothing of the way: the
-motion of its neighbours takes its place, and all later poses are carried along.
+From one pose to the next a vehicle moves as just before and just after, up to its acceleration. A
+slipping wheel, a wrong scan match or a reset origin makes a step that differs by more. Such a step
+contains no information: the motion of its neighbours replaces it, and all later poses are moved
+rigidly.
 """
 
 from dataclasses import dataclass, replace
@@ -16,10 +16,10 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Traj
 from l2m_gtsam.geometry import carried_back, compose, moved
 from l2m_gtsam.options import Options
 
-NEIGHBOURS = 3  # steps before and after that say how the vehicle moves
-LEAST_STEPS = 4  # of a drive in which a step can be told from the others
-ROUNDS = 20  # of looking again without what was found: a few are taken
-TOLD = 3  # jumps that are told one by one
+NEIGHBOURS = 3  # steps before and after, from which the motion is predicted
+LEAST_STEPS = 4  # drives of fewer steps have no jumps
+ROUNDS = 20  # limit of detections without the jumps found before: a few are needed
+MAX_REPORTED = 3  # jumps that are reported one by one
 
 
 class JumpOptions(Options):
@@ -44,19 +44,19 @@ class JumpOptions(Options):
 
 @dataclass(frozen=True)
 class Jump:
-    """A step of odometry in whose place the motion about it was put.
+    """A step of odometry that was replaced by the motion of its neighbours.
 
     Attributes
     ----------
     row
-        The pose before it in the trajectory that was mended.
+        Row of the pose before it in the repaired trajectory.
     seconds
-        When its end was, since the first pose.
+        Time of its end since the first pose.
     distance_m, angle_deg
-        What the step differed by.
+        Difference between the step and its replacement.
     covariance
-        Of a right perturbation of the motion in its place, rotation (rad) before translation (m),
-        shape (6, 6): as the drive's other steps differ from the motion about them.
+        Of a right perturbation of the replacement, rotation (rad) before translation (m), shape
+        (6, 6), by the differences of the drive's other steps from their neighbours.
     """
 
     row: int
@@ -73,11 +73,11 @@ class RepairedOdometry:
     Attributes
     ----------
     trajectory
-        Its poses.
+        The remaining poses, with jumps replaced.
     jumps
-        What was taken out, in order of time.
+        Replaced steps, in order of time.
     left_out
-        Poses that lay elsewhere than those before and after them, and are gone.
+        Number of isolated poses that were removed.
     """
 
     trajectory: Trajectory
@@ -86,33 +86,32 @@ class RepairedOdometry:
 
     @property
     def rows(self) -> IntArray:
-        """Poses before and after jumps, ascending."""
+        """Rows of the poses before and after jumps, ascending."""
         before = np.array([each.row for each in self.jumps], dtype=np.int64)
         return np.union1d(before, before + 1)
 
     def notes(self) -> tuple[str, ...]:
         """Return a sentence on each of a few jumps, and how many more there are."""
-        told = [
+        notes = [
             f"odometry jumps by {each.distance_m:.2f} m and {each.angle_deg:.1f} deg "
-            f"{each.seconds:.1f} s after its first pose: there it is taken to have moved on as it "
-            "did before and after"
-            for each in self.jumps[:TOLD]
+            f"{each.seconds:.1f} s after its first pose: the motion before and after replaces it"
+            for each in self.jumps[:MAX_REPORTED]
         ]
-        if len(self.jumps) > TOLD:
-            told.append(f"odometry jumps {len(self.jumps) - TOLD} more times")
+        if len(self.jumps) > MAX_REPORTED:
+            notes.append(f"odometry jumps {len(self.jumps) - MAX_REPORTED} more times")
         if self.left_out:
-            told.append(
-                "poses of odometry that lie elsewhere than those before and after them are left "
-                f"out: {self.left_out}"
+            notes.append(
+                f"isolated poses of odometry, far from those before and after, are left out: "
+                f"{self.left_out}"
             )
-        return tuple(told)
+        return tuple(notes)
 
 
 def without_jumps(trajectory: Trajectory, options: JumpOptions) -> RepairedOdometry:
     """Return odometry without its jumps; as it is where it has none.
 
-    Covariances of poses stay those of the way from the first pose: what the trajectory states for
-    the step that jumped gives way to that of the motion in its place.
+    Covariances of poses still accumulate from the first pose: that of the replacement takes the
+    place of what the trajectory states for the step that jumped.
 
     Parameters
     ----------
@@ -126,15 +125,15 @@ def without_jumps(trajectory: Trajectory, options: JumpOptions) -> RepairedOdome
     kept = np.arange(len(trajectory))
     for _ in range(ROUNDS):
         part = trajectory[kept]
-        found = _found(part, options)
-        # Between two jumps in a row lies a pose that belongs to neither side.
+        found = _jumps_among(part, options)
+        # A pose between two consecutive jumps belongs to neither side.
         stray = np.flatnonzero(found.jumped[:-1] & found.jumped[1:]) + 1
         if not len(stray):
             break
         kept = np.delete(kept, stray[::2])
     jumps = tuple(_jump(part, found, int(row)) for row in np.flatnonzero(found.jumped))
-    mended = _mended(part, found, jumps) if jumps else part
-    return RepairedOdometry(mended, jumps, len(trajectory) - len(part))
+    repaired = _repaired(part, found, jumps) if jumps else part
+    return RepairedOdometry(repaired, jumps, len(trajectory) - len(part))
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,7 @@ def _steps_of(trajectory: Trajectory) -> _Steps:
 
 
 @dataclass(frozen=True)
-class _Found:
+class _StepComparison:
     """What is expected of N steps, and which are jumps.
 
     Attributes
@@ -204,13 +203,13 @@ class _Found:
         return np.asarray(np.linalg.norm(self.off.reshape(-1, 2, 3), axis=2))
 
 
-def _found(trajectory: Trajectory, options: JumpOptions) -> _Found:
-    """Look for jumps, again without those that were found until the same ones are."""
+def _jumps_among(trajectory: Trajectory, options: JumpOptions) -> _StepComparison:
+    """Detect jumps, repeated without those found before until they are the same."""
     steps = _steps_of(trajectory)
     jumped = np.zeros(len(steps.seconds), dtype=np.bool_)
     for _ in range(ROUNDS):
         found = _compared(steps, ~jumped, options)
-        if 2 * found.jumped.sum() >= len(found.jumped):  # nothing to hold them against
+        if 2 * found.jumped.sum() >= len(found.jumped):  # no reference motion
             return replace(found, jumped=np.zeros_like(jumped))
         if np.array_equal(found.jumped, jumped):
             break
@@ -218,8 +217,8 @@ def _found(trajectory: Trajectory, options: JumpOptions) -> _Found:
     return found
 
 
-def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _Found:
-    """Hold steps against the good ones about them."""
+def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _StepComparison:
+    """Compare steps with their good neighbours."""
     velocity, away = _about(steps, good)
     expected = velocity * steps.seconds[:, None]
     turn = Rotation.from_rotvec(expected[:, :3])
@@ -227,7 +226,7 @@ def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _Found:
     off = np.hstack([(turn.inv() * Rotation.from_rotvec(steps.turn)).as_rotvec(), steps.way - way])
     off[:, 3:] = turn.inv().apply(off[:, 3:])
     reach = steps.seconds * away
-    found = _Found(turn.as_matrix(), way, off, reach, _acceleration(steps, good), good)
+    found = _StepComparison(turn.as_matrix(), way, off, reach, _acceleration(steps, good), good)
     sizes = found.sizes()
     limits = np.maximum(
         np.array([np.deg2rad(options.rotation_deg), options.position_m]),
@@ -258,7 +257,7 @@ def _acceleration(steps: _Steps, good: BoolArray) -> FloatArray:
     return np.asarray(np.mean(change.reshape(-1, 2, 3) ** 2, axis=(0, 2)))
 
 
-def _jump(trajectory: Trajectory, found: _Found, row: int) -> Jump:
+def _jump(trajectory: Trajectory, found: _StepComparison, row: int) -> Jump:
     angle, distance = found.sizes()[row].tolist()
     variance = found.acceleration * found.reach[row] ** 2
     return Jump(
@@ -270,8 +269,10 @@ def _jump(trajectory: Trajectory, found: _Found, row: int) -> Jump:
     )
 
 
-def _mended(trajectory: Trajectory, found: _Found, jumps: tuple[Jump, ...]) -> Trajectory:
-    """Put the motion about jumps in their place, and carry what comes after along."""
+def _repaired(
+    trajectory: Trajectory, found: _StepComparison, jumps: tuple[Jump, ...]
+) -> Trajectory:
+    """Replace jumps by the motion of their neighbours, and move all later poses rigidly."""
     R, p = trajectory.R.copy(), trajectory.p.copy()
     stated = trajectory.covariance
     covariance = None if stated is None else stated.copy()

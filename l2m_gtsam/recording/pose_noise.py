@@ -1,4 +1,4 @@
-"""How wrong the lidar's poses are, at any time of a drive."""
+"""Covariances of the lidar's poses at any time of a drive, as square roots."""
 
 import numpy as np
 from pydantic import Field

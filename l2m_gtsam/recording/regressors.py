@@ -1,4 +1,4 @@
-"""Numbers that go along with a drive, brought to the times of the readings."""
+"""Recorded numbers, interpolated at the times of the readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -130,8 +130,8 @@ def check_changes(readings: Readings, series: Sequence[ScalarSeries]) -> None:
     for each, values in zip(series, readings.regressors.T, strict=True):
         if np.ptp(values) <= STILL * np.abs(values).max():
             raise SyncError(
-                f"regressor {each.name!r}: it is {values[0]:g} at all readings, which nothing "
-                "tells from the offset H; leave it out of `bag.regressors`"
+                f"regressor {each.name!r}: it is {values[0]:g} at all readings, which cannot "
+                "be separated from the offset H; leave it out of `bag.regressors`"
             )
 
 

@@ -1,4 +1,4 @@
-"""Bring readings and poses together in time, and keep what says something new."""
+"""Interpolate poses at readings, and thin readings at the same place."""
 
 from dataclasses import replace
 

@@ -151,7 +151,7 @@ class TimeOffset:
 
     @property
     def estimated(self) -> bool:
-        """Whether the drive told it."""
+        """Whether the drive determined it."""
         return not self.held
 
 
@@ -176,7 +176,7 @@ class Disagreement:
     p_from, p_to
         Where the lidar was at the first and the last of these readings, metres, map frame, (3,).
     length
-        Way of the lidar in metres.
+        Length of the lidar's path in metres.
     readings
         Number of readings rejected.
     size

@@ -26,7 +26,7 @@ class DriftFigures(Record):
     Attributes
     ----------
     way_m
-        Length of the localised way in metres.
+        Length of the localised path in metres.
     end_m, end_deg
         Distance and angle of the last poses.
     largest_m, rms_m
@@ -41,7 +41,7 @@ class DriftFigures(Record):
 
     @property
     def end_share(self) -> float:
-        """Distance of the last poses as a share of the way."""
+        """Distance of the last poses as a share of the path's length."""
         return self.end_m / self.way_m if self.way_m > 0 else 0.0
 
 
@@ -52,7 +52,7 @@ class OdometryScale(Record):
     Attributes
     ----------
     longer
-        Share by which all ways are longer than odometry has them; negative: shorter.
+        Share by which all distances are longer than odometry has them; negative: shorter.
     sigma
         Its standard deviation.
     """
@@ -168,7 +168,7 @@ class StartSearch:
         By what natural logarithm the first is likelier than the second, tempered where the first
         leaves more than noise; infinite without a second.
     window_m, readings
-        The way that was looked at in the end, metres, and how many readings on it.
+        Length of the path that was searched in the end, metres, and number of readings on it.
     looked_at
         Places and headings of the lattice.
     """

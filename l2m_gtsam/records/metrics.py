@@ -177,7 +177,7 @@ class FitFigures(Record):
         Of the residuals, per axis.
     anomaly
         How much the field that the map predicts differs from a uniform one along the drive, per
-        axis, root mean square: what position is told by.
+        axis, root mean square: what determines the position.
     without_map
         What is left of the readings, per axis, if the field is taken to be uniform.
     """

@@ -13,7 +13,7 @@ from l2m_gtsam.records.calibration import Uncertainty
 
 @dataclass(frozen=True)
 class SensorPlan:
-    """What a drive will tell of one sensor.
+    """What a drive will determine of one sensor.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class DrivePlan:
         How the map's errors are counted.
     worst
         What is known least of the sensor that is known least, by itself: without what the readings
-        of others tell of the map's errors.
+        of others determine of the map's errors.
     motions
         The same with an extra motion, the most helpful first.
     doubts

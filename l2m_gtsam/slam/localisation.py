@@ -14,6 +14,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError, SyncError
+from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.dropouts import is_dead, mask_dropouts
@@ -248,5 +249,5 @@ def start_pose(odometry: Trajectory, options: StartPoseOptions) -> StartPose:
         p = np.array(options.position)
     if options.quaternion_xyzw is not None:
         R = Rotation.from_quat(options.quaternion_xyzw).as_matrix()
-    sigma = np.repeat([np.deg2rad(options.rotation_deg), options.position_m], 3)
-    return StartPose(RigidTransform(R, p), np.diag(sigma**2))
+    covariance = isotropic_covariance(options.rotation_deg, options.position_m)
+    return StartPose(RigidTransform(R, p), covariance)

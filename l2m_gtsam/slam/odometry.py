@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
-from l2m_gtsam.geometry import IDENTITY, between, moved
+from l2m_gtsam.geometry import IDENTITY, between, isotropic_covariance, moved
 from l2m_gtsam.lidar.odometry import LEAST_POINTS, ScanStep
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.recording.odometry_jumps import Jump, RepairedOdometry
@@ -49,6 +49,11 @@ class OdometrySteps:
 
     def __len__(self) -> int:
         return len(self.p)
+
+    @property
+    def path(self) -> FloatArray:
+        """Path length from the start to each key pose in metres, shape (K,)."""
+        return np.append(0.0, np.cumsum(np.linalg.norm(self.p, axis=1)))
 
     def until(self, count: int) -> "OdometrySteps":
         """Return so many first steps."""
@@ -115,7 +120,13 @@ def odometry_steps(
     p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
     stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
     if stated is not None:  # the repair of jumps has put their covariance into the poses'
-        return OdometrySteps(R, p, stated + _minimum(options), stated=True, scale=options.scale)
+        return OdometrySteps(
+            R,
+            p,
+            stated + isotropic_covariance(options.least_deg, options.least_m),
+            stated=True,
+            scale=options.scale,
+        )
     covariance = drift_covariance(R, p, options)
     for jump in jumps:
         covariance[np.searchsorted(rows, jump.row)] += jump.covariance
@@ -155,13 +166,9 @@ def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> Flo
     rotation = np.deg2rad(options.rotation_deg_per_m) ** 2 * over
     rotation += (options.rotation_share * turn) ** 2
     variance = np.repeat(np.column_stack([rotation, position]), 3, axis=1)
-    return np.asarray(variance[:, :, None] * np.eye(6) + _minimum(options))
-
-
-def _minimum(options: DriftOptions) -> FloatArray:
-    """Return what is added to every step's covariance, shape (6, 6)."""
-    sigma = np.repeat([np.deg2rad(options.least_deg), options.least_m], 3)
-    return np.diag(sigma**2)
+    return np.asarray(
+        variance[:, :, None] * np.eye(6) + isotropic_covariance(options.least_deg, options.least_m)
+    )
 
 
 def scan_odometry(

@@ -20,9 +20,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings, StepError, Whitening, rotation_matrices
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.map_prediction import MapPrediction
 from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import whitening
 
@@ -93,6 +94,50 @@ class RelativeMotions:
         key_pose = int(self.readings.key_pose[rows[0]])
         slope = self.readings.fraction[rows, None, None] * (by_lidar @ self.by_step[rows])
         return StepError(key_pose, self.steps[key_pose], slope)
+
+
+@dataclass(frozen=True)
+class DrivePrediction:
+    """A drive's N readings at an estimate.
+
+    Attributes
+    ----------
+    motions
+        Relative motions between the key poses.
+    prediction
+        The map at the readings.
+    """
+
+    motions: RelativeMotions
+    prediction: MapPrediction
+
+    @property
+    def interpolation_covariance(self) -> FloatArray:
+        """Covariance of residuals by odometry's errors between key poses, uT^2, (N, 3, 3)."""
+        return self.motions.interpolation_covariance(
+            np.arange(len(self.prediction.inside)), self.prediction.by_lidar
+        )
+
+    def squared(self, noise: FloatArray) -> FloatArray:
+        """Return squared Mahalanobis distances of the residuals, each alone, shape (N,)."""
+        return self.prediction.squared(
+            self.prediction.whitening(noise, extra=self.interpolation_covariance)
+        )
+
+    def independent(self, noise: FloatArray, used: BoolArray) -> FloatArray:
+        """Return the same of residuals that are decorrelated within each step, shape (N,).
+
+        Zero for readings that are not used or outside of the map.
+        """
+        prediction, squared = self.prediction, np.zeros(len(used))
+        own = prediction.whitening(noise)
+        rows = np.flatnonzero(used & prediction.inside)
+        key = self.motions.readings.key_pose[rows]
+        for part in np.split(rows, np.flatnonzero(np.diff(key)) + 1) if len(rows) else ():
+            white = self.motions.whitening(part, own[part], prediction.by_lidar[part])
+            e = white(prediction.residual[part, :, None]).reshape(-1, 3)
+            squared[part] = np.einsum("ni,ni->n", e, e)
+        return squared
 
 
 def interpolated_readings(

@@ -18,7 +18,6 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.disturbances import LEAST_LEFT, ROUNDS, ReadingFits, changed
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import (
-    MapPrediction,
     SharedMapErrors,
     errors_of,
     place_readings,
@@ -35,7 +34,7 @@ from l2m_gtsam.slam.pose_graph import (
     odometry_graph,
     scale_values,
 )
-from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
@@ -58,50 +57,6 @@ class SmoothingRound:
     values: gtsam.Values
     weights: FloatArray
     ending: Ending
-
-
-@dataclass(frozen=True)
-class DrivePrediction:
-    """A drive's N readings at an estimate.
-
-    Attributes
-    ----------
-    motions
-        Relative motions between the key poses.
-    prediction
-        The map at the readings.
-    """
-
-    motions: RelativeMotions
-    prediction: MapPrediction
-
-    @property
-    def interpolation_covariance(self) -> FloatArray:
-        """Covariance of residuals by odometry's errors between key poses, uT^2, (N, 3, 3)."""
-        return self.motions.interpolation_covariance(
-            np.arange(len(self.prediction.inside)), self.prediction.by_lidar
-        )
-
-    def squared(self, noise: FloatArray) -> FloatArray:
-        """Return squared Mahalanobis distances of the residuals, each alone, shape (N,)."""
-        return self.prediction.squared(
-            self.prediction.whitening(noise, extra=self.interpolation_covariance)
-        )
-
-    def independent(self, noise: FloatArray, used: BoolArray) -> FloatArray:
-        """Return the same of residuals that are decorrelated within each step, shape (N,).
-
-        Zero for readings that are not used or outside of the map.
-        """
-        prediction, squared = self.prediction, np.zeros(len(used))
-        own = prediction.whitening(noise)
-        rows = np.flatnonzero(used & prediction.inside)
-        key = self.motions.readings.key_pose[rows]
-        for part in np.split(rows, np.flatnonzero(np.diff(key)) + 1) if len(rows) else ():
-            white = self.motions.whitening(part, own[part], prediction.by_lidar[part])
-            e = white(prediction.residual[part, :, None]).reshape(-1, 3)
-            squared[part] = np.einsum("ni,ni->n", e, e)
-        return squared
 
 
 class SmoothingProblem:

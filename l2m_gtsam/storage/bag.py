@@ -263,10 +263,10 @@ def _needed(buffers: Buffers, chain: TfChain) -> set[str]:
 def _all_series(
     path: Path, buffers: Buffers, fields: list[Connection], options: BagOptions
 ) -> tuple[FieldSeries, ...]:
-    """Return every sensor's readings, in order of name; a silent topic is a sensor, too."""
-    heard = {topic for topic, _ in buffers.fields}
-    silent = {(c.topic, ""): FieldBuffer(c.topic, "") for c in fields if c.topic not in heard}
-    found = {**buffers.fields, **silent}
+    """Return every sensor's readings, in order of name; also of topics without messages."""
+    received = {topic for topic, _ in buffers.fields}
+    empty = {(c.topic, ""): FieldBuffer(c.topic, "") for c in fields if c.topic not in received}
+    found = {**buffers.fields, **empty}
     if not options.split_by_frame:
         _check_frames(path, list(found))
     names = sensor_names(found, options)

@@ -21,7 +21,7 @@ EARTH_UT = 50.0
 # A strength that is constant to this, relative, over many readings was normalised.
 CONSTANT = 1e-6
 ENOUGH_READINGS = 20
-# Readings that differ by less, relative, are a sensor that stands still, whatever its rounding.
+# Readings that differ by less, relative, are a sensor at rest, whatever its rounding.
 TURNED = 1e-3
 
 
@@ -106,7 +106,7 @@ def fault(found: Strength, turning: bool, unit: Unit) -> str | None:
 
 
 def _suspicion(as_written: float) -> str:
-    """Return the likely unit of a strength as it stands in the message."""
+    """Return the likely unit of a strength as written in the message."""
     fitting = [
         unit
         for unit in SUSPECTS
@@ -135,7 +135,7 @@ class RegressorTopic(Options):
     topic: str = Field(min_length=1)
     """Topic of any type; the leading slash does not matter."""
     field: str = Field(default="data", pattern=PATH)
-    """Where the number stands in a message: names with dots between, an element of an array with
+    """Where the number is in a message: names with dots between, an element of an array with
     its index, for example `current`, `twist.twist.linear.x` or `data[2]`."""
     scale: float = 1.0
     """Factor on the number; coefficients are in microtesla per unit of the product."""
@@ -183,8 +183,9 @@ class FixedTransform(Options):
             The quaternion is all zero.
         """
         if not any(self.quaternion_xyzw):
-            msg = "bag.tracked_to_lidar: the quaternion is all zero, it must be a rotation"
-            raise BagError(msg)
+            raise BagError(
+                "bag.tracked_to_lidar: the quaternion is all zero, it must be a rotation"
+            )
         R = Rotation.from_quat(self.quaternion_xyzw).as_matrix()
         return RigidTransform(R, np.array(self.translation))
 
@@ -196,7 +197,7 @@ class BagOptions(Options):
     """Topics of type sensor_msgs/MagneticField, names or globs; the leading slash does not
     matter."""
     split_by_frame: bool = False
-    """Whether one topic carries several sensors, told apart by `header.frame_id`; sensors are
+    """Whether one topic carries several sensors, distinguished by `header.frame_id`; sensors are
     then named after their frame instead of their topic."""
     poses: str | None = None
     """Topic of the poses: Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped;
@@ -215,7 +216,7 @@ class BagOptions(Options):
 
     regressors: dict[RegressorName, RegressorTopic] = Field(default_factory=dict)
     """Numbers that `l2m calibrate` reads beside the readings, by names of your choice: motor
-    currents, speeds, duty cycles. What follows them is told from the map's field."""
+    currents, speeds, duty cycles. What follows them is separated from the map's field."""
 
     @model_validator(mode="after")
     def _one_source_of_poses(self) -> "BagOptions":

@@ -63,7 +63,7 @@ def sensor_topics(bag: Bag, options: BagOptions, progress: Count | None) -> dict
     Raises
     ------
     BagError
-        No such topic, or one of several sensors that are not to be told apart.
+        No such topic, or one of several sensors that cannot be distinguished.
     """
     buffers: dict[Key, FieldBuffer] = {}
     for message in bag.messages(select_fields(bag, options), progress):
@@ -206,8 +206,8 @@ class Calibrator:
 def _topic(key: Key, frames: Mapping[str, Sequence[str]]) -> str:
     """Return the name of the corrected readings; of several sensors, each has its frame in it."""
     topic, frame = key
-    told = [frame.strip("/")] if len(frames[topic]) > 1 else []
-    return "/".join([topic, *filter(None, told), ENDING])
+    suffix = [frame.strip("/")] if len(frames[topic]) > 1 else []
+    return "/".join([topic, *filter(None, suffix), ENDING])
 
 
 def _readings(contents: Sequence[Any]) -> FloatArray:

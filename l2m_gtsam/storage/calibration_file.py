@@ -61,7 +61,7 @@ MODEL = {
     ),
     "disagreements": (
         "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
-        "ns, the lidar's way from p_from to p_to in m in the map, median residual (size) in uT"
+        "ns, the lidar's path from p_from to p_to in m in the map, median residual (size) in uT"
     ),
     "from_priors": (
         "what the readings leave open and only `calibration.priors` determine, or mostly (sigmas "
@@ -74,35 +74,13 @@ MODEL = {
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
 SENSOR_KEYS = (
-    "status",
-    "message",
-    "t_lidar_mag",
-    "t_sigma",
-    "C",
-    "C_sigma",
-    "H",
-    "H_sigma",
-    "R_lidar_mag",
-    "rotation_sigma",
-    "rotation_covariance",
-    "transforms",
-    "noise",
-    "undetermined",
-    "from_priors",
-    "residuals",
-    "readings",
-    "outside_map",
-    "rejected",
-    "start",
-    "time_offset",
-    "moving",
-    "models",
-    "not_compared",
-    "missing_in",
-    "unmodelled",
-    "covariance",
+    *("status", "message", "t_lidar_mag", "t_sigma", "C", "C_sigma", "H", "H_sigma"),
+    *("R_lidar_mag", "rotation_sigma", "rotation_covariance", "transforms", "noise"),
+    *("undetermined", "from_priors", "residuals", "readings", "outside_map", "rejected", "start"),
+    *("time_offset", "moving", "models", "not_compared", "missing_in"),
+    *("unmodelled", "covariance"),
 )
-"""In the order of the file: a matrix of 15 rows hides what follows it."""
+"""In the order of the file; the matrix of 15 rows comes last, since it hides what follows it."""
 
 
 @dataclass(frozen=True)

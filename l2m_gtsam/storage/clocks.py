@@ -1,7 +1,7 @@
 """Clocks of a bag's topics: stamps that are missing, of another time, or of a clock that was set.
 
 Header stamps are held against the times at which the messages were recorded: what lies between is
-how long they were on their way. That jitters, but does not change for good all at once.
+how long they were transmitted. That jitters, but does not change for good all at once.
 """
 
 from collections.abc import Iterable, Mapping
@@ -51,8 +51,8 @@ class ClockJump:
             for each in others
         )
 
-    def told(self, what: str) -> str:
-        """Return what is said of it."""
+    def text(self, what: str) -> str:
+        """Return a sentence about it, of stamps of a topic."""
         where = "ahead" if self.seconds > 0 else "back"
         return (
             f"header stamps of {what} jump {where} by {abs(self.seconds):.2f} s, "
@@ -122,9 +122,9 @@ def clock_notes(
     leading = [jump for stamps in poses for jump in clock_jumps(stamps)]
     for jump in leading:
         if jump.seconds < 0 or not jump.is_shared(every):
-            raise BagError(f"{path}: {jump.told('the poses')}; use `bag.stamps: record`")
+            raise BagError(f"{path}: {jump.text('the poses')}; use `bag.stamps: record`")
     return tuple(
-        f"{path}: {jump.told(f'topic {topic}')}, and its readings have poses of other times; use "
+        f"{path}: {jump.text(f'topic {topic}')}, and its readings have poses of other times; use "
         "`bag.stamps: record`"
         for topic, jumps in own.items()
         for jump in jumps

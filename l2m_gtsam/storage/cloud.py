@@ -89,7 +89,7 @@ class VoxelMeans:
         self._sums = np.column_stack([np.bincount(cell, column) for column in sums.T])
 
     def _keys_of(self, points: FloatArray) -> IntArray:
-        """Return one number per point that tells cells apart, shape (N,)."""
+        """Return one number per point that identifies its cell, shape (N,)."""
         cells = np.floor(points / self._edge).astype(np.int64)
         if self._origin is None:
             self._origin = cells[0]

@@ -30,7 +30,7 @@ def is_bag(path: Path) -> bool:
     Raises
     ------
     BagError
-        It cannot be told, because a folder cannot be read.
+        It is not known, because a folder cannot be read.
     """
     if is_folder(path):
         try:
@@ -115,8 +115,8 @@ def _in_utc(date: datetime) -> datetime:
     first, last = YEARS
     # A year away from both, lest the zone leads out of what a datetime can hold.
     if not first - 1 <= date.year <= last + 1 or not first <= _utc(date).year <= last:
-        told = {"year": date.year, "first": first, "last": last}
-        raise PydanticCustomError("date", "year {year}; accepted: {first} to {last}", told)
+        facts = {"year": date.year, "first": first, "last": last}
+        raise PydanticCustomError("date", "year {year}; accepted: {first} to {last}", facts)
     return _utc(date)
 
 

@@ -18,7 +18,7 @@ from l2m_gtsam.errors import L2MError, OutputError
 def atomic_path(path: Path) -> Iterator[Path]:
     """Give a temporary file to write, and rename it to ``path`` when the block ends well.
 
-    The temporary file stands in the same folder, so that the rename is one step of the file
+    The temporary file is in the same folder, so that the rename is one step of the file
     system. When the block fails it is removed, and what was under ``path`` before stays.
 
     Parameters
@@ -48,16 +48,14 @@ def renamed_path(path: Path) -> Iterator[Path]:
     Half of it may then be under the name; whoever reads it has to notice.
     """
     if path.exists() and not path.is_file():
-        msg = f"{path}: cannot be written: it exists and is not a regular file"
-        raise OutputError(msg)
+        raise OutputError(f"{path}: cannot be written: it exists and is not a regular file")
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         temporary.touch(exist_ok=False)
         yield temporary
         temporary.replace(path)
     except OSError as error:
-        msg = f"{path}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
+        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -102,8 +100,7 @@ def source_file(path: Path) -> SourceFile:
         else:
             _take_file(digest, path)
     except OSError as error:
-        msg = f"{path}: cannot be read: {error.strerror or error}"
-        raise L2MError(msg) from error
+        raise L2MError(f"{path}: cannot be read: {error.strerror or error}") from error
     return SourceFile(str(path), digest.hexdigest())
 
 
@@ -122,7 +119,7 @@ def _take_file(digest: Hasher, path: Path) -> None:
 
 
 LONGEST = 60  # letters: four bytes each and a digest are still a name for every file system
-DIGITS = 8  # of the digest that tells names apart
+DIGITS = 8  # of the digest that makes names differ
 PLAIN = "._-+ "  # beside letters and digits
 
 
@@ -132,16 +129,16 @@ def folder_names(
     """Return a folder's name for each of these names, no two alike on any file system.
 
     A name that is one already stays as it is. Any other, and all of those that are alike but for
-    upper and lower case, get a few digits of a digest. So the name of one does not depend on the
-    order in which they stand, and on others only when they are like it: one that had no digits gets
-    them when another like it is added.
+    upper and lower case, get a few digits of a digest. So a name does not
+    depend on the order of all, and on others only when they are like it: one that had no digits
+    gets them when another like it is added.
 
     Parameters
     ----------
     names
         Any text.
     identities
-        What stands behind each, unique.
+        What each name is of, unique.
     reserved
         Names that are taken.
     """
@@ -155,8 +152,8 @@ def folder_names(
 
 def printable(text: str) -> str:
     """Return text that can be written and shown anywhere: without control characters."""
-    told = text.encode("utf-8", "replace").decode("utf-8")
-    return "".join("\N{REPLACEMENT CHARACTER}" if _controls(each) else each for each in told)
+    encodable = text.encode("utf-8", "replace").decode("utf-8")
+    return "".join("\N{REPLACEMENT CHARACTER}" if _controls(each) else each for each in encodable)
 
 
 def _safe(name: str) -> str:

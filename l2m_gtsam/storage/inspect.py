@@ -79,7 +79,7 @@ class TopicReport:
 
 @dataclass(frozen=True)
 class BagReport:
-    """What is in a bag: its topics, and what stands in the way of using it, if anything."""
+    """What is in a bag: its topics, and what prevents its use, if anything."""
 
     path: Path
     topics: tuple[TopicReport, ...]
@@ -250,8 +250,8 @@ def _use(
         if wrong:
             return f"refused: {wrong}"
     if use is not None:
-        silent = measured is not None and not measured.readings
-        return f"{use}, but none is finite: the sensor is dead" if silent else use
+        dead = measured is not None and not measured.readings
+        return f"{use}, but none is finite: the sensor is dead" if dead else use
     if msgtype == FIELD_TYPE:
         return "not chosen by bag.fields"
     if msgtype in POSE_TYPES:

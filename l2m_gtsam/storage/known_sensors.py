@@ -65,7 +65,7 @@ def write_known_sensors(
     sensors
         The sensors.
     facts
-        Plain values that stand above them (seed, options).
+        Plain values above them (seed, options).
     header
         Comment on top.
     """

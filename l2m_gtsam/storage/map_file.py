@@ -56,8 +56,9 @@ def save_map(path: Path, state: MapState) -> None:
     everything = {**state.arrays, **_lidar_arrays(state.lidar)}
     arrays = {name: np.asarray(array, order="C") for name, array in everything.items()}
     if unfit := [name for name, array in arrays.items() if array.dtype.kind not in NUMERIC]:
-        msg = f"{path}: array {unfit[0]!r} is not numeric and cannot be part of a map file"
-        raise MapError(msg)
+        raise MapError(
+            f"{path}: array {unfit[0]!r} is not numeric and cannot be part of a map file"
+        )
     members = {
         HEADER: header,
         CHECKSUM: _checksum(header, arrays),
@@ -96,8 +97,9 @@ def load_map(path: Path) -> MapState:
         }
         checksum = _read_member(archive, CHECKSUM)
     if checksum.tobytes() != _checksum(header, arrays).tobytes():
-        msg = f"{path}: the checksum does not match, the file is damaged; build the map again"
-        raise MapError(msg)
+        raise MapError(
+            f"{path}: the checksum does not match, the file is damaged; build the map again"
+        )
     own = {name: array for name, array in arrays.items() if not name.startswith(LIDAR)}
     lidar = _lidar(path, arrays) if len(own) < len(arrays) else None
     return MapState(content["kind"], own, content["options"], content["provenance"], lidar)
@@ -132,8 +134,9 @@ def _encode_header(path: Path, state: MapState) -> npt.NDArray[np.uint8]:
     try:
         text = json.dumps(content, sort_keys=True)
     except (TypeError, ValueError) as error:
-        msg = f"{path}: options and provenance of a map must be plain values: {error}"
-        raise MapError(msg) from error
+        raise MapError(
+            f"{path}: options and provenance of a map must be plain values: {error}"
+        ) from error
     return np.frombuffer(text.encode(), dtype=np.uint8)
 
 
@@ -142,11 +145,10 @@ def _decode_header(path: Path, header: npt.NDArray[Any]) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise MapError(_foreign(path))
     if content.get("version") != VERSION:
-        msg = (
+        raise MapError(
             f"{path}: map version {content.get('version')!r}, this program reads version "
             f"{VERSION}; build the map again or use the program that wrote it"
         )
-        raise MapError(msg)
     parts = {"kind": str, "options": dict, "provenance": dict}
     if not all(isinstance(content.get(key), kind) for key, kind in parts.items()):
         raise MapError(_foreign(path))
@@ -169,15 +171,13 @@ def _read_member(archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
         shape, fortran, dtype = _read_array_header(member)
         declared = archive.getinfo(name).file_size - member.tell()
         if dtype.kind not in NUMERIC or fortran or _bytes_of(shape, dtype) != declared:
-            msg = f"array {name!r} is not what it declares to be"
-            raise ValueError(msg)
+            raise ValueError(f"array {name!r} is not what it declares to be")
         return np.frombuffer(bytearray(member.read()), dtype=dtype).reshape(shape)
 
 
 def _read_array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     if np.lib.format.read_magic(member) != (1, 0):
-        msg = "unknown version of an array"
-        raise ValueError(msg)
+        raise ValueError("unknown version of an array")
     return np.lib.format.read_array_header_1_0(member)
 
 
@@ -198,11 +198,10 @@ def _refuse_large(path: Path, archive: zipfile.ZipFile) -> None:
     """Refuse what the archive's own directory says is too much, before anything is unpacked."""
     declared = sum(info.file_size for info in archive.infolist())
     if declared > MAX_BYTES:
-        msg = (
+        raise MapError(
             f"{path}: unpacks to {declared / 1e9:.1f} GB, not a map of this program; at most "
             f"{MAX_BYTES / 1e9:.1f} GB are accepted"
         )
-        raise MapError(msg)
 
 
 def _foreign(path: Path) -> str:
@@ -218,11 +217,9 @@ def _translated(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        msg = f"{path}: no such map file; make one with `l2m map build`"
-        raise MapError(msg) from error
+        raise MapError(f"{path}: no such map file; make one with `l2m map build`") from error
     except OSError as error:
-        msg = f"{path}: cannot be read: {error.strerror or error}"
-        raise MapError(msg) from error
+        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (
         zipfile.BadZipFile,
         ValueError,

@@ -108,7 +108,7 @@ TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")
 
 @dataclass(frozen=True)
 class RawPose:
-    """A pose as it stands in a message; types without a covariance have None for it."""
+    """A pose as written in a message; types without a covariance have None for it."""
 
     position: Any
     orientation: Any

@@ -75,7 +75,7 @@ def chosen_cloud_topic(bag: Bag, topic: str | None) -> list[Connection]:
 
 
 def points_of(scan: Any) -> FloatArray:
-    """Return x, y and z of a PointCloud2 as they stand, shape (N, 3).
+    """Return x, y and z of a PointCloud2 as written, shape (N, 3).
 
     Raises
     ------

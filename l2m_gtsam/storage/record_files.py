@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.options import first_fault
 from l2m_gtsam.records.fleet import DATE, VERDICTS, DriveOutcome, SensorRow
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics, Record
@@ -213,15 +214,14 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            msg = f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
-            raise CalibrationError(msg)
+            raise CalibrationError(
+                f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
+            )
         return adapter.validate_json(path.read_bytes())
     except FileNotFoundError as error:
         raise CalibrationError(f"{path}: no such file; {writer}") from error
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
-        fault = error.errors()[0]
-        key = ".".join(str(part) for part in fault["loc"]) or "the file"
-        msg = f"{path}: not a {kind} file of this program: {key}: {fault['msg']}"
-        raise CalibrationError(msg) from error
+        fault = first_fault(error)
+        raise CalibrationError(f"{path}: not a {kind} file of this program: {fault}") from error

@@ -131,14 +131,14 @@ def _number(content: Any, steps: tuple[_Step, ...]) -> float:
     ValueError
         There is no such path, or no number at its end.
     """
-    value, way = content, "it"
+    value, name = content, "it"
     for step in steps:
         if step.name not in _names(value):
-            raise ValueError(f"has no {_dotted(steps)!r}: {way} {_described(value)}")
-        value, way = getattr(value, step.name), repr(step.name)
+            raise ValueError(f"has no {_dotted(steps)!r}: {name} {_described(value)}")
+        value, name = getattr(value, step.name), repr(step.name)
         if step.index is not None:
             if not isinstance(value, list | np.ndarray) or step.index >= len(value):
-                raise ValueError(f"has no {_dotted(steps)!r}: {way} {_described(value)}")
+                raise ValueError(f"has no {_dotted(steps)!r}: {name} {_described(value)}")
             value = value[step.index]
     if not isinstance(value, int | float | np.number | np.bool_):
         raise ValueError(f"has no number in {_dotted(steps)!r}: it {_described(value)}")

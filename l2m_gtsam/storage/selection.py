@@ -87,7 +87,7 @@ def sensor_names(
 ) -> dict[tuple[str, str], str]:
     """Name the sensors, by topic and frame: the topic without its leading slash, or the frame.
 
-    A frame that several topics share, or none, does not tell sensors apart: then the topic does,
+    A frame that several topics share, or none, does not identify a sensor: then the topic does,
     with the frame after it.
     """
     keys = list(keys)

@@ -12,6 +12,7 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.representer import SafeRepresenter
 
 from l2m_gtsam.errors import CalibrationError, L2MError
+from l2m_gtsam.options import first_fault
 from l2m_gtsam.storage.files import atomic_path
 
 # A calibration of a hundred sensors is under 1 MB; more than this is not ours.
@@ -39,23 +40,23 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
     """
     try:
         if path.stat().st_size > MAX_BYTES:
-            msg = f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
-            raise error(msg)
+            raise error(
+                f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
+            )
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as reason:
         why = "no such file" if isinstance(reason, FileNotFoundError) else "cannot be read as text"
-        msg = f"{path}: {why}"
-        raise error(msg) from reason
+        raise error(f"{path}: {why}") from reason
     try:
         return YAML(typ="safe", pure=True).load(text)
     except OverflowError as reason:  # moved to UTC, year 1 or 9999 may be left
-        msg = f"{path}: has a date that no calendar holds; accepted: years 2 to 9998"
-        raise error(msg) from reason
+        raise error(
+            f"{path}: has a date that no calendar holds; accepted: years 2 to 9998"
+        ) from reason
     except (YAMLError, ValueError, RecursionError) as reason:
         line = getattr(getattr(reason, "problem_mark", None), "line", None)
         where = "" if line is None else f", line {line + 1}"
-        msg = f"{path}: not valid YAML{where}"
-        raise error(msg) from reason
+        raise error(f"{path}: not valid YAML{where}") from reason
 
 
 def write_yaml(path: Path, content: dict[str, Any], header: str) -> None:
@@ -105,7 +106,6 @@ def read_checked(
     try:
         return adapter.validate_python(prepare(content) if isinstance(content, dict) else content)
     except ValidationError as error:
-        fault = error.errors()[0]
-        key = ".".join(str(part) for part in fault["loc"] if part not in added) or "the file"
-        msg = f"{path}: not a calibration file of this program: {key}: {fault['msg']}"
+        fault = first_fault(error, hidden=added)
+        msg = f"{path}: not a calibration file of this program: {fault}"
         raise CalibrationError(msg) from error

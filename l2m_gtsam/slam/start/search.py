@@ -14,6 +14,7 @@ from l2m_gtsam.calibration.start.global_start import spread_out
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.maps.field_map import Surveyed
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.localisation import StartCandidate, StartSearch, StartVerdict
@@ -188,8 +189,8 @@ def start_found(found: StartSearch, options: StartPoseOptions) -> StartPose:
     if found.verdict is not StartVerdict.UNIQUE:
         raise MapError(found.message)
     best = found.candidates[0]
-    sigma = np.repeat([np.deg2rad(options.rotation_deg), options.position_m], 3)
-    return StartPose(best.T_map_lidar, SIGMAS**2 * best.covariance + np.diag(sigma**2))
+    least = isotropic_covariance(options.rotation_deg, options.position_m)
+    return StartPose(best.T_map_lidar, SIGMAS**2 * best.covariance + least)
 
 
 def search_window(

@@ -12,7 +12,6 @@ drift as odometry does, and the sigmas do not show it.
 from dataclasses import dataclass
 
 import gtsam
-import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.errors import ConfigError
@@ -86,7 +85,7 @@ class Explorer:
         self._drive, self._options = drive, options
         self._pace = ExploringOptions() if pace is None else pace
         self._memory = FieldMemory.at_start(drive)
-        self._path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+        self._path = drive.steps.path
         self._first = self._solved = 0
         self._past: list[MarginalizedPose] = []
         self._belief = self._prior()

@@ -141,9 +141,11 @@ class TiledDrive:
             values.insert(M(tile.number), tile.robust_weights(sensors, noise))
         return values
 
-    def predictions(self, values: gtsam.Values, sensors: KnownSensors) -> list[MapPrediction]:
-        """Return each tile's prediction of its readings."""
-        return [tile.prediction(values.atVector(M(tile.number)), sensors) for tile in self.tiles]
+    def prediction(self, values: gtsam.Values, sensors: KnownSensors) -> MapPrediction:
+        """Return the tiles' predictions of all N readings, each in the frame of its anchor."""
+        tiles = self.tiles
+        parts = [tile.prediction(values.atVector(M(tile.number)), sensors) for tile in tiles]
+        return MapPrediction.joined(parts, [tile.rows for tile in tiles])
 
     def doubts(
         self, noise: FloatArray, weights: FloatArray, squared: FloatArray

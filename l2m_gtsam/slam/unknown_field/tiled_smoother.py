@@ -30,7 +30,7 @@ from l2m_gtsam.slam.pose_graph import (
     odometry_graph,
     scale_values,
 )
-from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
@@ -111,7 +111,7 @@ def incremental_poses(
     progress: Progress,
 ) -> list[gtsam.Pose3]:
     """Return the poses of a drive solved piece by piece, the last piece by odometry."""
-    path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    path = drive.steps.path
     poses = initial
     for end in np.arange(PIECE_M, path[-1], PIECE_M):
         progress("following the drive", float(end / path[-1]))
@@ -175,17 +175,15 @@ class TiledProblem:
         values.insert(scale_values(self._drive))
         for k, pose in enumerate(poses):
             values.insert(X(k), pose)
-        predictions = tiled.predictions(values, sensors)
-        whitenings = [prediction.whitening(noise) for prediction in predictions]
-        W = self._gathered(tiled, whitenings)
-        r2 = self._squared(tiled, motions, predictions, noise)
+        predicted = DrivePrediction(motions, tiled.prediction(values, sensors))
+        own = predicted.prediction.whitening(noise)
         robust = self._options.robust
+        r2 = predicted.squared(noise)
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
-        doubts = tiled.doubts(noise, weights, self._own_squared(tiled, predictions, whitenings))
+        doubts = tiled.doubts(noise, weights, predicted.prediction.squared(own))
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         fixed = None if self._free else self._drive.sensors.fixed()
-        W = W * np.sqrt(weights)[:, None, None]
-        by_lidar = self._gathered(tiled, [prediction.by_lidar for prediction in predictions])
+        W, by_lidar = own * np.sqrt(weights)[:, None, None], predicted.prediction.by_lidar
         graph = tiled.graph(motions, doubts, W, by_lidar, chosen, fixed)
         graph.push_back(self._odometry)
         graph.push_back(self._links)
@@ -205,17 +203,15 @@ class TiledProblem:
         marginals = Marginals(solved.graph.linearize(solved.values), order)
         motions = RelativeMotions.along(drive, solved.poses)
         tiled = solved.tiled.moved(motions, solved.poses, sensors)
-        predictions = tiled.predictions(solved.values, sensors)
+        predicted = DrivePrediction(motions, tiled.prediction(solved.values, sensors))
         solution = DriveSolution(
             drive=replace(drive, sensors=sensors),
             poses=solved.poses,
             pose_covariance=pose_covariances_together(marginals, len(drive)),
             calibration_covariance=sensor_covariances(marginals, solved.values, sensors),
-            prediction=self._prediction(solved, motions, tiled, predictions),
-            interpolation_covariance=self._gathered(
-                tiled, interpolation_covariances(tiled, motions, predictions)
-            ),
-            squared=self._squared(tiled, motions, predictions, sensors.noise),
+            prediction=_in_map(predicted, tiled, solved.poses, sensors),
+            interpolation_covariance=predicted.interpolation_covariance,
+            squared=predicted.squared(sensors.noise),
             weights=solved.weights,
             near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             odometry_chi2=2 * self._odometry.error(solved.values) / (6 * len(drive)),
@@ -223,64 +219,18 @@ class TiledProblem:
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
         )
-        path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+        path = drive.steps.path
         returns = tiled.anchoring.returns(path, AWAY_M)
         return FieldSolution(solution, len(tiled.tiles), returns)
 
-    def _gathered(self, tiled: TiledDrive, parts: list[FloatArray]) -> FloatArray:
-        """Return arrays of all tiles' readings in the order of the drive's, shape (N, ...)."""
-        whole = np.zeros((len(self._drive.readings), *parts[0].shape[1:]))
-        for tile, part in zip(tiled.tiles, parts, strict=True):
-            whole[tile.rows] = part
-        return whole
 
-    def _squared(
-        self,
-        tiled: TiledDrive,
-        motions: RelativeMotions,
-        predictions: list[MapPrediction],
-        noise: FloatArray,
-    ) -> FloatArray:
-        """Return squared Mahalanobis distances of the residuals, each alone, shape (N,)."""
-        pairs = zip(
-            predictions, interpolation_covariances(tiled, motions, predictions), strict=True
-        )
-        parts = [
-            prediction.squared(prediction.whitening(noise, extra=interpolation_covariance))
-            for prediction, interpolation_covariance in pairs
-        ]
-        return self._gathered(tiled, parts)
-
-    def _own_squared(
-        self, tiled: TiledDrive, predictions: list[MapPrediction], whitenings: list[FloatArray]
-    ) -> FloatArray:
-        """Return squared lengths of residuals by these whitening matrices, shape (N,)."""
-        pairs = zip(predictions, whitenings, strict=True)
-        return self._gathered(tiled, [prediction.squared(white) for prediction, white in pairs])
-
-    def _prediction(
-        self,
-        solved: TiledRound,
-        motions: RelativeMotions,
-        tiled: TiledDrive,
-        predictions: list[MapPrediction],
-    ) -> MapPrediction:
-        """Return the tiles' predictions with positions and axes of the map."""
-        where = place_readings(motions.readings, dict(enumerate(solved.poses)), solved.sensors)
-        anchors = [solved.poses[tile.anchor].rotation().matrix() for tile in tiled.tiles]
-        pairs = zip(predictions, anchors, strict=True)
-        variance = self._gathered(tiled, [each.map_variance @ (R**2).T for each, R in pairs])
-        residual = self._gathered(tiled, [prediction.residual for prediction in predictions])
-        by_lidar = self._gathered(tiled, [prediction.by_lidar for prediction in predictions])
-        return MapPrediction(where, np.ones(len(residual), bool), variance, residual, by_lidar)
-
-
-def interpolation_covariances(
-    tiled: TiledDrive, motions: RelativeMotions, predictions: list[MapPrediction]
-) -> list[FloatArray]:
-    """Return the covariances of each tile's residuals by odometry's errors, (n, 3, 3)."""
-    pairs = zip(tiled.tiles, predictions, strict=True)
-    return [
-        motions.interpolation_covariance(tile.rows, prediction.by_lidar)
-        for tile, prediction in pairs
-    ]
+def _in_map(
+    predicted: DrivePrediction, tiled: TiledDrive, poses: list[gtsam.Pose3], sensors: KnownSensors
+) -> MapPrediction:
+    """Return the tiles' predictions with positions and axes of the map."""
+    placed = place_readings(predicted.motions.readings, dict(enumerate(poses)), sensors)
+    variance = np.empty_like(predicted.prediction.map_variance)
+    for tile in tiled.tiles:
+        R = poses[tile.anchor].rotation().matrix()
+        variance[tile.rows] = predicted.prediction.map_variance[tile.rows] @ (R**2).T
+    return replace(predicted.prediction, placed=placed, map_variance=variance)

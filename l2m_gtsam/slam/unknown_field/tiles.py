@@ -88,7 +88,7 @@ def within_budget(resolution: Resolution, options: TileOptions) -> Resolution:
 
 def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) -> FieldPrior:
     """Learn the prior of the field from the first metres of a drive, at poses by odometry."""
-    path = np.append(0.0, np.cumsum(np.linalg.norm(drive.steps.p, axis=1)))
+    path = drive.steps.path
     early = np.flatnonzero(path[drive.readings.key_pose] <= options.learn_over_m)
     readings = drive.readings[early]
     where = place_readings(

@@ -37,7 +37,7 @@ class ExportedSensor:
 
 @dataclass(frozen=True)
 class Export:
-    """A calibration on its way into a file.
+    """A calibration as it is exported.
 
     Attributes
     ----------
@@ -122,8 +122,8 @@ def usable_sensors(result: CalibrationResult, fault: Fault) -> UsableSensors:
     left_out = {name: reason for name, reason in reasons.items() if reason is not None}
     chosen = tuple(sensor for sensor in result.sensors if sensor.sensor not in left_out)
     if not chosen:
-        told = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:5])
-        raise CalibrationError(f"no sensor is left to be written: {told or 'there is none'}")
+        why = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:5])
+        raise CalibrationError(f"no sensor is left to be written: {why or 'there is none'}")
     return UsableSensors(chosen, left_out)
 
 

@@ -6,10 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import RigidTransform
+from l2m_gtsam.geometry import as_matrix
 from l2m_gtsam.storage.calibration_file import (
     MODEL,
     UNCERTAINTY,
@@ -73,7 +72,7 @@ def kalibr_text(export: Export) -> str:
 
 def _entry(sensor: ExportedSensor, export: Export) -> dict[str, Any]:
     entry: dict[str, Any] = {"sensor": sensor.calibration.sensor, "frame": sensor.frame}
-    entry["T_mag_lidar"] = _homogeneous(sensor.T_lidar_mag.inverse())
+    entry["T_mag_lidar"] = as_matrix(sensor.T_lidar_mag.inverse()).tolist()
     offset = sensor.calibration.time_offset
     if offset is not None and offset.estimated:
         entry["timeshift_mag_lidar"] = offset.seconds
@@ -86,12 +85,6 @@ def _split_by_frame(export: Export) -> bool:
     """Return whether sensors are named after frames, which says nothing of their topics."""
     bag = export.result.options.get("bag")
     return isinstance(bag, dict) and bool(bag.get("split_by_frame"))
-
-
-def _homogeneous(transform: RigidTransform) -> list[list[float]]:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = transform.R, transform.t
-    return [[float(value) for value in row] for row in T]
 
 
 HEAD = '''

@@ -51,7 +51,7 @@ def joint_text(name: str, sensor: ExportedSensor, lidar_frame: str, indent: str)
     lidar_frame
         Link of the lidar, the parent.
     indent
-        What stands before its lines but the first.
+        Whitespace before all of its lines but the first.
     """
     transform = sensor.T_lidar_mag
     lines = [
@@ -102,7 +102,7 @@ class UrdfJoint:
 
 @dataclass
 class UrdfFile:
-    """A URDF and what stands in it where.
+    """A URDF, and where its links and joints are.
 
     Attributes
     ----------
@@ -206,7 +206,7 @@ class _Reader:
             self._joint = None
 
     def _end_of(self, start: int, here: int) -> int:
-        """Return where an element ends, of which the parser tells where its end tag begins."""
+        """Return where an element ends, of which the parser reports where its end tag begins."""
         data = self._found.data
         first = TAG_END.match(data, start)
         if first is not None and data[first.end() - 2 : first.end()] == b"/>":
@@ -285,7 +285,7 @@ def _spliced(urdf: UrdfFile, spans: list[tuple[UrdfJoint, bytes]], added: list[s
     newline = _newline(urdf)
     inserted = "".join(f"  {text}\n" for text in added).replace("\n", newline)
     line = urdf.data.rfind(b"\n", 0, urdf.end) + 1
-    fresh = not urdf.data[line : urdf.end].strip()  # the end tag stands on a line of its own
+    fresh = not urdf.data[line : urdf.end].strip()  # the end tag has a line of its own
     where = line if fresh and line else urdf.end
     parts, done = [], 0
     for joint, text in sorted(spans, key=lambda span: span[0].start):

@@ -11,11 +11,11 @@ from l2m_gtsam.data import LidarMap, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.geometry import between, difference, perturbed
 from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loop_closures
-from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, follow
+from l2m_gtsam.lidar.odometry import ScanOdometryOptions, ScanStep, follow
 from l2m_gtsam.lidar.registration import PoseEstimate, Refusal, unseen_covariance
 from l2m_gtsam.lidar.scan_localisation import (
     ScanLocalisationOptions,
-    SearchOptions,
+    ScanSearchOptions,
     find_start,
     localise_scans,
 )
@@ -28,7 +28,7 @@ DRIVE = rows(round_trip(150), range(1, 150, 4))  # once around the circle of 9.4
 OPTIONS = ScanLocalisationOptions()
 # Nothing of it but the floor and two walls can fit at a time.
 OTHER = Room(((-5.0, -8.0, 0.0), (4.0, 7.0, 5.0)))
-QUICK = SearchOptions(tried=6)
+QUICK = ScanSearchOptions(tried=6)
 
 
 def pose(trajectory: Trajectory, k: int) -> RigidTransform:
@@ -53,7 +53,7 @@ def cloud() -> Surface:
 
 @pytest.fixture(scope="module")
 def steps() -> list[ScanStep]:
-    return list(follow(scans(ROOM, DRIVE, np.random.default_rng(2)), OdometryOptions()))
+    return list(follow(scans(ROOM, DRIVE, np.random.default_rng(2)), ScanOdometryOptions()))
 
 
 def test_a_drive_on_a_cloud(cloud: Surface, steps: list[ScanStep]) -> None:
@@ -91,7 +91,9 @@ def test_scans_of_another_room_are_counted_and_left_out(
     cloud: Surface, steps: list[ScanStep]
 ) -> None:
     """Somebody stands around the lidar for a second; odometry bridges it."""
-    odd = list(follow(scans(OTHER, rows(DRIVE, [5]), np.random.default_rng(0)), OdometryOptions()))
+    odd = list(
+        follow(scans(OTHER, rows(DRIVE, [5]), np.random.default_rng(0)), ScanOdometryOptions())
+    )
     mixed = [
         replace(step, surface=odd[0].surface) if 5 <= k < 8 else step
         for k, step in enumerate(steps)
@@ -106,7 +108,7 @@ def test_scans_of_another_room_are_counted_and_left_out(
 def test_swept_scans_are_where_they_were_at_their_stamps(cloud: Surface) -> None:
     """At 1 m/s a turn of 0.1 s would move them by 5 cm."""
     true, twist = straight(6, speed=1.0), np.array([0, 0, 0, 1.0, 0, 0])
-    steps = follow(swept(ROOM, true, twist, 0.1), OdometryOptions())
+    steps = follow(swept(ROOM, true, twist, 0.1), ScanOdometryOptions())
     found = localise_scans(steps, cloud, unsure(pose(true, 0)), OPTIONS)
     error = np.linalg.norm(found.trajectory.p - true.p, axis=1)
     # The speed is that of the step before, wrong by centimetres per second.
@@ -135,7 +137,9 @@ def test_the_start_is_found_along_the_mapping_drive(cloud: Surface, steps: list[
 def test_an_ambiguous_start_is_refused() -> None:
     """An empty room looks the same turned by half a turn."""
     hall = Room(((-5.0, -3.0, 0.0), (5.0, 3.0, 3.0)))
-    steps = list(follow(scans(hall, rows(DRIVE, [3]), np.random.default_rng(2)), OdometryOptions()))
+    steps = list(
+        follow(scans(hall, rows(DRIVE, [3]), np.random.default_rng(2)), ScanOdometryOptions())
+    )
     with pytest.raises(LidarError, match=r"fits at several places, .* and .*; say with `lidar.st"):
         find_start(
             steps[0].surface,
@@ -148,7 +152,7 @@ def test_an_ambiguous_start_is_refused() -> None:
 
 def test_another_building_is_told(cloud: Surface) -> None:
     steps = list(
-        follow(scans(OTHER, rows(DRIVE, [3]), np.random.default_rng(2)), OdometryOptions())
+        follow(scans(OTHER, rows(DRIVE, [3]), np.random.default_rng(2)), ScanOdometryOptions())
     )
     with pytest.raises(LidarError, match="fits nowhere along the mapping drives"):
         find_start(
@@ -174,7 +178,7 @@ def test_loops_are_closed(steps: list[ScanStep]) -> None:
 
 def test_wrong_loops_are_refused(steps: list[ScanStep]) -> None:
     """Odometry believes to be back where it began; the scans are of another room."""
-    odd = follow(scans(OTHER, DRIVE, np.random.default_rng(3)), OdometryOptions())
+    odd = follow(scans(OTHER, DRIVE, np.random.default_rng(3)), ScanOdometryOptions())
     later = 60_000_000_000
     moved = [replace(each, stamp_ns=each.stamp_ns + later) for each in odd]
     found = find_loop_closures(

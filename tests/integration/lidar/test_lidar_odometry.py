@@ -7,11 +7,11 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, difference
-from l2m_gtsam.lidar.odometry import OdometryOptions, ScanStep, accumulated, follow, odometry
+from l2m_gtsam.lidar.odometry import ScanOdometryOptions, ScanStep, accumulated, follow, odometry
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from tests.worlds.lidar_rooms import CORRIDOR, ROOM, Room, round_trip, rows, scans, straight, swept
 
-OPTIONS = OdometryOptions()
+OPTIONS = ScanOdometryOptions()
 EMPTY = Room(ROOM.walls)
 QUICK = rows(round_trip(60), range(0, 60, 2))  # five scans per second, 5 m
 

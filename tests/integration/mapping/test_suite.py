@@ -10,14 +10,14 @@ from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, Traje
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
-from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
+from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from tests.drives.slam import SlamDrive, quiet, slam_drive
 from tests.worlds.exact import DipoleWorld
 from tests.worlds.surveyed import strange_hall, wandering
 
 CLOCK = 0.02  # seconds by which readings are late
-QUICK = SuiteOptions.model_validate(
+QUICK = SuiteCalibrationOptions.model_validate(
     {
         "sync": {"thin_distance_m": 0.05, "thin_angle_deg": 5.0},
         "windows": 1,
@@ -118,9 +118,9 @@ def test_a_drive_that_never_turns_says_what_it_does_not_tell() -> None:
     straight = replace(way, R=np.tile(np.eye(3), (len(way), 1, 1)))
     drive = slam_drive(strange_hall(4), truth, straight, rng, noise=0.1)
     result = calibrate_suite([replace(drive.recording, trajectory=straight)], None, QUICK, quiet)
-    (doubt,) = result.doubts
-    assert "t_lidar_mag x, t_lidar_mag y, t_lidar_mag z" in doubt
-    assert "H x" in doubt
+    (complexity,) = result.doubts
+    assert "t_lidar_mag x, t_lidar_mag y, t_lidar_mag z" in complexity
+    assert "H x" in complexity
     assert result.sensors[0].t_sigma.min() > 0.1
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from l2m_gtsam.data import Recording, Trajectory
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
-from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
+from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
@@ -44,7 +44,7 @@ def test_a_run_is_localised_in_the_map_of_another(shared_data: Path) -> None:
     Assumed ideal, the same sensor in its own map is led astray by 0.2 to 0.8 m.
     """
     first, second = (read(shared_data, run) for run in (0, 1))
-    suite = calibrate_suite([first], None, SuiteOptions.model_validate(QUICK), quiet)
+    suite = calibrate_suite([first], None, SuiteCalibrationOptions.model_validate(QUICK), quiet)
     drive, truth = with_drift(second, 35, 30, seed=1)
     options = SlamOptions.model_validate({"key_poses": POSES, "calibration": "refined"})
     result = localise(drive, mapped(first, suite), suite, options, quiet).result
@@ -63,7 +63,7 @@ def test_two_runs_under_motion_capture(shared_data: Path) -> None:
     NEES of a drive scatters; 18 are 3 per degree of freedom, from where the report warns.
     """
     first, second = (read(shared_data, run) for run in (0, 1))
-    suite = calibrate_suite([first], None, SuiteOptions(), quiet)
+    suite = calibrate_suite([first], None, SuiteCalibrationOptions(), quiet)
     field_map, nees = mapped(first, suite), []
     for seed in (1, 2, 3):
         drive, truth = with_drift(second, 0, 90, seed)

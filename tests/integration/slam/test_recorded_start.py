@@ -8,7 +8,7 @@ import pytest
 
 from l2m_gtsam.data import Recording, Trajectory
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
-from l2m_gtsam.mapping.suite_likelihood import SuiteOptions
+from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import StartVerdict
@@ -35,7 +35,7 @@ OPTIONS = SlamOptions.model_validate(
 def known(shared_data: Path) -> tuple[Recording, FieldMap, CalibrationResult]:
     """Run 1 with the map of run 0, and the sensor as calibrated by run 0 alone."""
     first, second = (read(shared_data, run) for run in (0, 1))
-    suite = calibrate_suite([first], None, SuiteOptions.model_validate(QUICK), quiet)
+    suite = calibrate_suite([first], None, SuiteCalibrationOptions.model_validate(QUICK), quiet)
     return second, mapped(first, suite), suite
 
 

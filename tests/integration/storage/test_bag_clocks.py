@@ -46,7 +46,7 @@ def test_a_clock_that_is_set_is_found(row: int, seconds: float, sign: int, seed:
     (jump,) = clock_jumps(times(ahead, usual(seed)))
     assert jump.seconds == pytest.approx(sign * seconds, abs=0.01)
     assert jump.after_s == pytest.approx(row / RATE_HZ, abs=0.1)
-    assert jump.told("topic /mag").startswith(
+    assert jump.text("topic /mag").startswith(
         f"header stamps of topic /mag jump {'ahead' if sign > 0 else 'back'} by "
     )
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
-from l2m_gtsam.mapping.suite_likelihood import SIZE, SuiteWindow, scored, undistorted
+from l2m_gtsam.mapping.suite_likelihood import SIZE, SuiteWindow, suite_likelihood, undistorted
 from tests.worlds.harmonic import GIVEN, TILTED, basis, places
 
 SENSORS = 2
@@ -52,7 +52,7 @@ def somewhere() -> FloatArray:
 
 def value(part: SuiteWindow, sensors: FloatArray) -> float:
     moved = at_clocks(part.readings, sensors[:, TIMED])
-    return scored(replace(part, readings=moved), sensors, GIVEN).value
+    return suite_likelihood(replace(part, readings=moved), sensors, GIVEN).value
 
 
 def test_the_likelihood_is_that_of_the_dense_process() -> None:
@@ -67,13 +67,13 @@ def test_the_likelihood_is_that_of_the_dense_process() -> None:
     C = sensors[part.readings.sensor, 3:12].reshape(-1, 3, 3)
     density = multivariate_normal(np.zeros(len(F)), covariance).logpdf(seen.field.ravel())
     expected = density - np.log(np.abs(np.linalg.det(C))).sum()
-    assert scored(part, sensors, GIVEN).value == pytest.approx(expected, rel=1e-9)
+    assert suite_likelihood(part, sensors, GIVEN).value == pytest.approx(expected, rel=1e-9)
 
 
 def test_slopes_are_those_of_the_likelihood() -> None:
     """Central differences err by their step squared, here about 1e-5 of the largest slope."""
     part, sensors = window(), somewhere()
-    slope = scored(part, sensors, GIVEN).slope.reshape(SENSORS, SIZE)
+    slope = suite_likelihood(part, sensors, GIVEN).slope.reshape(SENSORS, SIZE)
     differences, step = np.empty_like(slope), 1e-5
     for index in np.ndindex(*slope.shape):
         more, less = sensors.copy(), sensors.copy()
@@ -99,7 +99,9 @@ def test_information_is_what_slopes_of_many_draws_vary_by() -> None:
     for _ in range(400):
         field = np.einsum("nji,nj->ni", R, F @ (prior * rng.normal(size=len(model))))
         field += GIVEN.noise * rng.normal(size=field.shape)
-        found = scored(replace(part, readings=replace(part.readings, field=field)), truth, GIVEN)
+        found = suite_likelihood(
+            replace(part, readings=replace(part.readings, field=field)), truth, GIVEN
+        )
         draws.append(found.slope)
         information.append(np.diag(found.information))
     told, varied = np.mean(information, axis=0), np.var(draws, axis=0)
@@ -116,5 +118,5 @@ def test_how_high_a_drive_is_taken_to_be_says_nothing() -> None:
     level = np.tile(np.eye(3), (len(part.readings), 1, 1))
     straight = replace(part, readings=replace(part.readings, R_map_lidar=level))
     higher = sensors + np.where(np.arange(SIZE) < 3, 0.3, 0.0)
-    same = scored(straight, sensors, GIVEN).value
-    assert scored(straight, higher, GIVEN).value == pytest.approx(same, abs=1e-6)
+    same = suite_likelihood(straight, sensors, GIVEN).value
+    assert suite_likelihood(straight, higher, GIVEN).value == pytest.approx(same, abs=1e-6)

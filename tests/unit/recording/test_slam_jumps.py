@@ -25,13 +25,13 @@ def pose(trajectory: Trajectory, k: int) -> RigidTransform:
     return RigidTransform(trajectory.R[k], trajectory.p[k])
 
 
-def step_nees(true: Trajectory, mended: RepairedOdometry) -> float:
+def step_nees(true: Trajectory, repaired: RepairedOdometry) -> float:
     """Return the squared errors of the motions put in place of jumps, in sigmas of the graph's."""
     total, least = 0.0, drift_covariance(np.eye(3)[None], np.zeros((1, 3)), DriftOptions())[0]
-    for each in mended.jumps:
+    for each in repaired.jumps:
         step, other = (
             between(pose(part, each.row), pose(part, each.row + 1))
-            for part in (mended.trajectory, true)
+            for part in (repaired.trajectory, true)
         )
         error = difference(step, other)
         total += float(error @ np.linalg.solve(each.covariance + least, error))
@@ -47,12 +47,12 @@ def test_smooth_drives_have_no_jumps(faster: float, every: int) -> None:
     """
     way = (DRIVE.stamp_ns - DRIVE.stamp_ns[0]) / faster
     drive = replace(DRIVE, stamp_ns=way.astype(np.int64))[np.arange(0, len(DRIVE), every)]
-    mended = without_jumps(drive, OPTIONS)
-    assert mended.jumps == ()
-    assert mended.left_out == 0
-    assert mended.trajectory is not None
-    np.testing.assert_array_equal(mended.trajectory.p, drive.p)
-    assert mended.notes() == ()
+    repaired = without_jumps(drive, OPTIONS)
+    assert repaired.jumps == ()
+    assert repaired.left_out == 0
+    assert repaired.trajectory is not None
+    np.testing.assert_array_equal(repaired.trajectory.p, drive.p)
+    assert repaired.notes() == ()
 
 
 @given(st.integers(0, 1000), st.floats(0.0, 0.01), st.floats(0.0, 1.0))
@@ -100,16 +100,16 @@ def test_a_jump_anywhere_is_found_and_taken_out(
     row: int, metres: float, degrees: float, heading: float
 ) -> None:
     """The drive without it comes out as well as the step that is put in its place is known."""
-    mended = without_jumps(jumped(DRIVE, shift(row, metres, degrees, heading)), OPTIONS)
-    (jump,) = mended.jumps
+    repaired = without_jumps(jumped(DRIVE, shift(row, metres, degrees, heading)), OPTIONS)
+    (jump,) = repaired.jumps
     assert jump.row == row
     assert jump.seconds == pytest.approx((row + 1) / RATE_HZ)
     assert jump.distance_m == pytest.approx(metres, abs=0.03)
     assert jump.angle_deg == pytest.approx(abs(degrees), abs=2)
     # Chi squared of 6 degrees of freedom passes 22.5 once in 1,000; there are 600 places.
-    assert step_nees(DRIVE, mended) < 22.5
-    np.testing.assert_array_equal(mended.rows, [row, row + 1])
-    (note,) = mended.notes()
+    assert step_nees(DRIVE, repaired) < 22.5
+    np.testing.assert_array_equal(repaired.rows, [row, row + 1])
+    (note,) = repaired.notes()
     assert f"odometry jumps by {jump.distance_m:.2f} m and {jump.angle_deg:.1f} deg" in note
 
 
@@ -121,12 +121,12 @@ def test_several_jumps_are_taken_out(places: set[int], seed: int) -> None:
         shift(6 * k, rng.uniform(0.15, 2), rng.uniform(-90, 90), rng.uniform(-3, 3))
         for k in sorted(places)
     ]
-    mended = without_jumps(jumped(DRIVE, *shifts), OPTIONS)
-    assert [each.row for each in mended.jumps] == [each.row for each in shifts]
+    repaired = without_jumps(jumped(DRIVE, *shifts), OPTIONS)
+    assert [each.row for each in repaired.jumps] == [each.row for each in shifts]
     # 6 in the mean for each, and once in 1,000 as much as this for one of them.
-    assert step_nees(DRIVE, mended) < 22.5 + 6 * (len(shifts) - 1) * 2
+    assert step_nees(DRIVE, repaired) < 22.5 + 6 * (len(shifts) - 1) * 2
     if len(shifts) > 3:
-        assert mended.notes()[-1] == f"odometry jumps {len(shifts) - 3} more times"
+        assert repaired.notes()[-1] == f"odometry jumps {len(shifts) - 3} more times"
 
 
 def test_a_rotation_alone_is_a_jump() -> None:
@@ -139,11 +139,11 @@ def test_a_pose_that_lies_elsewhere_is_left_out() -> None:
     """There and back: what is known of the way past it stays known."""
     stray = replace(DRIVE, p=DRIVE.p.copy())
     stray.p[100] += [0.4, 0.0, 0.0]
-    mended = without_jumps(stray, OPTIONS)
-    assert mended.jumps == ()
-    assert mended.left_out == 1
-    np.testing.assert_array_equal(mended.trajectory.p, np.delete(DRIVE.p, 100, axis=0))
-    (note,) = mended.notes()
+    repaired = without_jumps(stray, OPTIONS)
+    assert repaired.jumps == ()
+    assert repaired.left_out == 1
+    np.testing.assert_array_equal(repaired.trajectory.p, np.delete(DRIVE.p, 100, axis=0))
+    (note,) = repaired.notes()
     assert note.endswith("are left out: 1")
 
 
@@ -173,13 +173,13 @@ def test_what_is_stated_of_poses_goes_on_past_a_jump() -> None:
         return replace(drive, covariance=np.stack(P))
 
     shifts = shift(150, 0.5, 10.0), shift(300, 2.0, -60.0)
-    mended = without_jumps(accumulated(jumped(DRIVE, *shifts), {}), OPTIONS)
-    own = {each.row: each.covariance for each in mended.jumps}
+    repaired = without_jumps(accumulated(jumped(DRIVE, *shifts), {}), OPTIONS)
+    own = {each.row: each.covariance for each in repaired.jumps}
     assert sorted(own) == [150, 300]
-    expected = accumulated(mended.trajectory, own).covariance
+    expected = accumulated(repaired.trajectory, own).covariance
     assert expected is not None
-    assert mended.trajectory.covariance is not None
-    np.testing.assert_allclose(mended.trajectory.covariance, expected, atol=1e-9)
+    assert repaired.trajectory.covariance is not None
+    np.testing.assert_allclose(repaired.trajectory.covariance, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("count", range(1, 6))
@@ -192,5 +192,5 @@ def test_poses_that_jump_everywhere_are_left_as_they_are() -> None:
     """Nothing tells how the vehicle moved."""
     rng = np.random.default_rng(1)
     wild = replace(DRIVE, p=10 * rng.normal(size=DRIVE.p.shape))
-    mended = without_jumps(wild, OPTIONS)
-    assert len(mended.trajectory) > len(DRIVE) / 2
+    repaired = without_jumps(wild, OPTIONS)
+    assert len(repaired.trajectory) > len(DRIVE) / 2

@@ -44,10 +44,8 @@ def counted(drawn: DrawnDrive, stated: float, spoilt: FloatArray, weights: Float
     poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
     tiled = TiledDrive.partition(RelativeMotions.along(drive, poses), poses, drive.sensors, PRIOR)
     noise = np.full(len(drive.sensors.names), stated)
-    predictions = tiled.predictions(tiled.weights(drive.sensors, noise), drive.sensors)
-    squared = spoilt.copy()
-    for tile, prediction in zip(tiled.tiles, predictions, strict=True):
-        squared[tile.rows] += prediction.squared(prediction.whitening(noise))
+    prediction = tiled.prediction(tiled.weights(drive.sensors, noise), drive.sensors)
+    squared = spoilt + prediction.squared(prediction.whitening(noise))
     of_noise = sum(each.parameters for each in tiled.doubts(noise, weights, squared))
     chosen = np.flatnonzero(weights)
     as_stated = (
