@@ -202,11 +202,6 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         residual = problem.batch.residuals(values, s).residual[rows]
         covariance = among((s,))
         gradient = np.concatenate([gradients.at(key) for key in keys_of(s)])
-        white = (W[rows] @ residual[:, :, None]).ravel()
-        own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
-        excess = unmodelled(
-            problem.view.readings, [own], OWN, covariance, len(problem.view.sensors)
-        )
         solutions.append(
             SensorSolution(
                 sensor=s,
@@ -215,9 +210,27 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
                 determinacy=test,
                 remaining_sigmas=float(np.sqrt(gradient @ covariance @ gradient)),
                 contradictions=tuple(each for each in missed if s in each.sensors),
-            ).widened(excess)
+            )
         )
     return tuple(solutions)
+
+
+def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
+    """Return the same with covariances that hold what the scatter of parts of the drive shows."""
+    values, W = estimate.values(problem.view.sensors), whitening(problem.covariance)
+    linear = problem.graph.linearize(values)
+    among = joint_covariance(linear, values, partial(covariance_by_qr, linear))
+    widened = []
+    for found in sensor_solutions(problem, estimate):
+        s = found.sensor
+        rows = problem.batch.rows_of(s)
+        residual = problem.batch.residuals(values, s).residual[rows]
+        white = (W[rows] @ residual[:, :, None]).ravel()
+        own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
+        together = len(problem.view.sensors)
+        excess = unmodelled(problem.view.readings, [own], OWN, among((s,)), together)
+        widened.append(found.widened(excess))
+    return tuple(widened)
 
 
 def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:

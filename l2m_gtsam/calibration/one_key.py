@@ -10,7 +10,7 @@ Where the lidar's motion tells a sensor's time offset from its place, ``S(i)`` i
 the readings' poses are taken anew as it moves.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
@@ -25,6 +25,7 @@ from l2m_gtsam.calibration.joint import (
     SensorSolution,
     joint_problem,
     joint_step,
+    robust_solutions,
     sensor_solutions,
 )
 from l2m_gtsam.calibration.optimise import Ending
@@ -121,7 +122,7 @@ def solve_one_key(
         What is known of the sensors beforehand.
     """
     stage = partial(progress, "map uncertainty")
-    finish = partial(solve_uncertain, progress=stage)
+    finish = Finish(robust_solutions, partial(solve_uncertain, progress=stage))
     return _solved(readings, field_map, t_start, options, progress, trajectory, priors, finish)
 
 
@@ -140,11 +141,12 @@ def solve_part(
     t_start
         Where the whole was found, metres, shape (S, 3).
     """
-    return _solved(readings, field_map, t_start, options, silent, None, NO_PRIORS, step_uncertain)
+    finish = Finish(sensor_solutions, step_uncertain)
+    return _solved(readings, field_map, t_start, options, silent, None, NO_PRIORS, finish)
 
 
-class Finish(Protocol):
-    """What is done over a map that knows its errors."""
+class SharedFinish(Protocol):
+    """The finish over a map that knows its errors."""
 
     def __call__(
         self,
@@ -157,6 +159,22 @@ class Finish(Protocol):
     ) -> UncertainSolution:
         """Return the solutions from the optimum with independent errors."""
         ...
+
+
+@dataclass(frozen=True)
+class Finish:
+    """How covariances come from the optimum with independent errors.
+
+    Attributes
+    ----------
+    independent
+        Over a map whose errors are independent.
+    shared
+        Over a map that knows its errors.
+    """
+
+    independent: Callable[[JointProblem, Estimate], tuple[SensorSolution, ...]]
+    shared: SharedFinish
 
 
 def _solved(
@@ -188,8 +206,8 @@ def _solved(
     view, tests = joint.problem.view, joint.problem.determinacies
     errors = shared_errors(field_map, view.readings, options.uncertainty)
     if errors is None:
-        return replace(outcome, solved=sensor_solutions(joint.problem, joint.estimate))
-    full = finish(view, field_map, errors, joint.estimate, tests, options)
+        return replace(outcome, solved=finish.independent(joint.problem, joint.estimate))
+    full = finish.shared(view, field_map, errors, joint.estimate, tests, options)
     if isinstance(field_map, RememberedMap):
         remember_near(field_map, joint, full.estimate)
     unshared = isinstance(errors, NothingShared)
