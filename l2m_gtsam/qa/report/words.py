@@ -1,4 +1,4 @@
-"""A calibration in words and numbers for people."""
+"""A calibration in words and numbers for people: what templates call."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.qa.report.figures.statistics import NAMES, correlations
 from l2m_gtsam.qa.report.page import vector, with_sigma
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
-from l2m_gtsam.records.metrics import Repeatability, SensorMetrics
+from l2m_gtsam.records.metrics import Repeatability, Row, SensorMetrics
 from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
 
@@ -80,6 +80,11 @@ def drives(found: Repeatability) -> str:
         f"Normalised square of what they differ by, per degree of freedom: {ratio:.2f} (1 is "
         f"consistent, {low:.2f} to {high:.2f} in 95 % of cases)"
     )
+
+
+def length(values: Row) -> float:
+    """Return the length of a vector."""
+    return float(np.linalg.norm(values))
 
 
 def strongest(sensor: SensorCalibration) -> str:
