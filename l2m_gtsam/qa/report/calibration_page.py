@@ -7,16 +7,16 @@ from dataclasses import dataclass
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.progress import Progress, counter, silent
 from l2m_gtsam.qa.options import QaOptions, thresholds
-from l2m_gtsam.qa.report import words
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.figures import map as map_figures
 from l2m_gtsam.qa.report.figures import readings, statistics
 from l2m_gtsam.qa.report.figures.comparison import drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
-from l2m_gtsam.qa.report.page import Picture, pictures, render
+from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
@@ -47,6 +47,12 @@ class SensorSection:
     metrics: SensorMetrics | None
     verdict: SensorVerdict
     pictures: dict[str, Picture]
+
+    @property
+    def roll_pitch_yaw(self) -> tuple[float, float, float] | None:
+        """Of R_lidar_mag in degrees; None where that is not known."""
+        R = self.sensor.R_lidar_mag
+        return roll_pitch_yaw(Rotation.from_matrix(R)) if np.isfinite(R).all() else None
 
 
 def calibration_page(
@@ -96,7 +102,8 @@ def calibration_page(
             found=[each for each in result.sensors if np.isfinite(each.t_lidar_mag).all()],
             pictures=pictures(figures),
             sections=sections,
-            words=words,
+            length=np.linalg.norm,
+            strongest_correlation=statistics.strongest_correlation,
             thresholds=thresholds(options),
             parameters=PARAMETERS,
             uncertainty=UNCERTAINTY[result.uncertainty],

@@ -14,12 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.figures.trends import SIGMAS, Trend, trend_figure, trends
-from l2m_gtsam.qa.report.page import (
-    Picture,
-    own_file,
-    render,
-    with_sigma,
-)
+from l2m_gtsam.qa.report.page import Picture, own_file, render, roll_pitch_yaw, with_sigma
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.records.fleet import ERROR, FleetRow, SensorRow
 
@@ -132,8 +127,7 @@ def _turned(sensor: SensorRow) -> str:
     """Return roll, pitch and yaw, and the largest sigma, in degrees."""
     if not np.isfinite(sensor.quaternion_xyzw).all():
         return "–"
-    # intrinsic z, y, x: what ROS calls yaw, pitch, roll
-    yaw, pitch, roll = Rotation.from_quat(sensor.quaternion_xyzw).as_euler("ZYX", degrees=True)
+    roll, pitch, yaw = roll_pitch_yaw(Rotation.from_quat(sensor.quaternion_xyzw))
     sigma = max(sensor.rotation_sigma)
     known = f" ± {sigma:.2f}" if np.isfinite(sigma) else ", part of it not determined"
     return f"{roll:.1f}, {pitch:.1f}, {yaw:.1f}{known}"

@@ -9,6 +9,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.report.drawing import Drawing
@@ -59,6 +60,12 @@ def vector(values: FloatArray, digits: int) -> str:
     return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
 
 
+def roll_pitch_yaw(turn: Rotation) -> tuple[float, float, float]:
+    """Return the angles of a rotation in degrees, as ROS names them (REP 103)."""
+    yaw, pitch, roll = turn.as_euler("ZYX", degrees=True)  # intrinsic z, y, x
+    return roll, pitch, yaw
+
+
 def render(template: str, **values: Any) -> str:
     """Return a page as HTML; text is escaped, nothing is loaded from anywhere.
 
@@ -84,6 +91,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.tests |= {"finite": np.isfinite}
     environment.filters |= {
         "number": number,
         "fixed": fixed,
