@@ -1,5 +1,6 @@
 """What the pages have in common: templates, numbers, pictures. A page needs no other file."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -91,7 +92,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.tests |= {"finite": np.isfinite}
+    environment.tests["finite"] = math.isfinite
     environment.filters |= {
         "number": number,
         "fixed": fixed,
