@@ -140,3 +140,22 @@ def clustered_mean(values: FloatArray, groups: IntArray) -> ClusteredMean:
     # The estimate is rough with few groups; it cannot lie beyond what sharing makes possible.
     effective = float(np.clip(effective, number, count))
     return ClusteredMean(mean, float(np.sqrt(variance)), effective, number)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A number of successes among independent trials."""
+
+    successes: int
+    trials: int
+
+    @property
+    def rate(self) -> float:
+        """Successes per trial."""
+        return self.successes / self.trials
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the probability."""
+        band = wilson_interval(self.rate, self.trials)
+        return band.low, band.high

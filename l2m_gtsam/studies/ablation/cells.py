@@ -24,11 +24,19 @@ from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method, Weighting
-from l2m_gtsam.studies.ablation.map_picture import MapPicture, WindowOptions
-from l2m_gtsam.studies.fingerprints import around, surveyed_floor, thinned
-from l2m_gtsam.studies.json_array import JsonFloats
+from l2m_gtsam.studies.ablation.map_image import MapImage, WindowOptions
+from l2m_gtsam.studies.json_arrays import JsonFloats
 from l2m_gtsam.studies.methods import two_step
-from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
+from l2m_gtsam.studies.site import (
+    SiteDrive,
+    SiteOptions,
+    SurveyedSite,
+    around,
+    random_drive,
+    surveyed,
+    surveyed_floor,
+    thinned,
+)
 
 DRIVE, START = 1, 2  # streams of randomness
 
@@ -88,7 +96,7 @@ class AblationOptions(Options):
 
 
 @dataclass(frozen=True)
-class Batch:
+class BatchErrors:
     """Errors of R calibrations by each of M methods, NaN for those without a result.
 
     Attributes
@@ -110,12 +118,12 @@ class Batch:
 class AblationCell:
     """A batch of calibrations on one map, or the map itself."""
 
-    batch: Batch | None = None
-    picture: MapPicture | None = None
+    batch: BatchErrors | None = None
+    picture: MapImage | None = None
 
 
 @dataclass(frozen=True)
-class Hall:
+class DrivenHall:
     """What all maps share.
 
     Attributes
@@ -128,13 +136,13 @@ class Hall:
         All of the study.
     """
 
-    part: Surveyed
+    part: SurveyedSite
     floor: float
     drives: tuple[SiteDrive, ...]
 
 
 @dataclass(frozen=True)
-class AblationPlace:
+class MappedDrives:
     """A map of one kind at one density.
 
     Attributes
@@ -145,20 +153,20 @@ class AblationPlace:
         The map.
     """
 
-    hall: Hall
+    hall: DrivenHall
     field_map: QueryableMap
 
 
-def ablation_place(options: AblationOptions, kind: str, spacing: float) -> AblationPlace:
+def mapped_drives(options: AblationOptions, kind: str, spacing: float) -> MappedDrives:
     """Return a map and the drives through it."""
     hall = ablation_hall(options)
     part = thinned(hall.part, spacing)
     chosen = map_options(options.site.mapping.model, kind, spacing)
-    return AblationPlace(replace(hall, part=part), part.map(chosen))
+    return MappedDrives(replace(hall, part=part), part.map(chosen))
 
 
 @lru_cache(maxsize=1)
-def ablation_hall(options: AblationOptions) -> Hall:
+def ablation_hall(options: AblationOptions) -> DrivenHall:
     """Return survey and drives; made once in each process."""
     whole = surveyed(options.site)
     drives = tuple(
@@ -167,7 +175,7 @@ def ablation_hall(options: AblationOptions) -> Hall:
     )
     # All drives take one route.
     part = around(whole, drives[0].readings.p_map_lidar, options.around)
-    return Hall(part, surveyed_floor(part.survey.points), drives)
+    return DrivenHall(part, surveyed_floor(part.survey.points), drives)
 
 
 def map_options(base: MapOptions, kind: str, spacing: float) -> MapOptions:
@@ -181,7 +189,7 @@ def map_options(base: MapOptions, kind: str, spacing: float) -> MapOptions:
     return base.model_copy(update={"kind": kind, "bilinear": bilinear})
 
 
-def ablation_batch(options: AblationOptions, place: AblationPlace, number: int) -> Batch:
+def ablation_batch(options: AblationOptions, place: MappedDrives, number: int) -> BatchErrors:
     """Calibrate the sensors of one batch by all methods."""
     first = number * options.batch
     errors = np.array(
@@ -190,11 +198,11 @@ def ablation_batch(options: AblationOptions, place: AblationPlace, number: int) 
             for which in range(first, first + options.batch)
         ]
     )
-    return Batch(errors[..., 0], errors[..., 1], errors[..., 2])
+    return BatchErrors(errors[..., 0], errors[..., 1], errors[..., 2])
 
 
 def calibration_errors(
-    options: AblationOptions, place: AblationPlace, which: int, solver: Solver
+    options: AblationOptions, place: MappedDrives, which: int, solver: Solver
 ) -> FloatArray:
     """Return the errors of t, C and H of one calibration, shape (3,)."""
     drive = place.hall.drives[which]

@@ -23,10 +23,10 @@ from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
-from l2m_gtsam.studies.bound import cramer_rao
-from l2m_gtsam.studies.json_array import JsonFloats
-from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_map
-from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
+from l2m_gtsam.studies.json_arrays import JsonFloats
+from l2m_gtsam.studies.methods import cramer_rao
+from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_map
+from l2m_gtsam.studies.site import SiteDrive, SiteOptions, SurveyedSite, random_drive, surveyed
 from l2m_gtsam.studies.table1.methods import (
     HARMONIC,
     MAGYC,
@@ -36,7 +36,7 @@ from l2m_gtsam.studies.table1.methods import (
     OURS,
     SLIDING,
     THINNED,
-    Found,
+    MethodResult,
     from_each,
     magyc,
     naive,
@@ -94,7 +94,7 @@ class Table1Options(Options):
 
 
 @dataclass(frozen=True)
-class Place:
+class SurveyedWarehouse:
     """A surveyed warehouse.
 
     Attributes
@@ -107,13 +107,13 @@ class Place:
         What the naive peer makes of the survey on the paths that it was asked for.
     """
 
-    site: Surveyed
+    site: SurveyedSite
     maps: dict[str, QueryableMap]
     naive: dict[RouteShape, NaiveMap] = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The naive peer's maps are fifty times as large as all others together.
-        return Place, (self.site, self.maps)
+        return SurveyedWarehouse, (self.site, self.maps)
 
     def naive_map(self, path: RouteShape, drive: SiteDrive, options: NaiveOptions) -> NaiveMap:
         """Return the naive peer's map around a path, made from its first drive."""
@@ -175,13 +175,17 @@ class Table1Cell:
     ends: tuple[Ends, ...]
 
 
-def prepare(options: Table1Options) -> Place:
+def prepare(options: Table1Options) -> SurveyedWarehouse:
     """Survey the warehouse and make its maps."""
     site = surveyed(options.site)
-    return Place(site, {kind: site.map(MapOptions(kind=kind)) for kind in (HARMONIC, SLIDING)})
+    return SurveyedWarehouse(
+        site, {kind: site.map(MapOptions(kind=kind)) for kind in (HARMONIC, SLIDING)}
+    )
 
 
-def compute(options: Table1Options, place: Place, level: int, row: int, number: int) -> Table1Cell:
+def compute(
+    options: Table1Options, place: SurveyedWarehouse, level: int, row: int, number: int
+) -> Table1Cell:
     """Calibrate the sensor of one drive by all methods.
 
     Parameters
@@ -217,7 +221,7 @@ def compute(options: Table1Options, place: Place, level: int, row: int, number: 
 
 
 def other_ends(
-    drive: SiteDrive, place: Place, t_start: FloatArray, options: Table1Options
+    drive: SiteDrive, place: SurveyedWarehouse, t_start: FloatArray, options: Table1Options
 ) -> list[Ends]:
     """Return where the paper's methods end on both maps, and ours on the paper's."""
     ends = [
@@ -229,7 +233,7 @@ def other_ends(
     return [*ends, ends_of(OURS, SLIDING, drive, found)]
 
 
-def ends_of(method: str, map_kind: str, drive: SiteDrive, found: Found) -> Ends:
+def ends_of(method: str, map_kind: str, drive: SiteDrive, found: MethodResult) -> Ends:
     """Return how far ends are from the truth."""
     sensor = drive.sensor
     truth = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])

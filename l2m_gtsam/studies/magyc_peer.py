@@ -21,7 +21,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.errors import PeerError
-from l2m_gtsam.studies.peers.estimate import PeerEstimate, soft_iron
+from l2m_gtsam.studies.methods import PeerEstimate, soft_iron
 
 PYTHON_VARIABLE = "L2M_MAGYC_PYTHON"
 PYTHON = Path(".venv-magyc/bin/python")

@@ -20,7 +20,7 @@ from l2m_gtsam.data import Distortion, FloatArray, IntArray, Readings
 from l2m_gtsam.errors import MapError, PeerError
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.options import Options
-from l2m_gtsam.studies.peers.estimate import PeerEstimate, soft_iron
+from l2m_gtsam.studies.methods import PeerEstimate, soft_iron
 
 FEWEST = 20
 
