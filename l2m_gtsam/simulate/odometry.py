@@ -22,7 +22,7 @@ class OdometryOrigin(StrEnum):
     START = "start"
 
 
-class OdometryOptions(Options):
+class OdometryDriftOptions(Options):
     """How odometry drifts along a drive."""
 
     scale: Annotated[float, Field(ge=0, lt=1)] = 0.01
@@ -41,7 +41,7 @@ class OdometryOptions(Options):
 
 
 def drifting(
-    poses: Trajectory, options: OdometryOptions, noise: NoiseOptions, rng: np.random.Generator
+    poses: Trajectory, options: OdometryDriftOptions, noise: NoiseOptions, rng: np.random.Generator
 ) -> Trajectory:
     """Return what odometry makes of a drive, with the covariance of every pose.
 
@@ -76,7 +76,7 @@ def drifting(
 
 
 def _errors(
-    options: OdometryOptions, way: FloatArray, rng: np.random.Generator
+    options: OdometryDriftOptions, way: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return heading error of N poses (rad), shifts (m) and scale errors of N - 1 steps."""
     root = np.sqrt(way)
@@ -102,7 +102,7 @@ def _about_vertical(angle: FloatArray) -> FloatArray:
 
 
 def _step_covariances(
-    options: OdometryOptions, R_map_lidar: FloatArray, R: FloatArray, p: FloatArray
+    options: OdometryDriftOptions, R_map_lidar: FloatArray, R: FloatArray, p: FloatArray
 ) -> FloatArray:
     """Return the covariance of each step's error, a right perturbation, shape (N - 1, 6, 6).
 

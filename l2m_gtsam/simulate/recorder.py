@@ -9,7 +9,7 @@ import numpy as np
 from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.simulate.drive import Motion
+from l2m_gtsam.simulate.drive import VehicleMotion
 from l2m_gtsam.simulate.lidar import SimulatedScans
 from l2m_gtsam.simulate.sensors import (
     NANOSECONDS,
@@ -41,7 +41,7 @@ class Vehicle:
 
     name: str
     sensors: tuple[KnownSensor, ...]
-    motion: Motion
+    motion: VehicleMotion
     sampling: SamplingOptions
     noise: NoiseOptions
 
@@ -51,7 +51,7 @@ class SimulatedDrive:
     """One drive: what was recorded, the true motion behind it, and the scans if there are any."""
 
     recording: Recording
-    motion: Motion
+    motion: VehicleMotion
     scans: SimulatedScans | None = None
 
     def truth(self) -> Trajectory:

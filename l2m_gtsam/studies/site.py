@@ -21,9 +21,9 @@ from l2m_gtsam.simulate.recorder import Vehicle, record
 from l2m_gtsam.simulate.route import calibration_route
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.simulate.sensors import (
-    ArrayOptions,
     NoiseOptions,
     SamplingOptions,
+    SensorArrayOptions,
     random_distortion,
 )
 from l2m_gtsam.simulate.world import SteelWorld
@@ -33,7 +33,7 @@ class SiteOptions(Options):
     """A warehouse, its survey and map, and the drives whose sensors are calibrated."""
 
     scenario: ScenarioOptions = ScenarioOptions(
-        array=ArrayOptions(count=1),
+        array=SensorArrayOptions(count=1),
         noise=NoiseOptions(field=0.2),
         calibration_sampling=SamplingOptions(field_rate=10.0),
     )

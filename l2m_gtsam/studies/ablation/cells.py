@@ -22,7 +22,7 @@ from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
+from l2m_gtsam.simulate.sensors import NoiseOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method, Weighting
 from l2m_gtsam.studies.ablation.map_image import MapImage, WindowOptions
 from l2m_gtsam.studies.json_arrays import JsonFloats
@@ -83,7 +83,7 @@ class AblationOptions(Options):
     """The part of the maps that is drawn."""
     site: SiteOptions = SiteOptions(
         scenario=ScenarioOptions(
-            array=ArrayOptions(count=1),
+            array=SensorArrayOptions(count=1),
             noise=NoiseOptions(field=0.5),
             calibration_sampling=SamplingOptions(field_rate=10.0),
         )

@@ -18,7 +18,12 @@ from l2m_gtsam.recording.sync import SyncOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
+from l2m_gtsam.simulate.sensors import (
+    MappingSuiteOptions,
+    NoiseOptions,
+    SamplingOptions,
+    SensorArrayOptions,
+)
 from l2m_gtsam.studies.site import SiteOptions
 
 
@@ -87,8 +92,8 @@ class ScalingOptions(Options):
     small_site: SiteOptions = SiteOptions(
         scenario=ScenarioOptions(
             floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
-            suite=SuiteOptions(lateral=(0.0,)),
-            array=ArrayOptions(count=1),
+            suite=MappingSuiteOptions(lateral=(0.0,)),
+            array=SensorArrayOptions(count=1),
             noise=NoiseOptions(field=0.2),
             calibration_route=CalibrationRouteOptions(turns=1),
             calibration_sampling=SamplingOptions(field_rate=20.0),

@@ -22,7 +22,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
+from l2m_gtsam.simulate.sensors import NoiseOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.studies.json_arrays import JsonFloats
 from l2m_gtsam.studies.methods import cramer_rao
 from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_map
@@ -79,7 +79,7 @@ class Table1Options(Options):
     """On the first so many drives of each path and noise the Cramer-Rao bound is computed."""
     site: SiteOptions = SiteOptions(
         scenario=ScenarioOptions(
-            array=ArrayOptions(count=1),
+            array=SensorArrayOptions(count=1),
             noise=NoiseOptions(field=0.05),
             calibration_sampling=SamplingOptions(field_rate=20.0),
         )
