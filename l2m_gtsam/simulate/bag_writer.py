@@ -115,7 +115,7 @@ class BagKind(StrEnum):
 
 
 class BagWriterOptions(Options):
-    """What a bag says beside poses and readings."""
+    """Topics, latencies and stated noise of a bag."""
 
     odometry_topic: str = "/odometry"
     """Topic of the poses."""
@@ -172,7 +172,7 @@ def write_bag(
     recording
         Poses and readings.
     options
-        What the bag says beside these.
+        Topics, latencies and stated noise.
     beside
         Scans and true poses. These are no odometry but ``PoseStamped``, so that a reader that looks
         for poses by type takes those of the recording.

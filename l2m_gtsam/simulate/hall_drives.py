@@ -98,7 +98,7 @@ def survey(
 ) -> HallSurvey:
     """Return a survey in lanes over the whole area, along x and along y by turns.
 
-    Lanes bend around what stands in their way. The sensor follows the uneven floor. Slightly
+    Lanes bend around structures. The sensor follows the uneven floor. Slightly
     fewer than ``count`` readings come about where two structures leave no room.
     """
     rng = np.random.default_rng([seed, 3])

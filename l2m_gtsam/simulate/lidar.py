@@ -1,4 +1,4 @@
-"""A spinning LiDAR that looks around a world of solid boxes, by casting rays."""
+"""A spinning LiDAR in a world of solid boxes, by casting rays."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ class SpinningLidarOptions(Options):
 
 
 class RayCaster:
-    """Solid boxes, ready to be looked at.
+    """Solid boxes as a mesh that rays are cast at.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from l2m_gtsam.simulate.warehouse import WarehouseOptions, build_warehouse
 from l2m_gtsam.simulate.world import SteelWorld
 
 MARGIN = 2.0  # metres that drives keep from the ends, for turning
-LANE_SHARE = 0.15  # of the width: how far from its middle the ways there and back lie
+LANE_SHARE = 0.15  # of the width: distance of the paths there and back from its middle
 
 
 class CorridorOptions(Options):
@@ -36,7 +36,7 @@ class CorridorOptions(Options):
     """Height of the ceiling above the floor in metres."""
     beyond: Annotated[float, Field(ge=0)] = 100.0
     """The corridor goes on so far past both ends, in metres: as long as this is more than the
-    LiDAR's range, nothing tells it where along the corridor it is."""
+    LiDAR's range, the position along the corridor is unobservable."""
     frame_pitch: Annotated[float, Field(gt=0)] = 3.0
     """Largest distance of neighbouring frames of steel in metres: posts behind both walls, beams
     over the ceiling and under the floor."""
@@ -77,7 +77,7 @@ def corridor_room(options: CorridorOptions) -> Solids:
 
 
 def corridor_walls(options: CorridorOptions) -> Solids:
-    """Return the walls along the way with steel, as plates without thickness."""
+    """Return the walls along the stretch with steel, as plates without thickness."""
     y = np.array([0.0, options.width])
     low = np.column_stack([np.zeros(2), y, np.zeros(2)])
     high = np.column_stack([np.full(2, options.length), y, np.full(2, options.height)])
@@ -108,7 +108,7 @@ class RouteOptions:
 
 @dataclass(frozen=True)
 class SimulatedPlace:
-    """A place and the ways through it.
+    """A place and the routes through it.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class SimulatedPlace:
     solids
         Everything that light meets.
     structure
-        Of that, what a map is told of as a place of steel.
+        Of that, what a map is given as the surfaces of steel.
     mapping_route, calibration_route
         Corner points in the map in metres, shape (M, 2).
     """
@@ -144,7 +144,7 @@ def hall(
     Parameters
     ----------
     floor, steel, routes
-        What stands where, and where vehicles drive.
+        Racks, steel, and where vehicles drive.
     earth
         The Earth's field in the map frame in microtesla, shape (3,).
     rng

@@ -41,7 +41,7 @@ FIRST_DAY, LAST_DAY = dt.date(1900, 1, 1), dt.date(2029, 12, 31)
 
 
 class EarthOptions(Options):
-    """Where and when the warehouse stands, and how its map lies on the ground."""
+    """Location and date of the warehouse, and the orientation of its map."""
 
     latitude: Annotated[float, Field(ge=-90, le=90)] = 1.3483
     """Geodetic latitude in degrees, north positive. The default is in Singapore."""
@@ -116,7 +116,7 @@ class ScenarioOptions(Options):
     """Point clouds of both drives, if it is given (`{}` for its defaults)."""
     odometry: OdometryDriftOptions | None = None
     """Drift of the poses of the vehicle with the array, if it is given (`{}` for its defaults);
-    the true poses stand beside them then."""
+    the true poses are recorded beside them then."""
 
     @model_serializer(mode="wrap")
     def _as_asked(self, content: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -91,7 +91,7 @@ class StructureCloudOptions(Options):
 def structure_cloud(
     world: SteelWorld | Solids, options: StructureCloudOptions, rng: np.random.Generator
 ) -> FloatArray:
-    """Return points on the surfaces of all bodies, as far as these stand above the floor.
+    """Return points on the surfaces of all bodies, as far as these are above the floor.
 
     Nothing hides anything: a hall is mapped from many places. What is buried, such as rebar and
     floor beams, is not seen.

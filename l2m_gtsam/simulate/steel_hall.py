@@ -17,7 +17,7 @@ from l2m_gtsam.simulate.world import SteelWorld
 
 MILD, STRONG = 1.0, 10.0  # factors on the polarisation of posts and racks
 EARTH = np.array([22.0, 3.0, -38.0])  # uT
-CELLS = (4, 3)  # structures stand one to a cell of 2 x 2 m
+CELLS = (4, 3)  # one structure in each cell of 2 x 2 m
 INDUCED = 5.0  # polarisation along a part's length, relative to the Earth's field there
 CROSS = 0.25  # remanence across a part's length, relative to that along it
 TESLA_PER_MICROTESLA = 1e-6
@@ -176,7 +176,7 @@ def _voxels(points: FloatArray) -> FloatArray:
 
 
 class CloudVariant(StrEnum):
-    """What the LiDAR is said to have seen of the structures."""
+    """What the LiDAR saw of the structures."""
 
     NONE = "none"
     ACCURATE = "accurate"
@@ -214,7 +214,7 @@ class Floor:
 
 @dataclass(frozen=True)
 class SteelHall:
-    """A hall: its steel, what stands in it, its floor.
+    """A hall: its steel, its structures, its floor.
 
     Attributes
     ----------
@@ -257,7 +257,7 @@ class SteelHall:
         nearest = np.argmin(self._distances(xy), axis=1)
         offset, half = xy - self._centres()[nearest], self._halves()[nearest]
         over = np.abs(offset) - half
-        # Within a footprint the way out is through the nearest side.
+        # From within a footprint the exit is the nearest side.
         through = (over == over.max(axis=1, keepdims=True)).astype(np.float64)
         outwards = np.where(over.max(axis=1, keepdims=True) > 0, np.maximum(over, 0.0), through)
         direction = np.where(offset < 0, -outwards, outwards)
@@ -305,7 +305,7 @@ def steel_hall(seed: int, strength: float = MILD, posts: int = 4, racks: int = 1
 
 
 def hall_cloud(hall: SteelHall, variant: CloudVariant, seed: int) -> FloatArray:
-    """Return what a LiDAR is said to have seen, shape (P, 3) in metres, empty for none."""
+    """Return what a LiDAR saw, shape (P, 3) in metres, empty for none."""
     rng = np.random.default_rng([seed, 2])
     angle = rng.uniform(-np.pi, np.pi, len(hall.steel))
     unit = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])

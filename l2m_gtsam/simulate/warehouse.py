@@ -1,4 +1,4 @@
-"""The steel of a warehouse: what stands where, and how it is magnetised."""
+"""The steel of a warehouse: places and magnetisation of its parts."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -53,7 +53,7 @@ class Parts:
 def alike(
     kind: str, section: SectionOptions, size: tuple[float, float, float], centres: FloatArray
 ) -> Parts:
-    """Return parts of one size that stand along the hall's axes."""
+    """Return parts of one size along the hall's axes."""
     count = len(centres)
     return Parts(kind, section.fill, np.tile(size, (count, 1)), centres, np.zeros(count))
 

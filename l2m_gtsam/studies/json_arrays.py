@@ -1,4 +1,4 @@
-"""Arrays within records that go through JSON, which has neither NaN nor infinity: null stands."""
+"""Arrays within records that go through JSON, which has neither NaN nor infinity: null instead."""
 
 import base64
 import zlib

@@ -1,4 +1,4 @@
-"""Ways to calibrate one sensor that studies compare, each from a given start."""
+"""Methods that ours is compared with, each from a given start, and the Cramer-Rao bound."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -191,7 +191,7 @@ def levenberg_marquardt(
     t_start
         The guess in the lidar frame in metres, shape (3,).
     noise
-        Standard deviation of the readings in uT, which the baseline is told.
+        Known standard deviation of the readings in uT.
     options
         Closed form, factors, and the largest number of linearisations.
     """
@@ -261,7 +261,7 @@ class PeerEstimate:
     H
         Offset in microtesla, shape (3,).
     soft_iron
-        ``soft_iron`` of C, shape (3, 3): all of C that a peer without a map can tell.
+        ``soft_iron`` of C, shape (3, 3): all of C that a peer without a map can determine.
     seconds
         Time of this calibration alone, without what is done once for a site.
     """

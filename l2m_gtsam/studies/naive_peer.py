@@ -2,7 +2,7 @@
 
 scikit-learn's Gaussian process for each axis of the field, on a thinned survey around the drive,
 and scipy's ``least_squares`` over t, C and H together, with numeric derivatives, on a part of the
-readings. Thinning is what makes it bearable: every look at the map costs the number of places
+readings. Thinning keeps it affordable: every query of the map costs the number of places
 times the number of survey readings.
 """
 

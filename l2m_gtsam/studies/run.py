@@ -178,7 +178,7 @@ def whole_page(study: Study[Opts, Any, Summary], content: StudyFile[Opts, Summar
         f"# {study.title}\n\n{study.page(content.summary)}\n\n"
         f"Made by `{made.command}`: {made.cells:,} cells, {made.core_seconds / 60:,.0f} minutes "
         f"of one core. Code {', '.join(made.code)}; {'; '.join(made.machines)}. Every number "
-        f"above stands in [{STUDY_FILE}]({STUDY_FILE}).\n"
+        f"above is in [{STUDY_FILE}]({STUDY_FILE}).\n"
     )
 
 
@@ -260,8 +260,8 @@ def code_version() -> str:
         return released
     # Limited to our folder: inside another project's checkout the log is empty.
     asked = [git, "-C", str(folder), "log", "-1", "--format=%h", "--", "."]
-    said = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - fixed words
-    return f"{released} ({said.stdout.strip()})" if said.stdout.strip() else released
+    log = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - fixed words
+    return f"{released} ({log.stdout.strip()})" if log.stdout.strip() else released
 
 
 def machine_class() -> str:

@@ -131,7 +131,7 @@ def clustered_mean(values: FloatArray, groups: IntArray) -> ClusteredMean:
     _, group = np.unique(groups, return_inverse=True)
     count, number = len(values), int(group.max()) + 1
     if number < 2:
-        raise ValueError("one group tells nothing of how groups differ; two or more are needed")
+        raise ValueError("one group does not show how groups differ; two or more are needed")
     mean = float(np.mean(values))
     sums = np.bincount(group, values - mean)
     variance = float(sums @ sums) / count**2 * number / (number - 1)

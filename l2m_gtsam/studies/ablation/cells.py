@@ -76,7 +76,7 @@ class AblationOptions(Options):
     height; 0 keeps the whole survey."""
     around: float = Field(default=3.0, gt=0)
     """Fingerprints within so many metres of the calibration drive take part: the rest of the hall
-    is not looked at."""
+    does not count."""
     guess: float = Field(default=0.3, gt=0)
     """Guesses are off the truth by up to this."""
     window: WindowOptions = WindowOptions()
@@ -90,9 +90,9 @@ class AblationOptions(Options):
     )
     """World, survey and drives, with the noise of the paper's study in both drives."""
     search: StartOptions = StartOptions()
-    """How our method looks for its start, around the guess."""
+    """Our method's search for its start, around the guess."""
     solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
-    """How our method solves: the study looks at values, not at sigmas."""
+    """How our method solves: the study is of values, not of sigmas."""
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class MapImage:
     rmse
         Root mean square of the field's error per axis in uT, where sensors pass.
     sigma
-        What the map itself says of that, in uT.
+        The map's own prediction of that, in uT.
     inside
         Share of the drives' readings that lie in the map.
     """

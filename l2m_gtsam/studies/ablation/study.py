@@ -232,7 +232,7 @@ def map_figure(table: AblationTable) -> Figure:
 
 
 def strengths(maps: tuple[MapRow, ...]) -> tuple[float, float]:
-    """Return the weakest and the strongest field that colours tell apart, uT: one scale for all.
+    """Return the weakest and the strongest field that colours distinguish, uT: one scale for all.
 
     Only where maps have data: between the racks' posts the truth is far stronger.
     """
@@ -252,7 +252,7 @@ def draw(axes: Axes, picture: MapImage, image: FloatArray, span: tuple[float, fl
 
 
 def mark(axes: Axes, picture: MapImage) -> None:
-    """Draw the fingerprints, those at several heights as one, and say what the map is worth."""
+    """Draw the fingerprints, those at several heights as one, and write the map's error."""
     x, y = picture.fingerprints.T
     axes.plot(x, y, ".", color="white", markersize=1.6, markeredgewidth=0, alpha=0.8)
     axes.text(

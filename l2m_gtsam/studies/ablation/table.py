@@ -11,7 +11,7 @@ from l2m_gtsam.studies.ablation.map_image import MapImage
 
 SURE = 1.96  # standard errors on each side of a mean that hold 95 %
 ROUNDING = 1e-6  # metres or microtesla; what differs by less is the same
-FEWEST = 2  # pairs of which a standard error can be told
+FEWEST = 2  # pairs that determine a standard error
 FAR_M, FAR_UT = 0.5, 5.0
 """An error of t or H beyond is none of noise and map, but another minimum."""
 
@@ -214,9 +214,9 @@ def compared(
 ) -> Comparison:
     """Return what one combination gains over another."""
     before, after = errors[place], errors[other]
-    said = other[0] if to is solver else to.value
+    changed = other[0] if to is solver else to.value
     gains = (gain(by(solver)(getattr(before, n)), by(to)(getattr(after, n))) for n in "tH")
-    return Comparison(*place, solver, said, *gains)
+    return Comparison(*place, solver, changed, *gains)
 
 
 def gain(before: FloatArray, after: FloatArray) -> Gain | None:

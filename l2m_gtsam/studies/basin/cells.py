@@ -2,11 +2,11 @@
 
 The protocol is the paper's (Success rate): random distortions, each with random starts; a
 calibration succeeds if the sensor's position ends within 2 cm (small) or 5 cm (medium) of the
-truth. All methods get the same readings, map and starts. *One-key* looks for a start in a ball
-around the given one and solves from there: the given start is all that it is told. *Published* is
+truth. All methods get the same readings, map and starts. *One-key* searches for a start in a ball
+around the given one and solves from there: the given start is its only information. *Published* is
 the paper's algorithm, *LM* Levenberg-Marquardt over t, C and H, from the given start itself.
 
-The starts of one distortion share a drive, and the lattice on which one-key looks: what differs
+The starts of one distortion share a drive, and the lattice of one-key's search: what differs
 between them is which of its nodes lie in the ball. Starts whose balls hold the same best nodes
 find the same place and end in the same result, which is then computed once. Starts are therefore
 no independent trials of one-key; distortions, each with a drive and noise of its own, are, given
@@ -59,9 +59,9 @@ class BasinOptions(Options):
     site: SiteOptions = SiteOptions()
     """World, map and drives."""
     search: StartOptions = StartOptions()
-    """How one-key looks for its start, around the given one."""
+    """One-key's search for its start, around the given one."""
     solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
-    """How one-key solves. The study looks at places, not at sigmas, which are ten times as much
+    """How one-key solves. The study is of places, not of sigmas, which are ten times as much
     work with the map's full uncertainty."""
 
 

@@ -101,7 +101,7 @@ class ScalingOptions(Options):
     )
     """Where workers calibrate: each number of them makes its map anew."""
     search: StartOptions = StartOptions()
-    """How starts are looked for."""
+    """Search for starts."""
     solve: OneKeyOptions = OneKeyOptions()
     """How calibrations are solved, but for how they count the map's errors."""
 
@@ -227,10 +227,10 @@ def scaling_table(options: ScalingOptions, measured: Iterable[Measurement]) -> S
     points = sorted(measured, key=lambda each: each.size)
     curves = []
     for part in Quantity:
-        for way in TimedTask:
-            own = tuple(each for each in points if (each.part, each.way) == (part, way))
+        for task in TimedTask:
+            own = tuple(each for each in points if (each.part, each.way) == (part, task))
             if own:
-                curves.append(Curve(part, way, own, exponent(own)))
+                curves.append(Curve(part, task, own, exponent(own)))
     found = [ratio(curve, peer_of(curves, curve.part)) for curve in curves]
     return ScalingTable(
         options, tuple(curves), tuple(each for each in found if each is not None), speeds(curves)

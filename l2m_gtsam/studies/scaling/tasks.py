@@ -97,7 +97,7 @@ def mapped_drive(
 def warmed(options: ScalingOptions, work: MappedDrive) -> MappedDrive:
     """Return a drive on whose map something was calibrated before.
 
-    A map makes ready what it is asked for the first time, which may take longer than the rest;
+    A map prepares tiles at their first query, which may take longer than the rest;
     compiled functions are loaded.
     """
     for uncertainty in Uncertainty:
@@ -117,7 +117,7 @@ def measured_solves(
         tasks[TimedTask.NUMERIC] = lambda: numeric_least_squares(
             work.readings, work.field_map, work.t_true
         )
-    took = {way: taken(task, options.rounds, options.long) for way, task in tasks.items()}
+    took = {task: taken(call, options.rounds, options.long) for task, call in tasks.items()}
     return tuple(
         Measurement(part, w, size, each.seconds, each.peak_mib) for w, each in took.items()
     )
@@ -132,19 +132,19 @@ def solved(options: ScalingOptions, work: MappedDrive, uncertainty: Uncertainty)
 
 
 def measured_map(
-    options: ScalingOptions, way: TimedTask, size: int, site: SurveyedSite
+    options: ScalingOptions, task: TimedTask, size: int, site: SurveyedSite
 ) -> Measurement:
     """Time how a map is made of the readings next to the middle of the hall."""
     part = replace(site, survey=middle(site.survey, size))
-    chosen = map_options(options.site.mapping.model, way)
+    chosen = map_options(options.site.mapping.model, task)
     took = taken(lambda: part.map(chosen), options.rounds, options.long)
-    return Measurement(Quantity.SURVEY, way, len(part.survey), took.seconds, took.peak_mib)
+    return Measurement(Quantity.SURVEY, task, len(part.survey), took.seconds, took.peak_mib)
 
 
-def map_options(base: MapOptions, way: TimedTask) -> MapOptions:
+def map_options(base: MapOptions, task: TimedTask) -> MapOptions:
     """Return the options of a kind of map; the dense process gets every reading."""
     dense = base.dense_gp.model_copy(update={"thinning": ThinningOptions(spacing=0.0)})
-    return base.model_copy(update={"kind": KINDS[way], "dense_gp": dense})
+    return base.model_copy(update={"kind": KINDS[task], "dense_gp": dense})
 
 
 def middle(survey: TrainingSet, most: int) -> TrainingSet:
@@ -169,7 +169,7 @@ class Taken:
     seconds
         Processor time of this process.
     peak_mib
-        By how much its memory grew at most, MiB; absent where the system does not tell.
+        By how much its memory grew at most, MiB; absent where the system does not report it.
     """
 
     seconds: float

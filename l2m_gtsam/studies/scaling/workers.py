@@ -1,7 +1,7 @@
 """A batch of calibrations on a number of local workers, timed: a process of its own.
 
-A cell of a study may be computed by a worker that must not start workers of its own; what stands
-here therefore runs as a program, which is given options and prints what it measured.
+A cell of a study may be computed by a worker that must not start workers of its own; this module
+therefore runs as a program, which is given options and prints what it measured.
 """
 
 import os
@@ -25,7 +25,7 @@ from l2m_gtsam.studies.site import Site, mapped_site, random_drive
 
 
 class WorkerBatch(Options):
-    """What the program is told."""
+    """Input of the program."""
 
     options: ScalingOptions
     workers: int
@@ -48,10 +48,10 @@ def measured_workers(options: ScalingOptions, workers: int) -> tuple[Measurement
     ClusterError
         The program ended with an error.
     """
-    told = WorkerBatch(options=options, workers=workers).model_dump_json()
+    batch = WorkerBatch(options=options, workers=workers).model_dump_json()
     program = [sys.executable, "-c", f"from {__name__} import main; main()"]
     # Our own program: nothing that it is called with comes from outside.
-    ran = subprocess.run(program, input=told, capture_output=True, text=True, check=False)  # noqa: S603
+    ran = subprocess.run(program, input=batch, capture_output=True, text=True, check=False)  # noqa: S603
     if ran.returncode:
         reason = (ran.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise ClusterError(f"a batch on {workers} workers failed: {reason}")

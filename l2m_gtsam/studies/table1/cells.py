@@ -2,9 +2,9 @@
 
 One survey of a warehouse gives the maps; its noise stays while that of the sensors to calibrate
 changes, as the paper adds noise to these alone. Each cell is one drive: a path, a noise level and
-a sensor of random place and distortion. Our full method runs from all starts. As it looks for the
-sensor around each start first, starts from which it finds the same place share one solve. The
-other methods run from fewer starts on the first few drives of each path.
+a sensor of random place and distortion. Our full method runs from all starts. As it searches
+around each start first, starts from which it finds the same place share one solve. The other
+methods run from fewer starts on the first few drives of each path.
 """
 
 from dataclasses import dataclass, field
@@ -61,7 +61,7 @@ class Table1Options(Options):
         RouteShape.SLALOM,
         RouteShape.WANDER,
     )
-    """What drives look like; the rows of the paper's table in its order."""
+    """Shapes of the drives; the rows of the paper's table in its order."""
     distortions: int = Field(default=50, ge=1)
     """Sensors of random place and distortion on each path at each noise, each on its own drive."""
     starts: int = Field(default=50, ge=1)
@@ -86,7 +86,7 @@ class Table1Options(Options):
     )
     """World, survey and drives."""
     search: StartOptions = StartOptions()
-    """How one-key looks for its start."""
+    """One-key's search for its start."""
     solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
     """How one-key solves: the table is of estimates, not of sigmas."""
     naive: NaiveOptions = NaiveOptions()

@@ -87,9 +87,9 @@ def naive(
 
 
 def magyc(readings: Readings, C: FloatArray) -> MethodResult:
-    """Return what magyc says of H on one drive; it looks for no place, and C only up to a turn.
+    """Return magyc's estimate of H on one drive; it finds no place, and C only up to a turn.
 
-    It takes the turn rates along the chip's axes, which the truth C, shape (3, 3), tells it.
+    It needs the turn rates along the chip's axes, which follow from the true C, shape (3, 3).
 
     Raises
     ------
@@ -117,7 +117,7 @@ def one_key(
     found = [each[0] for each in find_starts_around(readings, field_map, t_start, search)]
     none = np.full(3, np.nan)
     t_found = np.array([none if each is None else each.t_lidar_mag for each in found])
-    looked = (process_time() - begin) / len(t_start)
+    searched = (process_time() - begin) / len(t_start)
     places, which = np.unique(t_found, axis=0, return_inverse=True)
     vector = np.full((len(places), 15), np.nan)
     begin, somewhere = process_time(), np.flatnonzero(np.isfinite(places).all(axis=1))
@@ -126,4 +126,4 @@ def one_key(
         if solution.solved:
             vector[row] = solution.estimate.vector(0)
     solved = (process_time() - begin) / max(len(somewhere), 1)
-    return MethodResult(vector[which.ravel()], len(somewhere), looked + solved)
+    return MethodResult(vector[which.ravel()], len(somewhere), searched + solved)

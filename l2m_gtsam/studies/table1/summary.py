@@ -1,4 +1,4 @@
-"""What all drives of Table I say together, and the paper's Table I as it is printed."""
+"""Statistics of all drives of Table I, and the paper's Table I as printed."""
 
 import math
 from collections import defaultdict
@@ -112,7 +112,7 @@ class MethodErrors:
     Attributes
     ----------
     method, map_kind, path, noise
-        Which; no path stands for all of them together.
+        Which; no path means all of them together.
     calibrations, lost, far
         Tried, without a result, and with one beyond 5 cm.
     t, t2, C, H, H2
@@ -265,7 +265,7 @@ class Table1Summary:
 
 
 def summarise(options: Table1Options, cells: Mapping[str, Table1Cell]) -> Table1Summary:
-    """Return what all cells say together."""
+    """Return the statistics of all cells."""
     paths: dict[tuple[float, RouteShape], list[Table1Cell]] = defaultdict(list)
     levels: dict[float, list[Table1Cell]] = defaultdict(list)
     for cell in cells.values():
