@@ -5,7 +5,7 @@ from pathlib import Path
 
 from l2m_gtsam.batch.files import ensure_folder
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.simulate.bag_writer import BagKind, BagWriterOptions, Beside, write_bag
+from l2m_gtsam.simulate.bag_writer import BagKind, Beside, WriterOptions, write_bag
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.cloud import write_cloud
 from l2m_gtsam.storage.known_sensors import write_known_sensors
@@ -60,7 +60,7 @@ def _write_bags(
     out: Path, scenario: Scenario, kinds: Sequence[BagKind], progress: Progress
 ) -> None:
     """Write both drives as bags of every kind."""
-    options = BagWriterOptions(noise=scenario.options.noise)
+    options = WriterOptions(noise=scenario.options.noise)
     mapping, calibration = scenario.mapping, scenario.calibration
     truth = None if scenario.options.odometry is None else calibration.truth()
     drives = {

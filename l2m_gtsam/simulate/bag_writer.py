@@ -114,7 +114,7 @@ class BagKind(StrEnum):
     MCAP = "mcap"
 
 
-class BagWriterOptions(Options):
+class WriterOptions(Options):
     """Topics, latencies and stated noise of a bag."""
 
     odometry_topic: str = "/odometry"
@@ -154,7 +154,7 @@ def write_bag(
     path: Path,
     kind: BagKind,
     recording: Recording,
-    options: BagWriterOptions | None = None,
+    options: WriterOptions | None = None,
     beside: Beside | None = None,
 ) -> None:
     """Write a recording as a bag: odometry, and one topic of readings in tesla per sensor.
@@ -192,7 +192,7 @@ def write_bag(
         # rosbag2 repeats the folder's name inside, so the name is right and its parent temporary.
         with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as parent:
             unfinished = Path(parent) / path.name
-            _write(unfinished, kind, recording, options or BagWriterOptions(), beside or Beside())
+            _write(unfinished, kind, recording, options or WriterOptions(), beside or Beside())
             if path.is_dir():  # a folder that is not empty cannot be renamed over
                 path.rename(Path(parent) / "replaced")
             unfinished.rename(path)
@@ -210,7 +210,7 @@ def _is_replaceable(path: Path, kind: BagKind) -> bool:
 
 
 def _write(
-    path: Path, kind: BagKind, recording: Recording, options: BagWriterOptions, beside: Beside
+    path: Path, kind: BagKind, recording: Recording, options: WriterOptions, beside: Beside
 ) -> None:
     """Write all messages to a bag at this path."""
     dialect = ros1() if kind is BagKind.ROS1 else ros2()
@@ -237,7 +237,7 @@ def _writer(path: Path, kind: BagKind) -> Ros1Writer | Ros2Writer:
     return Ros2Writer(path, version=8, storage_plugin=plugin)  # 8: read by humble and later
 
 
-def _record_ns(channels: list[Channel], options: BagWriterOptions) -> IntArray:
+def _record_ns(channels: list[Channel], options: WriterOptions) -> IntArray:
     """Return when messages were recorded, channel by channel."""
     rng = np.random.default_rng(options.seed)
     stamps = np.concatenate([channel.stamp_ns for channel in channels])

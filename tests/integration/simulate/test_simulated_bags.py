@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.errors import OutputError
-from l2m_gtsam.simulate.bag_writer import BagKind, BagWriterOptions, write_bag
+from l2m_gtsam.simulate.bag_writer import BagKind, WriterOptions, write_bag
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.recorder import SimulatedDrive
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
@@ -147,7 +147,7 @@ def test_unknown_covariances_are_written_as_zero(tmp_path: Path, drive: Simulate
 def test_record_stamps_follow_by_a_latency(
     tmp_path: Path, drive: SimulatedDrive, kind: BagKind
 ) -> None:
-    options = BagWriterOptions(latency=0.002, latency_spread=0.001)
+    options = WriterOptions(latency=0.002, latency_spread=0.001)
     write_bag(bag_path(tmp_path, kind), kind, drive.recording, options)
     for messages in read_topics(bag_path(tmp_path, kind)).values():
         record = np.array([message.record_ns for message in messages])
@@ -196,7 +196,7 @@ def test_a_bag_is_replaced_and_nothing_is_left_beside_it(
     tmp_path: Path, drive: SimulatedDrive, kind: BagKind
 ) -> None:
     path = bag_path(tmp_path, kind)
-    write_bag(path, kind, drive.recording, BagWriterOptions(odometry_topic="/old"))
+    write_bag(path, kind, drive.recording, WriterOptions(odometry_topic="/old"))
     write_bag(path, kind, drive.recording)
     assert "/old" not in read_topics(path)
     assert list(tmp_path.iterdir()) == [path]
