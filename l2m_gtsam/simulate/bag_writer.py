@@ -142,8 +142,6 @@ class Beside:
     ----------
     scans
         Point clouds in the lidar frame, made one by one as they are written.
-    truth
-        True poses.
     """
 
     scans: Scans | None = None
@@ -167,10 +165,6 @@ def write_bag(
     ----------
     path
         File (ROS1, ending in ``.bag``) or folder (others).
-    kind
-        Container to write.
-    recording
-        Poses and readings.
     options
         Topics, latencies and stated noise.
     beside

@@ -83,8 +83,6 @@ def drive(
 
     Parameters
     ----------
-    options
-        Speeds and bounds.
     route
         Corner points in the map in metres, shape (M, 2).
     start_ns

@@ -128,10 +128,6 @@ class SimulatedScans:
 
     Attributes
     ----------
-    caster
-        What there is to see.
-    options
-        The LiDAR.
     poses_at
         Where it truly is.
     stamp_ns
@@ -195,10 +191,6 @@ def scans(
 
     Parameters
     ----------
-    solids
-        What there is to see.
-    options
-        The LiDAR.
     poses_at
         The true pose of the lidar at any time of the drive.
     stamp_ns

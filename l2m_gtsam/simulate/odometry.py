@@ -53,12 +53,8 @@ def drifting(
     ----------
     poses
         True poses of the lidar in the map.
-    options
-        How far it drifts.
     noise
         Of poses: the error of the first one.
-    rng
-        Source of randomness.
     """
     steps = np.diff(poses.p, axis=0)
     distance = np.linalg.norm(steps, axis=1)
@@ -108,8 +104,6 @@ def _step_covariances(
 
     Parameters
     ----------
-    options
-        How far odometry drifts.
     R_map_lidar
         True rotations at the ends of the steps, which determine the vertical.
     R

@@ -29,10 +29,6 @@ class Vehicle:
 
     Attributes
     ----------
-    name
-        Name of the drive.
-    sensors
-        Its magnetometers.
     motion
         Where its lidar truly is.
     sampling, noise
@@ -72,17 +68,6 @@ def record(
 
     Every source has its own clock phase and jitter; stamps are the true times of measurement,
     those of readings less ``SamplingOptions.clock_offset``.
-
-    Parameters
-    ----------
-    vehicle
-        The vehicle on its drive.
-    world
-        Source of the field.
-    rng
-        Source of randomness.
-    progress
-        Told after every sensor.
 
     Raises
     ------

@@ -60,13 +60,6 @@ class CalibrationRouteOptions(Options):
 def mapping_route(options: MappingRouteOptions, plan: FloorPlan) -> FloatArray:
     """Return a route over all lanes of all aisles, then of all cross aisles.
 
-    Parameters
-    ----------
-    options
-        Spacing of the lanes.
-    plan
-        Where aisles lie.
-
     Returns
     -------
     Corner points in the map in metres, shape (M, 2).
@@ -88,8 +81,6 @@ def calibration_route(options: CalibrationRouteOptions, plan: FloorPlan) -> Floa
     ----------
     options
         Number and size of the circles.
-    plan
-        Where aisles lie.
 
     Returns
     -------

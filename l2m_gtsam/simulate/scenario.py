@@ -133,16 +133,12 @@ class Scenario:
     ----------
     options
         The options it was made from.
-    plan
-        Racks and aisles.
     world
         All steel and the Earth's field.
     cloud
         Points that a LiDAR sees of the steel, in the map frame in metres, shape (N, 3).
     mapping
         The drive of the mapping suite.
-    calibration
-        The drive of the array.
     suite
         The mapping suite's sensors: known and free of distortion.
     truth
@@ -164,8 +160,6 @@ def simulate(options: ScenarioOptions, progress: Progress = silent) -> Scenario:
 
     Parameters
     ----------
-    options
-        Everything it depends on.
     progress
         Told how far each of the two drives is.
 

@@ -85,8 +85,6 @@ def random_array(options: SensorArrayOptions, rng: np.random.Generator) -> tuple
     ----------
     options
         Spread of places and distortions.
-    rng
-        Source of randomness.
     """
     return tuple(
         KnownSensor(f"mag_{index:02d}", place, random_distortion(options, rng))
@@ -138,16 +136,12 @@ def read_field(
 
     Parameters
     ----------
-    world
-        Source of the field.
     poses
         True poses of the lidar in the map, one per reading.
     sensor
         Place and distortion.
     noise
         White noise of the reading.
-    rng
-        Source of randomness.
 
     Returns
     -------
@@ -169,12 +163,8 @@ def measured_poses(poses: Trajectory, noise: NoiseOptions, rng: np.random.Genera
 
     Parameters
     ----------
-    poses
-        True poses.
     noise
         Errors of the rotation about the lidar's axes and of the position along the map's axes.
-    rng
-        Source of randomness.
     """
     sigmas = np.deg2rad(noise.rotation), noise.position
     white = [rng.normal(0.0, sigma, (len(poses), 3)) for sigma in sigmas]

@@ -102,8 +102,6 @@ def structure_cloud(
         Bodies over the floor, z = 0.
     options
         Which points are seen, and how well.
-    rng
-        Source of randomness.
 
     Returns
     -------

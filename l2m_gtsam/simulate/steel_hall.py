@@ -67,8 +67,6 @@ class SteelStructure:
 
     Attributes
     ----------
-    boxes
-        Its parts.
     centre, half
         Middle and half sides of the footprint in metres, shape (2,).
     """

@@ -33,8 +33,6 @@ class Parts:
 
     Attributes
     ----------
-    kind
-        What they are.
     fill
         Share of their outer section that is steel.
     dimensions, centres
@@ -129,12 +127,8 @@ def build_warehouse(
     ----------
     options
         Parts and their magnetisation.
-    plan
-        Where racks stand.
     earth
         The Earth's field in the map frame in microtesla, shape (3,).
-    rng
-        Source of randomness.
     """
     racks = (_uprights(options, plan), _rack_beams(options, plan)) if len(plan.block_x) else ()
     families = (

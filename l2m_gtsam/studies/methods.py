@@ -38,8 +38,6 @@ def two_step(
     ----------
     readings
         Of one sensor.
-    field_map
-        The magnetic map.
     t_start
         The guess in the lidar frame in metres, shape (3,).
     closed_form
@@ -65,12 +63,8 @@ def published(
     ----------
     readings
         Of one sensor; those that a step puts outside of the map are left out of the next.
-    field_map
-        The magnetic map.
     t_start
         The guess in the lidar frame in metres, shape (3,).
-    steps
-        The most iterations.
     """
     t, R = t_start.copy(), readings.R_map_lidar
     for _ in range(steps):
@@ -186,8 +180,6 @@ def levenberg_marquardt(
     ----------
     readings
         Of one sensor.
-    field_map
-        The magnetic map.
     t_start
         The guess in the lidar frame in metres, shape (3,).
     noise
@@ -227,8 +219,6 @@ def numeric_least_squares(
     ----------
     readings
         Of all sensors.
-    field_map
-        The magnetic map.
     t_start
         Where to start in the lidar frame in metres, shape (S, 3); C starts from I, H from zero.
     """

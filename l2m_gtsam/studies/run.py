@@ -44,8 +44,6 @@ class Provenance:
         Version, and commits where they are known, of the code that computed the cells.
     machines
         Classes of machine that computed them.
-    cells
-        How many there are.
     core_seconds
         That they took together.
     """
@@ -90,12 +88,8 @@ def run_study(
 
     Parameters
     ----------
-    study, options
-        What to compute.
     out
         Folder of ``study.json``, the page, the figures and, in ``cells``, all finished cells.
-    cluster
-        Who computes.
     progress
         Called with the study's name and the fraction of the cells that are finished.
     command

@@ -142,12 +142,8 @@ def around(site: SurveyedSite, path: FloatArray, distance: float) -> SurveyedSit
 
     Parameters
     ----------
-    site
-        World and survey.
     path
         Places in the map frame in metres, shape (M, 3).
-    distance
-        Metres.
     """
     rows = np.flatnonzero(_near(site.survey.points, path, distance))
     cloud = site.cloud[_near(site.cloud, path, distance)]

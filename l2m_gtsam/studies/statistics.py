@@ -41,8 +41,6 @@ class ClusteredMean:
     effective
         How many independent values would leave the mean as unsure as it is: between the number
         of groups and the number of values.
-    groups
-        How many there are.
     """
 
     mean: float

@@ -28,8 +28,6 @@ class Study(ABC, Generic[Opts, Cell, Summary]):
     ----------
     name
         Stem of its files and of its template.
-    title
-        Heading of its page.
     size
         Names of the options that only set the number of cells: finished cells remain valid when
         these change.

@@ -132,8 +132,6 @@ class DrivenHall:
         The survey around the drives.
     floor
         That it covers, in square metres.
-    drives
-        All of the study.
     """
 
     part: SurveyedSite
@@ -149,8 +147,6 @@ class MappedDrives:
     ----------
     hall
         Drives, and the fingerprints of which the map is made.
-    field_map
-        The map.
     """
 
     hall: DrivenHall

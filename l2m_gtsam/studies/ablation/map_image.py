@@ -116,8 +116,6 @@ def map_image(
 
     Parameters
     ----------
-    field_map
-        The map.
     part
         World, and the fingerprints of which the map is made.
     floor

@@ -35,10 +35,6 @@ class Combination:
 
     Attributes
     ----------
-    kind, spacing
-        Of the map.
-    solver
-        The method.
     calibrations, failed, far
         How many there are, how many of them ended without a result, and how many far off.
     t, C, H
@@ -127,8 +123,6 @@ class AblationTable:
 
     Attributes
     ----------
-    options
-        The study.
     maps
         By density, then kind.
     rows

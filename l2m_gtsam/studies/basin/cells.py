@@ -71,8 +71,6 @@ class RingCell:
 
     Attributes
     ----------
-    distortion, ring
-        Which cell this is.
     t_true
         Shape (3,).
     t_start
@@ -153,8 +151,6 @@ class BasinTable:
 
     Attributes
     ----------
-    options
-        The study.
     rows
         One per ring from the truth outwards.
     all_small, all_medium

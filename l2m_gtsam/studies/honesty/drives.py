@@ -87,8 +87,6 @@ class MappedHall:
     ----------
     hall
         The truth.
-    seed
-        Of the hall.
     noise
         Of its survey and drives in uT.
     field_map

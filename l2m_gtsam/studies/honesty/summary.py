@@ -118,8 +118,6 @@ class ParameterRow:
 
     Attributes
     ----------
-    name
-        Of the parameter.
     z_std, z_band
         Root mean square of the z-scores, and where it must lie with 95 %; surveys being
         independent.

@@ -112,10 +112,6 @@ class Measurement:
 
     Attributes
     ----------
-    part
-        The quantity that is grown.
-    way
-        What is timed.
     size
         The quantity: readings, sensors, readings of the survey, or workers.
     seconds
@@ -147,10 +143,6 @@ class Curve:
 
     Attributes
     ----------
-    part
-        The quantity.
-    way
-        What is timed.
     points
         From the smallest size to the largest.
     exponent
@@ -169,14 +161,8 @@ class Ratio:
 
     Attributes
     ----------
-    part, way
-        What it is compared with.
-    peer
-        The peer.
     size
         The largest that both were measured at.
-    times
-        The ratio of the times.
     """
 
     part: Quantity
@@ -192,8 +178,6 @@ class Speed:
 
     Attributes
     ----------
-    workers
-        How many.
     times
         The time of one worker over theirs, for computing alone.
     started

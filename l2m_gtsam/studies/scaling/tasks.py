@@ -41,8 +41,6 @@ class MappedDrive:
 
     Attributes
     ----------
-    field_map
-        The map.
     readings
         Of all sensors.
     t_true
@@ -71,12 +69,6 @@ def mapped_drive(
 
     Parameters
     ----------
-    options
-        The study.
-    site
-        World and survey.
-    sensors
-        How many.
     rate
         Readings of each per second.
     """
@@ -181,8 +173,6 @@ def taken(work: Callable[[], object], rounds: int, long: float) -> Taken:
 
     Parameters
     ----------
-    work
-        What is measured.
     rounds
         How often at most.
     long

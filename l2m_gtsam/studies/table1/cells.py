@@ -99,8 +99,6 @@ class SurveyedWarehouse:
 
     Attributes
     ----------
-    site
-        World and survey.
     maps
         Of the survey, by kind.
     naive
@@ -129,8 +127,6 @@ class Ends:
 
     Attributes
     ----------
-    method, map_kind
-        What was done.
     t, C, H
         Norms of the errors, in metres, Frobenius, and microtesla; NaN without a result,
         shape (N,).
@@ -156,15 +152,11 @@ class Table1Cell:
         In microtesla.
     path
         Its shape.
-    readings
-        Number of readings.
     places
         Distinct places from which one-key solved.
     bound
         Root of the bound's trace over t (m), C, and H (uT), shape (3,); empty where it was not
         computed.
-    ends
-        All methods.
     """
 
     noise: float
@@ -190,10 +182,6 @@ def compute(
 
     Parameters
     ----------
-    options
-        The study.
-    place
-        Where.
     level, row, number
         Which noise, which path, which of their drives.
     """

@@ -221,8 +221,6 @@ class Table1Summary:
 
     Attributes
     ----------
-    options
-        The study.
     entries
         All methods, maps, paths and noise levels.
     together
