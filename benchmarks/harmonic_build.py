@@ -2,7 +2,7 @@
 
 Two places: the open floor of ``map_queries``, and the simulated warehouse of ``l2m simulate``,
 where racks and posts that a LiDAR saw add some 17,000 candidate sources. Ten of either side by
-side show how the cost grows. The sliding Gaussian process of the same readings stands beside them.
+side show how the cost grows. The sliding Gaussian process of the same readings is beside them.
 """
 
 from collections.abc import Callable

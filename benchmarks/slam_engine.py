@@ -34,7 +34,7 @@ def seconds(work: Callable[[], object], repeats: int = 5) -> float:
 
 @dataclass(frozen=True)
 class Section:
-    """What is known of tiles and anchors, and what a stretch of the way adds to it."""
+    """What is known of tiles and anchors, and what a stretch of the path adds to it."""
 
     known: JointGaussian
     graph: gtsam.NonlinearFactorGraph

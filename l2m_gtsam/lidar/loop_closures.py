@@ -20,11 +20,11 @@ class LoopOptions(Options):
     """Where loop closures are searched for, and which are believed."""
 
     key_distance_m: float = Field(default=1.0, gt=0)
-    """A scan is kept after so much way; loops are between scans that were kept."""
+    """A key scan is kept after each such distance; loops are closed between key scans."""
     search_m: float = Field(default=3.0, gt=0)
-    """Places are compared that odometry has nearer than this, metres,"""
+    """Key scans are compared that are nearer than this by odometry, metres,"""
     least_way_m: float = Field(default=10.0, gt=0)
-    """and between which so much way lies."""
+    """and between which the path is at least this long, metres."""
     most: int = Field(default=2, ge=1)
     """The most earlier places that a scan is compared with, the nearest first."""
     registration: RegistrationOptions = RegistrationOptions(
@@ -52,13 +52,13 @@ class LoopClosureSearch:
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _KeyScan:
     """A scan as it is kept: its thinned points, in half the memory, and where odometry has it."""
 
     stamp_ns: int
     points: "np.ndarray[tuple[int, ...], np.dtype[np.float32]]"
     T: RigidTransform
-    way_m: float
+    path_m: float
 
     def surface(self) -> Surface:
         return Surface(self.points.astype(np.float64))
@@ -67,7 +67,7 @@ class _Kept:
 def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopClosureSearch:
     """Search a drive for loop closures.
 
-    Memory grows with the way, by about 0.1 MB for each scan that is kept.
+    Memory grows with the path, by about 0.1 MB for each scan that is kept.
 
     Parameters
     ----------
@@ -76,15 +76,15 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
     options
         Where to search, and what to believe.
     """
-    kept, loops, refused = list[_Kept](), list[LoopClosure](), Counter[Refusal]()
-    way, last = 0.0, None
+    kept, loops, refused = list[_KeyScan](), list[LoopClosure](), Counter[Refusal]()
+    path, last = 0.0, None
     for step in steps:
-        way += float(np.linalg.norm(step.step.t))
-        if last is not None and way - last < options.key_distance_m:
+        path += float(np.linalg.norm(step.step.t))
+        if last is not None and path - last < options.key_distance_m:
             continue
-        last = way
+        last = path
         points = step.surface.points.astype(np.float32)
-        here = _Kept(step.stamp_ns, points, step.T_odom_lidar, way)
+        here = _KeyScan(step.stamp_ns, points, step.T_odom_lidar, path)
         for earlier in _candidates(kept, here, options):
             closed = _closed(earlier, here, step.surface, options.registration)
             if isinstance(closed, LoopClosure):
@@ -95,16 +95,16 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
     return LoopClosureSearch(tuple(loops), dict(refused))
 
 
-def _candidates(kept: list[_Kept], here: _Kept, options: LoopOptions) -> list[_Kept]:
+def _candidates(kept: list[_KeyScan], here: _KeyScan, options: LoopOptions) -> list[_KeyScan]:
     """Return the earlier scans that may be of the same place, the nearest first."""
-    old = [each for each in kept if here.way_m - each.way_m >= options.least_way_m]
+    old = [each for each in kept if here.path_m - each.path_m >= options.least_way_m]
     away = [float(np.linalg.norm(each.T.t - here.T.t)) for each in old]
     near = [k for k in np.argsort(away)[: options.most] if away[k] <= options.search_m]
     return [old[k] for k in near]
 
 
 def _closed(
-    earlier: _Kept, here: _Kept, scan: Surface, options: RegistrationOptions
+    earlier: _KeyScan, here: _KeyScan, scan: Surface, options: RegistrationOptions
 ) -> LoopClosure | Refusal:
     """Return the loop closure between two scans, or why there is none."""
     first, guess = earlier.surface(), between(earlier.T, here.T)

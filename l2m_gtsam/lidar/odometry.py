@@ -1,8 +1,8 @@
 """Odometry from scans: KISS-ICP follows the lidar, generalised ICP on key scans refines it.
 
 KISS-ICP matches points to points of its own map. That is robust, but in rooms it drifts by about
-1 % of the way, and it takes every direction for determined. So each scan is registered once more,
-on the last key scan, from where KISS-ICP has it; that gives the pose and its covariance.
+1 % of the distance, and all directions count as determined. So each scan is registered once more,
+on the last key scan, from KISS-ICP's pose; that gives the pose and its covariance.
 """
 
 from collections.abc import Iterable, Iterator
@@ -82,9 +82,9 @@ class ScanOdometryOptions(Options):
     map_range_m: float = Field(default=60.0, gt=0)
     """KISS-ICP forgets what is further away than this, metres."""
     key_distance_m: float = Field(default=1.0, gt=0)
-    """A scan becomes the key scan after so much way,"""
+    """A scan becomes the key scan after this distance,"""
     key_angle_deg: float = Field(default=20.0, gt=0, le=180)
-    """or so much turning."""
+    """or this rotation."""
     registration: RegistrationOptions = RegistrationOptions(
         least_share=0.6, unseen_m=1.0, unseen_deg=5.0
     )
@@ -155,7 +155,7 @@ def odometry(scans: Iterable[Scan], options: ScanOdometryOptions) -> Trajectory:
 
 
 def accumulated(steps: Iterable[ScanStep]) -> Trajectory:
-    """Return the poses of steps; the covariance of each is that of the way from the first."""
+    """Return the poses of steps; the covariance of each is that of the motion from the first."""
     stamps, poses, covariances = [], list[RigidTransform](), list[FloatArray]()
     for each in steps:
         stamps.append(each.stamp_ns)

@@ -34,9 +34,9 @@ class PointCloudOptions(Options):
     odometry: ScanOdometryOptions = ScanOdometryOptions()
     """How the lidar is followed from scan to scan."""
     start: ScanStartOptions | None = None
-    """Where the drive begins in the map; looked for along the mapping drives if it is not given."""
+    """Where the drive begins in the map; if not given, searched for along the mapping drives."""
     search: ScanSearchOptions = ScanSearchOptions()
-    """How it is looked for."""
+    """How it is searched for."""
     localisation: ScanLocalisationOptions = ScanLocalisationOptions()
     """How scans are localised on the map's cloud."""
     loops: LoopOptions = LoopOptions()

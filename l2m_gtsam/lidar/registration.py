@@ -12,10 +12,10 @@ from l2m_gtsam.lidar.surface import (
     Planes,
     Surface,
     distances,
+    inflated,
     library,
     plane_information,
     plane_step,
-    tempered,
 )
 from l2m_gtsam.options import Options
 
@@ -147,7 +147,7 @@ def combined(
 
     The scan decides along what it shows, the expectation along the rest.
     """
-    seen = tempered(found.information, isotropic_covariance(options.floor_deg, options.floor_m))
+    seen = inflated(found.information, isotropic_covariance(options.floor_deg, options.floor_m))
     # Around the registered pose, in whose axes the information is.
     turn = np.kron(np.eye(2), found.T.R.T @ expected.T.R)
     known = np.linalg.inv(turn @ expected.covariance @ turn.T)
@@ -165,7 +165,7 @@ def by_scan(
 
 
 def unseen_covariance(options: RegistrationOptions) -> FloatArray:
-    """Return the covariance of a pose of which a scan says nothing, shape (6, 6)."""
+    """Return the covariance of a pose that a scan does not determine, shape (6, 6)."""
     return isotropic_covariance(options.unseen_deg, options.unseen_m)
 
 
@@ -229,14 +229,14 @@ def _matched(
 def _refined(
     scan: Surface, surface: Surface, T: RigidTransform, options: RegistrationOptions
 ) -> RigidTransform:
-    """Return a pose moved towards its planes, along what they tell better than what led to it."""
+    """Return a pose moved towards its planes, weighted against the accuracy of generalised ICP."""
     matched = _matched(scan, surface, T, options)
     if not matched.enough:
         return T
-    told = matched.information(T)
+    information = matched.information(T)
     before: FloatArray = np.diag(1 / np.square(np.repeat([GICP_RAD, GICP_M], 3)))
     step = plane_step(matched.points, T, matched.planes)
-    moved = np.linalg.solve(told + before, told @ step)
+    moved = np.linalg.solve(information + before, information @ step)
     return perturbed(T, np.asarray(moved, dtype=np.float64))
 
 

@@ -60,7 +60,7 @@ class ScanLocalisationOptions(Options):
     cloud_deg: float = Field(default=0.05, ge=0)
     """and of the rotation in degrees."""
     cloud_over_m: float = Field(default=5.0, gt=0)
-    """The way over which the cloud's errors are the same."""
+    """Path length over which the cloud's errors are the same."""
 
     def of_cloud(self) -> FloatArray:
         """Return the covariance that the cloud's errors add to a pose, shape (6, 6)."""
@@ -74,7 +74,7 @@ class ScanLocalisation:
     Attributes
     ----------
     fixes
-        What each believed scan alone says.
+        Pose of each believed scan by itself.
     trajectory
         Their poses by scans and odometry together; scans that were refused have none.
     refused
@@ -101,7 +101,7 @@ def localise_scans(
     """Register scan after scan on a cloud, each from where odometry expects it.
 
     Along what a scan shows, its pose is that of the registration; along the rest, that of odometry
-    from the scan before, and the covariance grows until something is seen again.
+    from the scan before, and the covariance grows until a scan determines it again.
 
     Parameters
     ----------
@@ -134,8 +134,8 @@ def spaced(
 ) -> tuple[PoseFix, ...]:
     """Return fixes whose errors may count as independent.
 
-    One is kept per ``apart_m`` metres of way. Those that share an error of the cloud get it as many
-    times as there are of them, so that all together say no more than one of them without noise.
+    One is kept per ``apart_m`` metres of path. n fixes that share an error of the cloud get n times
+    its covariance, so that together they know it no better than one of them without noise.
 
     Parameters
     ----------
@@ -151,9 +151,9 @@ def spaced(
         if np.linalg.norm(fix.T_map_lidar.t - kept[-1].T_map_lidar.t) >= apart_m:
             kept.append(fix)
     places = np.reshape([each.T_map_lidar.t for each in kept], (-1, 3))
-    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
+    path = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1)))
     half = options.cloud_over_m / 2
-    near = np.searchsorted(way, way + half, side="right") - np.searchsorted(way, way - half)
+    near = np.searchsorted(path, path + half, side="right") - np.searchsorted(path, path - half)
     more = options.of_cloud()
     return tuple(
         replace(each, covariance=each.covariance + (count - 1) * more)

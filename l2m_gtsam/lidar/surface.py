@@ -172,7 +172,7 @@ def _above_noise(H: FloatArray, N: FloatArray) -> FloatArray:
     return np.asarray(kept * np.outer(size, size))
 
 
-def tempered(information: FloatArray, least: FloatArray) -> FloatArray:
+def inflated(information: FloatArray, least: FloatArray) -> FloatArray:
     """Return information as it is if a covariance is added to the errors, both (6, 6).
 
     The same as ``inv(inv(information) + least)``, also for singular information.

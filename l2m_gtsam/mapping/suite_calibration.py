@@ -32,7 +32,7 @@ from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.rotation import polar_rotation
 
 REACH = 5.0  # standard deviations of a clock for which readings need poses around them
-UNTOLD = 0.5  # of the sigma that was assumed: a parameter known no better is told by nothing else
+UNDETERMINED = 0.5  # share of the prior sigma above which the drive does not determine a parameter
 PARAMETERS = (
     *("t_lidar_mag x", "t_lidar_mag y", "t_lidar_mag z"),
     *(f"C[{i},{j}]" for i in range(3) for j in range(3)),
@@ -132,12 +132,12 @@ def _result(
 
 def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibration:
     own = slice(SIZE * i, SIZE * (i + 1))
-    parameters, covariance = solution.parameters[i], solution.covariance[own, own]
+    parameters, covariance = solution.last.sensors[i], solution.last.covariance[own, own]
     distortion = Distortion.from_vector(parameters[3:TAU])
     rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
     sigma = float(np.sqrt(covariance[TAU, TAU]))
     status, message = _ending(solution)
-    noise = float(solution.prior.noise * np.cbrt(np.linalg.det(distortion.C)))
+    noise = float(solution.last.windows.prior.noise * np.cbrt(np.linalg.det(distortion.C)))
     residual = solution.residuals[i]
     white = np.tile(np.eye(3) / noise, (len(residual), 1, 1))
     return SensorCalibration(
@@ -171,16 +171,16 @@ def _ending(solution: SuiteSolution) -> tuple[SensorStatus, str]:
 def _doubts(
     names: Sequence[str], solution: SuiteSolution, options: SuiteCalibrationOptions
 ) -> tuple[str, ...]:
-    """Return which parameters the drive told little of, a sentence for each sensor."""
-    sigma = np.sqrt(np.diag(solution.covariance)).reshape(len(names), SIZE)
+    """Return the parameters that the drive hardly determines, a sentence for each sensor."""
+    sigma = np.sqrt(np.diag(solution.last.covariance)).reshape(len(names), SIZE)
     assumed = np.repeat(
         [options.position_m, options.matrix, options.offset_ut, options.clock_s], [3, 9, 3, 1]
     )
     sentences = []
     for name, own in zip(names, sigma, strict=True):
-        if untold := [PARAMETERS[k] for k in np.flatnonzero(own > UNTOLD * assumed)]:
+        if weak := [PARAMETERS[k] for k in np.flatnonzero(own > UNDETERMINED * assumed)]:
             sentences.append(
-                f"{name}: the drive says little of {', '.join(untold)}; drive with all headings "
+                f"{name}: the drive hardly determines {', '.join(weak)}; drive with all headings "
                 "and some tilt, or give what is known with --suite"
             )
     return tuple(sentences)

@@ -44,10 +44,10 @@ class SuiteCalibrationOptions(Options):
     """How the sensors of a mapping suite are calibrated from their own drive."""
 
     sync: SyncOptions = SyncOptions(thin_distance_m=0.03, thin_angle_deg=5.0)
-    """Which readings enter. One place seen with two headings tells most of the sensors."""
+    """Which readings enter. One place under two headings determines most of the sensors."""
     position_m: float = Field(default=0.3, gt=0)
     """How far a sensor may sit from where it is assumed, along each axis: standard deviation in
-    metres. Assumed is the lidar's origin, or what a suite says that is given to start from."""
+    metres. Assumed is the lidar's origin, or the suite that is given to start from."""
     matrix: float = Field(default=0.1, gt=0, lt=1)
     """How far each entry of C may be from what is assumed, the identity if nothing is given."""
     offset_ut: float = Field(default=20.0, gt=0)
@@ -55,7 +55,7 @@ class SuiteCalibrationOptions(Options):
     clock_s: float = Field(default=0.02, gt=0)
     """How far a sensor's clock may be off, in seconds."""
     windows: int = Field(default=4, ge=1)
-    """Parts of the survey that are looked at, spread over it."""
+    """Parts of the survey that are used, spread over it."""
     readings: int = Field(default=3000, ge=100)
     """The most readings of one of them."""
     modes: int = Field(default=300, ge=50)
@@ -75,8 +75,8 @@ class SuiteWindow:
     basis
         Waves.
     middle
-        Mean of the readings' places when the waves were laid, in metres, shape (3,). Waves move
-        with it: their prior knows heights, and must not tell how high the sensors sit.
+        Mean of the readings' positions when the basis was made, in metres, shape (3,). The basis
+        moves with it: its prior depends on heights, and must not determine the sensors' heights.
     readings
         As sensors read them, with the motion of the lidar, N in number.
     """
@@ -167,16 +167,16 @@ def suite_likelihood(
         Of the field, and the noise.
     """
     readings, basis, noise = window.readings, window.basis, prior.noise
-    seen = undistorted(readings, sensors)
-    points = seen.points - seen.points.mean(axis=0) + window.middle
+    undone = undistorted(readings, sensors)
+    points = undone.points - undone.points.mean(axis=0) + window.middle
     log_variance = basis.prior(prior).log_variance
-    normal = normal_of(basis, TrainingSet(points, seen.field, np.ones(len(readings))))
+    normal = normal_of(basis, TrainingSet(points, undone.field, np.ones(len(readings))))
     found, D = evidence(normal, log_variance, noise), np.exp(0.5 * log_variance)
     predicted, gradient = basis.field_and_gradient(points, D * found.mean)
-    r = seen.field - predicted
-    places = _wide(_place_slopes(readings, seen), readings.sensor, len(sensors))
+    r = undone.field - predicted
+    places = _wide(_place_slopes(readings, undone), readings.sensor, len(sensors))
     places -= places.mean(axis=0)
-    J = _wide(_field_slopes(readings, seen), readings.sensor, len(sensors)) - gradient @ places
+    J = _wide(_field_slopes(readings, undone), readings.sensor, len(sensors)) - gradient @ places
     complexity = _complexity_slopes(basis, points, D, found, noise)
     slope = -np.einsum("ni,nij->j", r, J) / noise**2 - np.einsum("ni,nij->j", complexity, places)
     turned, volume = _volume_change(readings, sensors)
@@ -203,24 +203,24 @@ def _wide(own: FloatArray, sensor: IntArray, count: int) -> FloatArray:
     return wide.reshape(len(own), 3, -1)
 
 
-def _place_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
+def _place_slopes(readings: Readings, undone: Undistorted) -> FloatArray:
     """Return derivatives of the sensors' places by their parameters, shape (N, 3, 16)."""
     R, J = readings.R_map_lidar, np.zeros((len(readings), 3, SIZE))
     J[:, :, T] = R
     if readings.motion is not None:
         w, v = readings.motion.twist_lidar[:, :3], readings.motion.twist_lidar[:, 3:]
-        J[:, :, TAU] = np.einsum("nij,nj->ni", R, v + np.cross(w, seen.lever))
+        J[:, :, TAU] = np.einsum("nij,nj->ni", R, v + np.cross(w, undone.lever))
     return J
 
 
-def _field_slopes(readings: Readings, seen: Undistorted) -> FloatArray:
+def _field_slopes(readings: Readings, undone: Undistorted) -> FloatArray:
     """Return derivatives of the undistorted fields by the sensors' parameters, (N, 3, 16)."""
     J = np.zeros((len(readings), 3, SIZE))
-    J[:, :, C] = -(seen.turned[:, :, :, None] * seen.b[:, None, None, :]).reshape(-1, 3, 9)
-    J[:, :, H] = -seen.turned
+    J[:, :, C] = -(undone.turned[:, :, :, None] * undone.b[:, None, None, :]).reshape(-1, 3, 9)
+    J[:, :, H] = -undone.turned
     if readings.motion is not None:
         w = readings.motion.twist_lidar[:, :3]
-        J[:, :, TAU] = np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, seen.b))
+        J[:, :, TAU] = np.einsum("nij,nj->ni", readings.R_map_lidar, np.cross(w, undone.b))
     return J
 
 
@@ -280,7 +280,7 @@ class SuiteWindows:
 def windows_over(
     readings: Readings, sensors: FloatArray, options: SuiteCalibrationOptions
 ) -> SuiteWindows:
-    """Learn the prior of the field where sensors with these parameters saw it, and lay windows.
+    """Learn the prior of the field from sensors with these parameters, and choose windows.
 
     Parameters
     ----------
@@ -296,8 +296,8 @@ def windows_over(
     MapError
         There are too few readings.
     """
-    seen, defaults = undistorted(readings, sensors), HarmonicOptions()
-    raw = training_set(seen.points, seen.field)
+    undone, defaults = undistorted(readings, sensors), HarmonicOptions()
+    raw = training_set(undone.points, undone.field)
     survey = merged(raw, defaults.merge, defaults.independent)
     learning = LearningOptions(windows=options.windows, rough=0, modes=options.modes)
     share = defaults.mode_share
@@ -307,8 +307,8 @@ def windows_over(
     resolution = affordable(wanted, defaults.tiling, learning.modes)
     tiling = tiling_of(survey.points, resolution, defaults.tiling, learning.modes, reach=0.0)
     parts, of = [], []
-    for tile, rows in _dealt(tiling, seen.points, options):
-        own = TrainingSet(seen.points[rows], seen.field[rows], np.ones(len(rows)))
+    for tile, rows in _dealt(tiling, undone.points, options):
+        own = TrainingSet(undone.points[rows], undone.field[rows], np.ones(len(rows)))
         centre = tiling.grid.centres[tile]
         basis = basis_of(own, centre, tiling.edge, resolution, [], np.empty(0))
         parts.append(SuiteWindow(basis, own.points.mean(axis=0), readings[rows]))

@@ -1,9 +1,9 @@
 """The sensors of a mapping suite by the marginal likelihood of their own drive.
 
-The drive's poses are known, the field is not. A sensor that is taken to sit or to read otherwise
-than it does sees at one place, under two headings, two fields, and over the drive one that no
-sources could make: both are unlikely. By Fisher scoring; strength and depth of the sources are
-learnt anew in rounds.
+The drive's poses are known, the field is not. With a wrong position or distortion a sensor measures
+two fields at one place under two headings, and over the drive a field that no sources could make:
+both are unlikely. The likelihood is maximised by Fisher scoring; strength and depth of the sources
+are learnt again in each round.
 """
 
 from collections.abc import Callable
@@ -23,16 +23,15 @@ from l2m_gtsam.mapping.suite_likelihood import (
     suite_likelihood,
     windows_over,
 )
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.solve.model_comparison import correlation_of
 
-# Nobody can tell fields that are all stronger by a factor from sensors that read less by it: the
-# mean of C's diagonals stays what it is assumed to be.
+# A common factor of all fields cannot be separated from its inverse in all sensors: the mean of C's
+# diagonals is held at its prior.
 SAME_SCALE = 1e-5
 DIAGONAL = [3, 7, 11]
 SMALLEST = 1 / 16  # of a step
-SETTLED = 0.5  # standard deviations that a round may still move a parameter by
+SETTLED = 0.5  # limit of a round's move of any parameter, in standard deviations
 GAIN = 0.01  # of the log likelihood: a step that gains less is the last
 
 ReadingsAt = Callable[[FloatArray], Readings]
@@ -40,88 +39,26 @@ ReadingsAt = Callable[[FloatArray], Readings]
 
 
 @dataclass(frozen=True)
-class SuiteSolution:
-    """Sensors of a suite.
+class SuiteRound:
+    """The sensors of a suite after a round.
 
     Attributes
     ----------
-    parameters
+    sensors
         (t, C row by row, H, time offset) in m, uT and s, shape (S, 16).
+    windows
+        Parts of the survey, with the prior of the field and the noise of a reading.
+    left
+        Of each window what the most likely field leaves of its readings, uT, shape (n, 3).
     covariance
-        Of all, shape (16 S, 16 S).
-    prior
-        Of the field, with the noise of a reading.
-    residuals
-        Of each sensor ``C b + H - z`` in uT over the readings that took part, shape (n, 3).
-    independent
-        As how many readings they all count: residuals near each other in time are alike.
-    converged
-        Whether the last round moved nothing any more.
-    rounds
-        That were taken.
+        Of all parameters, shape (16 S, 16 S).
+    settled
+        Whether Fisher scoring converged.
     """
-
-    parameters: FloatArray
-    covariance: FloatArray
-    prior: Hyperparameters
-    residuals: tuple[FloatArray, ...]
-    independent: float
-    converged: bool
-    rounds: int
-
-
-def solve_suite(
-    readings_at: ReadingsAt,
-    assumed: FloatArray,
-    options: SuiteCalibrationOptions,
-    progress: Progress,
-) -> SuiteSolution:
-    """Find the sensors of a suite.
-
-    Parameters
-    ----------
-    readings_at
-        The drive.
-    assumed
-        Parameters of the S sensors before anything is known, shape (S, 16).
-    options
-        How sure that is, and how to solve.
-    progress
-        Called with a stage and the fraction of it that is done.
-
-    Raises
-    ------
-    MapError
-        There are too few readings.
-    """
-    problem = SuiteProblem(readings_at, assumed, options)
-    sensors, moved = assumed, np.inf
-    for round_ in range(options.rounds):
-        progress("calibrating the suite", round_ / options.rounds)
-        found = problem.solved(sensors)
-        sensors, moved = found.sensors, found.moved(sensors)
-        if moved < SETTLED:
-            break
-    progress("calibrating the suite", 1.0)
-    return SuiteSolution(
-        parameters=sensors,
-        covariance=found.covariance,
-        prior=found.windows.prior,
-        residuals=found.residuals(),
-        independent=found.independent,
-        converged=bool(moved < SETTLED) and found.settled,
-        rounds=round_ + 1,
-    )
-
-
-@dataclass(frozen=True)
-class SuiteRound:
-    """Where a round led."""
 
     sensors: FloatArray
     windows: SuiteWindows
     left: tuple[FloatArray, ...]
-    independent: float
     covariance: FloatArray
     settled: bool
 
@@ -141,6 +78,65 @@ class SuiteRound:
         """Return the largest move of a parameter in its sigmas."""
         away = np.abs(self.sensors - before).ravel()
         return float((away / np.sqrt(np.diag(self.covariance))).max())
+
+
+@dataclass(frozen=True)
+class SuiteSolution:
+    """The last round.
+
+    Attributes
+    ----------
+    last
+        Sensors, windows and covariance.
+    residuals
+        Of each sensor ``C b + H - z`` in uT over the readings that were used, shape (n, 3).
+    converged
+        Whether the last round moved no parameter by more than ``SETTLED``.
+    rounds
+        Number of rounds.
+    """
+
+    last: SuiteRound
+    residuals: tuple[FloatArray, ...]
+    converged: bool
+    rounds: int
+
+
+def solve_suite(
+    readings_at: ReadingsAt,
+    assumed: FloatArray,
+    options: SuiteCalibrationOptions,
+    progress: Progress,
+) -> SuiteSolution:
+    """Estimate the sensors of a suite.
+
+    Parameters
+    ----------
+    readings_at
+        Readings of the survey for given clock offsets.
+    assumed
+        Prior means of the S sensors' parameters, shape (S, 16).
+    options
+        Prior sigmas, windows and limits.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    MapError
+        There are too few readings.
+    """
+    problem = SuiteProblem(readings_at, assumed, options)
+    sensors, moved = assumed, np.inf
+    for round_ in range(options.rounds):
+        progress("calibrating the suite", round_ / options.rounds)
+        found = problem.solved(sensors)
+        sensors, moved = found.sensors, found.moved(sensors)
+        if moved < SETTLED:
+            break
+    progress("calibrating the suite", 1.0)
+    converged = bool(moved < SETTLED) and found.settled
+    return SuiteSolution(found, found.residuals(), converged, round_ + 1)
 
 
 class SuiteProblem:
@@ -178,9 +174,9 @@ class SuiteProblem:
             if settled:
                 break
         alike = likeness(windows, score)
-        count = sum(len(rows) for rows in windows.rows)
-        covariance = self._covariance(score, alike)
-        return SuiteRound(sensors, windows, score.residuals, count / alike, covariance, settled)
+        return SuiteRound(
+            sensors, windows, score.residuals, self._covariance(score, alike), settled
+        )
 
     def _covariance(self, score: SuiteLikelihood, alike: float) -> FloatArray:
         """Return the covariance where so many readings count as one, shape (16 S, 16 S)."""

@@ -144,14 +144,14 @@ class _Steps:
     ----------
     seconds, middle
         How long each takes, and when its middle is, shape (N,).
-    turn, way
+    turn, shift
         Rotation vector in rad, and translation in m along the axes of the pose before, (N, 3).
     """
 
     seconds: FloatArray
     middle: FloatArray
     turn: FloatArray
-    way: FloatArray
+    shift: FloatArray
 
     def velocity(self) -> FloatArray:
         """Return rad/s and m/s, the latter along the axes that the body has half way, (N, 6).
@@ -159,7 +159,7 @@ class _Steps:
         On an arc these do not change, however long the steps are.
         """
         half = Rotation.from_rotvec(self.turn / 2).inv()
-        return np.hstack([self.turn, half.apply(self.way)]) / self.seconds[:, None]
+        return np.hstack([self.turn, half.apply(self.shift)]) / self.seconds[:, None]
 
 
 def _steps_of(trajectory: Trajectory) -> _Steps:
@@ -169,7 +169,7 @@ def _steps_of(trajectory: Trajectory) -> _Steps:
         seconds=np.diff(at),
         middle=(at[1:] + at[:-1]) / 2,
         turn=Rotation.from_matrix(R_back @ trajectory.R[1:]).as_rotvec(),
-        way=np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p, axis=0)),
+        shift=np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p, axis=0)),
     )
 
 
@@ -222,11 +222,13 @@ def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _StepComp
     velocity, away = _about(steps, good)
     expected = velocity * steps.seconds[:, None]
     turn = Rotation.from_rotvec(expected[:, :3])
-    way = Rotation.from_rotvec(expected[:, :3] / 2).apply(expected[:, 3:])
-    off = np.hstack([(turn.inv() * Rotation.from_rotvec(steps.turn)).as_rotvec(), steps.way - way])
+    shift = Rotation.from_rotvec(expected[:, :3] / 2).apply(expected[:, 3:])
+    off = np.hstack(
+        [(turn.inv() * Rotation.from_rotvec(steps.turn)).as_rotvec(), steps.shift - shift]
+    )
     off[:, 3:] = turn.inv().apply(off[:, 3:])
     reach = steps.seconds * away
-    found = _StepComparison(turn.as_matrix(), way, off, reach, _acceleration(steps, good), good)
+    found = _StepComparison(turn.as_matrix(), shift, off, reach, _acceleration(steps, good), good)
     sizes = found.sizes()
     limits = np.maximum(
         np.array([np.deg2rad(options.rotation_deg), options.position_m]),

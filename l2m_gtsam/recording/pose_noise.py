@@ -12,8 +12,8 @@ class PoseNoiseOptions(Options):
 
     position_m: float | None = Field(default=None, ge=0)
     """Standard deviation of the position per axis in metres, in place of what the recording
-    says. If neither this nor `rotation_deg` is given and the recording says nothing, poses are
-    taken as exact; if only one is given and the recording says nothing, the other is 0."""
+    says. If neither this nor `rotation_deg` is given and the recording states nothing, poses are
+    taken as exact; if only one is given and the recording states nothing, the other is 0."""
     rotation_deg: float | None = Field(default=None, ge=0, le=45)
     """Standard deviation of the rotation about each axis in degrees, in the same way."""
     correlation_s: float = Field(default=1.0, ge=0)
@@ -58,7 +58,7 @@ def pose_roots(
 
 
 def _stated(trajectory: Trajectory, stamp_ns: IntArray) -> FloatArray | None:
-    """Return what the recording says at these times, shape (N, 6, 6)."""
+    """Return the recording's covariances at these times, shape (N, 6, 6)."""
     if trajectory.covariance is None:
         return None
     last = len(trajectory) - 1

@@ -217,8 +217,8 @@ def _twist_at(trajectory: Trajectory, at: FloatArray, R: FloatArray) -> FloatArr
     between = np.maximum(late - early, np.finfo(float).tiny)[:, None]
     (R_early, p_early), (R_late, p_late) = (_poses_at(trajectory, t) for t in (early, late))
     turn = Rotation.from_matrix(R_early.transpose(0, 2, 1) @ R_late).as_rotvec()
-    way = np.einsum("nji,nj->ni", R, p_late - p_early)
-    return np.asarray(np.hstack([turn, way]) / between)
+    shift = np.einsum("nji,nj->ni", R, p_late - p_early)
+    return np.asarray(np.hstack([turn, shift]) / between)
 
 
 def _first_in_cell(readings: Readings, options: SyncOptions) -> BoolArray:

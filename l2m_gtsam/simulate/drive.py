@@ -45,7 +45,7 @@ class DriveOptions(Options):
 
 
 @dataclass(frozen=True)
-class Motion:
+class VehicleMotion:
     """The true motion of a lidar in the map, smooth in time.
 
     Attributes
@@ -75,7 +75,7 @@ class Motion:
 
 def drive(
     options: DriveOptions, route: FloatArray, start_ns: int, rng: np.random.Generator
-) -> Motion:
+) -> VehicleMotion:
     """Return the motion of a vehicle along a route.
 
     The route's corners are rounded, the vehicle slows down where the rounded path bends, and
@@ -83,8 +83,6 @@ def drive(
 
     Parameters
     ----------
-    options
-        Speeds and bounds.
     route
         Corner points in the map in metres, shape (M, 2).
     start_ns
@@ -105,7 +103,7 @@ def drive(
         bound * _sway(options, knots, rng)
         for bound in (options.heave, np.deg2rad(options.pitch), np.deg2rad(options.roll))
     )
-    return Motion(
+    return VehicleMotion(
         start_ns,
         float(time[-1]),
         CubicSpline(knots, np.column_stack([x, y, options.lidar_height + heave])),

@@ -6,8 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, Readings, Trajectory
-from l2m_gtsam.simulate.hall_parts import HALF_AREA
-from l2m_gtsam.simulate.steel_hall import SteelHall
+from l2m_gtsam.simulate.steel_hall import HALF_AREA, SteelHall
 
 CLEARANCE_M = 0.4  # of every reading to posts and racks, horizontally
 BODY_M = 0.55  # of the vehicle's middle
@@ -17,7 +16,7 @@ STEP_NS = 50_000_000
 
 
 @dataclass(frozen=True)
-class Survey:
+class HallSurvey:
     """Readings of an ideal magnetometer in the map frame.
 
     Attributes
@@ -44,7 +43,7 @@ class Survey:
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutField:
     """Places that no survey has read: points in metres and the true field in uT, (N, 3)."""
 
     points: FloatArray
@@ -96,10 +95,10 @@ def survey(
     heights: tuple[float, ...] = (0.4, 0.7, 1.0),
     noise: float = 0.2,
     count: int = 1500,
-) -> Survey:
+) -> HallSurvey:
     """Return a survey in lanes over the whole area, along x and along y by turns.
 
-    Lanes bend around what stands in their way. The sensor follows the uneven floor. Slightly
+    Lanes bend around structures. The sensor follows the uneven floor. Slightly
     fewer than ``count`` readings come about where two structures leave no room.
     """
     rng = np.random.default_rng([seed, 3])
@@ -108,17 +107,19 @@ def survey(
     points = np.concatenate(passes)
     points = points[hall.free(points, CLEARANCE_M)]
     field = hall.world.field(points) + noise * rng.standard_normal(points.shape)
-    return Survey(points, field, heights, noise)
+    return HallSurvey(points, field, heights, noise)
 
 
-def held_out(hall: SteelHall, seed: int, span: tuple[float, float], count: int = 600) -> HeldOut:
+def held_out(
+    hall: SteelHall, seed: int, span: tuple[float, float], count: int = 600
+) -> HeldOutField:
     """Return random places between lanes and between these heights over the floor."""
     rng = np.random.default_rng([seed, 4])
     # More than half of the floor is free.
     xy = rng.uniform(-HALF_AREA, HALF_AREA, (3 * count, 2))
     xy = xy[hall.free(xy, CLEARANCE_M)][:count]
     points = np.column_stack([xy, rng.uniform(*span, len(xy))])
-    return HeldOut(points, hall.world.field(points))
+    return HeldOutField(points, hall.world.field(points))
 
 
 def calibration_drive(

@@ -1,4 +1,4 @@
-"""A spinning LiDAR that looks around a world of solid boxes, by casting rays."""
+"""A spinning LiDAR in a world of solid boxes, by casting rays."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,10 +17,10 @@ NANOSECONDS = 1e9
 MISSING = "point clouds are cast with trimesh and embreex: pip install 'l2m-gtsam[lidar]'"
 
 PosesAt = Callable[[IntArray], Trajectory]
-"""The true poses of the lidar in the map at times, shape (N,), in nanoseconds: ``Motion.at``."""
+"""True poses of the lidar in the map at times (ns), shape (N,): ``VehicleMotion.at``."""
 
 
-class LidarOptions(Options):
+class SpinningLidarOptions(Options):
     """A LiDAR of beams that spin about the vertical axis of its frame."""
 
     beams: Annotated[int, Field(ge=1, le=256)] = 32
@@ -71,7 +71,7 @@ class LidarOptions(Options):
 
 
 class RayCaster:
-    """Solid boxes, ready to be looked at.
+    """Solid boxes as a mesh that rays are cast at.
 
     Parameters
     ----------
@@ -128,10 +128,6 @@ class SimulatedScans:
 
     Attributes
     ----------
-    caster
-        What there is to see.
-    options
-        The LiDAR.
     poses_at
         Where it truly is.
     stamp_ns
@@ -141,7 +137,7 @@ class SimulatedScans:
     """
 
     caster: RayCaster
-    options: LidarOptions
+    options: SpinningLidarOptions
     poses_at: PosesAt
     stamp_ns: IntArray
     seed: int = 0
@@ -170,7 +166,9 @@ class SimulatedScans:
         return Scan(stamp, points, times)
 
 
-def scan_stamps(options: LidarOptions, duration: float, rng: np.random.Generator) -> IntArray:
+def scan_stamps(
+    options: SpinningLidarOptions, duration: float, rng: np.random.Generator
+) -> IntArray:
     """Return when scans begin that end within ``duration`` seconds, in nanoseconds, shape (N,).
 
     The first one begins at a random share of the interval: sources are not synchronised.
@@ -183,16 +181,16 @@ def scan_stamps(options: LidarOptions, duration: float, rng: np.random.Generator
 
 
 def scans(
-    solids: Solids, options: LidarOptions, poses_at: PosesAt, stamp_ns: IntArray, seed: int = 0
+    solids: Solids,
+    options: SpinningLidarOptions,
+    poses_at: PosesAt,
+    stamp_ns: IntArray,
+    seed: int = 0,
 ) -> SimulatedScans:
     """Return the scans that a LiDAR takes of solid boxes, one per stamp.
 
     Parameters
     ----------
-    solids
-        What there is to see.
-    options
-        The LiDAR.
     poses_at
         The true pose of the lidar at any time of the drive.
     stamp_ns
@@ -209,7 +207,7 @@ def scans(
 
 
 def snapshots(
-    solids: Solids, options: LidarOptions, trajectory: Trajectory, seed: int = 0
+    solids: Solids, options: SpinningLidarOptions, trajectory: Trajectory, seed: int = 0
 ) -> SimulatedScans:
     """Return one snapshot of solid boxes at every pose of a trajectory.
 

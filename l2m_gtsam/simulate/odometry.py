@@ -1,4 +1,4 @@
-"""Odometry that drifts as a vehicle drives, and says how far it may have."""
+"""Odometry that drifts as a vehicle drives, with the covariance of its drift."""
 
 from enum import StrEnum
 from typing import Annotated
@@ -11,26 +11,26 @@ from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.sensors import NoiseOptions
 
-# An error of nothing cannot be told from one that is unknown: metres and radians.
+# A stated error of zero would read as an unknown one: metres and radians.
 LEAST_ERROR = 1e-6
 
 
 class OdometryOrigin(StrEnum):
-    """Where odometry says that a drive begins."""
+    """Origin of the odometry frame."""
 
     MAP = "map"
     START = "start"
 
 
-class OdometryOptions(Options):
+class OdometryDriftOptions(Options):
     """How odometry drifts along a drive."""
 
     scale: Annotated[float, Field(ge=0, lt=1)] = 0.01
-    """Every way is measured too long or too short by this share of it."""
+    """Every distance is measured too long or too short by this share of it."""
     scale_length: Annotated[float, Field(gt=0)] = 100.0
-    """After this way in metres it is drawn anew which of both."""
+    """After this distance in metres the sign of the scale error is drawn anew."""
     yaw_walk: Annotated[float, Field(ge=0)] = 0.05
-    """Random walk of the heading, degrees after a metre; it grows with the root of the way."""
+    """Random walk of the heading, degrees after a metre; it grows with the root of the distance."""
     position_walk: Annotated[float, Field(ge=0)] = 0.01
     """Random walk of the position along each axis, metres after a metre."""
     origin: OdometryOrigin = OdometryOrigin.MAP
@@ -41,28 +41,24 @@ class OdometryOptions(Options):
 
 
 def drifting(
-    poses: Trajectory, options: OdometryOptions, noise: NoiseOptions, rng: np.random.Generator
+    poses: Trajectory, options: OdometryDriftOptions, noise: NoiseOptions, rng: np.random.Generator
 ) -> Trajectory:
     """Return what odometry makes of a drive, with the covariance of every pose.
 
     Roll and pitch do not drift: gravity holds them. Covariances accumulate from step to step,
-    ``P' = Ad P Ad^T + Q``, with independent steps: those of a scale are exact for straight ways of
+    ``P' = Ad P Ad^T + Q``, with independent steps: those of a scale are exact for straight paths of
     ``scale_length`` and its multiples, and larger than the error elsewhere.
 
     Parameters
     ----------
     poses
         True poses of the lidar in the map.
-    options
-        How far it drifts.
     noise
         Of poses: the error of the first one.
-    rng
-        Source of randomness.
     """
     steps = np.diff(poses.p, axis=0)
-    way = np.linalg.norm(steps, axis=1)
-    yaw, shift, scale = _errors(options, way, rng)
+    distance = np.linalg.norm(steps, axis=1)
+    yaw, shift, scale = _errors(options, distance, rng)
     start, covariance = _start(noise, rng)
     # An error of the start turns and shifts everything, one of the heading all that follows.
     turn = poses.R[0] @ start.R @ poses.R[0].T @ _about_vertical(yaw)
@@ -76,13 +72,13 @@ def drifting(
 
 
 def _errors(
-    options: OdometryOptions, way: FloatArray, rng: np.random.Generator
+    options: OdometryDriftOptions, distance: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return heading error of N poses (rad), shifts (m) and scale errors of N - 1 steps."""
-    root = np.sqrt(way)
-    yaw = np.cumsum(np.deg2rad(options.yaw_walk) * root * rng.standard_normal(len(way)))
-    shift = options.position_walk * root[:, None] * rng.standard_normal((len(way), 3))
-    travelled = np.cumsum(way) - way
+    root = np.sqrt(distance)
+    yaw = np.cumsum(np.deg2rad(options.yaw_walk) * root * rng.standard_normal(len(distance)))
+    shift = options.position_walk * root[:, None] * rng.standard_normal((len(distance), 3))
+    travelled = np.cumsum(distance) - distance
     piece = (travelled / options.scale_length).astype(np.int64)
     sign = rng.choice([-1.0, 1.0], piece.max(initial=0) + 1)
     return np.append(0.0, yaw), shift, options.scale * sign[piece]
@@ -102,30 +98,28 @@ def _about_vertical(angle: FloatArray) -> FloatArray:
 
 
 def _step_covariances(
-    options: OdometryOptions, R_map_lidar: FloatArray, R: FloatArray, p: FloatArray
+    options: OdometryDriftOptions, R_map_lidar: FloatArray, R: FloatArray, p: FloatArray
 ) -> FloatArray:
     """Return the covariance of each step's error, a right perturbation, shape (N - 1, 6, 6).
 
     Parameters
     ----------
-    options
-        How far odometry drifts.
     R_map_lidar
-        True rotations at the ends of the steps, which tell where the vertical is.
+        True rotations at the ends of the steps, which determine the vertical.
     R
         Rotations of odometry there.
     p
         Positions of odometry, one more.
     """
     steps = np.einsum("nji,nj->ni", R, np.diff(p, axis=0))
-    way = np.linalg.norm(steps, axis=1)[:, None, None]
-    ahead = steps / np.maximum(way[:, 0], np.finfo(float).tiny)
+    distance = np.linalg.norm(steps, axis=1)[:, None, None]
+    ahead = steps / np.maximum(distance[:, 0], np.finfo(float).tiny)
     up = R_map_lidar[:, 2]
-    Q = np.zeros((len(way), 6, 6))
-    Q[:, :3, :3] = way * np.deg2rad(options.yaw_walk) ** 2 * up[:, :, None] * up[:, None]
-    Q[:, 3:, 3:] = way * options.position_walk**2 * np.eye(3)
+    Q = np.zeros((len(distance), 6, 6))
+    Q[:, :3, :3] = distance * np.deg2rad(options.yaw_walk) ** 2 * up[:, :, None] * up[:, None]
+    Q[:, 3:, 3:] = distance * options.position_walk**2 * np.eye(3)
     along = options.scale**2 * options.scale_length * ahead[:, :, None] * ahead[:, None]
-    Q[:, 3:, 3:] += way * along
+    Q[:, 3:, 3:] += distance * along
     return Q
 
 

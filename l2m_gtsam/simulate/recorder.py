@@ -9,7 +9,7 @@ import numpy as np
 from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.simulate.drive import Motion
+from l2m_gtsam.simulate.drive import VehicleMotion
 from l2m_gtsam.simulate.lidar import SimulatedScans
 from l2m_gtsam.simulate.sensors import (
     NANOSECONDS,
@@ -29,10 +29,6 @@ class Vehicle:
 
     Attributes
     ----------
-    name
-        Name of the drive.
-    sensors
-        Its magnetometers.
     motion
         Where its lidar truly is.
     sampling, noise
@@ -41,7 +37,7 @@ class Vehicle:
 
     name: str
     sensors: tuple[KnownSensor, ...]
-    motion: Motion
+    motion: VehicleMotion
     sampling: SamplingOptions
     noise: NoiseOptions
 
@@ -51,7 +47,7 @@ class SimulatedDrive:
     """One drive: what was recorded, the true motion behind it, and the scans if there are any."""
 
     recording: Recording
-    motion: Motion
+    motion: VehicleMotion
     scans: SimulatedScans | None = None
 
     def truth(self) -> Trajectory:
@@ -72,17 +68,6 @@ def record(
 
     Every source has its own clock phase and jitter; stamps are the true times of measurement,
     those of readings less ``SamplingOptions.clock_offset``.
-
-    Parameters
-    ----------
-    vehicle
-        The vehicle on its drive.
-    world
-        Source of the field.
-    rng
-        Source of randomness.
-    progress
-        Told after every sensor.
 
     Raises
     ------

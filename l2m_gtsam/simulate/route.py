@@ -26,7 +26,7 @@ class MappingRouteOptions(Options):
 
 
 class RouteShape(StrEnum):
-    """A way through the aisles."""
+    """A path through the aisles."""
 
     CIRCLES = "circles"
     EIGHT = "eight"
@@ -60,13 +60,6 @@ class CalibrationRouteOptions(Options):
 def mapping_route(options: MappingRouteOptions, plan: FloorPlan) -> FloatArray:
     """Return a route over all lanes of all aisles, then of all cross aisles.
 
-    Parameters
-    ----------
-    options
-        Spacing of the lanes.
-    plan
-        Where aisles lie.
-
     Returns
     -------
     Corner points in the map in metres, shape (M, 2).
@@ -88,8 +81,6 @@ def calibration_route(options: CalibrationRouteOptions, plan: FloorPlan) -> Floa
     ----------
     options
         Number and size of the circles.
-    plan
-        Where aisles lie.
 
     Returns
     -------
@@ -153,9 +144,9 @@ def wander(options: CalibrationRouteOptions, plan: FloorPlan) -> FloatArray:
     while travelled < options.length:
         (i, j), before = crossings[-1], crossings[-2:-1]
         around = [(i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)]
-        ways = [(m, n) for m, n in around if 0 <= m < len(x) and 0 <= n < len(y)]
-        ways = [way for way in ways if [way] != before]
-        m, n = ways[rng.integers(len(ways))]
+        inside = [(m, n) for m, n in around if 0 <= m < len(x) and 0 <= n < len(y)]
+        onwards = [crossing for crossing in inside if [crossing] != before]
+        m, n = onwards[rng.integers(len(onwards))]
         crossings.append((m, n))
         travelled += float(abs(x[m] - x[i]) + abs(y[n] - y[j]))
     crossings.append((home[0], crossings[-1][1]))
@@ -193,12 +184,12 @@ def _block_corners(plan: FloorPlan, row: int, block: int, aside: float) -> Float
 
 def _woven(start: FloatArray, end: FloatArray) -> FloatArray:
     """Return a wave from one corner to another, without the other, shape (M, 2)."""
-    way = end - start
-    length = float(np.hypot(*way))
+    side = end - start
+    length = float(np.hypot(*side))
     waves = max(1, round(length / WAVE_LENGTH))
     share = np.arange(waves * POINTS_PER_WAVE) / (waves * POINTS_PER_WAVE)
-    left = np.array([-way[1], way[0]]) / length
-    return start + share[:, None] * way + ASIDE * np.sin(2 * np.pi * waves * share)[:, None] * left
+    left = np.array([-side[1], side[0]]) / length
+    return start + share[:, None] * side + ASIDE * np.sin(2 * np.pi * waves * share)[:, None] * left
 
 
 def lanes_of(options: MappingRouteOptions, centres: FloatArray, width: float) -> FloatArray:

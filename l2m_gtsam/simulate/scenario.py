@@ -5,29 +5,28 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
+import ppigrf
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Progress, silent
-from l2m_gtsam.simulate.corridor import CorridorOptions
 from l2m_gtsam.simulate.drive import DriveOptions, drive
-from l2m_gtsam.simulate.earth import EarthOptions, earth_field
 from l2m_gtsam.simulate.floor_plan import FloorPlan, FloorPlanOptions
-from l2m_gtsam.simulate.lidar import LidarOptions, RayCaster, SimulatedScans, scan_stamps
-from l2m_gtsam.simulate.odometry import OdometryOptions, drifting
-from l2m_gtsam.simulate.place import Place, RouteOptions, corridor, hall
+from l2m_gtsam.simulate.lidar import RayCaster, SimulatedScans, SpinningLidarOptions, scan_stamps
+from l2m_gtsam.simulate.odometry import OdometryDriftOptions, drifting
+from l2m_gtsam.simulate.place import CorridorOptions, RouteOptions, SimulatedPlace, corridor, hall
 from l2m_gtsam.simulate.recorder import SimulatedDrive, Vehicle, record
 from l2m_gtsam.simulate.route import CalibrationRouteOptions, MappingRouteOptions
 from l2m_gtsam.simulate.sensors import (
-    ArrayOptions,
+    MappingSuiteOptions,
     NoiseOptions,
     SamplingOptions,
-    SuiteOptions,
+    SensorArrayOptions,
     mapping_suite,
     random_array,
 )
-from l2m_gtsam.simulate.structure import StructureOptions, structure_cloud
+from l2m_gtsam.simulate.solids import StructureCloudOptions, structure_cloud
 from l2m_gtsam.simulate.warehouse import WarehouseOptions
 from l2m_gtsam.simulate.world import SteelWorld
 
@@ -35,6 +34,45 @@ NANOSECONDS = 1_000_000_000
 MAPPING_TIME = dt.time(8)
 CALIBRATION_TIME = dt.time(10)
 ON_REQUEST = ("corridor", "lidar", "odometry")
+MICROTESLA_PER_NANOTESLA = 1e-3
+METRES_PER_KILOMETRE = 1e3
+# What the reference field's coefficients cover.
+FIRST_DAY, LAST_DAY = dt.date(1900, 1, 1), dt.date(2029, 12, 31)
+
+
+class EarthOptions(Options):
+    """Location and date of the warehouse, and the orientation of its map."""
+
+    latitude: Annotated[float, Field(ge=-90, le=90)] = 1.3483
+    """Geodetic latitude in degrees, north positive. The default is in Singapore."""
+    longitude: Annotated[float, Field(ge=-180, le=180)] = 103.6831
+    """Longitude in degrees, east positive."""
+    altitude: Annotated[float, Field(ge=-500, le=9000)] = 20.0
+    """Height above the ellipsoid in metres."""
+    date: Annotated[dt.date, Field(ge=FIRST_DAY, le=LAST_DAY)] = dt.date(2025, 6, 1)
+    """Day of the drives; the reference field's coefficients cover 1900 to 2029."""
+    x_axis_azimuth: float = 90.0
+    """Direction of the map's x axis, in degrees clockwise from north; 90 is x east, y north."""
+
+
+def earth_field(options: EarthOptions) -> FloatArray:
+    """Return the Earth's field in the map frame (z up) in microtesla, shape (3,).
+
+    The International Geomagnetic Reference Field (Alken et al., Earth Planets Space 73:49,
+    2021) as computed by `ppigrf`, which gives nanotesla along east, north and up.
+    """
+    east, north, up = (
+        float(np.squeeze(component)) * MICROTESLA_PER_NANOTESLA
+        for component in ppigrf.igrf(
+            options.longitude,
+            options.latitude,
+            options.altitude / METRES_PER_KILOMETRE,
+            dt.datetime.combine(options.date, dt.time()),
+        )
+    )
+    azimuth = np.deg2rad(options.x_axis_azimuth)
+    sin, cos = np.sin(azimuth), np.cos(azimuth)
+    return np.array([east * sin + north * cos, north * sin - east * cos, up])
 
 
 class ScenarioOptions(Options):
@@ -49,13 +87,13 @@ class ScenarioOptions(Options):
     """The hall and its racks."""
     warehouse: WarehouseOptions = WarehouseOptions()
     """The steel in the hall."""
-    structure: StructureOptions = StructureOptions()
+    structure: StructureCloudOptions = StructureCloudOptions()
     """What a LiDAR sees of it."""
     earth: EarthOptions = EarthOptions()
     """The Earth's field."""
-    suite: SuiteOptions = SuiteOptions()
+    suite: MappingSuiteOptions = MappingSuiteOptions()
     """The mapping vehicle's sensors."""
-    array: ArrayOptions = ArrayOptions()
+    array: SensorArrayOptions = SensorArrayOptions()
     """The sensors to be calibrated."""
     noise: NoiseOptions = NoiseOptions()
     """Noise of both drives."""
@@ -74,11 +112,11 @@ class ScenarioOptions(Options):
     corridor: CorridorOptions | None = None
     """A corridor without a feature in place of the hall, if it is given (`{}` for its defaults);
     it is driven from end to end and back, `calibration_route.laps` times."""
-    lidar: LidarOptions | None = None
+    lidar: SpinningLidarOptions | None = None
     """Point clouds of both drives, if it is given (`{}` for its defaults)."""
-    odometry: OdometryOptions | None = None
+    odometry: OdometryDriftOptions | None = None
     """Drift of the poses of the vehicle with the array, if it is given (`{}` for its defaults);
-    the true poses stand beside them then."""
+    the true poses are recorded beside them then."""
 
     @model_serializer(mode="wrap")
     def _as_asked(self, content: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -95,16 +133,12 @@ class Scenario:
     ----------
     options
         The options it was made from.
-    plan
-        Racks and aisles.
     world
         All steel and the Earth's field.
     cloud
         Points that a LiDAR sees of the steel, in the map frame in metres, shape (N, 3).
     mapping
         The drive of the mapping suite.
-    calibration
-        The drive of the array.
     suite
         The mapping suite's sensors: known and free of distortion.
     truth
@@ -126,8 +160,6 @@ def simulate(options: ScenarioOptions, progress: Progress = silent) -> Scenario:
 
     Parameters
     ----------
-    options
-        Everything it depends on.
     progress
         Told how far each of the two drives is.
 
@@ -161,7 +193,7 @@ def simulate(options: ScenarioOptions, progress: Progress = silent) -> Scenario:
     )
 
 
-def _place(options: ScenarioOptions, rng: np.random.Generator) -> Place:
+def _place(options: ScenarioOptions, rng: np.random.Generator) -> SimulatedPlace:
     """Return where both vehicles drive."""
     routes = RouteOptions(options.mapping_route, options.calibration_route)
     earth = earth_field(options.earth)
@@ -172,7 +204,7 @@ def _place(options: ScenarioOptions, rng: np.random.Generator) -> Place:
 
 def _mapper(
     options: ScenarioOptions,
-    place: Place,
+    place: SimulatedPlace,
     sensors: tuple[KnownSensor, ...],
     rng: np.random.Generator,
 ) -> Vehicle:
@@ -184,7 +216,7 @@ def _mapper(
 
 def _rover(
     options: ScenarioOptions,
-    place: Place,
+    place: SimulatedPlace,
     sensors: tuple[KnownSensor, ...],
     rng: np.random.Generator,
 ) -> Vehicle:
@@ -205,7 +237,7 @@ def _slipped(
 
 def _scanned(
     driven: SimulatedDrive,
-    options: LidarOptions | None,
+    options: SpinningLidarOptions | None,
     eye: RayCaster | None,
     rng: np.random.Generator,
 ) -> SimulatedDrive:

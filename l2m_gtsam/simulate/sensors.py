@@ -29,7 +29,7 @@ class NoiseOptions(Options):
     over this time. 0 gives every pose an error of its own."""
 
 
-class ArrayOptions(Options):
+class SensorArrayOptions(Options):
     """The array of magnetometers to be calibrated, on rings about the lidar's vertical axis."""
 
     count: Annotated[int, Field(ge=1, le=100)] = 12
@@ -52,7 +52,7 @@ class ArrayOptions(Options):
     """Largest offset per axis in microtesla: hard iron and electronics."""
 
 
-class SuiteOptions(Options):
+class MappingSuiteOptions(Options):
     """The mapping vehicle's own magnetometers, known and free of distortion."""
 
     lateral: Annotated[tuple[float, ...], Field(min_length=1)] = (-0.4, 0.0, 0.4)
@@ -75,7 +75,7 @@ class SamplingOptions(Options):
     taken at its stamp plus this."""
 
 
-def random_array(options: ArrayOptions, rng: np.random.Generator) -> tuple[KnownSensor, ...]:
+def random_array(options: SensorArrayOptions, rng: np.random.Generator) -> tuple[KnownSensor, ...]:
     """Return magnetometers at varied places with random distortions.
 
     C is a symmetric positive matrix (scale errors on its diagonal, soft iron beside it) times a
@@ -85,8 +85,6 @@ def random_array(options: ArrayOptions, rng: np.random.Generator) -> tuple[Known
     ----------
     options
         Spread of places and distortions.
-    rng
-        Source of randomness.
     """
     return tuple(
         KnownSensor(f"mag_{index:02d}", place, random_distortion(options, rng))
@@ -94,7 +92,7 @@ def random_array(options: ArrayOptions, rng: np.random.Generator) -> tuple[Known
     )
 
 
-def random_distortion(options: ArrayOptions, rng: np.random.Generator) -> Distortion:
+def random_distortion(options: SensorArrayOptions, rng: np.random.Generator) -> Distortion:
     """Return a random C and H; see ``random_array``."""
     R_mag_lidar = Rotation.from_rotvec(
         rng.normal(0.0, np.deg2rad(options.misalignment), 3)
@@ -105,7 +103,7 @@ def random_distortion(options: ArrayOptions, rng: np.random.Generator) -> Distor
     return Distortion(stretch @ R_mag_lidar, offset)
 
 
-def mapping_suite(options: SuiteOptions) -> tuple[KnownSensor, ...]:
+def mapping_suite(options: MappingSuiteOptions) -> tuple[KnownSensor, ...]:
     """Return ideal magnetometers in an upright grid across the vehicle."""
     places = [(0.0, y, z) for z in options.heights for y in options.lateral]
     return tuple(
@@ -138,16 +136,12 @@ def read_field(
 
     Parameters
     ----------
-    world
-        Source of the field.
     poses
         True poses of the lidar in the map, one per reading.
     sensor
         Place and distortion.
     noise
         White noise of the reading.
-    rng
-        Source of randomness.
 
     Returns
     -------
@@ -169,12 +163,8 @@ def measured_poses(poses: Trajectory, noise: NoiseOptions, rng: np.random.Genera
 
     Parameters
     ----------
-    poses
-        True poses.
     noise
         Errors of the rotation about the lidar's axes and of the position along the map's axes.
-    rng
-        Source of randomness.
     """
     sigmas = np.deg2rad(noise.rotation), noise.position
     white = [rng.normal(0.0, sigma, (len(poses), 3)) for sigma in sigmas]
@@ -214,7 +204,7 @@ def lasting(white: FloatArray, stamp_ns: IntArray, correlation: float) -> FloatA
     return np.asarray(solve_banded((1, 0), bands, fresh[:, None] * white))
 
 
-def _random_places(options: ArrayOptions, rng: np.random.Generator) -> FloatArray:
+def _random_places(options: SensorArrayOptions, rng: np.random.Generator) -> FloatArray:
     """Return positions in the lidar frame in metres, shape (count, 3)."""
     index = np.arange(options.count)
     angle = 2 * np.pi * index / options.count

@@ -1,5 +1,6 @@
-"""The steel of a warehouse: what stands where, and how it is magnetised."""
+"""The steel of a warehouse: places and magnetisation of its parts."""
 
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -9,11 +10,67 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.floor_plan import FloorPlan
-from l2m_gtsam.simulate.steel_parts import Parts, SectionOptions, alike, cells, grid, spread
 from l2m_gtsam.simulate.world import SteelWorld
 
 TESLA_PER_MICROTESLA = 1e-6
 TESLA_PER_MILLITESLA = 1e-3
+
+
+class SectionOptions(Options):
+    """The cross section of one kind of steel part, as a homogeneous box."""
+
+    breadth: Annotated[float, Field(gt=0)]
+    """Outer side of the section in metres."""
+    height: Annotated[float, Field(gt=0)]
+    """The other outer side in metres."""
+    fill: Annotated[float, Field(gt=0, le=1)]
+    """Share of the outer section that is steel: rolled and folded sections are mostly air."""
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Parts of one kind: boxes along x, y and z, turned about z.
+
+    Attributes
+    ----------
+    fill
+        Share of their outer section that is steel.
+    dimensions, centres
+        In metres, shape (N, 3).
+    yaw
+        In radians, shape (N,).
+    """
+
+    kind: str
+    fill: float
+    dimensions: FloatArray
+    centres: FloatArray
+    yaw: FloatArray
+
+
+def alike(
+    kind: str, section: SectionOptions, size: tuple[float, float, float], centres: FloatArray
+) -> Parts:
+    """Return parts of one size along the hall's axes."""
+    count = len(centres)
+    return Parts(kind, section.fill, np.tile(size, (count, 1)), centres, np.zeros(count))
+
+
+def spread(low: float, high: float, pitch: float) -> FloatArray:
+    """Return evenly spaced places from ``low`` to ``high``, at most ``pitch`` apart."""
+    # Rounding of the edges must not add a part where the pitch divides the length.
+    return np.linspace(low, high, int(np.ceil((high - low) / pitch - 1e-9)) + 1)
+
+
+def cells(extent: float, pitch: float) -> FloatArray:
+    """Return the centres of equal cells of about ``pitch`` that fill ``extent``."""
+    count = max(1, round(extent / pitch))
+    return (np.arange(count) + 0.5) * extent / count
+
+
+def grid(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return all pairs of x and y, shape (len(x) * len(y), 2)."""
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 class WarehouseOptions(Options):
@@ -70,12 +127,8 @@ def build_warehouse(
     ----------
     options
         Parts and their magnetisation.
-    plan
-        Where racks stand.
     earth
         The Earth's field in the map frame in microtesla, shape (3,).
-    rng
-        Source of randomness.
     """
     racks = (_uprights(options, plan), _rack_beams(options, plan)) if len(plan.block_x) else ()
     families = (

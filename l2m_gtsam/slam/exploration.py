@@ -86,7 +86,7 @@ def explore(
         The start is to be searched for, without a map.
     """
     if options.start.anywhere:
-        raise ConfigError("`slam.start.anywhere` looks for the start in a map: give one with --map")
+        raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
     drive, notes = prepared(recording, calibration, options, evidence)
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))

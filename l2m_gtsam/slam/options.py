@@ -11,22 +11,22 @@ from l2m_gtsam.solve.robust import RobustOptions
 
 
 class StartSearchOptions(Options):
-    """How the start of a drive is looked for all over a map."""
+    """How the start of a drive is searched for in a whole map."""
 
     window_m: float = Field(default=8.0, gt=0)
-    """Way of the drive that is looked at first. It is doubled until the start is unique,"""
+    """Path length of the first window. It is doubled until the start is unique,"""
     longest_m: float = Field(default=32.0, gt=0)
     """up to this, or to the end of the drive: over more, odometry's errors blur what is compared.
     """
     readings: int = Field(default=80, ge=10, le=400)
-    """The most readings of a window that take part, spread over its way."""
+    """Limit of readings of a window, spread over its path."""
     least_readings: int = Field(default=16, ge=6)
-    """Fewer readings tell no place: among thousands of places one explains them by chance."""
+    """Fewer readings do not determine a place: among thousands one explains them by chance."""
     step_m: float = Field(default=0.2, ge=0.05, le=1)
     """Of the lattice of places in the map; headings are as far apart as moves the outermost reading
     by a step. The field of a building varies over about three times that."""
     height_m: float | None = None
-    """Height of the lidar in the map where the drive begins, within `position_m`; looked for over
+    """Height of the lidar in the map where the drive begins, within `position_m`; searched for over
     all heights that the map has data for if not given."""
     outliers: float = Field(default=0.15, ge=0, lt=0.5)
     """Share of the readings that may be wrong without a place being ruled out."""
@@ -61,7 +61,7 @@ class TileOptions(Options):
     modes: int = Field(default=200, ge=30, le=1000)
     """The most waves of a tile. What shorter ones would hold counts as noise."""
     learn_over_m: float = Field(default=20.0, gt=0)
-    """The way from the start whose readings teach strength and depth of the sources: over it
+    """Path length from the start over which strength and depth of the sources are learnt: over it
     odometry has to be better than the field's detail."""
     hyperparameters: Hyperparameters | None = None
     """Strength and depth, where they are known; not learnt then."""
@@ -90,9 +90,9 @@ class KeyPoseOptions(Options):
     """Which poses of a drive are variables."""
 
     distance_m: float = Field(default=0.2, gt=0)
-    """A key pose is made after so much way,"""
+    """A key pose is made after this distance,"""
     angle_deg: float = Field(default=10.0, gt=0, le=180)
-    """or after so much turning. Readings lie between key poses, as far along as
+    """or after this rotation. Readings lie between key poses, as far along as
     odometry has them, and less surely so the further away both are."""
     readings: int = Field(default=8, ge=1)
     """The most readings of a sensor on a key pose, spread over its time: a vehicle that is parked
@@ -102,30 +102,30 @@ class KeyPoseOptions(Options):
 class DriftOptions(Options):
     """How wrong odometry becomes, where the recording does not say or is not asked.
 
-    Errors of odometry's steps count as independent, so that sigmas grow with the root of the way.
-    Shares are those after `over_m`: over less way than that the odometry is trusted less than a
-    constant share would have it, over more it is trusted more, and there the map speaks.
+    Errors of odometry's steps count as independent, so that sigmas grow with the root of the
+    distance. Shares are those after `over_m`: over less distance odometry is trusted less than with
+    a constant share, over more it is trusted more, and there the map dominates.
     """
 
     position_share: float = Field(default=0.01, gt=0, lt=1)
-    """Standard deviation of the position per axis, as a share of the way."""
+    """Standard deviation of the position per axis, as a share of the distance."""
     rotation_deg_per_m: float = Field(default=0.05, gt=0)
-    """Standard deviation of the rotation about each axis, in degrees per metre of way,"""
+    """Standard deviation of the rotation about each axis, in degrees per metre,"""
     rotation_share: float = Field(default=0.01, ge=0, lt=1)
     """and as a share of the turning itself."""
     over_m: float = Field(default=10.0, gt=0)
-    """The way over which these hold."""
+    """The distance over which these hold."""
     scale: float = Field(default=0.0, ge=0, lt=1)
-    """Standard deviation of a share by which all ways are too long or too short alike, as those
-    of wheels are. It is estimated with the poses; the other sigmas are of what odometry errs
-    beside it, and with the wide ones that are the default it is not needed."""
+    """Standard deviation of a relative error that all lengths share, as with wheels. It is
+    estimated with the poses, and the other sigmas are of the remaining errors. With their wide
+    defaults it is not needed."""
     stated: Usage = Usage.USED
     """Whether covariances that a recording states of its odometry count instead, where they grow
     along the drive."""
     least_m: float = Field(default=0.001, gt=0)
     """No step is known better than this,"""
     least_deg: float = Field(default=0.02, gt=0)
-    """nor than this in rotation. Both are added to what a recording says, too."""
+    """nor than this in rotation. Both are also added to what a recording states."""
 
 
 class StartPoseOptions(Options):
@@ -141,9 +141,8 @@ class StartPoseOptions(Options):
     rotation_deg: float = Field(default=2.0, gt=0, le=45)
     """Standard deviation of the rotation about each axis in degrees."""
     anywhere: bool = False
-    """The drive begins anywhere in the map: position and heading are looked for, from readings and
-    odometry alone. What is assumed then: the z axis of odometry's frame is up within
-    `rotation_deg`."""
+    """The drive begins anywhere in the map: position and heading are searched for, by readings and
+    odometry alone. The z axis of odometry's frame is assumed to be up within `rotation_deg`."""
     search: StartSearchOptions = StartSearchOptions()
     """How, with `anywhere`."""
 

@@ -18,19 +18,19 @@ from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.linear_algebra import information_root
 
-EXACT = 1e-9  # m, uT, or of an entry of C: what no reading can tell from nothing
+EXACT = 1e-9  # m, uT, or of an entry of C: sigma of parameters that are stated as exact
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
 HALF = 0.5  # a link that weighs more is believed; in the end weights are nearly 0 or 1
 
 
 def start_factor(start: StartPose) -> gtsam.NonlinearFactor:
-    """Return what is known of the first key pose."""
+    """Return the prior of the first key pose."""
     noise = gtsam.noiseModel.Gaussian.Covariance(start.covariance)
     return gtsam.PriorFactorPose3(X(0), as_pose(start.T_map_lidar), noise)
 
 
 def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.NonlinearFactor:
-    """Return what odometry says from a key pose to the next, if ways are longer by this share."""
+    """Return odometry's factor from a key pose to the next, its length corrected for an error."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     return gtsam.BetweenFactorPose3(
         X(number), X(number + 1), drive.step(number, scale_error), noise
@@ -38,18 +38,18 @@ def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.No
 
 
 def scaled_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
-    """Return the same where odometry's scale is a variable."""
+    """Return the same with odometry's scale as a variable."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     return scaled_step_factor(number, drive.step(number), noise)
 
 
 def link_pose(links: Links, number: int) -> gtsam.Pose3:
-    """Return where a scan has a key pose, in the map or in the frame of an earlier one."""
+    """Return the measured pose of a link, in the map or relative to an earlier key pose."""
     return gtsam.Pose3(gtsam.Rot3(links.R[number]), links.p[number])
 
 
 def link_factor(links: Links, number: int) -> gtsam.NonlinearFactor:
-    """Return what a scan says of a key pose."""
+    """Return the factor of a scan registration."""
     noise = gtsam.noiseModel.Gaussian.Covariance(links.covariance[number])
     pose = link_pose(links, number)
     origin, key = int(links.origin[number]), X(int(links.key_pose[number]))
@@ -59,7 +59,7 @@ def link_factor(links: Links, number: int) -> gtsam.NonlinearFactor:
 
 
 def link_graph(links: Links) -> gtsam.NonlinearFactorGraph:
-    """Return what scans say."""
+    """Return the factors of all scan registrations."""
     graph = gtsam.NonlinearFactorGraph()
     for number in range(len(links)):
         graph.add(link_factor(links, number))
@@ -72,7 +72,7 @@ def link_squared(links: Links, values: gtsam.Values) -> FloatArray:
 
 
 def calibration_graph(sensors: KnownSensors) -> gtsam.NonlinearFactorGraph:
-    """Return what is known of sensors that are variables: their covariance as prior."""
+    """Return the priors of calibrations that are variables."""
     graph = gtsam.NonlinearFactorGraph()
     for i, covariance in enumerate(sensors.covariance):
         at = np.concatenate([sensors.t[i], sensors.distortion[i]])
@@ -96,7 +96,7 @@ def calibration_values(sensors: KnownSensors) -> gtsam.Values:
 
 
 def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
-    """Return start and odometry."""
+    """Return the factors of start and odometry."""
     graph, sigma = gtsam.NonlinearFactorGraph(), drive.steps.scale
     graph.add(start_factor(drive.start))
     one_step = scaled_factor if sigma else step_factor
@@ -109,7 +109,7 @@ def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
 
 
 def scale_values(drive: Drive) -> gtsam.Values:
-    """Return odometry's scale as it is before anything is known of it, if it is a variable."""
+    """Return the initial value of odometry's scale, if it is a variable."""
     values = gtsam.Values()
     if drive.steps.scale:
         values.insert(G(), 0.0)
@@ -118,14 +118,14 @@ def scale_values(drive: Drive) -> gtsam.Values:
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """A drive by odometry and scans.
+    """A drive solved by odometry and scans alone.
 
     Attributes
     ----------
     poses
-        Key poses, K of them.
+        Estimates of the K key poses.
     believed
-        Which links are, shape (L,).
+        Which links are inliers, shape (L,).
     """
 
     poses: list[gtsam.Pose3]
@@ -133,14 +133,14 @@ class PoseGraph:
 
 
 def solve_pose_graph(drive: Drive, confidence: float) -> PoseGraph:
-    """Find key poses by odometry and links, and which links fit.
+    """Estimate key poses from odometry and links, and which links are inliers.
 
     Parameters
     ----------
     drive
-        The drive; its readings take no part.
+        K key poses with odometry and L links; its readings are not used.
     confidence
-        Of links with nothing but the errors that they state so many are believed.
+        Share of links with only the stated errors that are believed.
     """
     poses = drive.dead_reckoning()
     if not len(drive.links):
@@ -173,7 +173,7 @@ def _values(poses: list[gtsam.Pose3]) -> gtsam.Values:
 def write_g2o(path: Path, solution: DriveSolution) -> None:
     """Write localised key poses as vertices and odometry as edges.
 
-    The format knows no magnetic readings, no prior and no scale: ways are as long as they came
+    The format knows no magnetic readings, no prior and no scale: lengths are corrected as they came
     out. Numbers have six digits, as GTSAM writes them.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()

@@ -219,15 +219,15 @@ def _sensor(solution: DriveSolution, sensor: SensorCalibration, use: SensorUse) 
     if not use.used:
         return SensorRecord(use, timeline, None, None, None)
     inside = own[solution.prediction.inside[own]]
-    seen = sensor_evidence(solution, inside)
+    evidence = sensor_evidence(solution, inside)
     most = int(np.clip(DRAWN // len(solution.drive.sensors.names), FEWEST, MOST))
     start_ns = solution.drive.stamp_ns[:1]
     return SensorRecord(
         use=use,
         timeline=timeline,
-        fit=fit_figures(seen, float(solution.drive.sensors.noise[index])),
-        normalised=normalised_figures(seen),
-        series=series(curves(seen, sensor), seen, start_ns, most),
+        fit=fit_figures(evidence, float(solution.drive.sensors.noise[index])),
+        normalised=normalised_figures(evidence),
+        series=series(curves(evidence, sensor), evidence, start_ns, most),
     )
 
 

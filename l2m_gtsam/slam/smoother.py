@@ -145,7 +145,7 @@ class SmoothingProblem:
 
         Parameters
         ----------
-        seen
+        predicted
             The N readings at an estimate.
         weights
             Robust weights, shape (N,).

@@ -1,12 +1,21 @@
-"""Ways to calibrate one sensor that studies compare, each from a given start."""
+"""Methods that ours is compared with, each from a given start, and the Cramer-Rao bound."""
+
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_estimate
-from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings, reading_graph
+from l2m_gtsam.calibration.forecast import stated_at
+from l2m_gtsam.calibration.optimise import Optimizer, optimise
+from l2m_gtsam.calibration.view import QueryableMap, observe
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings
+from l2m_gtsam.errors import MapError
 from l2m_gtsam.progress import silent
+from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.closed_form import (
     MIN_READINGS,
     ClosedFormOptions,
@@ -14,6 +23,7 @@ from l2m_gtsam.solve.closed_form import (
     fit_distortion,
     row_weights,
 )
+from l2m_gtsam.solve.noise import reading_covariance
 
 PUBLISHED = ClosedFormOptions(weighting=Weighting.PAPER)
 SETTLED_M = 1e-5
@@ -28,8 +38,6 @@ def two_step(
     ----------
     readings
         Of one sensor.
-    field_map
-        The magnetic map.
     t_start
         The guess in the lidar frame in metres, shape (3,).
     closed_form
@@ -55,12 +63,8 @@ def published(
     ----------
     readings
         Of one sensor; those that a step puts outside of the map are left out of the next.
-    field_map
-        The magnetic map.
     t_start
         The guess in the lidar frame in metres, shape (3,).
-    steps
-        The most iterations.
     """
     t, R = t_start.copy(), readings.R_map_lidar
     for _ in range(steps):
@@ -80,3 +84,205 @@ def published(
             break
     none = np.zeros(1)
     return Estimate(t[None], found.vector()[None], np.ones(1), none, none)
+
+
+def cramer_rao(
+    readings: Readings,
+    field_map: QueryableMap,
+    sensor: KnownSensor,
+    noise: float,
+    options: OneKeyOptions,
+) -> FloatArray:
+    """Return the least covariance of (t, C, H) of one sensor, shape (15, 15).
+
+    It is the inverse of the information at the truth, with the map's errors unknown, too, and
+    their prior from the survey (the Bayesian bound of Van Trees).
+
+    Parameters
+    ----------
+    readings
+        Of the sensor.
+    field_map
+        The magnetic map, which has to know how its errors are correlated.
+    sensor
+        The truth.
+    noise
+        Standard deviation of the sensor's noise in uT.
+    options
+        Which of the readings enter.
+
+    Raises
+    ------
+    MapError
+        The map does not know how its errors are correlated.
+    """
+    none = np.zeros(1)
+    truth = Estimate(
+        sensor.t_lidar_mag[None],
+        sensor.distortion.vector()[None],
+        np.array([noise]),
+        none,
+        none,
+    )
+    return bound_at(readings, field_map, truth, options)[:-1, :-1]
+
+
+def bound_at(
+    readings: Readings, field_map: QueryableMap, truth: Estimate, options: OneKeyOptions
+) -> FloatArray:
+    """Return the least covariance of (t, C, H, time offset) of one sensor, shape (16, 16).
+
+    Parameters
+    ----------
+    readings
+        Of the sensor, with the poses that they have at its true time offset, as far as these are
+        known: errors of poses are unknowns, too.
+    field_map
+        The magnetic map, which has to know how its errors are correlated.
+    truth
+        The sensor, without a ridge.
+    options
+        Which of the readings enter, and how long errors of poses last.
+
+    Returns
+    -------
+    Infinite for what the data do not determine; NaN if too few readings lie inside the map.
+
+    Raises
+    ------
+    MapError
+        The map does not know how its errors are correlated.
+    """
+    if not isinstance(field_map, UncertainMap):
+        raise MapError("a bound needs a map that knows how its errors are correlated: harmonic")
+    view = observe(readings, field_map, truth, options.min_readings)
+    if not view.sensors:
+        return np.full((16, 16), np.nan)
+    shared = options.model_copy(update={"uncertainty": Uncertainty.FULL})
+    (solution,) = stated_at(view, field_map, truth, shared).solved
+    return solution.joint_covariance
+
+
+def levenberg_marquardt(
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    noise: float,
+    options: OneKeyOptions,
+) -> FloatArray:
+    """Return where one optimisation of one sensor's joint graph ends, metres, shape (3,).
+
+    C and H start from the closed form at the start. All readings take part, also those that a
+    wrong start places outside of the map, which answers smoothly there: with only those inside
+    many starts would leave nothing to optimise.
+
+    Parameters
+    ----------
+    readings
+        Of one sensor.
+    t_start
+        The guess in the lidar frame in metres, shape (3,).
+    noise
+        Known standard deviation of the readings in uT.
+    options
+        Closed form, factors, and the largest number of linearisations.
+    """
+    distortion = closed_form(readings, field_map, t_start, options)
+    start = Estimate(t_start[None], distortion.vector()[None], np.array([noise]), *np.zeros((2, 1)))
+    covariance = reading_covariance(np.full(len(readings), noise), np.zeros((len(readings), 3, 3)))
+    graph = reading_graph(batch_readings(readings, field_map), covariance, options.factors)
+    end = optimise(graph, start.values([0]), Optimizer.LM, options.joint_iterations)
+    return np.asarray(start.updated(end.values, [0]).t[0])
+
+
+def closed_form(
+    readings: Readings, field_map: QueryableMap, t: FloatArray, options: OneKeyOptions
+) -> Distortion:
+    """Return C and H of one sensor at a place in the lidar frame in metres, shape (3,)."""
+    R = readings.R_map_lidar
+    field, _ = field_map.field_and_gradient(R @ t + readings.p_map_lidar)
+    b_lidar = np.einsum("nji,nj->ni", R, field)
+    weights = np.ones(len(readings))
+    return fit_distortion(b_lidar, readings.field, weights, options.closed_form).distortion
+
+
+UNKNOWNS = 15  # of a sensor: t, C and H
+MOST_STEPS = 30
+
+
+def numeric_least_squares(
+    readings: Readings, field_map: QueryableMap, t_start: FloatArray
+) -> FloatArray:
+    """Return t, C row by row and H of S sensors, shape (S, 15).
+
+    Parameters
+    ----------
+    readings
+        Of all sensors.
+    t_start
+        Where to start in the lidar frame in metres, shape (S, 3); C starts from I, H from zero.
+    """
+    R, sensor = readings.R_map_lidar, readings.sensor
+
+    def residuals(x: FloatArray) -> FloatArray:
+        each = x.reshape(-1, UNKNOWNS)[sensor]
+        places = np.einsum("nij,nj->ni", R, each[:, :3]) + readings.p_map_lidar
+        field, _ = field_map.field_and_gradient(places)
+        b_lidar = np.einsum("nji,nj->ni", R, field)
+        C, H = each[:, 3:12].reshape(-1, 3, 3), each[:, 12:]
+        return np.asarray(np.einsum("nij,nj->ni", C, b_lidar) + H - readings.field).ravel()
+
+    ideal = np.tile(np.concatenate([np.eye(3).ravel(), np.zeros(3)]), (len(t_start), 1))
+    start = np.hstack([t_start, ideal])
+    end = least_squares(residuals, start.ravel(), x_scale="jac", max_nfev=MOST_STEPS)
+    return np.asarray(end.x.reshape(-1, UNKNOWNS))
+
+
+@dataclass(frozen=True)
+class PeerEstimate:
+    """The result of one calibration; NaN where a peer has no answer.
+
+    Attributes
+    ----------
+    t
+        Position of the sensor in the lidar frame in metres, shape (3,).
+    C
+        Distortion matrix, shape (3, 3).
+    H
+        Offset in microtesla, shape (3,).
+    soft_iron
+        ``soft_iron`` of C, shape (3, 3): all of C that a peer without a map can determine.
+    seconds
+        Time of this calibration alone, without what is done once for a site.
+    """
+
+    t: FloatArray
+    C: FloatArray
+    H: FloatArray
+    soft_iron: FloatArray
+    seconds: float
+
+    @classmethod
+    def nothing(cls, seconds: float) -> Self:
+        """Return the estimate of a peer that ended without a result."""
+        none = np.full((3, 3), np.nan)
+        return cls(none[0], none, none[0], none, seconds)
+
+
+def soft_iron(C: FloatArray) -> FloatArray:
+    """Return what of C stays when the lidar is turned and the field's unit changed.
+
+    That is the symmetric positive S of determinant one in ``C = s S Q``, with a number s and an
+    orthogonal Q: the shape of the ellipsoid that readings of a constant field lie on.
+
+    Parameters
+    ----------
+    C
+        Regular, shape (3, 3).
+
+    Returns
+    -------
+    Shape (3, 3).
+    """
+    U, s, _ = np.linalg.svd(C)
+    return np.asarray((U * s) @ U.T / np.cbrt(np.prod(s)))

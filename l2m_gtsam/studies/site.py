@@ -1,13 +1,14 @@
 """Where studies take place: a simulated warehouse with the map of its survey."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial import cKDTree
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.data import FloatArray, KnownSensor, Readings
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, KnownSensor, Readings
 from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.training import TrainingSet
@@ -20,9 +21,9 @@ from l2m_gtsam.simulate.recorder import Vehicle, record
 from l2m_gtsam.simulate.route import calibration_route
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.simulate.sensors import (
-    ArrayOptions,
     NoiseOptions,
     SamplingOptions,
+    SensorArrayOptions,
     random_distortion,
 )
 from l2m_gtsam.simulate.world import SteelWorld
@@ -32,7 +33,7 @@ class SiteOptions(Options):
     """A warehouse, its survey and map, and the drives whose sensors are calibrated."""
 
     scenario: ScenarioOptions = ScenarioOptions(
-        array=ArrayOptions(count=1),
+        array=SensorArrayOptions(count=1),
         noise=NoiseOptions(field=0.2),
         calibration_sampling=SamplingOptions(field_rate=10.0),
     )
@@ -48,7 +49,7 @@ class SiteOptions(Options):
 
 
 @dataclass(frozen=True)
-class Surveyed:
+class SurveyedSite:
     """A world and what a survey of it measured.
 
     Attributes
@@ -90,12 +91,12 @@ class SiteDrive:
     readings: Readings
 
 
-def surveyed(options: SiteOptions) -> Surveyed:
+def surveyed(options: SiteOptions) -> SurveyedSite:
     """Return the site and its survey."""
     scenario = simulate(options.scenario)
     suite = {sensor.sensor: sensor for sensor in scenario.suite}
     survey = suite_readings([scenario.mapping.recording], suite, options.mapping.sync)
-    return Surveyed(scenario.world, scenario.plan, survey, scenario.cloud)
+    return SurveyedSite(scenario.world, scenario.plan, survey, scenario.cloud)
 
 
 @lru_cache(maxsize=1)
@@ -106,7 +107,7 @@ def mapped_site(options: SiteOptions) -> Site:
 
 
 def random_drive(
-    site: Site | Surveyed, options: SiteOptions, rng: np.random.Generator
+    site: Site | SurveyedSite, options: SiteOptions, rng: np.random.Generator
 ) -> SiteDrive:
     """Return a drive through the site with a sensor of random place and distortion."""
     scenario = options.scenario
@@ -130,3 +131,60 @@ def random_place(options: SiteOptions, rng: np.random.Generator) -> FloatArray:
         place = rng.uniform(low, high)
         if np.linalg.norm(place) <= options.radius:
             return np.asarray(place)
+
+
+LAYER = 0.2  # metres; less than the suite's sensors are apart in height, more than it heaves
+CELL = 0.5  # metres; edge of the squares of which surveyed floor is counted
+
+
+def around(site: SurveyedSite, path: FloatArray, distance: float) -> SurveyedSite:
+    """Return the part of a site within a horizontal distance of a path.
+
+    Parameters
+    ----------
+    path
+        Places in the map frame in metres, shape (M, 3).
+    """
+    rows = np.flatnonzero(_near(site.survey.points, path, distance))
+    cloud = site.cloud[_near(site.cloud, path, distance)]
+    return replace(site, survey=site.survey[rows], cloud=cloud)
+
+
+def thinned(site: SurveyedSite, spacing: float) -> SurveyedSite:
+    """Return a site with fewer survey readings; see ``thinned_rows``."""
+    return replace(site, survey=site.survey[thinned_rows(site.survey.points, spacing)])
+
+
+def thinned_rows(points: FloatArray, spacing: float) -> IntArray:
+    """Return the readings that are left if each cell of the floor keeps one at each height.
+
+    Parameters
+    ----------
+    points
+        Places of the readings in the map frame in metres, shape (N, 3).
+    spacing
+        Edge of the cells in metres, of which each keeps the reading next to its middle; 0 keeps
+        all.
+
+    Returns
+    -------
+    Rows, ascending, shape (M,).
+    """
+    if spacing == 0.0:
+        return np.arange(len(points))
+    cells = np.floor(points / [spacing, spacing, LAYER]).astype(np.int64)
+    aside = points[:, :2] - (cells[:, :2] + 0.5) * spacing
+    nearest_first = np.argsort(np.linalg.norm(aside, axis=1), kind="stable")
+    _, first = np.unique(cells[nearest_first], axis=0, return_index=True)
+    return np.sort(nearest_first[first])
+
+
+def surveyed_floor(points: FloatArray) -> float:
+    """Return the floor on which readings, shape (N, 3) in metres, were taken, square metres."""
+    return float(len(np.unique(np.floor(points[:, :2] / CELL), axis=0)) * CELL**2)
+
+
+def _near(points: FloatArray, path: FloatArray, distance: float) -> BoolArray:
+    """Return which points, shape (N, 3), are within a horizontal distance of a path (M, 3)."""
+    away, _ = cKDTree(path[:, :2]).query(points[:, :2])
+    return np.asarray(away <= distance)

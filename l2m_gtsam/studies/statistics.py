@@ -41,8 +41,6 @@ class ClusteredMean:
     effective
         How many independent values would leave the mean as unsure as it is: between the number
         of groups and the number of values.
-    groups
-        How many there are.
     """
 
     mean: float
@@ -131,7 +129,7 @@ def clustered_mean(values: FloatArray, groups: IntArray) -> ClusteredMean:
     _, group = np.unique(groups, return_inverse=True)
     count, number = len(values), int(group.max()) + 1
     if number < 2:
-        raise ValueError("one group tells nothing of how groups differ; two or more are needed")
+        raise ValueError("one group does not show how groups differ; two or more are needed")
     mean = float(np.mean(values))
     sums = np.bincount(group, values - mean)
     variance = float(sums @ sums) / count**2 * number / (number - 1)
@@ -140,3 +138,22 @@ def clustered_mean(values: FloatArray, groups: IntArray) -> ClusteredMean:
     # The estimate is rough with few groups; it cannot lie beyond what sharing makes possible.
     effective = float(np.clip(effective, number, count))
     return ClusteredMean(mean, float(np.sqrt(variance)), effective, number)
+
+
+@dataclass(frozen=True)
+class Share:
+    """A number of successes among independent trials."""
+
+    successes: int
+    trials: int
+
+    @property
+    def rate(self) -> float:
+        """Successes per trial."""
+        return self.successes / self.trials
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's 95 % interval of the probability."""
+        band = wilson_interval(self.rate, self.trials)
+        return band.low, band.high

@@ -4,7 +4,7 @@ import numpy as np
 
 from l2m_gtsam.data import BoolArray
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
-from l2m_gtsam.studies.honesty.trouble import SHARE, Disturbed, disturbed
+from l2m_gtsam.studies.honesty.drives import SHARE, Disturbed, disturbed
 
 MOMENT = 4.0  # A m^2, of a steel part: felt beyond thrice the noise along 5 m of the drive
 ASIDE_M = 0.9

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.exploration import EXACT_START, Exploration, explore
@@ -13,7 +14,7 @@ from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
-from tests.drives.slam import SlamDrive, calibrated, quiet, slam_drive
+from tests.drives.slam import SlamDrive, calibrated, slam_drive
 from tests.worlds.exact import dipole_world
 
 COARSE = {"distance_m": 0.3, "readings": 2}  # enough, and quick
@@ -79,4 +80,4 @@ def prepared_drive(
 
 def explored(drive: SlamDrive, sensors: tuple[KnownSensor, ...], **options: object) -> Exploration:
     chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
-    return explore(drive.recording, calibrated(sensors), chosen, quiet)
+    return explore(drive.recording, calibrated(sensors), chosen, silent)

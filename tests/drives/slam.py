@@ -141,10 +141,6 @@ def calibrated(
     return calibration(*entries)
 
 
-def quiet(_stage: str, _fraction: float) -> None:
-    """Tell nobody."""
-
-
 def small_hall(
     seed: int, seconds: float, sensors: int = 2
 ) -> tuple[tuple[KnownSensor, ...], SlamDrive]:

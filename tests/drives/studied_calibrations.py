@@ -11,8 +11,9 @@ from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import MILD, CloudVariant, SteelHall, hall_cloud, steel_hall
-from l2m_gtsam.studies.honesty.outcomes import Honesty, Outcomes, honesty
-from l2m_gtsam.studies.honesty.place import drive_seed, start_near
+from l2m_gtsam.studies.honesty.cells import Outcomes
+from l2m_gtsam.studies.honesty.drives import drive_seed, start_near
+from l2m_gtsam.studies.honesty.summary import Consistency, consistency
 from tests.worlds.studied_maps import Build, Scene, StudiedMap
 
 START_M = 0.05  # each axis of a start is at most this far from the truth
@@ -136,7 +137,7 @@ class CalibrationRow:
     determined: int
     error: FloatArray
     sigma: FloatArray
-    honesty: dict[str, Honesty]
+    honesty: dict[str, Consistency]
 
     def __str__(self) -> str:
         heights = "/".join(f"{height:g}" for height in self.heights)
@@ -239,5 +240,7 @@ def _row(
         len(determined.error),
         error=np.sqrt(np.mean(outcomes.error[:, :3] ** 2, axis=0)),
         sigma=np.sqrt(np.mean(variances[:, :3], axis=0)) if enough else np.full(3, np.nan),
-        honesty={name: honesty(determined, at) for name, at in blocks.items()} if enough else {},
+        honesty={name: consistency(determined, at) for name, at in blocks.items()}
+        if enough
+        else {},
     )

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate import world as world_module
-from l2m_gtsam.simulate.earth import EarthOptions, earth_field
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions, plan_floor
+from l2m_gtsam.simulate.scenario import EarthOptions, earth_field
 from l2m_gtsam.simulate.warehouse import WarehouseOptions, build_warehouse
 from l2m_gtsam.simulate.world import SteelWorld
 

@@ -15,16 +15,15 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.studies.ablation.cells import (
     AblationCell,
     AblationOptions,
-    Batch,
+    BatchErrors,
     Solver,
     map_options,
 )
-from l2m_gtsam.studies.ablation.map_picture import MapPicture, WindowOptions
-from l2m_gtsam.studies.ablation.packed import STEP, Packed
-from l2m_gtsam.studies.ablation.page import ablation_page
+from l2m_gtsam.studies.ablation.map_image import MapImage, WindowOptions
 from l2m_gtsam.studies.ablation.study import ABLATION
 from l2m_gtsam.studies.ablation.table import AblationTable, ablation_table, gain
-from l2m_gtsam.studies.fingerprints import LAYER, thinned_rows
+from l2m_gtsam.studies.json_arrays import STEP, Packed
+from l2m_gtsam.studies.site import LAYER, thinned_rows
 from tests.support.inline_study import run_inline
 from tests.worlds.study_sites import one_row_site
 
@@ -73,17 +72,17 @@ def test_every_method_comes_near_on_a_map_of_the_whole_survey(table: AblationTab
 
 def test_page_and_figures_are_made_of_the_file(out: Path, table: AblationTable) -> None:
     page = (out / "ablation.md").read_text(encoding="utf-8")
-    assert ablation_page(table) in page
+    assert ABLATION.page(table) in page
     for name in re.findall(r"!\[.*\]\((.*)\)", page):
         assert (out / name).stat().st_size > 10_000
     assert json.loads((out / "study.json").read_text())["summary"]["rows"][0]["solver"] == "OLS"
 
 
-def picture() -> MapPicture:
+def picture() -> MapImage:
     """A map that is a fifth of a microtesla off everywhere."""
     truth = np.full((3, 4), 50.0)
     box = (0.0, 4.0, 0.0, 3.0)
-    return MapPicture(box, 0.5, truth + 0.2, truth, np.zeros((2, 2)), 100, 10.0, 0.2, 0.1, 1.0)
+    return MapImage(box, 0.5, truth + 0.2, truth, np.zeros((2, 2)), 100, 10.0, 0.2, 0.1, 1.0)
 
 
 def made_up(H: dict[tuple[str, float], dict[Solver, float]]) -> AblationTable:
@@ -93,7 +92,7 @@ def made_up(H: dict[tuple[str, float], dict[Solver, float]]) -> AblationTable:
     cells = {}
     for place in [(kind, spacing) for kind in MADE_UP.kinds for spacing in MADE_UP.spacings]:
         errors = np.array([[H.get(place, {}).get(solver, 1.0) for solver in Solver]]) + drives
-        batch = Batch(errors / 100, errors / 10, errors)
+        batch = BatchErrors(errors / 100, errors / 10, errors)
         cells[place] = [AblationCell(picture=picture()), AblationCell(batch=batch)]
     return ablation_table(MADE_UP, cells)
 
@@ -116,10 +115,10 @@ def test_the_page_says_what_the_paper_claims_and_what_came_out() -> None:
     far = dict.fromkeys(Solver, 3.0)
     near = dict.fromkeys(Solver, 2.5)
     held = made_up({("bilinear", 0.0): near, ("bilinear", 1.0): far})
-    assert "the gain is over 0.2 uT at the densest, and clearly larger" in ablation_page(held)
+    assert "the gain is over 0.2 uT at the densest, and clearly larger" in ABLATION.page(held)
     failed = made_up({("bilinear", 0.0): dict.fromkeys(Solver, 1.1)})
     said = "the gain is not over 0.2 uT at the densest, and not clearly larger"
-    assert said in ablation_page(failed)
+    assert said in ABLATION.page(failed)
 
 
 def test_the_page_counts_maps_on_which_weights_help() -> None:
@@ -131,7 +130,7 @@ def test_the_page_counts_maps_on_which_weights_help() -> None:
 
 def test_calibrations_without_a_result_are_counted_and_left_out() -> None:
     lost = np.array([[np.nan], [1.0], [3.0]]) * np.ones((1, len(Solver)))
-    batch = Batch(lost, lost, lost)
+    batch = BatchErrors(lost, lost, lost)
     cells = [AblationCell(picture=picture()), AblationCell(batch=batch)]
     options = AblationOptions(kinds=("bilinear",), spacings=(0.0,))
     row = ablation_table(options, {("bilinear", 0.0): cells}).rows[0]

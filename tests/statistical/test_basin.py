@@ -1,5 +1,6 @@
 """The basin study: its counts, that it repeats itself, and (`make study`) what it promises."""
 
+import re
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,29 +16,28 @@ from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.studies.basin.cells import (
     DRIVE,
     BasinOptions,
-    Cell,
     DistortionCells,
+    RingCell,
     basin_table,
     cells_of,
 )
-from l2m_gtsam.studies.basin.report import basin_figure, basin_markdown
 from l2m_gtsam.studies.basin.study import BASIN
 from l2m_gtsam.studies.run import run_study
-from l2m_gtsam.studies.share import Share
 from l2m_gtsam.studies.site import mapped_site, random_drive
+from l2m_gtsam.studies.statistics import Share
 from tests.worlds.study_sites import TINY_BASIN as TINY
 
 
 @lru_cache
-def tiny_cells() -> tuple[Cell, ...]:
+def tiny_cells() -> tuple[RingCell, ...]:
     return cells_of(TINY, mapped_site(TINY.site), 0).rings
 
 
-def made_up(distortion: int, ring: int, errors: list[float]) -> Cell:
+def made_up(distortion: int, ring: int, errors: list[float]) -> RingCell:
     """A cell where one-key ends with these errors, LM never moves, and published leaves the map."""
     count = len(errors)
     t_start = np.full((count, 3), 1.0)
-    return Cell(
+    return RingCell(
         distortion=distortion,
         ring=ring,
         t_true=np.zeros(3),
@@ -111,15 +111,17 @@ def test_a_distortion_counts_where_every_start_of_every_ring_succeeded() -> None
     ]
     table = basin_table(TINY, cells)
     assert (table.all_small, table.all_medium) == (Share(1, 4), Share(2, 4))
-    assert "1 of 4" in basin_markdown(table)
+    assert "1 of 4" in BASIN.page(table)
 
 
 def test_table_and_figure_say_how_many_starts_each_method_got() -> None:
     cells = [made_up(0, 0, [0.01, 0.01, 0.01]), made_up(1, 0, [0.01, 0.01])]
     table = basin_table(TINY, cells)
-    line = basin_markdown(table).splitlines()[2].split(" | ")
-    assert (line[1], line[6]) == ("5", "4")
-    (axes,) = basin_figure(table).axes
+    line = re.search("^[|] 0.00.*", BASIN.page(table), flags=re.M)
+    assert line is not None
+    cells_of_line = line[0].split(" | ")
+    assert (cells_of_line[1], cells_of_line[6]) == ("5", "4")
+    (axes,) = BASIN.figures(table)["basin"].axes
     _, legend = axes.get_legend_handles_labels()
     assert "LM, within 2 cm (4 starts a ring)" in legend
     assert "one-key, within 2 cm (5 starts a ring)" in legend

@@ -7,12 +7,13 @@ import gtsam
 import numpy as np
 import pytest
 
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
 from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from tests.drives.exploring import OnLine, prepared_drive, rms
-from tests.drives.slam import calibrated, laps, quiet
+from tests.drives.slam import calibrated, laps
 from tests.worlds.exact import random_sensors
 
 SEEDS, SENSORS = range(1, 7), 6
@@ -39,7 +40,7 @@ def outcome(seed: int) -> Outcome:
     drive, truth = prepared_drive(seed, laps(TWO_AND_A_HALF), sensors, calibrated(sensors), OPTIONS)
     found = OnLine.over(drive, truth, OPTIONS, ExploringOptions())
     begin = drive.dead_reckoning()
-    batch = map_drive(drive, begin, drive_prior(drive, begin, OPTIONS.tiles), OPTIONS, quiet)
+    batch = map_drive(drive, begin, drive_prior(drive, begin, OPTIONS.tiles), OPTIONS, silent)
     anchors = [tile.anchor for tile in found.explorer.memory.tiles]
     poses = found.explorer.poses()
     return Outcome(

@@ -10,14 +10,16 @@ from pydantic import TypeAdapter, ValidationError
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.studies.bound import cramer_rao
-from l2m_gtsam.studies.honesty.cells import Cell, Stated, bound_of, cell_of
-from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
-from l2m_gtsam.studies.honesty.page import honesty_page
-from l2m_gtsam.studies.honesty.pictures import honesty_figures
-from l2m_gtsam.studies.honesty.place import drive_through, surveyed_hall
-from l2m_gtsam.studies.honesty.study import HONESTY, keys, prepare, site
-from l2m_gtsam.studies.honesty.summary import NAMES, HonestySummary, Verdict, honesty_summary
+from l2m_gtsam.studies.honesty.cells import HonestyCell, Stated, bound_of, cell_of
+from l2m_gtsam.studies.honesty.drives import Condition, HonestyOptions, drive_through, mapped_hall
+from l2m_gtsam.studies.honesty.study import HONESTY
+from l2m_gtsam.studies.honesty.summary import (
+    NAMES,
+    ConsistencyVerdict,
+    HonestySummary,
+    honesty_summary,
+)
+from l2m_gtsam.studies.methods import cramer_rao
 from tests.support.inline_study import run_inline
 from tests.worlds.quick_maps import quick
 
@@ -42,7 +44,7 @@ def covariance(seed: int) -> FloatArray:
     return np.asarray(SIGMAS[:, None] * (root @ root.T) * SIGMAS)
 
 
-def made_up(told: float = 1.0, least: float = 1.0, shared: float = 0.0) -> list[Cell]:
+def made_up(told: float = 1.0, least: float = 1.0, shared: float = 0.0) -> list[HonestyCell]:
     """Cells of errors of a known covariance.
 
     Stated are covariances times ``told``; the bound is that of sigmas times ``least``, and
@@ -56,11 +58,11 @@ def made_up(told: float = 1.0, least: float = 1.0, shared: float = 0.0) -> list[
         error = (own + np.sqrt(shared) * rng.normal(size=16)) @ root.T
         stated = Stated(error, np.tile(told * P, (len(error), 1, 1)))
         bound = np.tile(least**2 * P, (len(error), 1, 1))
-        cells.append(Cell(Condition.CLEAN, 0.2, survey, stated, stated, bound))
+        cells.append(HonestyCell(Condition.CLEAN, 0.2, survey, stated, stated, bound))
     return cells
 
 
-def judged(cells: list[Cell]) -> Verdict:
+def judged(cells: list[HonestyCell]) -> ConsistencyVerdict:
     return honesty_summary(MADE_UP, cells).of(Uncertainty.FULL)[0]
 
 
@@ -68,7 +70,7 @@ def test_true_covariances_are_found_true() -> None:
     verdict = judged(made_up())
     assert (verdict.wanted, verdict.solved, verdict.determined) == (200, 200, 200)
     assert [row.name for row in verdict.blocks] == ["t", "C, H", "all", "offset"]
-    assert verdict.honest
+    assert verdict.consistent
     assert tuple(row.name for row in verdict.parameters) == NAMES
     # Of 32 figures each is out of its 95 % band by chance once in 20: 1.6, and 6 once in 200.
     out = sum(row.z_std not in row.z_band for row in verdict.parameters)
@@ -85,16 +87,16 @@ def test_true_covariances_are_found_true() -> None:
 @pytest.mark.parametrize("told", [0.5, 2.0])
 def test_covariances_of_wrong_size_are_called_out(told: float) -> None:
     true, verdict = judged(made_up()), judged(made_up(told))
-    assert not verdict.honest
+    assert not verdict.consistent
     for row, right in zip(verdict.blocks, true.blocks, strict=True):
         assert row.honesty.nees == pytest.approx(right.honesty.nees / told)
-        assert not row.honesty.honest, row.name
+        assert not row.honesty.consistent, row.name
     for one, right_one in zip(verdict.parameters, true.parameters, strict=True):
         assert one.z_std == pytest.approx(right_one.z_std / np.sqrt(told))
         assert (one.covered < right_one.covered) == (told < 1)
         assert one.z_std not in one.z_band, one.name
     side = "above it (sigmas too small)" if told < 1 else "below it (sigmas too large)"
-    page = honesty_page(honesty_summary(MADE_UP, made_up(told)))
+    page = HONESTY.page(honesty_summary(MADE_UP, made_up(told)))
     assert f"NEES of t, (C, H), all together and the time offset {side}" in page
 
 
@@ -112,7 +114,7 @@ def test_errors_are_held_against_the_bound() -> None:
     ratio = judged(made_up()).bounds[0].ratio
     far = judged(made_up(least=0.5)).bounds[0]
     assert far.ratio == pytest.approx(2 * ratio)
-    page = honesty_page(honesty_summary(MADE_UP, made_up(least=0.5)))
+    page = HONESTY.page(honesty_summary(MADE_UP, made_up(least=0.5)))
     assert f"the error of t is {far.ratio:.2f} times the bound (" in page
     assert ", beyond the 1.3 aimed at" in page
 
@@ -124,7 +126,7 @@ def test_offsets_are_judged_where_they_are_known() -> None:
         covariances = cell.full.covariance.copy()
         covariances[:, 15, 15] = np.inf
         full = replace(cell.full, covariance=covariances)
-        adapter = TypeAdapter(Cell)
+        adapter = TypeAdapter(HonestyCell)
         cells.append(adapter.validate_json(adapter.dump_json(replace(cell, full=full))))
     verdict = judged(cells)
     assert [row.name for row in verdict.blocks] == ["t", "C, H", "all"]
@@ -148,10 +150,10 @@ def test_what_was_not_solved_or_determined_is_counted_and_left_out() -> None:
 def test_one_survey_is_not_judged() -> None:
     verdict = judged(made_up()[:1])
     assert not verdict.blocks
-    assert not verdict.honest
+    assert not verdict.consistent
     summary = HonestySummary(MADE_UP, (verdict,))
-    assert "of too few surveys to judge" in honesty_page(summary)
-    assert set(honesty_figures(summary)) == {"nees", "coverage", "zscores"}
+    assert "of too few surveys to judge" in HONESTY.page(summary)
+    assert set(HONESTY.figures(summary)) == {"nees", "coverage", "zscores"}
 
 
 def test_a_study_of_one_survey_is_refused() -> None:
@@ -165,9 +167,9 @@ def test_a_map_that_does_not_know_its_errors_is_refused() -> None:
 
 
 def test_both_conditions_of_a_survey_share_its_map() -> None:
-    names = keys(HonestyOptions())
+    names = HONESTY.keys(HonestyOptions())
     assert len(names) == len(set(names)) == 80
-    places = [site(HonestyOptions(), name) for name in names]
+    places = [HONESTY.site(HonestyOptions(), name) for name in names]
     assert len(set(places)) == 60
     # Cells of one place come together, so that its map is made and let go once.
     changes = sum(a != b for a, b in pairwise(places))
@@ -188,9 +190,9 @@ def test_the_study_runs_and_repeats_itself(tmp_path: Path) -> None:
         "coverage.png",
         "zscores.png",
     }
-    key = keys(TINY)[1]
-    cell = HONESTY.compute(TINY, key, prepare(TINY, site(TINY, key)))
-    adapter = TypeAdapter(Cell)
+    key = HONESTY.keys(TINY)[1]
+    cell = HONESTY.compute(TINY, key, HONESTY.prepare(TINY, HONESTY.site(TINY, key)))
+    adapter = TypeAdapter(HonestyCell)
     kept = TypeAdapter(dict).validate_json((tmp_path / "cells" / f"{key}.json").read_bytes())
     assert adapter.dump_python(cell, mode="json") == kept["cell"]
 
@@ -201,7 +203,7 @@ def test_the_bound_is_what_the_solve_states_at_the_truth() -> None:
     120 readings tell the noise to 1 / sqrt(2 * 360) = 4 %; linearised at the estimate in place of
     the truth they differ by a few per cent more.
     """
-    place = surveyed_hall(TINY, 0.2, 0)
+    place = mapped_hall(TINY, 0.2, 0)
     cell = cell_of(TINY, place, Condition.CLEAN)
     stated, least = (
         np.sqrt(np.diagonal(each[0])[:15]) for each in (cell.full.covariance, cell.bound)

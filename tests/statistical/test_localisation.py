@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.slam import calibrated, quiet, rounds, slam_drive
+from tests.drives.slam import calibrated, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.surveyed import NOISE, survey
@@ -21,7 +22,7 @@ def one_drive(seed: int) -> FloatArray:
     world, sensors = dipole_world(seed), random_sensors(seed, 2)
     drive = slam_drive(world, sensors, rounds(30), rng, NOISE)
     result = localise(
-        drive.recording, survey(world, rng), calibrated(sensors, NOISE), SlamOptions(), quiet
+        drive.recording, survey(world, rng), calibrated(sensors, NOISE), SlamOptions(), silent
     ).result
     assert result.status is LocalisationStatus.LOCALISED
     nees = float(pose_nees(drive.truth, result.trajectory).mean())

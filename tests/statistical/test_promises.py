@@ -16,9 +16,9 @@ from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive
 from l2m_gtsam.simulate.steel_hall import CloudVariant
-from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
+from l2m_gtsam.studies.honesty.drives import Condition, HonestyOptions
 from l2m_gtsam.studies.honesty.study import HONESTY
-from l2m_gtsam.studies.honesty.summary import TARGET, Verdict
+from l2m_gtsam.studies.honesty.summary import TARGET, ConsistencyVerdict
 from l2m_gtsam.studies.run import run_study
 from tests.drives.studied_calibrations import (
     CalibrationCase,
@@ -48,7 +48,7 @@ OFF_PLANE: dict[tuple[float, ...], tuple[float, float]] = {
     (0.4, 0.7, 1.0): (0.4, 1.0),
 }
 
-Judged = dict[tuple[Condition, float], Verdict]
+Judged = dict[tuple[Condition, float], ConsistencyVerdict]
 
 
 def kind(name: str, harmonic: HarmonicOptions | None = None) -> Build:
@@ -123,7 +123,7 @@ def test_stated_errors_of_a_calibration_are_true(judged: Judged, noise: float) -
     full = judged[Condition.CLEAN, noise]
     assert full.determined == full.wanted == 200
     for row in full.blocks:
-        assert row.honesty.honest, f"{row.name}: {row.honesty}"
+        assert row.honesty.consistent, f"{row.name}: {row.honesty}"
     assert full.blocks[0].name == full.bounds[0].name == "t"
     assert 0.92 <= full.blocks[0].honesty.coverage <= 0.98
     assert full.bounds[0].ratio <= TARGET
@@ -138,7 +138,7 @@ def test_stated_errors_are_true_with_everything_wrong(judged: Judged) -> None:
     assert full.determined == full.wanted == 200
     assert [row.name for row in full.blocks] == ["t", "C, H", "all", "offset"]
     for row in full.blocks:
-        assert row.honesty.honest, f"{row.name}: {row.honesty}"
+        assert row.honesty.consistent, f"{row.name}: {row.honesty}"
 
 
 @pytest.mark.parametrize("heights", list(OFF_PLANE))

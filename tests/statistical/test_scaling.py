@@ -11,13 +11,18 @@ from hypothesis import strategies as st
 
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.maps.training import training_set
-from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
-from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
-from l2m_gtsam.studies.scaling.page import scaling_page
-from l2m_gtsam.studies.scaling.stopwatch import taken
+from l2m_gtsam.studies.methods import numeric_least_squares
+from l2m_gtsam.studies.scaling.measurements import (
+    Measurement,
+    Quantity,
+    ScalingOptions,
+    ScalingTable,
+    TimedTask,
+    exponent,
+    scaling_table,
+)
 from l2m_gtsam.studies.scaling.study import SCALING
-from l2m_gtsam.studies.scaling.table import ScalingTable, exponent, scaling_table
-from l2m_gtsam.studies.scaling.tasks import middle
+from l2m_gtsam.studies.scaling.tasks import middle, taken
 from l2m_gtsam.studies.scaling.workers import Stint, rate
 from tests.support.inline_study import run_inline
 from tests.worlds.exact import dipole_world, random_sensors
@@ -58,75 +63,77 @@ def table(out: Path) -> ScalingTable:
 def test_every_size_is_timed(table: ScalingTable) -> None:
     found = {(c.part, c.way): [each.size for each in c.points] for c in table.curves}
     assert found == {
-        (Part.READINGS, Way.POINT): [60, 120],
-        (Part.READINGS, Way.FULL): [60, 120],
-        (Part.READINGS, Way.NUMERIC): [60],
-        (Part.SENSORS, Way.POINT): [1],
-        (Part.SENSORS, Way.FULL): [1],
-        (Part.SENSORS, Way.NUMERIC): [1],
-        (Part.SURVEY, Way.HARMONIC): [300, 600],
-        (Part.SURVEY, Way.SLIDING): [300, 600],
-        (Part.SURVEY, Way.DENSE): [100, 200],
-        (Part.WORKERS, Way.BATCH): [1],
-        (Part.WORKERS, Way.STARTED): [1],
+        (Quantity.READINGS, TimedTask.POINT): [60, 120],
+        (Quantity.READINGS, TimedTask.FULL): [60, 120],
+        (Quantity.READINGS, TimedTask.NUMERIC): [60],
+        (Quantity.SENSORS, TimedTask.POINT): [1],
+        (Quantity.SENSORS, TimedTask.FULL): [1],
+        (Quantity.SENSORS, TimedTask.NUMERIC): [1],
+        (Quantity.SURVEY, TimedTask.HARMONIC): [300, 600],
+        (Quantity.SURVEY, TimedTask.SLIDING): [300, 600],
+        (Quantity.SURVEY, TimedTask.DENSE): [100, 200],
+        (Quantity.WORKERS, TimedTask.BATCH): [1],
+        (Quantity.WORKERS, TimedTask.STARTED): [1],
     }
     assert all(point.seconds > 0 for curve in table.curves for point in curve.points)
 
 
 def test_the_start_of_workers_takes_time(table: ScalingTable) -> None:
-    alone, started = (c.points[0] for c in table.curves if c.part is Part.WORKERS)
+    alone, started = (c.points[0] for c in table.curves if c.part is Quantity.WORKERS)
     assert started.seconds > alone.seconds
 
 
 def test_page_and_figure_are_made_of_the_file(out: Path, table: ScalingTable) -> None:
     page = (out / "scaling.md").read_text(encoding="utf-8")
-    assert scaling_page(table) in page
+    assert SCALING.page(table) in page
     for name in re.findall(r"!\[.*\]\((.*)\)", page):
         assert (out / name).stat().st_size > 10_000
 
 
-def points(part: Part, way: Way, seconds: dict[int, float]) -> list[Measurement]:
+def points(part: Quantity, way: TimedTask, seconds: dict[int, float]) -> list[Measurement]:
     return [Measurement(part, way, size, each) for size, each in seconds.items()]
 
 
 @given(power=st.floats(-2.0, 4.0), unit=st.floats(1e-4, 1e3))
 def test_the_exponent_is_that_of_a_power(power: float, unit: float) -> None:
-    measured = points(Part.SURVEY, Way.DENSE, {n: unit * n**power for n in (10, 100, 1000)})
+    measured = points(
+        Quantity.SURVEY, TimedTask.DENSE, {n: unit * n**power for n in (10, 100, 1000)}
+    )
     # Logarithms up to 30 are rounded to 1e-15 of themselves.
     assert exponent(tuple(measured)) == pytest.approx(power, abs=1e-9)
 
 
 def test_the_exponent_is_that_of_the_largest_sizes() -> None:
     seconds = {1: 5.0, 2: 5.0, 4: 4.0, 8: 8.0, 16: 16.0}
-    assert exponent(tuple(points(Part.SURVEY, Way.DENSE, seconds))) == pytest.approx(1.0)
+    assert exponent(tuple(points(Quantity.SURVEY, TimedTask.DENSE, seconds))) == pytest.approx(1.0)
 
 
 def test_one_size_has_no_exponent() -> None:
-    assert exponent(tuple(points(Part.SURVEY, Way.DENSE, {5: 1.0}))) is None
+    assert exponent(tuple(points(Quantity.SURVEY, TimedTask.DENSE, {5: 1.0}))) is None
 
 
 def test_ratios_are_those_at_the_largest_size_of_both() -> None:
     measured = [
-        *points(Part.READINGS, Way.POINT, {10: 1.0, 20: 2.0, 40: 4.0}),
-        *points(Part.READINGS, Way.NUMERIC, {10: 3.0, 20: 12.0}),
-        *points(Part.SENSORS, Way.POINT, {1: 1.0}),
+        *points(Quantity.READINGS, TimedTask.POINT, {10: 1.0, 20: 2.0, 40: 4.0}),
+        *points(Quantity.READINGS, TimedTask.NUMERIC, {10: 3.0, 20: 12.0}),
+        *points(Quantity.SENSORS, TimedTask.POINT, {1: 1.0}),
     ]
     (found,) = scaling_table(ScalingOptions(), measured).ratios
-    assert (found.size, found.times, found.peer) == (20, 6.0, Way.NUMERIC)
+    assert (found.size, found.times, found.peer) == (20, 6.0, TimedTask.NUMERIC)
 
 
 def test_speeds_are_relative_to_the_fewest_workers() -> None:
     measured = [
-        *points(Part.WORKERS, Way.BATCH, {1: 10.0, 2: 5.0}),
-        *points(Part.WORKERS, Way.STARTED, {1: 12.0, 2: 8.0}),
+        *points(Quantity.WORKERS, TimedTask.BATCH, {1: 10.0, 2: 5.0}),
+        *points(Quantity.WORKERS, TimedTask.STARTED, {1: 12.0, 2: 8.0}),
     ]
     one, two = scaling_table(ScalingOptions(), measured).speeds
     assert (one.times, two.workers, two.times, two.started) == (1.0, 2, 2.0, 1.5)
 
 
 def test_a_page_of_a_part_has_no_empty_sections() -> None:
-    table = scaling_table(ScalingOptions(), points(Part.SURVEY, Way.DENSE, {10: 1.0}))
-    assert re.findall(r"^## (.*)", scaling_page(table), flags=re.M) == ["Size of the map"]
+    table = scaling_table(ScalingOptions(), points(Quantity.SURVEY, TimedTask.DENSE, {10: 1.0}))
+    assert re.findall(r"^## (.*)", SCALING.page(table), flags=re.M) == ["Size of the map"]
 
 
 def test_the_first_calibration_of_a_process_does_not_count() -> None:

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.calibration.view import Compilable
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
-from tests.drives.slam import calibrated, quiet, slam_drive
+from tests.drives.slam import calibrated, slam_drive
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.surveyed import in_odometry, survey, wandering
 
@@ -27,7 +28,7 @@ def outcomes(hall: int, options: SlamOptions, seconds: float) -> list[str]:
         sensors = random_sensors(1000 * hall + number, 2)
         drive = slam_drive(world, sensors, wandering(rng, seconds), rng)
         lost, _ = prepared(in_odometry(drive.recording, rng), calibrated(sensors), options)
-        found = find_start(lost, field_map, options, quiet)
+        found = find_start(lost, field_map, options, silent)
         away = [np.linalg.norm(c.T_map_lidar.t - drive.truth.p[0]) for c in found.candidates]
         right = bool(away) and away[0] < NEAR
         told.append(f"{found.verdict.value} {'right' if right else 'wrong'}")

@@ -151,7 +151,7 @@ def test_the_calibration_study_finds_an_exact_map_honest(
         # 24 calibrations: the mean is known to sqrt(2 dof / 24); four of these are allowed.
         assert honest.honesty[name].nees == pytest.approx(dof, abs=4 * np.sqrt(2 * dof / 24))
         assert sure.honesty[name].nees == pytest.approx(4 * honest.honesty[name].nees)
-        assert not sure.honesty[name].honest
+        assert not sure.honesty[name].consistent
     assert 0.95 in honest.honesty["t"].coverage_band
     # Squares of 24 errors per axis: their root mean is known to 14 %.
     np.testing.assert_allclose(honest.error, honest.sigma, rtol=0.5)

@@ -1,5 +1,6 @@
 """Table I: one small run through the whole path, and its figures on made-up drives."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -10,10 +11,9 @@ from pydantic import TypeAdapter
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.studies.site import random_drive
-from l2m_gtsam.studies.table1 import report
 from l2m_gtsam.studies.table1.cells import (
     Ends,
-    Place,
+    SurveyedWarehouse,
     Table1Cell,
     Table1Options,
     compute,
@@ -27,9 +27,15 @@ from l2m_gtsam.studies.table1.methods import (
     SLIDING,
     as_published,
 )
-from l2m_gtsam.studies.table1.paper import NOISES, Printed, printed
-from l2m_gtsam.studies.table1.study import TABLE1, keys
-from l2m_gtsam.studies.table1.summary import Table1Summary, summarise
+from l2m_gtsam.studies.table1.study import TABLE1
+from l2m_gtsam.studies.table1.summary import (
+    BETTER,
+    NOISES,
+    Printed,
+    Table1Summary,
+    printed,
+    summarise,
+)
 from tests.worlds.study_sites import one_row_site
 
 NOISE = 0.2
@@ -45,13 +51,13 @@ TINY = Table1Options(
 
 
 @pytest.fixture(scope="module")
-def place() -> Place:
+def place() -> SurveyedWarehouse:
     return prepare(TINY)
 
 
 @pytest.fixture(scope="module")
-def cells(place: Place) -> dict[str, Table1Cell]:
-    return {key: compute(TINY, place, *map(int, key.split("-"))) for key in keys(TINY)}
+def cells(place: SurveyedWarehouse) -> dict[str, Table1Cell]:
+    return {key: compute(TINY, place, *map(int, key.split("-"))) for key in TABLE1.keys(TINY)}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +66,7 @@ def summary(cells: Mapping[str, Table1Cell]) -> Table1Summary:
 
 
 def test_our_method_comes_within_centimetres_from_every_start(summary: Table1Summary) -> None:
-    ours = summary.entry(OURS, HARMONIC, RouteShape.CIRCLES, NOISE)
+    ours = summary.entry(RouteShape.CIRCLES, NOISE, OURS, HARMONIC)
     assert (ours.calibrations, ours.lost, ours.far) == (6, 0, 0)
     # 170 readings a drive: the bound is about 8 mm.
     assert ours.t is not None
@@ -76,7 +82,7 @@ def test_every_method_has_an_entry_on_its_maps(summary: Table1Summary) -> None:
     assert {each.calibrations for each in others} == {TINY.others * TINY.other_starts}
 
 
-def test_the_published_algorithm_off_the_map_has_no_result(place: Place) -> None:
+def test_the_published_algorithm_off_the_map_has_no_result(place: SurveyedWarehouse) -> None:
     drive = random_drive(place.site, TINY.site, np.random.default_rng(1))
     away = np.array([500.0, 0.0, 0.0])
     assert np.isnan(as_published(drive.readings, place.maps[HARMONIC], away)).all()
@@ -148,10 +154,9 @@ def test_all_paths_together_are_one_set_of_errors() -> None:
 def test_a_row_that_misses_its_aim_is_named_with_its_bound(bound: float, word: str) -> None:
     aim = printed("t", 0, NOISE)
     assert aim is not None
-    error = 1.1 * np.sqrt(aim.mean / report.BETTER)
-    (line,) = report.missed(summarise(TINY, {"a": made_up([error], bound)}))
-    assert "path 1 at 0.2 uT" in line
-    assert f"the bound {word} it" in line
+    error = 1.1 * np.sqrt(aim.mean / BETTER)
+    page = TABLE1.page(summarise(TINY, {"a": made_up([error], bound)}))
+    assert re.search(f"^- .*path 1 at 0.2 uT.*the bound {word} it", page, flags=re.M)
 
 
 def test_a_peer_that_knows_no_place_is_not_lost() -> None:
@@ -159,7 +164,7 @@ def test_a_peer_that_knows_no_place_is_not_lost() -> None:
     ends = Ends("peer", "-", nothing, nothing, np.array([1.0, np.nan]), 1.0)
     cell = made_up([0.01])
     made = summarise(TINY, {"a": replace(cell, ends=(*cell.ends, ends))})
-    entry = made.entry("peer", "-", RouteShape.CIRCLES, NOISE)
+    entry = made.entry(RouteShape.CIRCLES, NOISE, "peer", "-")
     assert (entry.calibrations, entry.lost, entry.far) == (2, 1, 0)
     assert entry.t is None
     assert entry.H is not None
@@ -167,7 +172,9 @@ def test_a_peer_that_knows_no_place_is_not_lost() -> None:
 
 
 def test_a_row_that_reaches_its_aim_is_not() -> None:
-    assert not list(report.missed(summarise(TINY, {"a": made_up([0.001])})))
+    made = summarise(TINY, {"a": made_up([0.001])})
+    assert not list(made.shortfalls())
+    assert "All rows reach it." in TABLE1.page(made)
 
 
 def test_the_printed_table_is_the_papers() -> None:

@@ -37,54 +37,42 @@ class ToySummary:
     values: tuple[float, ...]
 
 
-def keys(options: ToyOptions) -> tuple[str, ...]:
-    return tuple(f"cell-{number}" for number in range(options.cells))
+class ToyStudy(Study[ToyOptions, ToyCell, ToySummary]):
+    name = "toy"
+    title = "Random numbers"
+    size = frozenset({"cells", "seconds", "log", "deadly"})
+    options = ToyOptions
+    cell = ToyCell
+    summary = ToySummary
+
+    def keys(self, options: ToyOptions) -> tuple[str, ...]:
+        return tuple(f"cell-{number}" for number in range(options.cells))
+
+    def site(self, options: ToyOptions, key: str) -> str:
+        return "even" if int(key[5:]) % 2 == 0 else "odd"
+
+    def prepare(self, options: ToyOptions, site: str) -> float:
+        return 10.0 if site == "even" else 20.0
+
+    def compute(self, options: ToyOptions, key: str, shared: float) -> ToyCell:
+        if options.log:
+            with Path(options.log).open("a") as log:
+                log.write(f"{key}\n")
+            begun = Path(options.log).read_text().count(f"{key}\n")
+            if key == options.deadly and begun == 1:
+                os._exit(1)
+        time.sleep(options.seconds)
+        return ToyCell(shared + float(np.random.default_rng([options.seed, int(key[5:])]).normal()))
+
+    def summarise(self, options: ToyOptions, cells: Mapping[str, ToyCell]) -> ToySummary:
+        values = tuple(cell.value for cell in cells.values())
+        return ToySummary(float(np.mean(values)), values)
+
+    def page(self, summary: ToySummary) -> str:
+        return f"Mean {summary.mean!r} of {summary.values!r}."
+
+    def figures(self, summary: ToySummary) -> dict[str, Figure]:
+        return {}
 
 
-def site(options: ToyOptions, key: str) -> str:
-    return "even" if int(key[5:]) % 2 == 0 else "odd"
-
-
-def prepare(options: ToyOptions, name: str) -> float:
-    return 10.0 if name == "even" else 20.0
-
-
-def compute(options: ToyOptions, key: str, place: float) -> ToyCell:
-    if options.log:
-        with Path(options.log).open("a") as log:
-            log.write(f"{key}\n")
-        begun = Path(options.log).read_text().count(f"{key}\n")
-        if key == options.deadly and begun == 1:
-            os._exit(1)
-    time.sleep(options.seconds)
-    return ToyCell(place + float(np.random.default_rng([options.seed, int(key[5:])]).normal()))
-
-
-def summarise(options: ToyOptions, cells: Mapping[str, ToyCell]) -> ToySummary:
-    values = tuple(cell.value for cell in cells.values())
-    return ToySummary(float(np.mean(values)), values)
-
-
-def page(summary: ToySummary) -> str:
-    return f"Mean {summary.mean!r} of {summary.values!r}."
-
-
-def figures(summary: ToySummary) -> dict[str, Figure]:
-    return {}
-
-
-TOY = Study(
-    name="toy",
-    title="Random numbers",
-    options=ToyOptions,
-    size=frozenset({"cells", "seconds", "log", "deadly"}),
-    cell=ToyCell,
-    summary=ToySummary,
-    keys=keys,
-    site=site,
-    prepare=prepare,
-    compute=compute,
-    summarise=summarise,
-    page=page,
-    figures=figures,
-)
+TOY = ToyStudy()

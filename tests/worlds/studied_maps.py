@@ -10,7 +10,7 @@ import numpy as np
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import MapSummary
-from l2m_gtsam.simulate.hall_drives import Survey, held_out, survey
+from l2m_gtsam.simulate.hall_drives import HallSurvey, held_out, survey
 from l2m_gtsam.simulate.steel_hall import (
     MILD,
     STRONG,
@@ -40,7 +40,7 @@ class Scene:
         The truth.
     """
 
-    survey: Survey
+    survey: HallSurvey
     cloud: FloatArray
     hall: SteelHall
 

@@ -4,6 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from l2m_gtsam.cli.tables import new_table
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -15,6 +16,18 @@ from l2m_gtsam.records.calibration import (
 )
 from l2m_gtsam.records.sensor_models import Model, ModelComparison, ModelFigures, MovingField
 
+HEADINGS = (
+    "t_lidar_mag (m)",
+    "± (mm)",
+    "H (uT)",
+    "|C - R| max",
+    "rotation (deg)",
+    "clock (ms)",
+    "|residual| rms (uT)",
+    "readings used",
+    "outside map",
+    "rejected",
+)
 MODEL_HEADINGS = (
     "parameters",
     "rms (uT)",
@@ -27,21 +40,7 @@ MODEL_HEADINGS = (
 
 def calibration_table(result: CalibrationResult) -> Table:
     """Return one row per sensor: position, sigma, offset, scale, rotation, residual, status."""
-    table = Table(title="Calibration: B_meas = C @ B_lidar + H", title_justify="left")
-    table.add_column("sensor", no_wrap=True)
-    for heading in (
-        "t_lidar_mag (m)",
-        "± (mm)",
-        "H (uT)",
-        "|C - R| max",
-        "rotation (deg)",
-        "clock (ms)",
-        "|residual| rms (uT)",
-        "readings used",
-        "outside map",
-        "rejected",
-    ):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = new_table("Calibration: B_meas = C @ B_lidar + H", "sensor", HEADINGS)
     table.add_column("status")
     for sensor in result.sensors:
         table.add_row(*_calibration_row(sensor))
@@ -134,12 +133,9 @@ def held_clocks_note(result: CalibrationResult) -> str:
 
 def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Table:
     """Return truth, estimate, error and sigma of every sensor's position, and errors of C and H."""
-    table = Table(title="Truth and estimate", title_justify="left")
-    table.add_column("sensor")
-    for heading in ("true t (m)", "estimated t (m)", "error (mm)", "sigma (mm)"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for heading in ("|C error|", "sigma", "|H error| (uT)", "sigma"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    place = ("true t (m)", "estimated t (m)", "error (mm)", "sigma (mm)")
+    others = ("|C error|", "sigma", "|H error| (uT)", "sigma")
+    table = new_table("Truth and estimate", "sensor", [*place, *others])
     for known in truth:
         table.add_row(*_truth_row(known, result[known.sensor]))
     return table

@@ -4,34 +4,30 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from l2m_gtsam.cli.tables import new_table
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.plan import DrivePlan, SensorPlan, Worst
 from l2m_gtsam.storage.inspect import BagReport, TopicReport
 
+HEADINGS = (
+    "assumed t (m)",
+    "± t (mm)",
+    "± C by column",
+    "± H (uT)",
+    "± rotation (deg)",
+    "± clock (ms)",
+    "readings",
+    "outside map",
+)
 OPEN = "-"  # for a sigma that nothing bounds
 UNITS = {"t": (1e3, "mm"), "C": (1.0, ""), "H": (1.0, "uT")}
 
 
 def plan_table(plan: DrivePlan) -> Table:
     """Return one row per sensor: sigmas of position, C, H and rotation, and what stays open."""
-    table = Table(
-        title=f"What this drive will determine, with a noise of {plan.noise:.3g} uT",
-        title_justify="left",
-        caption="sigmas; of C the largest of each column; - is not determined",
-        caption_justify="left",
-    )
-    table.add_column("sensor")
-    for heading in (
-        "assumed t (m)",
-        "± t (mm)",
-        "± C by column",
-        "± H (uT)",
-        "± rotation (deg)",
-        "± clock (ms)",
-        "readings",
-        "outside map",
-    ):
-        table.add_column(heading, justify="right", no_wrap=True)
+    title = f"What this drive will determine, with a noise of {plan.noise:.3g} uT"
+    caption = "sigmas; of C the largest of each column; - is not determined"
+    table = new_table(title, "sensor", HEADINGS, caption)
     table.add_column("not determined", overflow="fold")
     for sensor in plan.sensors:
         table.add_row(*_sensor_row(sensor))

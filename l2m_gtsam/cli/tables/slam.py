@@ -4,16 +4,15 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from l2m_gtsam.cli.tables import new_table
 from l2m_gtsam.records.localisation import LocalisationResult, ScanUse, StartSearch
 from l2m_gtsam.records.localisation_file import TruthRecord
 
 
 def slam_table(result: LocalisationResult) -> Table:
     """Return one row per sensor: what its readings were worth."""
-    table = Table(title="Readings", title_justify="left")
-    table.add_column("sensor", no_wrap=True)
-    for heading in ("on key poses", "outside map", "rejected", "residual rms (uT)", "chi2 per dof"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    counts = ("on key poses", "outside map", "rejected")
+    table = new_table("Readings", "sensor", [*counts, "residual rms (uT)", "chi2 per dof"])
     for each in result.sensors:
         table.add_row(
             escape(each.sensor),

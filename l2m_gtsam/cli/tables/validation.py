@@ -4,6 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from l2m_gtsam.cli.tables import new_table
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
     ComparedSensor,
@@ -18,19 +19,15 @@ COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
 
 def validation_table(drive: DriveValidation, verdict: Verdict) -> Table:
     """Return one row per sensor: field errors before and after, NIS, and the verdict."""
-    table = Table(
-        title="Readings beside pose, map and calibration",
-        title_justify="left",
-        caption="e_B: mean squared distance to the map's field (uT^2); distance and axes (of the "
-        "lidar): mean ± std after the calibration (uT); NIS per degree of freedom, in brackets "
-        "where 95 % of all lie",
-        caption_justify="left",
+    errors = ("e_B before", "e_B after", "distance", "x", "y", "z", "NIS")
+    table = new_table(
+        "Readings beside pose, map and calibration",
+        "sensor",
+        [*errors, "readings", "outside", "rejected"],
+        "e_B: mean squared distance to the map's field (uT^2); distance and axes (of the lidar): "
+        "mean ± std after the calibration (uT); NIS per degree of freedom, in brackets where 95 % "
+        "of all lie",
     )
-    table.add_column("sensor", no_wrap=True)
-    for heading in ("e_B before", "e_B after", "distance", "x", "y", "z", "NIS", "readings"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for heading in ("outside", "rejected"):
-        table.add_column(heading, justify="right", no_wrap=True)
     table.add_column("verdict")
     levels = {each.sensor: each.level for each in verdict.sensors}
     for sensor in drive.sensors:
@@ -66,16 +63,13 @@ def _level(level: str) -> str:
 
 def change_table(comparison: CalibrationComparison) -> Table:
     """Return one row per sensor: differences with their sigmas, and the chi-square tests."""
-    table = Table(
-        title="New less old calibration",
-        title_justify="left",
-        caption="chi-square / degrees of freedom over each part and all; ! where chance makes as "
-        "much less than once in 1,000 times",
-        caption_justify="left",
+    table = new_table(
+        "New less old calibration",
+        "sensor",
+        ("t (mm)", "H (uT)", "place", "rotation", "gains", "angles", "C", "H", "all"),
+        "chi-square / degrees of freedom over each part and all; ! where chance makes as much less "
+        "than once in 1,000 times",
     )
-    table.add_column("sensor", no_wrap=True)
-    for heading in ("t (mm)", "H (uT)", "place", "rotation", "gains", "angles", "C", "H", "all"):
-        table.add_column(heading, justify="right", no_wrap=True)
     for sensor in comparison.sensors:
         table.add_row(*_comparison_row(sensor))
     for each in comparison.missing:

@@ -14,13 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.figures.trends import SIGMAS, Trend, trend_figure, trends
-from l2m_gtsam.qa.report.page import (
-    Picture,
-    own_file,
-    render,
-    with_sigma,
-)
-from l2m_gtsam.qa.report.svg import SETTINGS, as_svg
+from l2m_gtsam.qa.report.page import Picture, own_file, render, roll_pitch_yaw, with_sigma
+from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.records.fleet import ERROR, FleetRow, SensorRow
 
 REPORT = "report.html"  # in the folder of each drive
@@ -87,42 +82,34 @@ def fleet_page(rows: Sequence[FleetRow], options: FleetOptions) -> str:
     """
     all_trends = trends(rows)
     drawn = _chosen(all_trends, options.pictures)
-    with mpl.rc_context(SETTINGS):
-        pictures = [_picture(k, trend) for k, trend in enumerate(drawn)]
     script = own_file("sort.js")
-    return render(
-        "fleet.html.j2",
-        rows=rows,
-        coordinates=_coordinates,
-        turned=_turned,
-        link=_link,
-        count=tally(rows),
-        failed=[row for row in rows if row.verdict == ERROR],
-        outlying=[row for row in rows if row.outliers],
-        pictures=pictures,
-        left_out=len(all_trends) - len(drawn),
-        options=options,
-        style=own_file("style.css") + own_file("fleet.css"),
-        script=script,
-        digest=b64encode(hashlib.sha256(script.encode()).digest()).decode(),
-    )
+    with mpl.rc_context(SETTINGS):
+        return render(
+            "fleet.html.j2",
+            rows=rows,
+            coordinates=_coordinates,
+            turned=_turned,
+            link=_link,
+            count=tally(rows),
+            failed=[row for row in rows if row.verdict == ERROR],
+            outlying=[row for row in rows if row.outliers],
+            pictures=[
+                (each, Picture(f"trend-{k}", trend_figure(each))) for k, each in enumerate(drawn)
+            ],
+            small=_small,
+            bars=SIGMAS,
+            left_out=len(all_trends) - len(drawn),
+            options=options,
+            style=own_file("style.css") + own_file("fleet.css"),
+            script=script,
+            digest=b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        )
 
 
 def _chosen(found: Sequence[Trend], most: int) -> list[Trend]:
     """Return as many trends as are drawn, in their order; those with outliers go first."""
     first = sorted(range(len(found)), key=lambda k: -found[k].outliers)[:most]
     return [found[k] for k in sorted(first)]
-
-
-def _picture(k: int, trend: Trend) -> Picture:
-    drives, marked = len(trend.days), trend.outliers
-    alt = (
-        f"{trend.sensor} of {trend.vehicle} over {drives} drives: position less its weighted mean "
-        f"along x, y and z, and the length of H, with bars of {SIGMAS} sigma; {marked} marked."
-    )
-    caption = f"{drives} drives, {marked} marked." if marked else f"{drives} drives."
-    drawn = _small(as_svg(trend_figure(trend), f"trend-{k}", alt))
-    return Picture(f"{trend.vehicle}: {trend.sensor}", drawn, caption)
 
 
 def _small(svg: Markup) -> Markup:
@@ -140,8 +127,7 @@ def _turned(sensor: SensorRow) -> str:
     """Return roll, pitch and yaw, and the largest sigma, in degrees."""
     if not np.isfinite(sensor.quaternion_xyzw).all():
         return "–"
-    # intrinsic z, y, x: what ROS calls yaw, pitch, roll
-    yaw, pitch, roll = Rotation.from_quat(sensor.quaternion_xyzw).as_euler("ZYX", degrees=True)
+    roll, pitch, yaw = roll_pitch_yaw(Rotation.from_quat(sensor.quaternion_xyzw))
     sigma = max(sensor.rotation_sigma)
     known = f" ± {sigma:.2f}" if np.isfinite(sigma) else ", part of it not determined"
     return f"{roll:.1f}, {pitch:.1f}, {yaw:.1f}{known}"

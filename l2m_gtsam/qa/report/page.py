@@ -1,5 +1,7 @@
 """What the pages have in common: templates, numbers, pictures. A page needs no other file."""
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -8,56 +10,41 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.report.drawing import Drawing
-from l2m_gtsam.qa.report.figures.map import residual_figure
-from l2m_gtsam.qa.report.figures.statistics import chi_square_figure
 from l2m_gtsam.qa.report.svg import as_svg
-from l2m_gtsam.records.metrics import Normalised, Series
+from l2m_gtsam.records.metrics import Row
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of a page: its title, the drawing, and what to look for."""
+    """A figure of a page, and its name, which is unique in the page."""
 
-    title: str
-    svg: Markup
-    caption: str
+    name: str
+    figure: Figure | Drawing
 
-
-def picture(title: str, figure: Figure | Drawing, name: str, alt: str, caption: str) -> Picture:
-    """Return a figure of the page; see ``Picture`` and ``as_svg``."""
-    return Picture(title, as_svg(figure, name, alt), caption)
+    def svg(self, alt: str) -> Markup:
+        """Return it as an element of the page; ``alt`` is what it shows."""
+        return as_svg(self.figure, self.name, alt)
 
 
-def residual_map_picture(anchor: str, sensor: str, series: Series) -> Picture:
-    """Return the residuals of a sensor over the map."""
-    return picture(
-        "Residuals over the map",
-        residual_figure(series),
-        f"{anchor}-place",
-        f"Length of the residuals of {sensor} where they were read.",
-        "Bright spots that keep together are places where map and readings disagree.",
-    )
-
-
-def normalised_picture(anchor: str, sensor: str, found: Normalised, as_stated: str) -> Picture:
-    """Return the normalised residuals of a sensor, and what bars on the dashed line mean."""
-    std = ", ".join(f"{each:.2f}" for each in found.std)
-    return picture(
-        "Normalised residuals",
-        chi_square_figure(found),
-        f"{anchor}-chi2",
-        f"Squared normalised residuals of {sensor} beside chi-square: standard deviations {std} "
-        f"along x, y, z, {found.beyond_95:.1%} beyond the 95 % quantile.",
-        f"Bars on the dashed line: {as_stated}. Standard deviations {std} (1 is consistent).",
-    )
+def pictures(figures: Mapping[str, Figure | Drawing], anchor: str = "") -> dict[str, Picture]:
+    """Return figures of a page, named by their keys after the anchor of their section."""
+    start = f"{anchor}-" if anchor else ""
+    return {key: Picture(f"{start}{key}", figure) for key, figure in figures.items()}
 
 
 def number(value: float, digits: int = 3) -> str:
     """Return a number with so many significant digits; a dash where it is none or infinite."""
     return f"{value:.{digits}g}" if np.isfinite(value) else "–"
+
+
+def fixed(values: float | Row, digits: int) -> str:
+    """Return one number or several with so many digits behind the point."""
+    each = values if isinstance(values, tuple) else (values,)
+    return ", ".join(f"{value:.{digits}f}" for value in each)
 
 
 def with_sigma(value: float, sigma: float, digits: int) -> str:
@@ -74,8 +61,17 @@ def vector(values: FloatArray, digits: int) -> str:
     return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
 
 
+def roll_pitch_yaw(turn: Rotation) -> tuple[float, float, float]:
+    """Return the angles of a rotation in degrees, as ROS names them (REP 103)."""
+    yaw, pitch, roll = turn.as_euler("ZYX", degrees=True)  # intrinsic z, y, x
+    return roll, pitch, yaw
+
+
 def render(template: str, **values: Any) -> str:
-    """Return a page as HTML; text is escaped, nothing is loaded from anywhere."""
+    """Return a page as HTML; text is escaped, nothing is loaded from anywhere.
+
+    Figures are drawn here: matplotlib's need ``SETTINGS``.
+    """
     given = {"style": own_file("style.css"), **values}
     return _environment().get_template(template).render(**given)
 
@@ -96,5 +92,11 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"number": number, "vector": vector, "with_sigma": with_sigma}
+    environment.tests["finite"] = math.isfinite
+    environment.filters |= {
+        "number": number,
+        "fixed": fixed,
+        "vector": vector,
+        "with_sigma": with_sigma,
+    }
     return environment

@@ -7,7 +7,7 @@ import numpy as np
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.repeatability import repeat
-from l2m_gtsam.qa.verdict.sensor import Case, clock, ending, fit, misfit, precision
+from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, misfit, precision
 from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Verdict
@@ -68,11 +68,7 @@ def _wrong_map(cases: tuple[Case, ...]) -> list[Reason]:
     known = [case for case in cases if case.metrics and np.isfinite(case.sensor.t_sigma).all()]
     if not known or not all(map(misfit, known)):
         return []
-    text = (
-        "The map does not fit this drive: a field that is the same everywhere explains the "
-        "readings as well. Is it the map of this place, and are the poses in its frame?"
-    )
-    return [Reason(Level.FAIL, text)]
+    return [Reason(Level.FAIL, WRONG_MAP)]
 
 
 def _on_drive(cases: tuple[Case, ...]) -> list[Reason]:

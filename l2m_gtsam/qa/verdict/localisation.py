@@ -7,6 +7,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.metrics.trajectory import HEADING, LocalisedTrajectory, localised_trajectory
 from l2m_gtsam.qa.options import Limit, QaOptions, SlamQaOptions, thresholds
+from l2m_gtsam.qa.verdict.sensor import outside_map
 from l2m_gtsam.records.localisation import LocalisationStatus, OdometryScale, ScanUse
 from l2m_gtsam.records.localisation_file import (
     POSE_FREEDOM,
@@ -260,9 +261,7 @@ def _counted(sensor: SensorRecord, options: QaOptions) -> list[Reason]:
             "the vehicle, and do not count: the place has changed since it was mapped, "
             "something passed by, or the sensor is no longer as calibrated.",
         ),
-        *options.outside_map.reasons(
-            lost, f"{lost:.0%} of its readings lie outside the map and do not count."
-        ),
+        *outside_map(lost, options),
         *options.chi_square.reasons(
             use.chi2_per_dof,
             f"Its residuals are {use.chi2_per_dof**0.5:.1f} times as large as noise and map lead "

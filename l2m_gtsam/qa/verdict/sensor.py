@@ -25,6 +25,10 @@ HEADS = {
     SensorStatus.CONTRADICTED: "What is known contradicts the readings",
     SensorStatus.FLIPPED_AXIS: "An axis is reversed",
 }
+WRONG_MAP = (
+    "The map does not fit this drive: a field that is the same everywhere explains the readings as "
+    "well. Is it the map of this place, and are the poses in its frame?"
+)
 
 
 @dataclass(frozen=True)
@@ -118,10 +122,14 @@ def fit(case: Case) -> list[Reason]:
         share = sensor.rejected / inside
         text = f"{share:.0%} of its readings fit neither map nor distortion and do not count."
         reasons += options.rejected.reasons(share, text)
-        lost = sensor.outside_map / (inside + sensor.outside_map)
-        text = f"{lost:.0%} of its readings lie outside the map and do not count."
-        reasons += options.outside_map.reasons(lost, text)
+        reasons += outside_map(sensor.outside_map / (inside + sensor.outside_map), options)
     return reasons
+
+
+def outside_map(share: float, options: QaOptions) -> list[Reason]:
+    """Return that a share of a sensor's readings lies outside the map, if it is large."""
+    text = f"{share:.0%} of its readings lie outside the map and do not count."
+    return options.outside_map.reasons(share, text)
 
 
 def misfit(case: Case) -> bool:

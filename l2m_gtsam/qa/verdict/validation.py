@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
+from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, outside_map
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
     CalibrationPart,
@@ -91,12 +92,7 @@ def _add_missing(found: dict[str, list[Reason]], missing: tuple[NotValidated, ..
 def _on_drive(drive: DriveValidation, options: QaOptions) -> list[Reason]:
     """Return what concerns all sensors."""
     if drive.sensors and all(_misfit(each, options) for each in drive.sensors):
-        text = (
-            "The map does not fit this drive: a field that is the same everywhere explains the "
-            "readings as well. Is it the map of this place, and are the poses in its frame? "
-            "The calibration was not tested."
-        )
-        return [Reason(Level.FAIL, text)]
+        return [Reason(Level.FAIL, f"{WRONG_MAP} The calibration was not tested.")]
     return [
         *(Reason(Level.WARN, each) for each in drive.doubts),
         *(Reason(Level.PASS, each) for each in drive.notes),
@@ -170,9 +166,7 @@ def _counted(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
             f"{share:.0%} of its readings fit no calibration that explains the others and do not "
             "count: the place has changed there since it was mapped, or something passed by.",
         ),
-        *options.outside_map.reasons(
-            lost, f"{lost:.0%} of its readings lie outside the map and do not count."
-        ),
+        *outside_map(lost, options),
     ]
 
 

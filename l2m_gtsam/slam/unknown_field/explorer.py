@@ -31,7 +31,7 @@ class ExploringOptions(Options):
     """How an unknown field is explored on line; lengths in metres of path."""
 
     group_m: float = Field(default=2.0, gt=0)
-    """After so much way what has come is solved; until then poses are carried on by odometry. Half
+    """New key poses are solved after this distance; until then they are predicted by odometry. Half
     of it costs nearly twice the time."""
     section_m: float = Field(default=10.0, gt=0)
     """So much is solved together; of what lies further back tiles alone are kept. A vehicle that

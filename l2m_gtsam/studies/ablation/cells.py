@@ -22,13 +22,21 @@ from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
+from l2m_gtsam.simulate.sensors import NoiseOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method, Weighting
-from l2m_gtsam.studies.ablation.map_picture import MapPicture, WindowOptions
-from l2m_gtsam.studies.fingerprints import around, surveyed_floor, thinned
-from l2m_gtsam.studies.json_array import JsonFloats
+from l2m_gtsam.studies.ablation.map_image import MapImage, WindowOptions
+from l2m_gtsam.studies.json_arrays import JsonFloats
 from l2m_gtsam.studies.methods import two_step
-from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
+from l2m_gtsam.studies.site import (
+    SiteDrive,
+    SiteOptions,
+    SurveyedSite,
+    around,
+    random_drive,
+    surveyed,
+    surveyed_floor,
+    thinned,
+)
 
 DRIVE, START = 1, 2  # streams of randomness
 
@@ -68,27 +76,27 @@ class AblationOptions(Options):
     height; 0 keeps the whole survey."""
     around: float = Field(default=3.0, gt=0)
     """Fingerprints within so many metres of the calibration drive take part: the rest of the hall
-    is not looked at."""
+    does not count."""
     guess: float = Field(default=0.3, gt=0)
     """Guesses are off the truth by up to this."""
     window: WindowOptions = WindowOptions()
     """The part of the maps that is drawn."""
     site: SiteOptions = SiteOptions(
         scenario=ScenarioOptions(
-            array=ArrayOptions(count=1),
+            array=SensorArrayOptions(count=1),
             noise=NoiseOptions(field=0.5),
             calibration_sampling=SamplingOptions(field_rate=10.0),
         )
     )
     """World, survey and drives, with the noise of the paper's study in both drives."""
     search: StartOptions = StartOptions()
-    """How our method looks for its start, around the guess."""
+    """Our method's search for its start, around the guess."""
     solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
-    """How our method solves: the study looks at values, not at sigmas."""
+    """How our method solves: the study is of values, not of sigmas."""
 
 
 @dataclass(frozen=True)
-class Batch:
+class BatchErrors:
     """Errors of R calibrations by each of M methods, NaN for those without a result.
 
     Attributes
@@ -110,12 +118,12 @@ class Batch:
 class AblationCell:
     """A batch of calibrations on one map, or the map itself."""
 
-    batch: Batch | None = None
-    picture: MapPicture | None = None
+    batch: BatchErrors | None = None
+    picture: MapImage | None = None
 
 
 @dataclass(frozen=True)
-class Hall:
+class DrivenHall:
     """What all maps share.
 
     Attributes
@@ -124,41 +132,37 @@ class Hall:
         The survey around the drives.
     floor
         That it covers, in square metres.
-    drives
-        All of the study.
     """
 
-    part: Surveyed
+    part: SurveyedSite
     floor: float
     drives: tuple[SiteDrive, ...]
 
 
 @dataclass(frozen=True)
-class AblationPlace:
+class MappedDrives:
     """A map of one kind at one density.
 
     Attributes
     ----------
     hall
         Drives, and the fingerprints of which the map is made.
-    field_map
-        The map.
     """
 
-    hall: Hall
+    hall: DrivenHall
     field_map: QueryableMap
 
 
-def ablation_place(options: AblationOptions, kind: str, spacing: float) -> AblationPlace:
+def mapped_drives(options: AblationOptions, kind: str, spacing: float) -> MappedDrives:
     """Return a map and the drives through it."""
     hall = ablation_hall(options)
     part = thinned(hall.part, spacing)
     chosen = map_options(options.site.mapping.model, kind, spacing)
-    return AblationPlace(replace(hall, part=part), part.map(chosen))
+    return MappedDrives(replace(hall, part=part), part.map(chosen))
 
 
 @lru_cache(maxsize=1)
-def ablation_hall(options: AblationOptions) -> Hall:
+def ablation_hall(options: AblationOptions) -> DrivenHall:
     """Return survey and drives; made once in each process."""
     whole = surveyed(options.site)
     drives = tuple(
@@ -167,7 +171,7 @@ def ablation_hall(options: AblationOptions) -> Hall:
     )
     # All drives take one route.
     part = around(whole, drives[0].readings.p_map_lidar, options.around)
-    return Hall(part, surveyed_floor(part.survey.points), drives)
+    return DrivenHall(part, surveyed_floor(part.survey.points), drives)
 
 
 def map_options(base: MapOptions, kind: str, spacing: float) -> MapOptions:
@@ -181,7 +185,7 @@ def map_options(base: MapOptions, kind: str, spacing: float) -> MapOptions:
     return base.model_copy(update={"kind": kind, "bilinear": bilinear})
 
 
-def ablation_batch(options: AblationOptions, place: AblationPlace, number: int) -> Batch:
+def ablation_batch(options: AblationOptions, place: MappedDrives, number: int) -> BatchErrors:
     """Calibrate the sensors of one batch by all methods."""
     first = number * options.batch
     errors = np.array(
@@ -190,11 +194,11 @@ def ablation_batch(options: AblationOptions, place: AblationPlace, number: int) 
             for which in range(first, first + options.batch)
         ]
     )
-    return Batch(errors[..., 0], errors[..., 1], errors[..., 2])
+    return BatchErrors(errors[..., 0], errors[..., 1], errors[..., 2])
 
 
 def calibration_errors(
-    options: AblationOptions, place: AblationPlace, which: int, solver: Solver
+    options: AblationOptions, place: MappedDrives, which: int, solver: Solver
 ) -> FloatArray:
     """Return the errors of t, C and H of one calibration, shape (3,)."""
     drive = place.hall.drives[which]

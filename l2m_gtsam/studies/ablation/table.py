@@ -6,18 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.studies.ablation.cells import AblationCell, AblationOptions, Batch, Solver
-from l2m_gtsam.studies.ablation.map_picture import MapPicture
+from l2m_gtsam.studies.ablation.cells import AblationCell, AblationOptions, BatchErrors, Solver
+from l2m_gtsam.studies.ablation.map_image import MapImage
 
 SURE = 1.96  # standard errors on each side of a mean that hold 95 %
 ROUNDING = 1e-6  # metres or microtesla; what differs by less is the same
-FEWEST = 2  # pairs of which a standard error can be told
+FEWEST = 2  # pairs that determine a standard error
 FAR_M, FAR_UT = 0.5, 5.0
 """An error of t or H beyond is none of noise and map, but another minimum."""
 
 
 @dataclass(frozen=True)
-class Spread:
+class ErrorQuantiles:
     """Where the errors of some calibrations lie, in the unit of these errors."""
 
     mean: float
@@ -35,10 +35,6 @@ class Combination:
 
     Attributes
     ----------
-    kind, spacing
-        Of the map.
-    solver
-        The method.
     calibrations, failed, far
         How many there are, how many of them ended without a result, and how many far off.
     t, C, H
@@ -51,9 +47,9 @@ class Combination:
     calibrations: int
     failed: int
     far: int
-    t: Spread | None
-    C: Spread | None
-    H: Spread | None
+    t: ErrorQuantiles | None
+    C: ErrorQuantiles | None
+    H: ErrorQuantiles | None
 
 
 @dataclass(frozen=True)
@@ -78,6 +74,16 @@ class Gain:
     def sure(self) -> bool:
         """Whether the interval leaves out zero, by more than rounding."""
         return abs(self.mean) > max(self.margin, ROUNDING)
+
+    @property
+    def smaller(self) -> bool:
+        """Whether errors clearly shrink."""
+        return self.sure and self.mean > 0
+
+    @property
+    def larger(self) -> bool:
+        """Whether errors clearly grow."""
+        return self.sure and self.mean < 0
 
 
 @dataclass(frozen=True)
@@ -108,7 +114,7 @@ class MapRow:
 
     kind: str
     spacing: float
-    picture: MapPicture
+    picture: MapImage
 
 
 @dataclass(frozen=True)
@@ -117,8 +123,6 @@ class AblationTable:
 
     Attributes
     ----------
-    options
-        The study.
     maps
         By density, then kind.
     rows
@@ -139,12 +143,12 @@ class AblationTable:
     method_gains: tuple[Comparison, ...]
 
 
-Place = tuple[str, float]
+MapKey = tuple[str, float]
 """Kind and spacing of a map."""
 
 
 def ablation_table(
-    options: AblationOptions, cells: Mapping[Place, Sequence[AblationCell]]
+    options: AblationOptions, cells: Mapping[MapKey, Sequence[AblationCell]]
 ) -> AblationTable:
     """Return errors and gains of all cells, given by map."""
     places = [(kind, spacing) for spacing in options.spacings for kind in options.kinds]
@@ -169,13 +173,13 @@ def ablation_table(
     )
 
 
-def joined(cells: Sequence[AblationCell]) -> Batch:
+def joined(cells: Sequence[AblationCell]) -> BatchErrors:
     """Return all calibrations of one map."""
     batches = [each.batch for each in cells if each.batch is not None]
-    return Batch(*(np.concatenate([getattr(b, name) for b in batches]) for name in "tCH"))
+    return BatchErrors(*(np.concatenate([getattr(b, name) for b in batches]) for name in "tCH"))
 
 
-def combination(place: Place, solver: Solver, errors: Batch) -> Combination:
+def combination(place: MapKey, solver: Solver, errors: BatchErrors) -> Combination:
     """Return the errors of one method on one map."""
     of = by(solver)
     failed = int(np.count_nonzero(~np.isfinite(of(errors.t))))
@@ -190,23 +194,23 @@ def by(solver: Solver) -> Callable[[FloatArray], FloatArray]:
     return lambda errors: errors[:, column]
 
 
-def spread(errors: FloatArray) -> Spread | None:
+def spread(errors: FloatArray) -> ErrorQuantiles | None:
     """Return where errors, shape (R,), lie; those that are NaN do not count."""
     known = errors[np.isfinite(errors)]
     if not len(known):
         return None
     p05, p25, median, p75, p95 = np.quantile(known, [0.05, 0.25, 0.5, 0.75, 0.95]).tolist()
-    return Spread(float(known.mean()), p05, p25, median, p75, p95, float(known.max()))
+    return ErrorQuantiles(float(known.mean()), p05, p25, median, p75, p95, float(known.max()))
 
 
 def compared(
-    place: Place, solver: Solver, errors: Mapping[Place, Batch], other: Place, to: Solver
+    place: MapKey, solver: Solver, errors: Mapping[MapKey, BatchErrors], other: MapKey, to: Solver
 ) -> Comparison:
     """Return what one combination gains over another."""
     before, after = errors[place], errors[other]
-    said = other[0] if to is solver else to.value
+    changed = other[0] if to is solver else to.value
     gains = (gain(by(solver)(getattr(before, n)), by(to)(getattr(after, n))) for n in "tH")
-    return Comparison(*place, solver, said, *gains)
+    return Comparison(*place, solver, changed, *gains)
 
 
 def gain(before: FloatArray, after: FloatArray) -> Gain | None:

@@ -2,11 +2,11 @@
 
 The protocol is the paper's (Success rate): random distortions, each with random starts; a
 calibration succeeds if the sensor's position ends within 2 cm (small) or 5 cm (medium) of the
-truth. All methods get the same readings, map and starts. *One-key* looks for a start in a ball
-around the given one and solves from there: the given start is all that it is told. *Published* is
+truth. All methods get the same readings, map and starts. *One-key* searches for a start in a ball
+around the given one and solves from there: the given start is its only information. *Published* is
 the paper's algorithm, *LM* Levenberg-Marquardt over t, C and H, from the given start itself.
 
-The starts of one distortion share a drive, and the lattice on which one-key looks: what differs
+The starts of one distortion share a drive, and the lattice of one-key's search: what differs
 between them is which of its nodes lie in the ball. Starts whose balls hold the same best nodes
 find the same place and end in the same result, which is then computed once. Starts are therefore
 no independent trials of one-key; distortions, each with a drive and noise of its own, are, given
@@ -28,11 +28,10 @@ from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_a
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import FoundStart, Uncertainty
-from l2m_gtsam.studies.basin.levenberg_marquardt import levenberg_marquardt
-from l2m_gtsam.studies.json_array import JsonBools, JsonFloats
-from l2m_gtsam.studies.methods import published
-from l2m_gtsam.studies.share import Share
+from l2m_gtsam.studies.json_arrays import JsonBools, JsonFloats
+from l2m_gtsam.studies.methods import levenberg_marquardt, published
 from l2m_gtsam.studies.site import Site, SiteDrive, SiteOptions, random_drive
+from l2m_gtsam.studies.statistics import Share
 
 DRIVE, STARTS = 1, 2  # streams of randomness
 
@@ -60,20 +59,18 @@ class BasinOptions(Options):
     site: SiteOptions = SiteOptions()
     """World, map and drives."""
     search: StartOptions = StartOptions()
-    """How one-key looks for its start, around the given one."""
+    """One-key's search for its start, around the given one."""
     solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
-    """How one-key solves. The study looks at places, not at sigmas, which are ten times as much
+    """How one-key solves. The study is of places, not of sigmas, which are ten times as much
     work with the map's full uncertainty."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class RingCell:
     """What came of one distortion and one ring; positions in the lidar frame in metres.
 
     Attributes
     ----------
-    distortion, ring
-        Which cell this is.
     t_true
         Shape (3,).
     t_start
@@ -112,7 +109,7 @@ class Cell:
 class DistortionCells:
     """All rings of one distortion, from the truth outwards."""
 
-    rings: tuple[Cell, ...]
+    rings: tuple[RingCell, ...]
 
 
 @dataclass(frozen=True)
@@ -154,8 +151,6 @@ class BasinTable:
 
     Attributes
     ----------
-    options
-        The study.
     rows
         One per ring from the truth outwards.
     all_small, all_medium
@@ -169,8 +164,8 @@ class BasinTable:
 
 
 @dataclass(frozen=True)
-class Found:
-    """What the search found from N given starts; see ``Cell``.
+class FoundStarts:
+    """What the search found from N given starts; see ``RingCell``.
 
     Attributes
     ----------
@@ -200,7 +195,7 @@ def cells_of(options: BasinOptions, site: Site, distortion: int) -> DistortionCe
     for index, ring in enumerate(rings):
         rows = slice(index * options.starts, (index + 1) * options.starts)
         few = t_start[rows][: options.few_starts]
-        cell = Cell(
+        cell = RingCell(
             distortion=distortion,
             ring=ring,
             t_true=t_true,
@@ -227,13 +222,13 @@ def random_starts(
     return np.asarray(t_true + offset * direction)
 
 
-def search(site: Site, drive: SiteDrive, t_start: FloatArray, options: StartOptions) -> Found:
+def search(site: Site, drive: SiteDrive, t_start: FloatArray, options: StartOptions) -> FoundStarts:
     """Return what one-key finds around each given start, shape (N, 3)."""
     each = find_starts_around(drive.readings, site.field_map, t_start, options)
     found = [starts[0] for starts in each]
     nowhere = FoundStart(np.full(3, np.nan), np.inf, None)
     margin = np.array([(start or nowhere).margin for start in found])
-    return Found(
+    return FoundStarts(
         np.array([(start or nowhere).t_lidar_mag for start in found]),
         np.where(np.isfinite(margin), margin, np.nan),
         np.array([start is not None and start.ambiguous(options.clear) for start in found]),
@@ -274,7 +269,7 @@ def plain_lm(
     return np.array(ends)
 
 
-def basin_table(options: BasinOptions, cells: Sequence[Cell]) -> BasinTable:
+def basin_table(options: BasinOptions, cells: Sequence[RingCell]) -> BasinTable:
     """Return the counts of all cells; rings without any are left out."""
     rings = sorted({each.ring for each in cells})
     rows = [ring_row(options, [each for each in cells if each.ring == ring]) for ring in rings]
@@ -289,7 +284,7 @@ def basin_table(options: BasinOptions, cells: Sequence[Cell]) -> BasinTable:
     )
 
 
-def ring_row(options: BasinOptions, cells: Sequence[Cell]) -> RingRow:
+def ring_row(options: BasinOptions, cells: Sequence[RingCell]) -> RingRow:
     """Return the counts of the cells of one ring."""
     ours = np.concatenate([each.error(each.t_one_key) for each in cells])
     theirs = np.concatenate([each.error(each.t_published) for each in cells])

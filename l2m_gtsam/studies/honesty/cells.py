@@ -2,23 +2,89 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.one_key import solve_one_key
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.studies.bound import bound_at
-from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
-from l2m_gtsam.studies.honesty.outcomes import Outcomes
-from l2m_gtsam.studies.honesty.place import Place, drive_through, start_near
-from l2m_gtsam.studies.honesty.trouble import Disturbed
-from l2m_gtsam.studies.json_array import JsonFloats
+from l2m_gtsam.studies.honesty.drives import (
+    Condition,
+    Disturbed,
+    HonestyOptions,
+    MappedHall,
+    drive_through,
+    start_near,
+)
+from l2m_gtsam.studies.json_arrays import JsonFloats
+from l2m_gtsam.studies.methods import bound_at
 
 PARAMETERS = 16
+OFFSET = slice(15, 16)
+BLOCKS = {"t": slice(0, 3), "C, H": slice(3, 15), "all": slice(0, 15)}
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """What came of N calibrations.
+
+    Attributes
+    ----------
+    error
+        Estimate minus truth of t in metres, C row by row, H in uT and time offset in seconds,
+        NaN where there is none, shape (N, 16).
+    covariance
+        As the calibrations say, not finite for what is undetermined, shape (N, 16, 16).
+    survey
+        Number of the survey of each, shape (N,).
+    """
+
+    error: FloatArray
+    covariance: FloatArray
+    survey: IntArray
+
+    def __len__(self) -> int:
+        return len(self.survey)
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Outcomes]") -> Self:
+        """Return the outcomes of all parts."""
+        return cls(
+            np.concatenate([part.error for part in parts]),
+            np.concatenate([part.covariance for part in parts]),
+            np.concatenate([part.survey for part in parts]),
+        )
+
+    def solved(self) -> "Outcomes":
+        """Return those that have a result."""
+        return self[np.flatnonzero(np.isfinite(self.error).all(axis=1))]
+
+    def determined_rows(self) -> IntArray:
+        """Return the rows of those of which t, C and H have a result and a finite variance."""
+        finite = np.isfinite(self.covariance[:, :15, :15]).all(axis=(1, 2))
+        return np.flatnonzero(finite & np.isfinite(self.error).all(axis=1))
+
+    def determined(self) -> "Outcomes":
+        """Return those of which t, C and H have a result and a finite variance."""
+        return self[self.determined_rows()]
+
+    @property
+    def blocks(self) -> dict[str, slice]:
+        """Parameters to judge together by name; the time offset where all of these know it."""
+        timed = len(self) > 0 and bool(np.isfinite(self.covariance[:, OFFSET, OFFSET]).all())
+        return BLOCKS | ({"offset": OFFSET} if timed else {})
+
+    @property
+    def enough(self) -> bool:
+        """Whether these are of more than one survey."""
+        return len(np.unique(self.survey)) > 1
+
+    def __getitem__(self, rows: IntArray) -> "Outcomes":
+        return Outcomes(self.error[rows], self.covariance[rows], self.survey[rows])
 
 
 @dataclass(frozen=True)
@@ -38,7 +104,7 @@ class Stated:
 
 
 @dataclass(frozen=True)
-class Cell:
+class HonestyCell:
     """What came of the drives through one hall.
 
     Attributes
@@ -66,21 +132,21 @@ class Cell:
         return Outcomes(stated.error, stated.covariance, survey)
 
 
-def cell_of(options: HonestyOptions, place: Place, condition: Condition) -> Cell:
+def cell_of(options: HonestyOptions, hall: MappedHall, condition: Condition) -> HonestyCell:
     """Calibrate on all drives through a hall."""
-    drives = [drive_through(options, place, condition, n) for n in range(options.drives)]
-    return Cell(
+    drives = [drive_through(options, hall, condition, n) for n in range(options.drives)]
+    return HonestyCell(
         condition=condition,
-        noise=place.noise,
-        survey=place.seed,
-        full=stated_by(options, place, drives, Uncertainty.FULL),
-        independent=stated_by(options, place, drives, Uncertainty.INDEPENDENT),
-        bound=np.stack([bound_of(place, drive, options.solve) for drive in drives]),
+        noise=hall.noise,
+        survey=hall.seed,
+        full=stated_by(options, hall, drives, Uncertainty.FULL),
+        independent=stated_by(options, hall, drives, Uncertainty.INDEPENDENT),
+        bound=np.stack([bound_of(hall, drive, options.solve) for drive in drives]),
     )
 
 
 def stated_by(
-    options: HonestyOptions, place: Place, drives: Sequence[Disturbed], uncertainty: Uncertainty
+    options: HonestyOptions, hall: MappedHall, drives: Sequence[Disturbed], uncertainty: Uncertainty
 ) -> Stated:
     """Return what calibrations of drives of one sensor say."""
     solve = options.solve.model_copy(update={"uncertainty": uncertainty})
@@ -88,9 +154,9 @@ def stated_by(
     covariance = np.full((len(drives), PARAMETERS, PARAMETERS), np.nan)
     for number, disturbed in enumerate(drives):
         drive = disturbed.drive
-        start = start_near(drive, place.seed, number, options.start)
+        start = start_near(drive, hall.seed, number, options.start)
         solution = solve_one_key(
-            drive.readings, place.field_map, start, solve, trajectory=drive.trajectory
+            drive.readings, hall.field_map, start, solve, trajectory=drive.trajectory
         )
         for found in solution.solved:
             vector = np.append(solution.estimate.vector(0), solution.estimate.offset[0])
@@ -99,7 +165,7 @@ def stated_by(
     return Stated(error, covariance)
 
 
-def bound_of(place: Place, disturbed: Disturbed, options: OneKeyOptions) -> FloatArray:
+def bound_of(hall: MappedHall, disturbed: Disturbed, options: OneKeyOptions) -> FloatArray:
     """Return the Cramer-Rao bound of the full model for one sensor, shape (16, 16).
 
     Of the readings that are not spoilt, which the solve has to find out by itself; see
@@ -109,8 +175,8 @@ def bound_of(place: Place, disturbed: Disturbed, options: OneKeyOptions) -> Floa
     readings = drive.readings.select(disturbed.change == 0)
     if readings.motion is not None:
         readings = with_offsets(readings, drive.trajectory, drive.offset)
-    truth = true_estimate(drive.truth(), place.noise)
-    return bound_at(readings, place.field_map, truth, options)
+    truth = true_estimate(drive.truth(), hall.noise)
+    return bound_at(readings, hall.field_map, truth, options)
 
 
 def true_estimate(truth: FloatArray, noise: float) -> Estimate:

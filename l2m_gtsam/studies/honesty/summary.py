@@ -8,14 +8,16 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.studies.honesty.cells import Cell
-from l2m_gtsam.studies.honesty.conditions import Condition, HonestyOptions
-from l2m_gtsam.studies.honesty.outcomes import OFFSET, Honesty, Outcomes, honesty
+from l2m_gtsam.studies.honesty.cells import OFFSET, HonestyCell, Outcomes
+from l2m_gtsam.studies.honesty.drives import Condition, HonestyOptions
 from l2m_gtsam.studies.statistics import (
+    LEVEL,
     Band,
     chi_square_band,
     clustered_mean,
+    ellipsoid_coverage,
     inside_interval,
+    nees,
     wilson_interval,
 )
 
@@ -33,11 +35,81 @@ EDGES = np.linspace(-4.0, 4.0, 17)  # of the histograms of z-scores
 
 
 @dataclass(frozen=True)
+class Consistency:
+    """Whether the covariance of some parameters is true.
+
+    Attributes
+    ----------
+    dof
+        Number of the parameters: what the NEES is expected to be.
+    nees
+        Mean over all calibrations.
+    standard_error
+        Of that mean, surveys being independent.
+    band
+        Of chi-square, for as many independent calibrations as leave the mean equally unsure.
+    narrow
+        Of chi-square, had no two calibrations anything in common.
+    coverage, coverage_band
+        Of the 95 % ellipsoid, with Wilson's interval for the effective number.
+    """
+
+    dof: int
+    nees: float
+    standard_error: float
+    band: Band
+    narrow: Band
+    coverage: float
+    coverage_band: Band
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the mean NEES is in its band."""
+        return self.nees in self.band
+
+    @property
+    def coverage_true(self) -> bool:
+        """Whether the interval of the coverage holds 95 %."""
+        return LEVEL in self.coverage_band
+
+    def __str__(self) -> str:
+        mark = "in" if self.consistent else "OUT of"
+        return (
+            f"NEES {self.nees:8.2f} +- {self.standard_error:<6.2f} {mark} {self.band!s:<10}"
+            f" (independent: {self.narrow!s}),"
+            f" 95 % ellipsoid holds {100 * self.coverage:5.1f} % ({self.coverage_band!s})"
+        )
+
+
+def consistency(outcomes: Outcomes, block: slice) -> Consistency:
+    """Return whether the covariances of a block of the parameters are true.
+
+    Raises
+    ------
+    ValueError
+        If the outcomes are of fewer than two surveys.
+    """
+    dof = block.stop - block.start
+    values = nees(outcomes.error[:, block], outcomes.covariance[:, block, block])
+    mean = clustered_mean(values, outcomes.survey)
+    covered = clustered_mean(ellipsoid_coverage(values, dof), outcomes.survey)
+    return Consistency(
+        dof,
+        mean.mean,
+        mean.standard_error,
+        chi_square_band(dof, mean.effective),
+        chi_square_band(dof, len(values)),
+        covered.mean,
+        wilson_interval(covered.mean, covered.effective),
+    )
+
+
+@dataclass(frozen=True)
 class BlockRow:
     """Whether the covariance of a block is true: t, (C, H), all of these, or the time offset."""
 
     name: str
-    honesty: Honesty
+    honesty: Consistency
 
 
 @dataclass(frozen=True)
@@ -46,8 +118,6 @@ class ParameterRow:
 
     Attributes
     ----------
-    name
-        Of the parameter.
     z_std, z_band
         Root mean square of the z-scores, and where it must lie with 95 %; surveys being
         independent.
@@ -61,6 +131,16 @@ class ParameterRow:
     z_band: Band
     covered: float
     interval: Band
+
+    @property
+    def spread_true(self) -> bool:
+        """Whether the spread of the z-scores is in its band."""
+        return self.z_std in self.z_band
+
+    @property
+    def coverage_true(self) -> bool:
+        """Whether the interval of the coverage holds 95 %."""
+        return LEVEL in self.interval
 
 
 @dataclass(frozen=True)
@@ -94,7 +174,7 @@ class Histogram:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ConsistencyVerdict:
     """One condition at one noise level, with one way to count the map's errors.
 
     Attributes
@@ -120,9 +200,20 @@ class Verdict:
     histograms: tuple[Histogram, ...]
 
     @property
-    def honest(self) -> bool:
+    def consistent(self) -> bool:
         """Whether the NEES of every block is in its band."""
-        return bool(self.blocks) and all(row.honesty.honest for row in self.blocks)
+        return bool(self.blocks) and all(row.honesty.consistent for row in self.blocks)
+
+    def sides(self) -> dict[str, list[BlockRow]]:
+        """Return the blocks by where their NEES lies, in the words of the page."""
+        sides = ("in band", "above it (sigmas too small)", "below it (sigmas too large)")
+        found: dict[str, list[BlockRow]] = {side: [] for side in sides}
+        for row in self.blocks:
+            each = row.honesty
+            found[sides[0 if each.consistent else 1 if each.nees > each.band.high else 2]].append(
+                row
+            )
+        return found
 
 
 @dataclass(frozen=True)
@@ -130,9 +221,9 @@ class HonestySummary:
     """The study's outcome: verdicts by condition and noise, full before independent."""
 
     options: HonestyOptions
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[ConsistencyVerdict, ...]
 
-    def of(self, uncertainty: Uncertainty) -> tuple[Verdict, ...]:
+    def of(self, uncertainty: Uncertainty) -> tuple[ConsistencyVerdict, ...]:
         """Return the verdicts on one way to count the map's errors."""
         return tuple(each for each in self.verdicts if each.uncertainty is uncertainty)
 
@@ -143,7 +234,7 @@ def settings(options: HonestyOptions) -> tuple[tuple[Condition, float], ...]:
     return (*clean, *product([Condition.TROUBLED], options.troubled_noises))
 
 
-def honesty_summary(options: HonestyOptions, cells: Sequence[Cell]) -> HonestySummary:
+def honesty_summary(options: HonestyOptions, cells: Sequence[HonestyCell]) -> HonestySummary:
     """Return the verdicts on all cells."""
     verdicts = []
     for condition, noise in settings(options):
@@ -152,7 +243,7 @@ def honesty_summary(options: HonestyOptions, cells: Sequence[Cell]) -> HonestySu
     return HonestySummary(options, tuple(verdicts))
 
 
-def verdict(cells: Sequence[Cell], uncertainty: Uncertainty) -> Verdict:
+def verdict(cells: Sequence[HonestyCell], uncertainty: Uncertainty) -> ConsistencyVerdict:
     """Return the verdict on the cells of one condition at one noise level."""
     outcomes = Outcomes.joined([cell.outcomes(uncertainty) for cell in cells])
     bound = np.concatenate([cell.bound for cell in cells])
@@ -162,14 +253,14 @@ def verdict(cells: Sequence[Cell], uncertainty: Uncertainty) -> Verdict:
     judged, bound = outcomes[rows], bound[rows]
     names = tuple(judged.blocks) if judged.enough else ()
     groups = [g for g in GROUPS if names and (g != "offset" or g in names)]
-    return Verdict(
+    return ConsistencyVerdict(
         condition=cells[0].condition,
         noise=cells[0].noise,
         uncertainty=uncertainty,
         wanted=len(outcomes),
         solved=len(outcomes.solved()),
         determined=len(judged),
-        blocks=tuple(BlockRow(n, honesty(judged, judged.blocks[n])) for n in names),
+        blocks=tuple(BlockRow(n, consistency(judged, judged.blocks[n])) for n in names),
         parameters=tuple(row for g in groups for row in parameter_rows(judged, GROUPS[g])),
         bounds=tuple(
             bound_row(g, judged, bound)

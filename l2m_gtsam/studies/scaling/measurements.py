@@ -4,9 +4,11 @@ Each quantity is grown while the others stay as they are. Times are those of one
 time), but for those of several workers.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
+import numpy as np
 from pydantic import Field
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
@@ -16,11 +18,16 @@ from l2m_gtsam.recording.sync import SyncOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
+from l2m_gtsam.simulate.sensors import (
+    MappingSuiteOptions,
+    NoiseOptions,
+    SamplingOptions,
+    SensorArrayOptions,
+)
 from l2m_gtsam.studies.site import SiteOptions
 
 
-class Part(StrEnum):
+class Quantity(StrEnum):
     """A quantity that is grown; its value is what page and figures call it."""
 
     READINGS = "readings"
@@ -29,7 +36,7 @@ class Part(StrEnum):
     WORKERS = "workers"
 
 
-class Way(StrEnum):
+class TimedTask(StrEnum):
     """What is timed."""
 
     POINT = "ours, values"
@@ -85,8 +92,8 @@ class ScalingOptions(Options):
     small_site: SiteOptions = SiteOptions(
         scenario=ScenarioOptions(
             floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
-            suite=SuiteOptions(lateral=(0.0,)),
-            array=ArrayOptions(count=1),
+            suite=MappingSuiteOptions(lateral=(0.0,)),
+            array=SensorArrayOptions(count=1),
             noise=NoiseOptions(field=0.2),
             calibration_route=CalibrationRouteOptions(turns=1),
             calibration_sampling=SamplingOptions(field_rate=20.0),
@@ -94,7 +101,7 @@ class ScalingOptions(Options):
     )
     """Where workers calibrate: each number of them makes its map anew."""
     search: StartOptions = StartOptions()
-    """How starts are looked for."""
+    """Search for starts."""
     solve: OneKeyOptions = OneKeyOptions()
     """How calibrations are solved, but for how they count the map's errors."""
 
@@ -105,10 +112,6 @@ class Measurement:
 
     Attributes
     ----------
-    part
-        The quantity that is grown.
-    way
-        What is timed.
     size
         The quantity: readings, sensors, readings of the survey, or workers.
     seconds
@@ -117,8 +120,8 @@ class Measurement:
         By how much memory grew meanwhile, at most; absent where it is not known.
     """
 
-    part: Part
-    way: Way
+    part: Quantity
+    way: TimedTask
     size: int
     seconds: float
     peak_mib: float | None = None
@@ -129,3 +132,127 @@ class ScalingCell:
     """What was measured at one size."""
 
     measurements: tuple[Measurement, ...]
+
+
+STEEP = 3  # the largest sizes, of which the exponent is taken: small ones cost what is fixed
+
+
+@dataclass(frozen=True)
+class Curve:
+    """How time grows with one quantity.
+
+    Attributes
+    ----------
+    points
+        From the smallest size to the largest.
+    exponent
+        Slope of log time over log size through the largest sizes; absent for a single size.
+    """
+
+    part: Quantity
+    way: TimedTask
+    points: tuple[Measurement, ...]
+    exponent: float | None
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """How many times as long the peer takes as what it is compared with.
+
+    Attributes
+    ----------
+    size
+        The largest that both were measured at.
+    """
+
+    part: Quantity
+    way: TimedTask
+    peer: TimedTask
+    size: int
+    times: float
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What several workers gain.
+
+    Attributes
+    ----------
+    times
+        The time of one worker over theirs, for computing alone.
+    started
+        The same with the start of the workers and what they prepare.
+    """
+
+    workers: int
+    times: float
+    started: float
+
+
+@dataclass(frozen=True)
+class ScalingTable:
+    """The study's outcome."""
+
+    options: ScalingOptions
+    curves: tuple[Curve, ...]
+    ratios: tuple[Ratio, ...]
+    speeds: tuple[Speed, ...]
+
+
+PEERS = {
+    Quantity.READINGS: TimedTask.NUMERIC,
+    Quantity.SENSORS: TimedTask.NUMERIC,
+    Quantity.SURVEY: TimedTask.DENSE,
+}
+
+
+def scaling_table(options: ScalingOptions, measured: Iterable[Measurement]) -> ScalingTable:
+    """Return curves, ratios and speeds of all measurements."""
+    points = sorted(measured, key=lambda each: each.size)
+    curves = []
+    for part in Quantity:
+        for task in TimedTask:
+            own = tuple(each for each in points if (each.part, each.way) == (part, task))
+            if own:
+                curves.append(Curve(part, task, own, exponent(own)))
+    found = [ratio(curve, peer_of(curves, curve.part)) for curve in curves]
+    return ScalingTable(
+        options, tuple(curves), tuple(each for each in found if each is not None), speeds(curves)
+    )
+
+
+def exponent(points: tuple[Measurement, ...]) -> float | None:
+    """Return how steep the largest of some points, in order of size, lie in logarithms."""
+    last = points[-STEEP:]
+    if len({each.size for each in last}) < 2:
+        return None
+    size, seconds = np.log([[each.size, each.seconds] for each in last]).T
+    return float(np.polyfit(size, seconds, 1)[0])
+
+
+def peer_of(curves: Iterable[Curve], part: Quantity) -> Curve | None:
+    """Return the peer's curve for a quantity, if there is one."""
+    wanted = (part, PEERS.get(part))
+    return next((each for each in curves if (each.part, each.way) == wanted), None)
+
+
+def ratio(curve: Curve, peer: Curve | None) -> Ratio | None:
+    """Return how much longer the peer takes; nothing for the peer itself and without a peer."""
+    if peer is None or curve.way is peer.way:
+        return None
+    ours = {each.size: each.seconds for each in curve.points}
+    both = [each for each in peer.points if each.size in ours]
+    if not both:
+        return None
+    last = both[-1]
+    return Ratio(curve.part, curve.way, peer.way, last.size, last.seconds / ours[last.size])
+
+
+def speeds(curves: Iterable[Curve]) -> tuple[Speed, ...]:
+    """Return what each number of workers gains over the fewest."""
+    of = {each.way: each.points for each in curves if each.part is Quantity.WORKERS}
+    alone, started = of.get(TimedTask.BATCH, ()), of.get(TimedTask.STARTED, ())
+    return tuple(
+        Speed(a.size, alone[0].seconds / a.seconds, started[0].seconds / s.seconds)
+        for a, s in zip(alone, started, strict=True)
+    )

@@ -1,7 +1,10 @@
 """The measurements of the scaling study within one process."""
 
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
+from time import process_time
 
 import numpy as np
 
@@ -19,13 +22,15 @@ from l2m_gtsam.simulate.drive import drive
 from l2m_gtsam.simulate.recorder import Vehicle, record
 from l2m_gtsam.simulate.route import calibration_route
 from l2m_gtsam.simulate.sensors import random_array
-from l2m_gtsam.studies.fingerprints import around
-from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
-from l2m_gtsam.studies.scaling.numeric_peer import numeric_least_squares
-from l2m_gtsam.studies.scaling.stopwatch import taken
-from l2m_gtsam.studies.site import Surveyed
+from l2m_gtsam.studies.methods import numeric_least_squares
+from l2m_gtsam.studies.scaling.measurements import Measurement, Quantity, ScalingOptions, TimedTask
+from l2m_gtsam.studies.site import SurveyedSite, around
 
-KINDS = {Way.HARMONIC: "harmonic", Way.SLIDING: "sliding_gp", Way.DENSE: "dense_gp"}
+KINDS = {
+    TimedTask.HARMONIC: "harmonic",
+    TimedTask.SLIDING: "sliding_gp",
+    TimedTask.DENSE: "dense_gp",
+}
 WARM = 200  # readings that pass everywhere on the drive
 SENSORS, ROUTE = 1, 2  # streams of randomness
 
@@ -36,8 +41,6 @@ class MappedDrive:
 
     Attributes
     ----------
-    field_map
-        The map.
     readings
         Of all sensors.
     t_true
@@ -59,17 +62,13 @@ class MappedDrive:
         return replace(self, readings=spread(self.readings, most))
 
 
-def mapped_drive(options: ScalingOptions, site: Surveyed, sensors: int, rate: float) -> MappedDrive:
+def mapped_drive(
+    options: ScalingOptions, site: SurveyedSite, sensors: int, rate: float
+) -> MappedDrive:
     """Return a drive with the first sensors of the site's array, and the map around it.
 
     Parameters
     ----------
-    options
-        The study.
-    site
-        World and survey.
-    sensors
-        How many.
     rate
         Readings of each per second.
     """
@@ -90,7 +89,7 @@ def mapped_drive(options: ScalingOptions, site: Surveyed, sensors: int, rate: fl
 def warmed(options: ScalingOptions, work: MappedDrive) -> MappedDrive:
     """Return a drive on whose map something was calibrated before.
 
-    A map makes ready what it is asked for the first time, which may take longer than the rest;
+    A map prepares tiles at their first query, which may take longer than the rest;
     compiled functions are loaded.
     """
     for uncertainty in Uncertainty:
@@ -99,18 +98,18 @@ def warmed(options: ScalingOptions, work: MappedDrive) -> MappedDrive:
 
 
 def measured_solves(
-    options: ScalingOptions, part: Part, size: int, work: MappedDrive, numeric: bool
+    options: ScalingOptions, part: Quantity, size: int, work: MappedDrive, numeric: bool
 ) -> tuple[Measurement, ...]:
     """Time our method, without and with the map's shared errors, and the peer where wanted."""
-    tasks: dict[Way, Callable[[], object]] = {
-        Way.POINT: lambda: solved(options, work, Uncertainty.INDEPENDENT),
-        Way.FULL: lambda: solved(options, work, Uncertainty.FULL),
+    tasks: dict[TimedTask, Callable[[], object]] = {
+        TimedTask.POINT: lambda: solved(options, work, Uncertainty.INDEPENDENT),
+        TimedTask.FULL: lambda: solved(options, work, Uncertainty.FULL),
     }
     if numeric:
-        tasks[Way.NUMERIC] = lambda: numeric_least_squares(
+        tasks[TimedTask.NUMERIC] = lambda: numeric_least_squares(
             work.readings, work.field_map, work.t_true
         )
-    took = {way: taken(task, options.rounds, options.long) for way, task in tasks.items()}
+    took = {task: taken(call, options.rounds, options.long) for task, call in tasks.items()}
     return tuple(
         Measurement(part, w, size, each.seconds, each.peak_mib) for w, each in took.items()
     )
@@ -124,18 +123,20 @@ def solved(options: ScalingOptions, work: MappedDrive, uncertainty: Uncertainty)
     return solve_one_key(work.readings, work.field_map, np.array(starts), chosen)
 
 
-def measured_map(options: ScalingOptions, way: Way, size: int, site: Surveyed) -> Measurement:
+def measured_map(
+    options: ScalingOptions, task: TimedTask, size: int, site: SurveyedSite
+) -> Measurement:
     """Time how a map is made of the readings next to the middle of the hall."""
     part = replace(site, survey=middle(site.survey, size))
-    chosen = map_options(options.site.mapping.model, way)
+    chosen = map_options(options.site.mapping.model, task)
     took = taken(lambda: part.map(chosen), options.rounds, options.long)
-    return Measurement(Part.SURVEY, way, len(part.survey), took.seconds, took.peak_mib)
+    return Measurement(Quantity.SURVEY, task, len(part.survey), took.seconds, took.peak_mib)
 
 
-def map_options(base: MapOptions, way: Way) -> MapOptions:
+def map_options(base: MapOptions, task: TimedTask) -> MapOptions:
     """Return the options of a kind of map; the dense process gets every reading."""
     dense = base.dense_gp.model_copy(update={"thinning": ThinningOptions(spacing=0.0)})
-    return base.model_copy(update={"kind": KINDS[way], "dense_gp": dense})
+    return base.model_copy(update={"kind": KINDS[task], "dense_gp": dense})
 
 
 def middle(survey: TrainingSet, most: int) -> TrainingSet:
@@ -144,3 +145,72 @@ def middle(survey: TrainingSet, most: int) -> TrainingSet:
     centre = (places.min(axis=0) + places.max(axis=0)) / 2
     away = np.abs(places - centre).max(axis=1)
     return survey[np.sort(np.argsort(away, kind="stable")[:most])]
+
+
+STATUS, REFERENCES = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+FORGET_PEAK = "5"  # see proc(5)
+KIB_PER_MIB = 1024
+
+
+@dataclass(frozen=True)
+class Taken:
+    """What a piece of work took.
+
+    Attributes
+    ----------
+    seconds
+        Processor time of this process.
+    peak_mib
+        By how much its memory grew at most, MiB; absent where the system does not report it.
+    """
+
+    seconds: float
+    peak_mib: float | None
+
+
+def taken(work: Callable[[], object], rounds: int, long: float) -> Taken:
+    """Return the least time of some rounds, and the peak of memory in the first.
+
+    Parameters
+    ----------
+    rounds
+        How often at most.
+    long
+        Work that takes so many seconds is not repeated.
+    """
+    gc.collect()  # what earlier work left would be freed meanwhile, and hide what this takes
+    before = _memory("VmRSS") if _forget_peak() else None
+    seconds = timed(work)
+    after = _memory("VmHWM")
+    peak = None if before is None or after is None else max(after - before, 0.0)
+    for _ in range(rounds - 1):
+        if seconds >= long:
+            break
+        seconds = min(seconds, timed(work))
+    return Taken(seconds, peak)
+
+
+def timed(work: Callable[[], object]) -> float:
+    """Return the processor time of a piece of work in seconds."""
+    start = process_time()
+    work()
+    return process_time() - start
+
+
+def _forget_peak() -> bool:
+    """Start counting the peak of this process' memory anew; return whether that is possible."""
+    try:
+        REFERENCES.write_text(FORGET_PEAK, encoding="ascii")
+    except OSError:
+        return False
+    return True
+
+
+def _memory(name: str) -> float | None:
+    """Return an entry of this process' status in MiB, if the system has it."""
+    try:
+        lines = STATUS.read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    found = [line for line in lines if line.startswith(f"{name}:")]
+    return float(found[0].split()[1]) / KIB_PER_MIB if found else None

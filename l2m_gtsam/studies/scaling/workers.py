@@ -1,7 +1,7 @@
 """A batch of calibrations on a number of local workers, timed: a process of its own.
 
-A cell of a study may be computed by a worker that must not start workers of its own; what stands
-here therefore runs as a program, which is given options and prints what it measured.
+A cell of a study may be computed by a worker that must not start workers of its own; this module
+therefore runs as a program, which is given options and prints what it measured.
 """
 
 import os
@@ -20,12 +20,12 @@ from l2m_gtsam.errors import ClusterError
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.studies.scaling.measurements import Measurement, Part, ScalingOptions, Way
+from l2m_gtsam.studies.scaling.measurements import Measurement, Quantity, ScalingOptions, TimedTask
 from l2m_gtsam.studies.site import Site, mapped_site, random_drive
 
 
-class Batch(Options):
-    """What the program is told."""
+class WorkerBatch(Options):
+    """Input of the program."""
 
     options: ScalingOptions
     workers: int
@@ -48,17 +48,17 @@ def measured_workers(options: ScalingOptions, workers: int) -> tuple[Measurement
     ClusterError
         The program ended with an error.
     """
-    told = Batch(options=options, workers=workers).model_dump_json()
+    batch = WorkerBatch(options=options, workers=workers).model_dump_json()
     program = [sys.executable, "-c", f"from {__name__} import main; main()"]
     # Our own program: nothing that it is called with comes from outside.
-    ran = subprocess.run(program, input=told, capture_output=True, text=True, check=False)  # noqa: S603
+    ran = subprocess.run(program, input=batch, capture_output=True, text=True, check=False)  # noqa: S603
     if ran.returncode:
         reason = (ran.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise ClusterError(f"a batch on {workers} workers failed: {reason}")
     return TypeAdapter(tuple[Measurement, ...]).validate_json(ran.stdout)
 
 
-def batch_measurements(batch: Batch) -> tuple[Measurement, ...]:
+def batch_measurements(batch: WorkerBatch) -> tuple[Measurement, ...]:
     """Compute a batch, and return its time with and without the start of the workers."""
     options = batch.options
     work = Work(lambda key: "small", partial(place, options), partial(stint, options))
@@ -68,8 +68,8 @@ def batch_measurements(batch: Batch) -> tuple[Measurement, ...]:
     whole = time.monotonic() - begin
     alone = options.calibrations / rate(stints)
     return (
-        Measurement(Part.WORKERS, Way.BATCH, batch.workers, alone),
-        Measurement(Part.WORKERS, Way.STARTED, batch.workers, whole),
+        Measurement(Quantity.WORKERS, TimedTask.BATCH, batch.workers, alone),
+        Measurement(Quantity.WORKERS, TimedTask.STARTED, batch.workers, whole),
     )
 
 
@@ -113,6 +113,6 @@ def steady_rate(own: list[Stint]) -> float:
 
 def main() -> None:
     """Read a batch as JSON, compute it, and print the measurements as JSON."""
-    batch = Batch.model_validate_json(sys.stdin.read())
+    batch = WorkerBatch.model_validate_json(sys.stdin.read())
     measured = batch_measurements(batch)
     print(TypeAdapter(tuple[Measurement, ...]).dump_json(measured).decode())

@@ -2,9 +2,9 @@
 
 One survey of a warehouse gives the maps; its noise stays while that of the sensors to calibrate
 changes, as the paper adds noise to these alone. Each cell is one drive: a path, a noise level and
-a sensor of random place and distortion. Our full method runs from all starts. As it looks for the
-sensor around each start first, starts from which it finds the same place share one solve. The
-other methods run from fewer starts on the first few drives of each path.
+a sensor of random place and distortion. Our full method runs from all starts. As it searches
+around each start first, starts from which it finds the same place share one solve. The other
+methods run from fewer starts on the first few drives of each path.
 """
 
 from dataclasses import dataclass, field
@@ -22,11 +22,11 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.route import RouteShape
 from l2m_gtsam.simulate.scenario import ScenarioOptions
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions
-from l2m_gtsam.studies.bound import cramer_rao
-from l2m_gtsam.studies.json_array import JsonFloats
-from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_map
-from l2m_gtsam.studies.site import SiteDrive, SiteOptions, Surveyed, random_drive, surveyed
+from l2m_gtsam.simulate.sensors import NoiseOptions, SamplingOptions, SensorArrayOptions
+from l2m_gtsam.studies.json_arrays import JsonFloats
+from l2m_gtsam.studies.methods import cramer_rao
+from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_map
+from l2m_gtsam.studies.site import SiteDrive, SiteOptions, SurveyedSite, random_drive, surveyed
 from l2m_gtsam.studies.table1.methods import (
     HARMONIC,
     MAGYC,
@@ -36,7 +36,7 @@ from l2m_gtsam.studies.table1.methods import (
     OURS,
     SLIDING,
     THINNED,
-    Found,
+    MethodResult,
     from_each,
     magyc,
     naive,
@@ -61,7 +61,7 @@ class Table1Options(Options):
         RouteShape.SLALOM,
         RouteShape.WANDER,
     )
-    """What drives look like; the rows of the paper's table in its order."""
+    """Shapes of the drives; the rows of the paper's table in its order."""
     distortions: int = Field(default=50, ge=1)
     """Sensors of random place and distortion on each path at each noise, each on its own drive."""
     starts: int = Field(default=50, ge=1)
@@ -79,14 +79,14 @@ class Table1Options(Options):
     """On the first so many drives of each path and noise the Cramer-Rao bound is computed."""
     site: SiteOptions = SiteOptions(
         scenario=ScenarioOptions(
-            array=ArrayOptions(count=1),
+            array=SensorArrayOptions(count=1),
             noise=NoiseOptions(field=0.05),
             calibration_sampling=SamplingOptions(field_rate=20.0),
         )
     )
     """World, survey and drives."""
     search: StartOptions = StartOptions()
-    """How one-key looks for its start."""
+    """One-key's search for its start."""
     solve: OneKeyOptions = OneKeyOptions(uncertainty=Uncertainty.INDEPENDENT)
     """How one-key solves: the table is of estimates, not of sigmas."""
     naive: NaiveOptions = NaiveOptions()
@@ -94,26 +94,24 @@ class Table1Options(Options):
 
 
 @dataclass(frozen=True)
-class Place:
+class SurveyedWarehouse:
     """A surveyed warehouse.
 
     Attributes
     ----------
-    site
-        World and survey.
     maps
         Of the survey, by kind.
     naive
         What the naive peer makes of the survey on the paths that it was asked for.
     """
 
-    site: Surveyed
+    site: SurveyedSite
     maps: dict[str, QueryableMap]
     naive: dict[RouteShape, NaiveMap] = field(default_factory=dict)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The naive peer's maps are fifty times as large as all others together.
-        return Place, (self.site, self.maps)
+        return SurveyedWarehouse, (self.site, self.maps)
 
     def naive_map(self, path: RouteShape, drive: SiteDrive, options: NaiveOptions) -> NaiveMap:
         """Return the naive peer's map around a path, made from its first drive."""
@@ -129,8 +127,6 @@ class Ends:
 
     Attributes
     ----------
-    method, map_kind
-        What was done.
     t, C, H
         Norms of the errors, in metres, Frobenius, and microtesla; NaN without a result,
         shape (N,).
@@ -156,15 +152,11 @@ class Table1Cell:
         In microtesla.
     path
         Its shape.
-    readings
-        Number of readings.
     places
         Distinct places from which one-key solved.
     bound
         Root of the bound's trace over t (m), C, and H (uT), shape (3,); empty where it was not
         computed.
-    ends
-        All methods.
     """
 
     noise: float
@@ -175,21 +167,21 @@ class Table1Cell:
     ends: tuple[Ends, ...]
 
 
-def prepare(options: Table1Options) -> Place:
+def prepare(options: Table1Options) -> SurveyedWarehouse:
     """Survey the warehouse and make its maps."""
     site = surveyed(options.site)
-    return Place(site, {kind: site.map(MapOptions(kind=kind)) for kind in (HARMONIC, SLIDING)})
+    return SurveyedWarehouse(
+        site, {kind: site.map(MapOptions(kind=kind)) for kind in (HARMONIC, SLIDING)}
+    )
 
 
-def compute(options: Table1Options, place: Place, level: int, row: int, number: int) -> Table1Cell:
+def compute(
+    options: Table1Options, place: SurveyedWarehouse, level: int, row: int, number: int
+) -> Table1Cell:
     """Calibrate the sensor of one drive by all methods.
 
     Parameters
     ----------
-    options
-        The study.
-    place
-        Where.
     level, row, number
         Which noise, which path, which of their drives.
     """
@@ -217,7 +209,7 @@ def compute(options: Table1Options, place: Place, level: int, row: int, number: 
 
 
 def other_ends(
-    drive: SiteDrive, place: Place, t_start: FloatArray, options: Table1Options
+    drive: SiteDrive, place: SurveyedWarehouse, t_start: FloatArray, options: Table1Options
 ) -> list[Ends]:
     """Return where the paper's methods end on both maps, and ours on the paper's."""
     ends = [
@@ -229,7 +221,7 @@ def other_ends(
     return [*ends, ends_of(OURS, SLIDING, drive, found)]
 
 
-def ends_of(method: str, map_kind: str, drive: SiteDrive, found: Found) -> Ends:
+def ends_of(method: str, map_kind: str, drive: SiteDrive, found: MethodResult) -> Ends:
     """Return how far ends are from the truth."""
     sensor = drive.sensor
     truth = np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])

@@ -13,9 +13,9 @@ from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts_a
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
+from l2m_gtsam.studies.magyc_peer import ChipDrive, magyc_peer, magyc_python
 from l2m_gtsam.studies.methods import published, two_step
-from l2m_gtsam.studies.peers.magyc import ChipDrive, magyc_peer, magyc_python
-from l2m_gtsam.studies.peers.naive import NaiveMap, NaiveOptions, naive_peer
+from l2m_gtsam.studies.naive_peer import NaiveMap, NaiveOptions, naive_peer
 
 OURS, NAIVE, MAGYC = "one-key", "naive peer", "magyc"
 HARMONIC, SLIDING, THINNED, NO_MAP = "harmonic", "sliding_gp", "thinned GP", "none"
@@ -25,7 +25,7 @@ Solver = Callable[[Readings, QueryableMap, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
-class Found:
+class MethodResult:
     """Where a method ended from N starts.
 
     Attributes
@@ -69,27 +69,27 @@ OTHERS: dict[str, Solver] = {
 
 def from_each(
     solve: Solver, readings: Readings, field_map: QueryableMap, t_start: FloatArray
-) -> Found:
+) -> MethodResult:
     """Return where a method ends from each start, shape (N, 3)."""
     begin = process_time()
     ends = np.array([solve(readings, field_map, t) for t in t_start])
-    return Found(ends, len(t_start), (process_time() - begin) / len(t_start))
+    return MethodResult(ends, len(t_start), (process_time() - begin) / len(t_start))
 
 
 def naive(
     readings: Readings, field_map: NaiveMap, t_start: FloatArray, options: NaiveOptions
-) -> Found:
+) -> MethodResult:
     """Return where the naive peer ends from each start, shape (N, 3)."""
     begin = process_time()
     ends = [naive_peer(readings, field_map, t, options) for t in t_start]
     vector = np.array([np.concatenate([end.t, end.C.ravel(), end.H]) for end in ends])
-    return Found(vector, len(ends), (process_time() - begin) / len(ends))
+    return MethodResult(vector, len(ends), (process_time() - begin) / len(ends))
 
 
-def magyc(readings: Readings, C: FloatArray) -> Found:
-    """Return what magyc says of H on one drive; it looks for no place, and C only up to a turn.
+def magyc(readings: Readings, C: FloatArray) -> MethodResult:
+    """Return magyc's estimate of H on one drive; it finds no place, and C only up to a turn.
 
-    It takes the turn rates along the chip's axes, which the truth C, shape (3, 3), tells it.
+    It needs the turn rates along the chip's axes, which follow from the true C, shape (3, 3).
 
     Raises
     ------
@@ -99,7 +99,7 @@ def magyc(readings: Readings, C: FloatArray) -> Found:
     R_mag_lidar = np.asarray(polar(C)[0])
     (estimate,) = magyc_peer([ChipDrive(readings, R_mag_lidar)], magyc_python())
     vector = np.concatenate([estimate.t, estimate.C.ravel(), estimate.H])
-    return Found(vector[None], 1, estimate.seconds)
+    return MethodResult(vector[None], 1, estimate.seconds)
 
 
 def one_key(
@@ -108,7 +108,7 @@ def one_key(
     t_start: FloatArray,
     search: StartOptions,
     options: OneKeyOptions,
-) -> Found:
+) -> MethodResult:
     """Return where the full method ends from each start, shape (N, 3).
 
     Starts from which the search finds the same place share the solve from there.
@@ -117,7 +117,7 @@ def one_key(
     found = [each[0] for each in find_starts_around(readings, field_map, t_start, search)]
     none = np.full(3, np.nan)
     t_found = np.array([none if each is None else each.t_lidar_mag for each in found])
-    looked = (process_time() - begin) / len(t_start)
+    searched = (process_time() - begin) / len(t_start)
     places, which = np.unique(t_found, axis=0, return_inverse=True)
     vector = np.full((len(places), 15), np.nan)
     begin, somewhere = process_time(), np.flatnonzero(np.isfinite(places).all(axis=1))
@@ -126,4 +126,4 @@ def one_key(
         if solution.solved:
             vector[row] = solution.estimate.vector(0)
     solved = (process_time() - begin) / max(len(somewhere), 1)
-    return Found(vector[which.ravel()], len(somewhere), looked + solved)
+    return MethodResult(vector[which.ravel()], len(somewhere), searched + solved)

@@ -15,7 +15,7 @@ from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.simulate.hall_drives import CalibrationDrive, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import CloudVariant, hall_cloud, steel_hall
 from l2m_gtsam.solve.robust import Loss, RobustOptions
-from l2m_gtsam.studies.honesty.trouble import Disturbed, spikes
+from l2m_gtsam.studies.honesty.drives import Disturbed, spikes
 from tests.drives.disturbances import bursts, moved_steel
 
 NOISE = 0.2

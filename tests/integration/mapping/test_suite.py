@@ -11,8 +11,9 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
-from tests.drives.slam import SlamDrive, quiet, slam_drive
+from tests.drives.slam import SlamDrive, slam_drive
 from tests.worlds.exact import DipoleWorld
 from tests.worlds.surveyed import strange_hall, wandering
 
@@ -72,7 +73,7 @@ def errors(found: CalibrationResult, truth: tuple[KnownSensor, ...]) -> FloatArr
 def found() -> tuple[tuple[KnownSensor, ...], Recording, CalibrationResult]:
     truth = suite(2, 2)
     recording = surveyed(2, truth, strange_hall(2))
-    return truth, recording, calibrate_suite([recording], None, QUICK, quiet)
+    return truth, recording, calibrate_suite([recording], None, QUICK, silent)
 
 
 def test_sensors_are_found_with_the_field(
@@ -117,7 +118,7 @@ def test_a_drive_that_never_turns_says_what_it_does_not_tell() -> None:
     way = wandering(rng, 40.0, within=1.5)
     straight = replace(way, R=np.tile(np.eye(3), (len(way), 1, 1)))
     drive = slam_drive(strange_hall(4), truth, straight, rng, noise=0.1)
-    result = calibrate_suite([replace(drive.recording, trajectory=straight)], None, QUICK, quiet)
+    result = calibrate_suite([replace(drive.recording, trajectory=straight)], None, QUICK, silent)
     (complexity,) = result.doubts
     assert "t_lidar_mag x, t_lidar_mag y, t_lidar_mag z" in complexity
     assert "H x" in complexity
@@ -131,7 +132,7 @@ def test_a_stuck_sensor_is_refused(
     first, second = recording.series
     stuck = replace(second, field=np.tile(second.field[:1], (len(second), 1)))
     with pytest.raises(MapError, match="'mag_01' is stuck on one value"):
-        calibrate_suite([replace(recording, series=(first, stuck))], None, QUICK, quiet)
+        calibrate_suite([replace(recording, series=(first, stuck))], None, QUICK, silent)
 
 
 def test_what_is_known_is_where_it_begins(
@@ -146,7 +147,7 @@ def test_what_is_known_is_where_it_begins(
         )
         for each in truth
     }
-    again = calibrate_suite([recording], known, QUICK, quiet)
+    again = calibrate_suite([recording], known, QUICK, silent)
     for one, other in zip(result.sensors, again.sensors, strict=True):
         assert np.all(np.abs(one.t_lidar_mag - other.t_lidar_mag) < one.t_sigma)
         assert np.all(np.abs(one.distortion.H - other.distortion.H) < one.H_sigma)

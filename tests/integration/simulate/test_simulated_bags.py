@@ -19,7 +19,12 @@ from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.recorder import SimulatedDrive
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
-from l2m_gtsam.simulate.sensors import ArrayOptions, NoiseOptions, SamplingOptions, SuiteOptions
+from l2m_gtsam.simulate.sensors import (
+    MappingSuiteOptions,
+    NoiseOptions,
+    SamplingOptions,
+    SensorArrayOptions,
+)
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions as ReadOptions
 
@@ -30,9 +35,9 @@ KINDS = list(BagKind)
 def drive() -> SimulatedDrive:
     options = ScenarioOptions(
         floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
-        suite=SuiteOptions(lateral=(0.0,), heights=(0.0,)),
+        suite=MappingSuiteOptions(lateral=(0.0,), heights=(0.0,)),
         mapping_sampling=SamplingOptions(field_rate=0.5, pose_rate=1.0),
-        array=ArrayOptions(count=3),
+        array=SensorArrayOptions(count=3),
         calibration_route=CalibrationRouteOptions(turns=1),
     )
     return simulate(options).calibration

@@ -13,8 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.bag_writer import BagKind, Beside, write_bag
-from l2m_gtsam.simulate.lidar import LidarOptions
-from l2m_gtsam.simulate.odometry import OdometryOptions
+from l2m_gtsam.simulate.lidar import SpinningLidarOptions
+from l2m_gtsam.simulate.odometry import OdometryDriftOptions
 from l2m_gtsam.simulate.recorder import SimulatedDrive
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.storage.bag import read_recording, read_trajectory
@@ -160,7 +160,7 @@ def test_clouds_beside_a_recording_leave_its_messages_as_they_are(tmp_path: Path
 def test_options_are_told_only_where_they_are_asked_for() -> None:
     groups = {"corridor", "lidar", "odometry"}
     assert not groups & set(ScenarioOptions().model_dump(mode="json"))
-    options = ScenarioOptions(lidar=LidarOptions(), odometry=OdometryOptions())
+    options = ScenarioOptions(lidar=SpinningLidarOptions(), odometry=OdometryDriftOptions())
     told = options.model_dump(mode="json")
     assert told["lidar"]["beams"] == 32
     assert ScenarioOptions.model_validate(told) == options

@@ -13,15 +13,15 @@ from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
-from l2m_gtsam.simulate.sensors import ArrayOptions, SamplingOptions, SuiteOptions
+from l2m_gtsam.simulate.sensors import MappingSuiteOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.storage.cloud import read_cloud
 from tests.worlds.quick_maps import QUICK_HARMONIC
 
 SMALL = ScenarioOptions(
     floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
-    suite=SuiteOptions(lateral=(-0.3, 0.3), heights=(0.0,)),
+    suite=MappingSuiteOptions(lateral=(-0.3, 0.3), heights=(0.0,)),
     mapping_sampling=SamplingOptions(field_rate=4.0),
-    array=ArrayOptions(count=1),
+    array=SensorArrayOptions(count=1),
     calibration_route=CalibrationRouteOptions(turns=1),
     calibration_sampling=SamplingOptions(field_rate=1.0),
 )

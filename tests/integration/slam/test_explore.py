@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import KnownSensor, Trajectory
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.slam.exploration import Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
 from tests.drives.exploring import COARSE, explored
-from tests.drives.slam import SlamDrive, calibrated, laps, quiet, slam_drive
+from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -97,7 +98,7 @@ def test_a_calibration_is_refined_without_a_map() -> None:
     # Tiles that are a little larger than by default: fewer, in less than half the time.
     chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0}}
     options = SlamOptions.model_validate(chosen)
-    found = explore(drive.recording, rough, options, quiet).result
+    found = explore(drive.recording, rough, options, silent).result
     assert found.calibration is not None
     before, after, nees = [], [], []
     for truth, start in zip(sensors, rough.sensors, strict=True):

@@ -8,12 +8,13 @@ import pytest
 
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
 from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from tests.drives.exploring import OnLine, prepared_drive, rms
-from tests.drives.slam import calibrated, laps, quiet
+from tests.drives.slam import calibrated, laps
 from tests.worlds.exact import random_sensors
 
 SMALL = (1.9, 1.4)  # radii of laps of 10 m
@@ -51,7 +52,7 @@ def test_poses_are_where_all_solved_together_are(round_and_round: OnLine) -> Non
     drive, options = round_and_round.drive, SlamOptions.model_validate(QUICK)
     begin = drive.dead_reckoning()
     prior = drive_prior(drive, begin, options.tiles)
-    batch = map_drive(drive, begin, prior, options, quiet).solution.poses
+    batch = map_drive(drive, begin, prior, options, silent).solution.poses
     pairs = zip(round_and_round.explorer.poses(), batch, strict=True)
     apart = np.array([np.linalg.norm(a.translation() - b.translation()) for a, b in pairs])
     assert rms(apart) < 0.03

@@ -10,6 +10,7 @@ import pytest
 from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.disturbances import slips
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.pose_graph import write_g2o
@@ -17,7 +18,7 @@ from l2m_gtsam.slam.record import odometry_covariance
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.slam.solution import DriveSolution
 from tests.drives.drawn import DrawnDrive, drawn_drive
-from tests.drives.slam import quiet, rounds
+from tests.drives.slam import rounds
 from tests.worlds.exact import dipole_world, random_sensors
 
 SEEDS, SIGMA = tuple(range(8)), 0.02
@@ -51,7 +52,7 @@ def scaled(seed: int) -> Scaled:
 @cache
 def localised(seed: int) -> DriveSolution:
     options = SlamOptions(drift=DRIFT)
-    return localise_drive(scaled(seed).drawn.drive, dipole_world(seed), options, quiet)
+    return localise_drive(scaled(seed).drawn.drive, dipole_world(seed), options, silent)
 
 
 def off(drawn: DrawnDrive, poses: list[gtsam.Pose3]) -> FloatArray:
@@ -87,7 +88,7 @@ def test_a_scale_that_is_no_variable_is_missed() -> None:
     seed = max(SEEDS, key=lambda each: abs(scaled(each).longer))
     drive = scaled(seed).drawn.drive
     blind = replace(drive, steps=replace(drive.steps, scale=0.0))
-    solution = localise_drive(blind, dipole_world(seed), SlamOptions(drift=DRIFT), quiet)
+    solution = localise_drive(blind, dipole_world(seed), SlamOptions(drift=DRIFT), silent)
     assert solution.scale is None
     assert nees(scaled(seed).drawn, solution) > 2 * nees(scaled(seed).drawn, localised(seed))
 

@@ -13,11 +13,12 @@ import pytest
 from l2m_gtsam.data import Recording, Trajectory
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
 from tests.drives.motion_capture import QUICK, mapped, read
-from tests.drives.slam import drifted, quiet
+from tests.drives.slam import drifted
 from tests.support.pose_errors import pose_nees, position_error
 
 # Residuals of readings less than some 0.3 s apart are alike: one reading on a key pose.
@@ -44,10 +45,10 @@ def test_a_run_is_localised_in_the_map_of_another(shared_data: Path) -> None:
     Assumed ideal, the same sensor in its own map is led astray by 0.2 to 0.8 m.
     """
     first, second = (read(shared_data, run) for run in (0, 1))
-    suite = calibrate_suite([first], None, SuiteCalibrationOptions.model_validate(QUICK), quiet)
+    suite = calibrate_suite([first], None, SuiteCalibrationOptions.model_validate(QUICK), silent)
     drive, truth = with_drift(second, 35, 30, seed=1)
     options = SlamOptions.model_validate({"key_poses": POSES, "calibration": "refined"})
-    result = localise(drive, mapped(first, suite), suite, options, quiet).result
+    result = localise(drive, mapped(first, suite), suite, options, silent).result
     before, after = (position_error(truth, each) for each in (result.odometry, result.trajectory))
     print(f"{1e3 * before:.0f} -> {1e3 * after:.0f} mm")
     nees = pose_nees(truth, result.trajectory).mean()
@@ -63,19 +64,19 @@ def test_two_runs_under_motion_capture(shared_data: Path) -> None:
     NEES of a drive scatters; 18 are 3 per degree of freedom, from where the report warns.
     """
     first, second = (read(shared_data, run) for run in (0, 1))
-    suite = calibrate_suite([first], None, SuiteCalibrationOptions(), quiet)
+    suite = calibrate_suite([first], None, SuiteCalibrationOptions(), silent)
     field_map, nees = mapped(first, suite), []
     for seed in (1, 2, 3):
         drive, truth = with_drift(second, 0, 90, seed)
         options = SlamOptions.model_validate({"key_poses": POSES, "calibration": "refined"})
-        result = localise(drive, field_map, suite, options, quiet).result
+        result = localise(drive, field_map, suite, options, silent).result
         before = position_error(truth, result.odometry)
         after = position_error(truth, result.trajectory)
         nees.append(pose_nees(truth, result.trajectory).mean())
         print(f"in the map: {1e3 * before:.0f} -> {1e3 * after:.0f} mm, NEES {nees[-1]:.1f}")
         assert after < 0.2 * before
         fixed = SlamOptions.model_validate({"key_poses": POSES})
-        alone = explore(drive, suite, fixed, quiet).result
+        alone = explore(drive, suite, fixed, silent).result
         found = position_error(truth, alone.trajectory)
         own = pose_nees(truth, alone.trajectory).mean()
         print(f"alone: {1e3 * before:.0f} -> {1e3 * found:.0f} mm, NEES {own:.1f}")

@@ -10,13 +10,14 @@ from l2m_gtsam.data import Recording, Trajectory
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
 from tests.drives.motion_capture import QUICK, mapped, read
-from tests.drives.slam import drifted, quiet
+from tests.drives.slam import drifted
 from tests.worlds.surveyed import in_odometry
 
 # An area of 2.4 x 2.3 m: fine, and over few metres.
@@ -35,7 +36,7 @@ OPTIONS = SlamOptions.model_validate(
 def known(shared_data: Path) -> tuple[Recording, FieldMap, CalibrationResult]:
     """Run 1 with the map of run 0, and the sensor as calibrated by run 0 alone."""
     first, second = (read(shared_data, run) for run in (0, 1))
-    suite = calibrate_suite([first], None, SuiteCalibrationOptions.model_validate(QUICK), quiet)
+    suite = calibrate_suite([first], None, SuiteCalibrationOptions.model_validate(QUICK), silent)
     return second, mapped(first, suite), suite
 
 
@@ -57,7 +58,7 @@ def test_a_recorded_drive_is_found_in_the_map_of_another(
     """Within 20 cm, in windows of 3 m: of 22 starts 1 to 15 cm (docs/slam-measurements.md)."""
     run, field_map, calibration = known
     drive, _ = prepared(part(run, start_s, 25.0, seed=int(start_s)), calibration, OPTIONS)
-    found = find_start(drive, field_map, OPTIONS, quiet)
+    found = find_start(drive, field_map, OPTIONS, silent)
     since = 1e-9 * (run.trajectory.stamp_ns - run.trajectory.stamp_ns[0])
     truth = run.trajectory.p[np.searchsorted(since, start_s)]
     assert found.verdict is StartVerdict.UNIQUE, found.message

@@ -8,18 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
-from tests.drives.slam import (
-    COARSE,
-    WIDE,
-    SlamDrive,
-    calibrated,
-    quiet,
-    small_hall,
-)
+from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, small_hall
 from tests.support.pose_errors import position_error
 from tests.worlds.exact import dipole_world
 
@@ -31,7 +25,7 @@ def located(
     **options: object,
 ) -> LocalisationResult:
     chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
-    return localise(drive.recording, field_map, known, chosen, quiet).result
+    return localise(drive.recording, field_map, known, chosen, silent).result
 
 
 def test_a_known_map_takes_the_drift_out() -> None:

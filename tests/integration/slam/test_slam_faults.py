@@ -7,6 +7,7 @@ import pytest
 
 from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, RigidTransform
 from l2m_gtsam.errors import SyncError
+from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.localisation import judge_localisation
 from l2m_gtsam.records.calibration import CalibrationResult
@@ -16,7 +17,7 @@ from l2m_gtsam.slam.localisation import Localisation, localise
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.record import RecordContext, localisation_record
 from tests.drives.faults import jumped, opened, shift, with_steel
-from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, quiet, rounds, slam_drive
+from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -30,7 +31,7 @@ def found(
     drive: SlamDrive, known: CalibrationResult, seed: int = 1, **options: object
 ) -> Localisation:
     chosen = SlamOptions.model_validate({"key_poses": COARSE, **options})
-    return localise(drive.recording, dipole_world(seed), known, chosen, quiet)
+    return localise(drive.recording, dipole_world(seed), known, chosen, silent)
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +193,7 @@ def test_fixes_that_stop_are_bridged_by_odometry_and_readings(
     known, scanned = calibrated(sensors), [*range(8), *range(23, 30)]
     seen = fixes(drive, range(30))
     some = replace(seen, fixes=tuple(seen.fixes[k] for k in scanned))
-    result = localise(drive.recording, WORLD, known, options, quiet, evidence=some).result
+    result = localise(drive.recording, WORLD, known, options, silent, evidence=some).result
     assert result.scans is not None
     assert result.scans.rejected == 0
     assert error(drive, result) < 0.03
@@ -204,7 +205,7 @@ def test_fixes_that_stop_are_bridged_by_odometry_and_readings(
     assert sigma[(seconds > 9) & (seconds < 21)].max() > 1.2 * seen_then
     # Half of the drive without any.
     early = replace(seen, fixes=seen.fixes[:15])
-    result = localise(drive.recording, WORLD, known, options, quiet, evidence=early).result
+    result = localise(drive.recording, WORLD, known, options, silent, evidence=early).result
     assert error(drive, result) < 0.05
     assert pose_nees(drive.truth, result.trajectory).mean() < 12
     assert position_sigmas(result)[-1] > 1.5 * seen_then
@@ -236,7 +237,7 @@ def test_another_field_where_scans_fit_is_not_here(
     options = SlamOptions.model_validate({"key_poses": COARSE})
     world, seen = dipole_world(99), fixes(drive, range(30))
     result = localise(
-        drive.recording, world, calibrated(sensors), options, quiet, evidence=seen
+        drive.recording, world, calibrated(sensors), options, silent, evidence=seen
     ).result
     assert result.status is LocalisationStatus.NOT_HERE
     # Poses are held by the scans: what is refused is not nonsense.

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
-from tests.drives.slam import COARSE, calibrated, quiet, small_hall
+from tests.drives.slam import COARSE, calibrated, small_hall
 from tests.worlds.exact import dipole_world
 
 LATE = 8  # key poses
@@ -32,7 +33,7 @@ def test_a_calibration_that_is_far_off_converges_on_line() -> None:
     world = dipole_world(1)
     follower = Follower(drive, world, options.robust, free=True, section=50)
     last = [follower.step(number) for number in range(len(drive))][-1]
-    batch = localise_drive(drive, world, options, quiet)
+    batch = localise_drive(drive, world, options, silent)
     sigma = np.sqrt(np.einsum("sii->si", batch.calibration_covariance))
     apart = np.abs(vectors(last.sensors) - vectors(batch.drive.sensors)) / sigma
     assert apart.max() < 1.0

@@ -11,6 +11,7 @@ from l2m_gtsam.lidar.loop_closures import LoopOptions, find_loop_closures
 from l2m_gtsam.lidar.registration import PoseEstimate, RegistrationOptions
 from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions, localise_scans, spaced
 from l2m_gtsam.lidar.surface import Surface, smoothed
+from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.odometry_jumps import RepairedOdometry, without_jumps
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
@@ -19,7 +20,7 @@ from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.odometry import scan_odometry
 from l2m_gtsam.slam.options import SlamOptions, TileOptions
 from l2m_gtsam.storage.cloud import thinned_cloud
-from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, quiet, rounds, slam_drive
+from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.lidar_rooms import CORRIDOR, Room, rows, scans
@@ -65,7 +66,9 @@ def found_by(
     drive: SlamDrive, known: tuple[KnownSensor, ...], seen: ScanEvidence
 ) -> LocalisationResult:
     world = dipole_world(1)
-    return localise(drive.recording, world, calibrated(known), OPTIONS, quiet, evidence=seen).result
+    return localise(
+        drive.recording, world, calibrated(known), OPTIONS, silent, evidence=seen
+    ).result
 
 
 @pytest.fixture(scope="module")
@@ -134,7 +137,7 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     assert len(loops) > 10
     # Tiles that are a little larger than by default: fewer, in less than half the time.
     options = OPTIONS.model_copy(update={"tiles": TileOptions(core=4.0)})
-    found = explore(drive.recording, calibrated(known), options, quiet, evidence=loops).result
+    found = explore(drive.recording, calibrated(known), options, silent, evidence=loops).result
     assert found.scans is not None
     assert found.by_scans is not None
     assert (found.scans.loops, found.scans.rejected) == (len(loops), 0)

@@ -8,11 +8,12 @@ from pydantic import ValidationError
 
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.localisation import LocalisationStatus, StartSearch, StartVerdict
 from l2m_gtsam.slam.localisation import localise, prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
-from tests.drives.slam import SlamDrive, calibrated, quiet, slam_drive
+from tests.drives.slam import SlamDrive, calibrated, slam_drive
 from tests.support.pose_errors import position_error
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
 from tests.worlds.surveyed import SurveyedWorld, in_odometry, strange_hall, surveyed, wandering
@@ -39,7 +40,7 @@ def searched(
     sensors, drive = lost
     options = searching(**search)
     prepared_drive, _ = prepared(drive.recording, calibrated(sensors), options)
-    return find_start(prepared_drive, field_map, options, quiet)
+    return find_start(prepared_drive, field_map, options, silent)
 
 
 def away(found: StartSearch, start: FloatArray) -> list[float]:
@@ -67,7 +68,7 @@ def test_the_drive_is_followed_from_there() -> None:
     world = strange_hall(7)
     sensors, drive = lost_drive(world, 7)
     options = searching()
-    found = localise(drive.recording, surveyed(world), calibrated(sensors), options, quiet).result
+    found = localise(drive.recording, surveyed(world), calibrated(sensors), options, silent).result
     assert found.status is LocalisationStatus.LOCALISED
     assert found.start is not None
     assert found.start.verdict is StartVerdict.UNIQUE
@@ -112,7 +113,7 @@ def test_two_rooms_alike_are_both_told() -> None:
     assert min(away(found, start + apart)) < 0.2
     options = searching(longest_m=8.0)
     with pytest.raises(MapError, match="places of the map or more explain the readings"):
-        localise(drive.recording, field_map, calibrated(sensors), options, quiet)
+        localise(drive.recording, field_map, calibrated(sensors), options, silent)
 
 
 def test_another_building_is_not_here() -> None:
@@ -167,8 +168,8 @@ def test_a_longer_window_decides() -> None:
 
 def test_a_map_that_does_not_tell_its_places_is_refused() -> None:
     sensors, drive = lost_drive(dipole_world(1), 1, seconds=3)
-    with pytest.raises(MapError, match="does not state where it has data"):
-        localise(drive.recording, dipole_world(1), calibrated(sensors), searching(), quiet)
+    with pytest.raises(MapError, match="does not tell where it has data"):
+        localise(drive.recording, dipole_world(1), calibrated(sensors), searching(), silent)
 
 
 def test_a_known_start_is_not_looked_for() -> None:

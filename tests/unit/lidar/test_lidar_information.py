@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.geometry import difference, perturbed
-from l2m_gtsam.lidar.surface import Planes, distances, fitted_planes, plane_information, tempered
+from l2m_gtsam.lidar.surface import Planes, distances, fitted_planes, inflated, plane_information
 
 
 def unit(vectors: FloatArray) -> FloatArray:
@@ -94,9 +94,9 @@ def test_tempered_information_is_that_of_the_sum_of_covariances() -> None:
     root = rng.standard_normal((6, 6))
     information, least = root @ root.T, np.diag(rng.uniform(0.1, 1.0, 6))
     expected = np.linalg.inv(np.linalg.inv(information) + least)
-    np.testing.assert_allclose(tempered(information, least), expected, rtol=1e-9)
+    np.testing.assert_allclose(inflated(information, least), expected, rtol=1e-9)
     singular = root[:, :4] @ root[:, :4].T
-    assert np.linalg.matrix_rank(tempered(singular, least), tol=1e-9) == 4
+    assert np.linalg.matrix_rank(inflated(singular, least), tol=1e-9) == 4
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -8,13 +8,12 @@ import pytest
 from scipy.spatial import KDTree
 
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.simulate.corridor import CorridorOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
-from l2m_gtsam.simulate.lidar import LidarOptions, snapshots
-from l2m_gtsam.simulate.place import Place, RouteOptions, corridor, hall
+from l2m_gtsam.simulate.lidar import SpinningLidarOptions, snapshots
+from l2m_gtsam.simulate.place import CorridorOptions, RouteOptions, SimulatedPlace, corridor, hall
 from l2m_gtsam.simulate.route import CalibrationRouteOptions, MappingRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
-from l2m_gtsam.simulate.sensors import ArrayOptions, SamplingOptions, SuiteOptions
+from l2m_gtsam.simulate.sensors import MappingSuiteOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.simulate.solids import Solids
 from l2m_gtsam.simulate.warehouse import WarehouseOptions
 
@@ -24,12 +23,12 @@ ROUTES = RouteOptions(MappingRouteOptions(), CalibrationRouteOptions(laps=2))
 
 
 @cache
-def featureless() -> Place:
+def featureless() -> SimulatedPlace:
     return corridor(OPTIONS, WarehouseOptions(), ROUTES, EARTH, np.random.default_rng(1))
 
 
 @cache
-def furnished() -> Place:
+def furnished() -> SimulatedPlace:
     floor = FloorPlanOptions(length=30.0, width=16.0, rack_rows=2)
     return hall(floor, WarehouseOptions(), ROUTES, EARTH, np.random.default_rng(1))
 
@@ -40,7 +39,7 @@ def standing(*places: tuple[float, float, float]) -> Trajectory:
     return Trajectory(stamps, R, np.array(places), "map", "lidar")
 
 
-def seen(solids: Solids, options: LidarOptions, *places: tuple[float, float, float]) -> Any:
+def seen(solids: Solids, options: SpinningLidarOptions, *places: tuple[float, float, float]) -> Any:
     return [scan.points for scan in snapshots(solids, options, standing(*places))]
 
 
@@ -59,14 +58,14 @@ def information(points: FloatArray, thickness: float) -> tuple[FloatArray, Float
 
 
 def test_scans_are_the_same_wherever_along_the_corridor() -> None:
-    exact = LidarOptions(noise=0.0)
+    exact = SpinningLidarOptions(noise=0.0)
     here, there = seen(featureless().solids, exact, (11.0, 2.3, 0.8), (48.3, 2.3, 0.8))
     # Of coordinates of up to 160 m, in double precision.
     np.testing.assert_allclose(here, there, rtol=0, atol=1e-10)
 
 
 def test_scan_matching_knows_nothing_of_the_way_along_and_in_a_hall_it_does() -> None:
-    dense = LidarOptions(beams=64, columns=1800, furthest=15.0, noise=0.0)
+    dense = SpinningLidarOptions(beams=64, columns=1800, furthest=15.0, noise=0.0)
     (points,) = seen(featureless().solids, dense, (30.0, 2.3, 0.8))
     values, vectors = information(points, 1e-6)
     assert values[0] < 1e-12  # of normals, squared: rounding of metres over centimetres
@@ -115,8 +114,8 @@ def test_a_map_is_told_of_the_walls_that_hide_steel() -> None:
     scenario = simulate(
         ScenarioOptions(
             corridor=CorridorOptions(length=8.0),
-            suite=SuiteOptions(lateral=(0.0,), heights=(0.0,)),
-            array=ArrayOptions(count=1),
+            suite=MappingSuiteOptions(lateral=(0.0,), heights=(0.0,)),
+            array=SensorArrayOptions(count=1),
             mapping_sampling=SamplingOptions(field_rate=1.0, pose_rate=1.0),
             calibration_sampling=SamplingOptions(field_rate=1.0, pose_rate=1.0),
         )

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import moved
-from l2m_gtsam.simulate.odometry import OdometryOptions, OdometryOrigin, drifting
+from l2m_gtsam.simulate.odometry import OdometryDriftOptions, OdometryOrigin, drifting
 from l2m_gtsam.simulate.sensors import NoiseOptions
 from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, Usage
@@ -46,7 +46,7 @@ def error(true: Trajectory, found: Trajectory, row: int) -> FloatArray:
     return np.concatenate([turn, back @ (true.p[row] - found.p[row])])
 
 
-def nees(true: Trajectory, rows: tuple[int, ...], options: OdometryOptions) -> FloatArray:
+def nees(true: Trajectory, rows: tuple[int, ...], options: OdometryDriftOptions) -> FloatArray:
     """Normalised squared errors, runs by rows."""
     found = []
     for seed in range(RUNS):
@@ -59,7 +59,7 @@ def nees(true: Trajectory, rows: tuple[int, ...], options: OdometryOptions) -> F
 
 def test_a_scale_error_alone_is_one_percent_of_the_way() -> None:
     true = straight(80.0)
-    options = OdometryOptions(yaw_walk=0, position_walk=0)
+    options = OdometryDriftOptions(yaw_walk=0, position_walk=0)
     ends = []
     for seed in range(20):
         odometry = drifting(true, options, SILENT, np.random.default_rng(seed))
@@ -72,7 +72,7 @@ def test_a_scale_error_alone_is_one_percent_of_the_way() -> None:
 
 def test_a_scale_is_drawn_anew_after_its_length() -> None:
     true = straight(1000.0, poses=500)
-    options = OdometryOptions(yaw_walk=0, position_walk=0, scale_length=50.0)
+    options = OdometryDriftOptions(yaw_walk=0, position_walk=0, scale_length=50.0)
     odometry = drifting(true, options, SILENT, np.random.default_rng(1))
     share = np.diff(odometry.p[:, 0]) / np.diff(true.p[:, 0]) - 1
     pieces = share.reshape(20, 25)
@@ -84,7 +84,7 @@ def test_a_scale_is_drawn_anew_after_its_length() -> None:
 
 def test_without_any_drift_poses_are_true_up_to_the_start() -> None:
     true = loop()
-    options = OdometryOptions(scale=0, yaw_walk=0, position_walk=0)
+    options = OdometryDriftOptions(scale=0, yaw_walk=0, position_walk=0)
     odometry = drifting(true, options, SILENT, np.random.default_rng(3))
     # A start off by a microradian, 30 m further on; five standard deviations.
     np.testing.assert_allclose(odometry.p, true.p, rtol=0, atol=5 * 30e-6)
@@ -95,7 +95,7 @@ def test_without_any_drift_poses_are_true_up_to_the_start() -> None:
 def test_on_a_straight_way_of_whole_pieces_covariances_are_those_of_the_errors(
     length: float,
 ) -> None:
-    found = nees(straight(length), (1, 100), OdometryOptions())
+    found = nees(straight(length), (1, 100), OdometryDriftOptions())
     # Means of chi-square of 6, whose variance is 12: five standard deviations. After one step the
     # scale counts as redrawn, which it is not: less than 6 by up to one.
     within = 5 * np.sqrt(12 / RUNS)
@@ -105,19 +105,19 @@ def test_on_a_straight_way_of_whole_pieces_covariances_are_those_of_the_errors(
 
 def test_on_a_bent_way_covariances_are_no_less_than_the_errors() -> None:
     """Errors of a scale cancel on the way back, what is stated does not; all else is exact."""
-    found = nees(loop(), (40, 80, 119), OdometryOptions())
+    found = nees(loop(), (40, 80, 119), OdometryDriftOptions())
     within = 5 * np.sqrt(12 / RUNS)
     mean = found.mean(axis=0)
     assert np.all(mean < 6 + within)
     assert np.all(mean > 4.5 - within)
-    exact = nees(loop(), (119,), OdometryOptions(scale=0.0))
+    exact = nees(loop(), (119,), OdometryDriftOptions(scale=0.0))
     assert exact.mean() == pytest.approx(6.0, abs=within)
 
 
 def test_covariances_accumulate_step_by_step() -> None:
     """P' = Ad P Ad^T + Q, against the sums at the first pose."""
     true = loop()
-    odometry = drifting(true, OdometryOptions(), NoiseOptions(), np.random.default_rng(2))
+    odometry = drifting(true, OdometryDriftOptions(), NoiseOptions(), np.random.default_rng(2))
     assert odometry.covariance is not None
     drift = DriftOptions(least_m=1e-12, least_deg=1e-12)
     steps = odometry_steps(odometry, np.arange(len(true)), drift)
@@ -131,7 +131,7 @@ def test_covariances_accumulate_step_by_step() -> None:
 @pytest.mark.parametrize("true", [straight(60.0), loop()], ids=["straight", "loop"])
 def test_localisation_takes_the_stated_covariances_of_steps(true: Trajectory) -> None:
     """They accumulate as that of odometry does, so that each step's own is found again."""
-    options = OdometryOptions()
+    options = OdometryDriftOptions()
     odometry = drifting(true, options, NoiseOptions(), np.random.default_rng(2))
     rows = np.arange(0, len(true), 4)
     drift = DriftOptions(least_m=1e-9, least_deg=1e-9)
@@ -149,7 +149,9 @@ def test_localisation_takes_the_stated_covariances_of_steps(true: Trajectory) ->
 def test_an_origin_at_the_start_changes_the_frame_alone() -> None:
     true = loop()
     at_map, at_start = (
-        drifting(true, OdometryOptions(origin=origin), NoiseOptions(), np.random.default_rng(4))
+        drifting(
+            true, OdometryDriftOptions(origin=origin), NoiseOptions(), np.random.default_rng(4)
+        )
         for origin in OdometryOrigin
     )
     np.testing.assert_allclose(at_start.R[0], np.eye(3), rtol=0, atol=1e-15)
@@ -165,7 +167,7 @@ def test_an_origin_at_the_start_changes_the_frame_alone() -> None:
 def test_a_seed_gives_the_same_drift_and_another_another() -> None:
     true = loop()
     one, again, other = (
-        drifting(true, OdometryOptions(), NoiseOptions(), np.random.default_rng(seed))
+        drifting(true, OdometryDriftOptions(), NoiseOptions(), np.random.default_rng(seed))
         for seed in (5, 5, 6)
     )
     assert one.p.tobytes() == again.p.tobytes()
@@ -176,7 +178,7 @@ def test_a_seed_gives_the_same_drift_and_another_another() -> None:
 
 def test_what_odometry_states_may_be_left() -> None:
     """Then steps are as sure as the options say, as if nothing were stated."""
-    odometry = drifting(loop(), OdometryOptions(), NoiseOptions(), np.random.default_rng(2))
+    odometry = drifting(loop(), OdometryDriftOptions(), NoiseOptions(), np.random.default_rng(2))
     rows = np.arange(0, len(odometry), 4)
     left = odometry_steps(odometry, rows, DriftOptions(stated=Usage.IGNORED))
     silent = odometry_steps(replace(odometry, covariance=None), rows, DriftOptions())

@@ -15,22 +15,21 @@ from l2m_gtsam.simulate.recorder import SimulatedDrive
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions, simulate
 from l2m_gtsam.simulate.sensors import (
-    ArrayOptions,
+    MappingSuiteOptions,
     NoiseOptions,
     SamplingOptions,
-    SuiteOptions,
+    SensorArrayOptions,
     lasting,
     measured_poses,
     random_array,
     sample_stamps,
 )
-from l2m_gtsam.simulate.steel_parts import SectionOptions
-from l2m_gtsam.simulate.warehouse import WarehouseOptions
+from l2m_gtsam.simulate.warehouse import SectionOptions, WarehouseOptions
 
 SMALL: dict[str, Any] = {
     "floor_plan": FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
-    "suite": SuiteOptions(lateral=(-0.3, 0.3), heights=(-0.4, 0.0)),
-    "array": ArrayOptions(count=3),
+    "suite": MappingSuiteOptions(lateral=(-0.3, 0.3), heights=(-0.4, 0.0)),
+    "array": SensorArrayOptions(count=3),
     "calibration_route": CalibrationRouteOptions(turns=1),
     "mapping_sampling": SamplingOptions(field_rate=4.0, pose_rate=5.0),
     "calibration_sampling": SamplingOptions(field_rate=10.0, pose_rate=10.0),
@@ -84,7 +83,7 @@ def test_another_seed_changes_every_array(scenario: Scenario) -> None:
 
 
 def test_another_array_leaves_world_and_mapping_drive_alone(scenario: Scenario) -> None:
-    options = ScenarioOptions(seed=3, **{**SMALL, "array": ArrayOptions(count=2)})
+    options = ScenarioOptions(seed=3, **{**SMALL, "array": SensorArrayOptions(count=2)})
     other = simulate(options)
     np.testing.assert_array_equal(other.world.polarisations, scenario.world.polarisations)
     assert other.mapping.recording.source == scenario.mapping.recording.source
@@ -194,7 +193,7 @@ def test_a_clock_that_is_behind_stamps_early(scenario: Scenario) -> None:
 
 
 def test_distortion_is_positive_times_the_mounting_rotation() -> None:
-    sensors = random_array(ArrayOptions(count=100), np.random.default_rng(1))
+    sensors = random_array(SensorArrayOptions(count=100), np.random.default_rng(1))
     for sensor in sensors:
         u, s, vt = np.linalg.svd(sensor.distortion.C)
         turn = np.arccos((np.trace(u @ vt) - 1) / 2)
@@ -241,7 +240,7 @@ def test_progress_runs_from_nothing_to_all() -> None:
 
 def test_a_sensor_that_would_hit_steel_is_refused() -> None:
     # Lanes lie 1.05 m from the rack's face, uprights of 0.6 m just behind it.
-    wide = {**SMALL, "suite": SuiteOptions(lateral=(0.0, 1.3), heights=(0.0,))}
+    wide = {**SMALL, "suite": MappingSuiteOptions(lateral=(0.0, 1.3), heights=(0.0,))}
     thick = WarehouseOptions(upright=SectionOptions(breadth=0.6, height=0.6, fill=0.1))
     with pytest.raises(ConfigError, match="suite_01 would pass through steel"):
         simulate(ScenarioOptions(warehouse=thick, **wide))

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
-from l2m_gtsam.simulate.drive import Motion, drive
+from l2m_gtsam.simulate.drive import VehicleMotion, drive
 from l2m_gtsam.simulate.floor_plan import FloorPlan, plan_floor
 from l2m_gtsam.simulate.route import calibration_route, mapping_route
 from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -23,24 +23,24 @@ def plan() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def mapping(plan: FloorPlan) -> Motion:
+def mapping(plan: FloorPlan) -> VehicleMotion:
     route = mapping_route(OPTIONS.mapping_route, plan)
     return drive(OPTIONS.mapping_drive, route, START_NS, np.random.default_rng(1))
 
 
 @pytest.fixture(scope="module")
-def calibration(plan: FloorPlan) -> Motion:
+def calibration(plan: FloorPlan) -> VehicleMotion:
     route = calibration_route(OPTIONS.calibration_route, plan)
     return drive(OPTIONS.calibration_drive, route, START_NS, np.random.default_rng(2))
 
 
 @pytest.fixture(params=["mapping", "calibration"])
-def motion(request: pytest.FixtureRequest) -> Motion:
-    chosen: Motion = request.getfixturevalue(request.param)
+def motion(request: pytest.FixtureRequest) -> VehicleMotion:
+    chosen: VehicleMotion = request.getfixturevalue(request.param)
     return chosen
 
 
-def poses_at(motion: Motion, rate: float) -> Trajectory:
+def poses_at(motion: VehicleMotion, rate: float) -> Trajectory:
     seconds = np.arange(0.0, motion.duration, 1 / rate)
     return motion.at(motion.start_ns + (seconds * 1e9).astype(np.int64))
 
@@ -53,7 +53,7 @@ def array() -> tuple[KnownSensor, ...]:
     return random_array(OPTIONS.array, np.random.default_rng(3))
 
 
-def test_attitude_and_heave_stay_slight(motion: Motion) -> None:
+def test_attitude_and_heave_stay_slight(motion: VehicleMotion) -> None:
     poses = poses_at(motion, 20.0)
     _, pitch, roll = Rotation.from_matrix(poses.R).as_euler("ZYX", degrees=True).T
     # Bounded at the splines' knots; between them a cubic overshoots by far less than 1 %.
@@ -89,7 +89,7 @@ def test_turns_keep_the_yaw_rate(name: str, limit: float, request: pytest.Fixtur
     assert 0.9 * limit < np.abs(np.diff(yaw) / 0.05).max() < 1.02 * limit
 
 
-def test_mapping_drive_covers_the_free_floor(plan: FloorPlan, mapping: Motion) -> None:
+def test_mapping_drive_covers_the_free_floor(plan: FloorPlan, mapping: VehicleMotion) -> None:
     suite = mapping_suite(OPTIONS.suite)
     seen = all_points(poses_at(mapping, 8.0), suite)[:, :2]
     x, y = np.meshgrid(np.arange(1.0, plan.length - 1, 0.1), np.arange(1.0, plan.width - 1, 0.1))
@@ -104,7 +104,7 @@ def test_mapping_drive_covers_the_free_floor(plan: FloorPlan, mapping: Motion) -
 
 
 def test_calibration_drive_stays_where_the_map_was_seen(
-    mapping: Motion, calibration: Motion
+    mapping: VehicleMotion, calibration: VehicleMotion
 ) -> None:
     seen = all_points(poses_at(mapping, 8.0), mapping_suite(OPTIONS.suite))
     asked = all_points(poses_at(calibration, 10.0), array())
@@ -115,7 +115,7 @@ def test_calibration_drive_stays_where_the_map_was_seen(
     assert asked[:, 2].max() < seen[:, 2].max()
 
 
-def test_calibration_drive_turns_through_all_headings_both_ways(calibration: Motion) -> None:
+def test_calibration_drive_turns_through_all_headings_both_ways(calibration: VehicleMotion) -> None:
     poses = poses_at(calibration, 20.0)
     yaw = np.arctan2(poses.R[:, 1, 0], poses.R[:, 0, 0])
     counts, _ = np.histogram(yaw, bins=12, range=(-np.pi, np.pi))
@@ -128,7 +128,7 @@ def test_calibration_drive_turns_through_all_headings_both_ways(calibration: Mot
 
 
 def test_no_sensor_passes_through_steel(
-    plan: FloorPlan, mapping: Motion, calibration: Motion
+    plan: FloorPlan, mapping: VehicleMotion, calibration: VehicleMotion
 ) -> None:
     rng = np.random.default_rng(4)
     world = build_warehouse(OPTIONS.warehouse, plan, np.zeros(3), rng)
@@ -138,7 +138,7 @@ def test_no_sensor_passes_through_steel(
         assert not world.inside(all_points(poses, sensors)).any()
 
 
-def test_motion_is_smooth_between_its_knots(motion: Motion) -> None:
+def test_motion_is_smooth_between_its_knots(motion: VehicleMotion) -> None:
     fine = poses_at(motion, 1000.0)
     # 1.5 m/s in turns of at most 1.5 rad/s accelerate by 2.3 m/s^2, braking comes beside it.
     acceleration = np.diff(fine.p[10_000:60_000:10], n=2, axis=0) / 0.01**2

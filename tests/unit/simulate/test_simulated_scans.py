@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.records.scans import Scan
-from l2m_gtsam.simulate.lidar import LidarOptions, RayCaster, scans, snapshots
+from l2m_gtsam.simulate.lidar import RayCaster, SpinningLidarOptions, scans, snapshots
 from l2m_gtsam.simulate.solids import Solids
 
 ROOM = np.array([8.0, 6.0, 3.0])
 START_NS = 1_700_000_000_000_000_000
-EXACT = LidarOptions(noise=0.0, nearest=0.0, columns=360)
+EXACT = SpinningLidarOptions(noise=0.0, nearest=0.0, columns=360)
 # Surfaces are met in double precision; rays start at coordinates below 10 m.
 ROUNDING_M = 1e-12
 
@@ -70,7 +70,7 @@ def test_what_stands_in_front_hides_what_is_behind() -> None:
 
 
 def test_ranges_are_noisy_along_the_ray_as_stated_and_cut_off() -> None:
-    options = LidarOptions(noise=0.02, nearest=1.5, furthest=4.0)
+    options = SpinningLidarOptions(noise=0.02, nearest=1.5, furthest=4.0)
     p = np.array([4.0, 3.0, 1.0])
     scan = snapshots(room(), options, still(np.eye(3), p))[0]
     measured = np.linalg.norm(scan.points, axis=1)
@@ -85,12 +85,12 @@ def test_ranges_are_noisy_along_the_ray_as_stated_and_cut_off() -> None:
 
 def test_a_seed_gives_the_same_scans_in_any_order_and_another_gives_others() -> None:
     poses = still(np.eye(3), ROOM / 2)
-    first, again = (snapshots(room(), LidarOptions(), poses, seed=4) for _ in range(2))
+    first, again = (snapshots(room(), SpinningLidarOptions(), poses, seed=4) for _ in range(2))
     backwards = [again[1], again[0]][::-1]
     for ours, theirs in zip(first, backwards, strict=True):
         assert ours.points.tobytes() == theirs.points.tobytes()
     assert not np.array_equal(first[0].points, first[1].points)
-    other = snapshots(room(), LidarOptions(), poses, seed=5)
+    other = snapshots(room(), SpinningLidarOptions(), poses, seed=5)
     assert not np.array_equal(first[0].points, other[0].points)
 
 
@@ -146,7 +146,7 @@ def test_options_that_contradict_each_other_are_refused(
     wrong: dict[str, Any], complaint: str
 ) -> None:
     with pytest.raises(ValidationError, match=complaint):
-        LidarOptions(**wrong)
+        SpinningLidarOptions(**wrong)
 
 
 def test_without_the_libraries_one_line_says_how_to_get_them(

@@ -8,16 +8,17 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.simulate.hall_drives import (
     CLEARANCE_M,
-    Survey,
+    HallSurvey,
     calibration_drive,
     held_out,
     survey,
 )
-from l2m_gtsam.simulate.hall_parts import HALF_AREA, VOXEL_M
 from l2m_gtsam.simulate.steel_hall import (
     EARTH,
+    HALF_AREA,
     SHIFT_M,
     STRONG,
+    VOXEL_M,
     CloudVariant,
     SteelHall,
     hall_cloud,
@@ -39,7 +40,7 @@ def hall(seed: int) -> SteelHall:
 
 
 @pytest.fixture(scope="module")
-def surveyed(hall: SteelHall, seed: int) -> Survey:
+def surveyed(hall: SteelHall, seed: int) -> HallSurvey:
     return survey(hall, seed)
 
 
@@ -104,7 +105,7 @@ def test_all_steel_is_where_it_belongs(hall: SteelHall) -> None:
     assert (out_of_bodies(hall, np.column_stack([timber, np.full(5, 0.5)])) > 0.4).all()
 
 
-def test_magnitudes_are_those_of_a_hall(hall: SteelHall, surveyed: Survey, seed: int) -> None:
+def test_magnitudes_are_those_of_a_hall(hall: SteelHall, surveyed: HallSurvey, seed: int) -> None:
     """A few uT of mild steel, some tens around strong posts (design of the studies)."""
     mild = held_out(hall, seed, surveyed.span).field - EARTH
     strong_hall = steel_hall(seed, STRONG)
@@ -155,7 +156,7 @@ def test_a_survey_covers_the_free_floor(
     assert np.mean(hall.distance(s.points) < 0.8) > 0.3
 
 
-def test_survey_noise_is_as_stated(hall: SteelHall, surveyed: Survey) -> None:
+def test_survey_noise_is_as_stated(hall: SteelHall, surveyed: HallSurvey) -> None:
     noise = surveyed.field - hall.world.field(surveyed.points)
     # 4,500 draws: the standard deviation is known to 1.1 %, four of its errors are allowed.
     assert noise.std() == pytest.approx(0.2, rel=0.045)

@@ -14,11 +14,11 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.structure import StructureOptions as VoxelOptions
 from l2m_gtsam.maps.harmonic.structure import candidate_sources
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions, plan_floor
-from l2m_gtsam.simulate.structure import StructureOptions, structure_cloud
+from l2m_gtsam.simulate.solids import StructureCloudOptions, structure_cloud
 from l2m_gtsam.simulate.warehouse import WarehouseOptions, build_warehouse
 from l2m_gtsam.simulate.world import SteelWorld
 
-EXACT = StructureOptions(noise=0.0)
+EXACT = StructureCloudOptions(noise=0.0)
 ROUNDING = 1e-9  # metres
 VOXELS = VoxelOptions()
 PASSES = (0.4, 0.7, 1.0)  # heights of sensors over the floor in metres
@@ -31,12 +31,12 @@ def body(size: FloatArray, centre: FloatArray, R: FloatArray) -> SteelWorld:
     return SteelWorld(("post",), size[None], centre[None], R[None], np.zeros((1, 3)), np.zeros(3))
 
 
-def cloud_of(world: SteelWorld, options: StructureOptions = EXACT) -> FloatArray:
+def cloud_of(world: SteelWorld, options: StructureCloudOptions = EXACT) -> FloatArray:
     return structure_cloud(world, options, np.random.default_rng(0))
 
 
-def up_to(height: float) -> StructureOptions:
-    return StructureOptions(noise=0.0, height=height)
+def up_to(height: float) -> StructureCloudOptions:
+    return StructureCloudOptions(noise=0.0, height=height)
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +97,7 @@ def test_the_hall_is_the_sum_of_its_bodies(hall: SteelWorld) -> None:
 
 
 def test_noise_is_as_large_as_said_and_repeatable(hall: SteelWorld) -> None:
-    options = StructureOptions(noise=0.03)
+    options = StructureCloudOptions(noise=0.03)
     noise = cloud_of(hall, options) - cloud_of(hall)
     # 4 standard errors of a standard deviation and of a mean of this many numbers.
     count = noise.size

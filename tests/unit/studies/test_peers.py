@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, KnownSensor, LidarMotion, Readings
 from l2m_gtsam.errors import MapError, PeerError
-from l2m_gtsam.studies.peers.estimate import soft_iron
-from l2m_gtsam.studies.peers.magyc import ChipDrive, magyc_peer, magyc_python
-from l2m_gtsam.studies.peers.naive import NaiveOptions, naive_map, naive_peer
+from l2m_gtsam.studies.magyc_peer import ChipDrive, magyc_peer, magyc_python
+from l2m_gtsam.studies.methods import soft_iron
+from l2m_gtsam.studies.naive_peer import NaiveOptions, naive_map, naive_peer
 from tests.worlds.exact import DipoleWorld, drive, random_sensors
 
 NOISE = 0.05  # uT, of surveys and drives

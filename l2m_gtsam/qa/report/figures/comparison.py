@@ -74,11 +74,6 @@ def _draw(axes: Axes, values: FloatArray, sigma: float) -> None:
     axes.plot(place[~known], np.zeros(np.sum(~known)), "x", color=MUTED, markersize=5)
 
 
-def drive_names(bags: Sequence[str]) -> str:
-    """Return which number stands for which drive, in order of time."""
-    return ", ".join(f"{k + 1} {bag}" for k, bag in enumerate(bags))
-
-
 def field_errors_figure(sensors: Sequence[ValidatedSensor]) -> Figure:
     """Draw the mean distance of readings to the map, as read and corrected, a row per sensor."""
     figure, axes = _rows(sensors)

@@ -160,3 +160,10 @@ def _names(matrix: Panel) -> None:
         matrix.text(MATRIX.left - 5, y + 3, name, letters("end", SMALL))
         at = f"translate({x + 3:.1f} {MATRIX.bottom + 6:.1f}) rotate(-90)"
         matrix.parts.append(f'<text transform="{at}" style="{letters("end", SMALL)}">{name}</text>')
+
+
+def strongest_correlation(sensor: SensorCalibration) -> str:
+    """Return the pair of parameters of the largest correlation, with that."""
+    lower = np.abs(np.tril(np.nan_to_num(correlations(sensor)), -1))
+    i, j = np.unravel_index(int(np.argmax(lower)), lower.shape)
+    return f"{NAMES[j]} and {NAMES[i]}, {correlations(sensor)[i, j]:+.2f}"

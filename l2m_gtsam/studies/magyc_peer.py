@@ -1,13 +1,13 @@
 """The calibrator from the package index: `magyc`, which wants a gyroscope and a uniform field.
 
-It knows no map. From readings and turn rates it tells H and the soft iron: where the field is the
-same everywhere it changes, seen from the sensor, only as the sensor turns, dB/dt = -w x B.
-Position, rotation and scale it cannot tell. What it needs contradicts what we need (numpy below
+It uses no map. From readings and turn rates it estimates H and the soft iron: where the field is
+the same everywhere it changes, seen from the sensor, only as the sensor turns, dB/dt = -w x B.
+Position, rotation and scale remain open. What it needs contradicts what we need (numpy below
 2), so that it has an environment of its own, made by ``make magyc``.
 
 It is made for chips that hold both a magnetometer and a gyroscope, along the same axes, and wants
 them so: six degrees between the two cost it 1.5 uT. A study that knows the truth gives it the rates
-that a gyroscope on the sensor's own chip would have told, to the noise of the poses.
+that a gyroscope on the sensor's own chip would measure, up to the noise of the poses.
 """
 
 import os
@@ -21,7 +21,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.errors import PeerError
-from l2m_gtsam.studies.peers.estimate import PeerEstimate, soft_iron
+from l2m_gtsam.studies.methods import PeerEstimate, soft_iron
 
 PYTHON_VARIABLE = "L2M_MAGYC_PYTHON"
 PYTHON = Path(".venv-magyc/bin/python")
@@ -51,7 +51,7 @@ def magyc_python() -> Path:
     Raises
     ------
     PeerError
-        There is none, neither where ``L2M_MAGYC_PYTHON`` says nor in this folder.
+        There is none, neither at ``L2M_MAGYC_PYTHON`` nor in this folder.
     """
     python = Path(os.environ.get(PYTHON_VARIABLE, PYTHON))
     if not python.is_file():

@@ -2,7 +2,7 @@
 
 scikit-learn's Gaussian process for each axis of the field, on a thinned survey around the drive,
 and scipy's ``least_squares`` over t, C and H together, with numeric derivatives, on a part of the
-readings. Thinning is what makes it bearable: every look at the map costs the number of places
+readings. Thinning keeps it affordable: every query of the map costs the number of places
 times the number of survey readings.
 """
 
@@ -20,7 +20,7 @@ from l2m_gtsam.data import Distortion, FloatArray, IntArray, Readings
 from l2m_gtsam.errors import MapError, PeerError
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.options import Options
-from l2m_gtsam.studies.peers.estimate import PeerEstimate, soft_iron
+from l2m_gtsam.studies.methods import PeerEstimate, soft_iron
 
 FEWEST = 20
 

@@ -9,8 +9,8 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.options import Options
 from l2m_gtsam.simulate.world import SteelWorld
-from l2m_gtsam.studies.ablation.packed import Packed
-from l2m_gtsam.studies.site import SiteDrive, Surveyed
+from l2m_gtsam.studies.json_arrays import Packed
+from l2m_gtsam.studies.site import SiteDrive, SurveyedSite
 
 
 class WindowOptions(Options):
@@ -25,7 +25,7 @@ class WindowOptions(Options):
 
 
 @dataclass(frozen=True)
-class MapPicture:
+class MapImage:
     """A map at one height, and what it is worth.
 
     Attributes
@@ -47,7 +47,7 @@ class MapPicture:
     rmse
         Root mean square of the field's error per axis in uT, where sensors pass.
     sigma
-        What the map itself says of that, in uT.
+        The map's own prediction of that, in uT.
     inside
         Share of the drives' readings that lie in the map.
     """
@@ -65,7 +65,7 @@ class MapPicture:
 
 
 @dataclass(frozen=True)
-class Window:
+class ImageWindow:
     """Points of a picture.
 
     Attributes
@@ -105,19 +105,17 @@ class Window:
         return points[(x > left) & (x < right) & (y > bottom) & (y < top), :2]
 
 
-def map_picture(
+def map_image(
     field_map: QueryableMap,
-    part: Surveyed,
+    part: SurveyedSite,
     floor: float,
     drives: tuple[SiteDrive, ...],
     options: WindowOptions,
-) -> MapPicture:
+) -> MapImage:
     """Return a picture of a map of a survey, and how wrong it is where sensors pass.
 
     Parameters
     ----------
-    field_map
-        The map.
     part
         World, and the fingerprints of which the map is made.
     floor
@@ -132,7 +130,7 @@ def map_picture(
     sample = field_map.query(places)
     inside = sample.inside
     off = sample.field[inside] - part.world.field(places[inside])
-    return MapPicture(
+    return MapImage(
         extent=window.extent,
         z=window.z,
         strength=window.image(field_map.query(window.points).field),
@@ -146,13 +144,13 @@ def map_picture(
     )
 
 
-def window_around(centre: FloatArray, survey: FloatArray, options: WindowOptions) -> Window:
+def window_around(centre: FloatArray, survey: FloatArray, options: WindowOptions) -> ImageWindow:
     """Return a window about a place (3,) in metres, in the middle of the survey's heights."""
     x, y = (
         centre[axis] + np.arange(-extent / 2, extent / 2 + options.step / 2, options.step)
         for axis, extent in enumerate((options.width, options.height))
     )
-    return Window(x, y, float(survey[:, 2].min() + survey[:, 2].max()) / 2)
+    return ImageWindow(x, y, float(survey[:, 2].min() + survey[:, 2].max()) / 2)
 
 
 def sensor_places(drive: SiteDrive) -> FloatArray:

@@ -1,1 +1,0 @@
-"""Peers: what a user could do without this project, as rows of the studies' tables."""
