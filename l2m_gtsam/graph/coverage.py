@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import gtsam
 import numpy as np
+from scipy.linalg import cholesky
 from scipy.linalg.lapack import dtrtri
 
 from l2m_factors import M, P, map_weights_information, pose_errors_prior
@@ -14,6 +15,7 @@ from l2m_gtsam.graph.calibration import Estimate
 from l2m_gtsam.graph.moving_fields import MovingFields
 from l2m_gtsam.graph.pose_errors import PoseKnots, pose_seconds
 from l2m_gtsam.graph.view import View
+from l2m_gtsam.threads import in_threads
 
 POSE = 6  # weights of a knot
 # Readings of a group: what is left of their poses' error is a matrix of three times as many rows.
@@ -170,16 +172,21 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
     segment = np.zeros(len(x), dtype=np.int64) if knots is None else knots.segment(seconds)
     told = errors.errors_over(x)
     owner, rest, groups = told.owner(x), np.empty_like(x), []
-    for tile in told.sizes():
+
+    def asked(tile: int) -> tuple[IntArray, FloatArray]:
         rows = np.flatnonzero(owner == tile)
-        features = told.features(x[rows], tile)
+        return rows, told.features(x[rows], tile)
+
+    tiles = list(told.sizes())
+    for tile, (rows, features) in zip(tiles, in_threads(asked, tiles), strict=True):
         shared = np.einsum("nir,nir->ni", features, features)
         rest[rows] = np.maximum(view.map_variance[rows] - shared, 0.0)
         for own in together(readings, segment, rows, whole=knots is None):
             first = rows[own[0]]
             where = int(readings.sensor[first]), tile, int(segment[first])
             groups.append(Group(*where, rows[own], features[own]))
-    root, _ = dtrtri(np.linalg.cholesky(told.covariance), lower=1)
+    root = cholesky(told.covariance, lower=True, check_finite=False)
+    root, _ = dtrtri(root, lower=1, overwrite_c=1)
     return Coverage(tuple(groups), rest, told.sizes(), root, knots, seconds)
 
 
