@@ -16,6 +16,7 @@ from l2m_gtsam.calibration.moving_fields import MovingFields
 from l2m_gtsam.calibration.pose_errors import PoseKnots, pose_seconds
 from l2m_gtsam.calibration.view import View
 from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.parallel.threads import in_threads
 
 POSE = 6  # weights of a knot
 # Readings of a group: what is left of their poses' error is a matrix of three times as many rows.
@@ -179,9 +180,13 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
     segment = np.zeros(len(x), dtype=np.int64) if knots is None else knots.segment(seconds)
     told = errors.errors_over(x)
     owner, rest, groups = told.owner(x), np.empty_like(x), []
-    for tile in told.sizes():
+
+    def asked(tile: int) -> tuple[IntArray, FloatArray]:
         rows = np.flatnonzero(owner == tile)
-        features = told.features(x[rows], tile)
+        return rows, told.features(x[rows], tile)
+
+    tiles = list(told.sizes())
+    for tile, (rows, features) in zip(tiles, in_threads(asked, tiles), strict=True):
         shared = np.einsum("nir,nir->ni", features, features)
         rest[rows] = np.maximum(view.map_variance[rows] - shared, 0.0)
         for own in together(readings, segment, rows, whole=knots is None):

@@ -176,8 +176,8 @@ def with_offsets(readings: Readings, trajectory: Trajectory, offset: FloatArray)
             readings, R_map_lidar=np.empty((0, 3, 3)), p_map_lidar=np.empty((0, 3)), motion=motion
         )
     at = 1e-9 * (readings.stamp_ns - trajectory.stamp_ns[0]) + own
-    R, p = _poses_at(trajectory, at)
-    motion = LidarMotion(_twist_at(trajectory, at, R), own)
+    R, p, twist = _moving_at(trajectory, at)
+    motion = LidarMotion(twist, own)
     return replace(readings, R_map_lidar=R, p_map_lidar=p, motion=motion)
 
 
@@ -196,7 +196,7 @@ def interpolated(trajectory: Trajectory, stamp_ns: IntArray) -> Trajectory:
 def twists(trajectory: Trajectory, stamp_ns: IntArray) -> FloatArray:
     """Return the body's velocity at N times: rad/s, then m/s, in its own frame, shape (N, 6)."""
     at = 1e-9 * (stamp_ns - trajectory.stamp_ns[0])
-    return _twist_at(trajectory, at, _poses_at(trajectory, at)[0])
+    return _moving_at(trajectory, at)[2]
 
 
 def _poses_at(trajectory: Trajectory, at: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -210,15 +210,18 @@ def _poses_at(trajectory: Trajectory, at: FloatArray) -> tuple[FloatArray, Float
     return R, np.column_stack([np.interp(at, seconds, axis) for axis in trajectory.p.T])
 
 
-def _twist_at(trajectory: Trajectory, at: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the lidar's twist in its own frame where it has these rotations, shape (N, 6)."""
+def _moving_at(trajectory: Trajectory, at: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return poses as ``_poses_at``, and the lidar's twist in its own frame, shape (N, 6)."""
     end = 1e-9 * float(trajectory.stamp_ns[-1] - trajectory.stamp_ns[0])
     early, late = np.clip([at - TWIST_S / 2, at + TWIST_S / 2], 0.0, end)
     between = np.maximum(late - early, np.finfo(float).tiny)[:, None]
-    (R_early, p_early), (R_late, p_late) = (_poses_at(trajectory, t) for t in (early, late))
+    # All at once: to begin takes as long as to interpolate thousands.
+    rotations, positions = _poses_at(trajectory, np.concatenate([at, early, late]))
+    R, R_early, R_late = np.split(rotations, 3)
+    p, p_early, p_late = np.split(positions, 3)
     turn = Rotation.from_matrix(R_early.transpose(0, 2, 1) @ R_late).as_rotvec()
     shift = np.einsum("nji,nj->ni", R, p_late - p_early)
-    return np.asarray(np.hstack([turn, shift]) / between)
+    return R, p, np.hstack([turn, shift]) / between
 
 
 def _first_in_cell(readings: Readings, options: SyncOptions) -> BoolArray:

@@ -8,7 +8,7 @@ only the types that are read are parsed, each from the bag's own definition wher
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +215,7 @@ def _default_typestore(is_ros1: bool) -> Typestore:
     return store
 
 
+@lru_cache(maxsize=64)  # a bag's sensors are of few types
 def typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typestore:
     """Return the bag's own definition of a type, or ROS's where it has none as text."""
     if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():

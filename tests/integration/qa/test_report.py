@@ -8,11 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE
-from l2m_gtsam.batch.reports import REPORT_FILE, report_folder, write_report
+from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, Appraised
+from l2m_gtsam.batch.reports import (
+    REPORT_FILE,
+    SLAM_FILE,
+    report_calibration,
+    report_folder,
+    write_report,
+)
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.config import Config
+from l2m_gtsam.errors import OutputError
 from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.options import Limit, QaOptions
@@ -87,6 +94,19 @@ def test_the_report_needs_no_bag_and_no_map(
     result = read_calibration(made.folder / CALIBRATION_FILE)
     write_report(tmp_path, result, made.metrics, QaOptions())
     assert (tmp_path / REPORT_FILE).read_text() == reported[1]
+
+
+def test_what_was_just_written_is_reported_without_being_read(
+    made: Made, reported: tuple[Level, str], tmp_path: Path
+) -> None:
+    """The same page as of its folder, and the same refusal beside a localisation."""
+    found = Appraised(read_calibration(made.folder / CALIBRATION_FILE), made.metrics)
+    assert report_calibration(tmp_path, found, QaOptions()).level is reported[0]
+    assert (tmp_path / REPORT_FILE).read_text() == reported[1]
+    for name in (METRICS_FILE, SLAM_FILE):
+        (tmp_path / name).touch()
+    with pytest.raises(OutputError, match="one report each"):
+        report_calibration(tmp_path, found, QaOptions())
 
 
 def test_the_page_has_all_that_a_person_looks_for(reported: tuple[Level, str]) -> None:
