@@ -49,10 +49,31 @@ def kernel_matrix(x: FloatArray, y: FloatArray, signal: float) -> FloatArray:
     signal
         Prior standard deviation s in uT.
     """
-    rows = np.column_stack([x, -0.5 * np.sum(x * x, axis=1), np.ones(len(x))])
-    offset = 2 * np.log(signal) - 0.5 * np.sum(y * y, axis=1)
-    columns = np.column_stack([y, np.ones(len(y)), offset])
-    K = rows @ columns.T
+    return kernel_to(x, training_columns(y, signal))
+
+
+def training_columns(y: FloatArray, signal: float) -> FloatArray:
+    """Return the features of training points in the exponent, shape (5, M); see ``kernel_matrix``.
+
+    They stay the same for all points that are asked for.
+    """
+    offset = 2 * np.log(signal) - 0.5 * np.einsum("mi,mi->m", y, y)
+    return np.ascontiguousarray(np.column_stack([y, np.ones(len(y)), offset]).T)
+
+
+def kernel_to(x: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return the kernel between scaled points, shape (N, 3), and training points, shape (N, M).
+
+    Parameters
+    ----------
+    x
+        Scaled points, shape (N, 3).
+    columns
+        From ``training_columns``, shape (5, M).
+    """
+    rows = np.empty((len(x), 5))
+    rows[:, :3], rows[:, 3], rows[:, 4] = x, -0.5 * np.einsum("ni,ni->n", x, x), 1.0
+    K = rows @ columns
     np.exp(K, out=K)
     return np.asarray(K)
 

@@ -1,14 +1,24 @@
 """A Gaussian process conditioned on the readings near one block, ready for batches of points."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cho_solve, cholesky
+from scipy.linalg.blas import dtrmm
+from scipy.linalg.lapack import dtrtri
 
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.hyperparameters import Hyperparameters, not_definite
-from l2m_gtsam.maps.kernel import kernel_matrix, mean_and_gradient, mean_weights, scaled
+from l2m_gtsam.maps.kernel import (
+    kernel_matrix,
+    kernel_to,
+    mean_and_gradient,
+    mean_weights,
+    scaled,
+    training_columns,
+)
 from l2m_gtsam.maps.training import TrainingSet
 
 
@@ -44,9 +54,10 @@ class Posterior:
         Of ``mean_weights``, shape (M, 12).
     noise_variance
         Of each reading in square microtesla, shape (M,).
-    factor
-        Lower Cholesky factor of the readings' covariance in microtesla, shape (M, M), or None
-        where memory is short: then it is computed again for each batch that asks for variances.
+    whitener
+        Inverse of the lower Cholesky factor of the readings' covariance in 1/uT, shape (M, M), or
+        None where memory is short: then it is computed again for each batch that asks for
+        variances. A product with it takes a third of the time of a solve with the factor.
     """
 
     hyperparameters: Hyperparameters
@@ -54,12 +65,17 @@ class Posterior:
     y: FloatArray
     weights: FloatArray
     noise_variance: FloatArray
-    factor: FloatArray | None
+    whitener: FloatArray | None
+
+    @cached_property
+    def columns(self) -> FloatArray:
+        """Of ``training_columns``, shape (5, M)."""
+        return training_columns(self.y, self.hyperparameters.signal)
 
     def rows(self, points: FloatArray) -> KernelRows:
         """Return the kernel rows of points in metres, shape (N, 3)."""
         x = scaled(points, self.centre, self.hyperparameters.length_scale)
-        return KernelRows(x, kernel_matrix(x, self.y, self.hyperparameters.signal))
+        return KernelRows(x, kernel_to(x, self.columns))
 
     def mean_and_gradient(self, rows: KernelRows) -> tuple[FloatArray, FloatArray]:
         """Return the residual's mean (N, 3) in uT and its gradient (N, 3, 3) in uT/m."""
@@ -67,10 +83,10 @@ class Posterior:
 
     def variance(self, rows: KernelRows) -> FloatArray:
         """Return the posterior variance of each axis in square microtesla, shape (N,)."""
-        factor = self.factor
-        if factor is None:
-            factor = factorise(self.y, self.noise_variance, self.hyperparameters)
-        V = solve_triangular(factor, rows.K.T, lower=True, check_finite=False)
+        whitener = self.whitener
+        if whitener is None:
+            whitener = inverted(factorise(self.y, self.noise_variance, self.hyperparameters))
+        V = dtrmm(1.0, whitener, rows.K.T, lower=1)
         explained = np.einsum("mn,mn->n", V, V)
         return np.asarray(np.maximum(self.hyperparameters.signal**2 - explained, 0.0))
 
@@ -79,9 +95,9 @@ class Posterior:
         least = self.hyperparameters.signal**2 * np.exp(-0.5 * reach**2)
         return np.asarray(rows.K.max(axis=1) >= least)
 
-    def without_factor(self) -> "Posterior":
+    def without_whitener(self) -> "Posterior":
         """Return the same posterior in less memory."""
-        return replace(self, factor=None)
+        return replace(self, whitener=None)
 
 
 def condition(
@@ -109,7 +125,8 @@ def condition(
     noise_variance = hyperparameters.noise**2 / readings.weight
     factor = factorise(y, noise_variance, hyperparameters)
     alpha = cho_solve((factor, True), readings.field - mean, check_finite=False)
-    return Posterior(hyperparameters, centre, y, mean_weights(alpha, y), noise_variance, factor)
+    weights, whitener = mean_weights(alpha, y), inverted(factor)
+    return Posterior(hyperparameters, centre, y, weights, noise_variance, whitener)
 
 
 def factorise(
@@ -123,3 +140,9 @@ def factorise(
         return np.asarray(cholesky(K.T, lower=True, overwrite_a=True, check_finite=False))
     except LinAlgError:
         raise MapError(not_definite(hyperparameters)) from None
+
+
+def inverted(factor: FloatArray) -> FloatArray:
+    """Return the inverse of a lower triangular matrix, which it replaces, shape (M, M)."""
+    inverse, _ = dtrtri(factor, lower=1, overwrite_c=1)
+    return np.asarray(inverse)

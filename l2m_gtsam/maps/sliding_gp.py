@@ -31,8 +31,8 @@ from l2m_gtsam.maps.trained import (
 from l2m_gtsam.maps.training import TrainingSet, checked_points
 
 KIND = "sliding_gp"
-MOST_IN_BLOCK = 6000  # rows; the factor of such a block takes 290 MB
-FACTOR_MEMORY = 1e9  # bytes of factors that are kept for variances
+MOST_IN_BLOCK = 6000  # rows; the whitener of such a block takes 290 MB
+FACTOR_MEMORY = 1e9  # bytes of whiteners that are kept for variances
 BATCH = 256  # points whose kernel rows are in memory, and about in cache, at once
 
 
@@ -218,10 +218,11 @@ class SlidingGP:
         """Yield every point once, block by block and batch by batch."""
         owner = self.grid.block_of(points)
         order = np.argsort(owner, kind="stable")
-        edges = np.flatnonzero(np.diff(owner[order])) + 1
-        for group in np.split(order, edges):
-            for start in range(0, len(group), BATCH):
-                yield Visit(int(owner[group[0]]), group[start : start + BATCH])
+        counts = np.bincount(owner)
+        ends = np.cumsum(counts)
+        for block in np.flatnonzero(counts):
+            for start in range(ends[block] - counts[block], ends[block], BATCH):
+                yield Visit(int(block), order[start : min(start + BATCH, ends[block])])
 
 
 def check_sizes(members: list[IntArray], block: float) -> None:
@@ -235,9 +236,9 @@ def check_sizes(members: list[IntArray], block: float) -> None:
 
 
 def posteriors(trained: Trained, members: list[IntArray]) -> Iterator[Posterior]:
-    """Yield the posterior of each block, with its factor as long as memory lasts."""
+    """Yield the posterior of each block, with its whitener as long as memory lasts."""
     mean, used = trained.readings.mean, 0
     for rows in members:
         posterior = condition(trained.readings[rows], mean, trained.hyperparameters)
         used += 8 * len(rows) ** 2
-        yield posterior if used <= FACTOR_MEMORY else posterior.without_factor()
+        yield posterior if used <= FACTOR_MEMORY else posterior.without_whitener()
