@@ -35,12 +35,14 @@ from l2m_gtsam.graph.joint import (
 )
 from l2m_gtsam.graph.optimise import Ending
 from l2m_gtsam.graph.priors import NO_PRIORS, Priors
+from l2m_gtsam.graph.remembered_map import remembered
 from l2m_gtsam.graph.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.graph.uncertain import UncertainSolution, solve_uncertain, step_uncertain
 from l2m_gtsam.graph.view import QueryableMap, View, observe
 from l2m_gtsam.results import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
 from l2m_gtsam.sync import with_offsets
+from l2m_gtsam.threads import one_blas_thread
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
@@ -167,6 +169,7 @@ class Finish(Protocol):
         ...
 
 
+@one_blas_thread()
 def _solved(
     readings: Readings,
     field_map: QueryableMap,
@@ -177,6 +180,7 @@ def _solved(
     priors: Priors,
     finish: Finish,
 ) -> OneKeySolution:
+    field_map = remembered(field_map)
     good = readings.select(plausible(readings, field_map, t_start, options.robust))
     start = start_estimate(t_start, options, priors)
     near = alternate(good, field_map, start, options, tell)

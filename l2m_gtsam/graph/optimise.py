@@ -88,6 +88,7 @@ def polish(
     params = gtsam.GaussNewtonParams()
     _limit(params, steps, solver)
     engine = gtsam.GaussNewtonOptimizer(graph, values, params)
+    worst = (1 + SEAM_RISE) * engine.error() + SEAM_RISE
     try:
         for _ in range(steps):
             engine.iterate()
@@ -95,8 +96,7 @@ def polish(
         if not refused(error):
             raise
         return Optimised(values, Ending.SINGULAR)
-    worst = (1 + SEAM_RISE) * graph.error(values) + SEAM_RISE
-    good = graph.error(engine.values()) <= worst
+    good = engine.error() <= worst
     return Optimised(engine.values() if good else values, Ending.TOLERANCE)
 
 

@@ -2,9 +2,13 @@
 
 What a map is worth at a place, its variance, costs a triangular solve with hundreds of weights:
 forty times its field. A calibration comes back to the places of a drive, where sensors start and
-where they were found, to test ranks, to compare models and to judge residuals.
+where they were found, to test ranks, to compare models and to judge residuals. Within a solve one
+step after the other asks for the field where the last one ended, of all readings or of those that
+count: the last few answers are remembered, too.
 """
 
+from collections import deque
+from dataclasses import dataclass
 from threading import Lock
 from typing import Any
 
@@ -15,6 +19,16 @@ from l2m_gtsam.graph.view import QueryableMap
 
 MOST = 500_000  # places that are remembered: 100 MB
 VALUES = 15  # field, gradient and variance
+RECENT = 2  # answers without variances that are remembered
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Field (N, 3) in uT and gradient (N, 3, 3) in uT/m at points (N, 3) in metres."""
+
+    points: FloatArray
+    field: FloatArray
+    gradient: FloatArray
 
 
 class RememberedMap:
@@ -32,6 +46,7 @@ class RememberedMap:
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
+        self._recent: deque[Answer] = deque(maxlen=RECENT)
 
     def __getattr__(self, name: str) -> Any:
         if name == "_map":  # before there is one, as when another process unpacks it
@@ -42,13 +57,36 @@ class RememberedMap:
         return RememberedMap, (self._map,)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return field and gradient, which are not remembered: they cost little."""
-        return self._map.field_and_gradient(points)
+        """Return field and gradient; those of the last few questions are remembered."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        fresh = np.ones(len(points), dtype=np.bool_)
+        with self._lock:
+            recent = tuple(self._recent)
+        for answer in reversed(recent):
+            if not fresh.any():
+                break
+            ask = np.flatnonzero(fresh)
+            at = rows_among(answer.points, points[ask])
+            told = ask[at >= 0]
+            field[told], gradient[told] = answer.field[at[at >= 0]], answer.gradient[at[at >= 0]]
+            fresh[told] = False
+        if fresh.any():
+            field[fresh], gradient[fresh] = self._map.field_and_gradient(points[fresh])
+            self._remember(points, field, gradient)
+        return field, gradient
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
         with self._lock:
-            return self._recalled(np.ascontiguousarray(points, dtype=np.float64))
+            sample = self._recalled(points)
+        self._remember(points, sample.field, sample.gradient)
+        return sample
+
+    def _remember(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> None:
+        with self._lock:
+            self._recent.append(Answer(points.copy(), field.copy(), gradient.copy()))
 
     def _recalled(self, points: FloatArray) -> FieldSample:
         names = points.view(f"V{points.itemsize * points.shape[1]}").ravel().tolist()
@@ -72,3 +110,32 @@ class RememberedMap:
         values = self._values[at]
         gradient = values[:, 3:12].reshape(-1, 3, 3)
         return FieldSample(values[:, :3], gradient, values[:, 12:], self._inside[at])
+
+
+def remembered(field_map: QueryableMap) -> RememberedMap:
+    """Return a map with a memory; the map itself if it has one."""
+    return field_map if isinstance(field_map, RememberedMap) else RememberedMap(field_map)
+
+
+def rows_among(known: FloatArray, wanted: FloatArray) -> IntArray:
+    """Return in which row of known places each wanted one is, -1 where in none, shape (M,).
+
+    Parameters
+    ----------
+    known, wanted
+        Places, shapes (N, 3) and (M, 3); equal to the last bit or not at all.
+    """
+    if np.array_equal(known, wanted):
+        return np.arange(len(known))
+    names, wanted_names = _names(known), _names(wanted)
+    if not len(np.intersect1d(names, wanted_names)):  # as most often: the sensor has moved
+        return np.full(len(wanted), -1)
+    order = np.argsort(names)
+    at = np.searchsorted(names, wanted_names, sorter=order)
+    found = order[np.minimum(at, len(known) - 1)]
+    return np.asarray(np.where((known[found] == wanted).all(axis=1), found, -1))
+
+
+def _names(places: FloatArray) -> FloatArray:
+    """Return a number for each place that hardly any other has, shape (N,)."""
+    return np.asarray(places[:, 0] + np.pi * places[:, 1] + np.e * places[:, 2])
