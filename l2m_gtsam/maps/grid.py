@@ -55,9 +55,10 @@ class Grid:
     def _own(self, points: FloatArray) -> IntArray:
         """Return the block in which each point lies, -1 if in none, shape (N,)."""
         lowest, highest = self.cells.min(axis=0), self.cells.max(axis=0)
-        # One cell more on each side is for all that is outside.
-        cells = np.floor((points[:, :2] - self.origin) / self.size)
-        cells = np.clip(cells, lowest - 1, highest + 1).astype(np.int64) - lowest
+        # To the middle of one cell more on each side, which is for all that is outside.
+        nearest, furthest = (lowest - 0.5) * self.size, (highest + 1.5) * self.size
+        along = np.clip(points[:, :2] - self.origin, nearest, furthest)
+        cells = np.floor(along / self.size).astype(np.int64) - lowest
         width = highest[1] - lowest[1] + 3
         names = (self.cells - lowest) @ (width, 1)  # in order, as the cells are
         wanted = cells @ (width, 1)

@@ -4,10 +4,7 @@
 
 All points here are *scaled*: taken from a centre near the data and divided by the length scale,
 so that k = s^2 exp(x.y - |x|^2 / 2 - |y|^2 / 2). The exponent is one matrix product of five
-features per point, and value and gradient of a posterior mean are a second one:
-
-    mean_i     = sum_j k_j alpha_ji
-    dmean_i/dx = -(1/l) sum_j (x - y_j) k_j alpha_ji = (1/l) (K [alpha_i y] - x mean_i)
+features per point.
 
 The three axes of the field share the kernel, hence one matrix is factorised instead of three and
 the variance is isotropic: the vertical axis is usually the roughest and the sigmas of the three
@@ -76,46 +73,3 @@ def kernel_to(x: FloatArray, columns: FloatArray) -> FloatArray:
     K = rows @ columns
     np.exp(K, out=K)
     return np.asarray(K)
-
-
-def mean_weights(alpha: FloatArray, y: FloatArray) -> FloatArray:
-    """Return [alpha, alpha (x) y], shape (M, 12): what ``mean_and_gradient`` multiplies.
-
-    Parameters
-    ----------
-    alpha
-        Weights of the training readings per axis, shape (M, 3).
-    y
-        Scaled training points, shape (M, 3).
-    """
-    outer = alpha[:, :, None] * y[:, None, :]
-    return np.hstack([alpha, outer.reshape(len(y), 9)])
-
-
-def mean_and_gradient(
-    K: FloatArray, weights: FloatArray, x: FloatArray, length_scale: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the posterior mean without its constant and its gradient.
-
-    Parameters
-    ----------
-    K
-        Kernel between the points and the training points, shape (N, M).
-    weights
-        From ``mean_weights``, shape (M, 12).
-    x
-        Scaled points, shape (N, 3).
-    length_scale
-        Metres.
-
-    Returns
-    -------
-    mean
-        uT, shape (N, 3).
-    gradient
-        ``gradient[n, i, j]`` = dmean_i/dx_j in uT/m, shape (N, 3, 3).
-    """
-    sums = K @ weights
-    mean = sums[:, :3]
-    moments = sums[:, 3:].reshape(-1, 3, 3)
-    return mean, (moments - mean[:, :, None] * x[:, None, :]) / length_scale

@@ -11,31 +11,8 @@ from scipy.linalg.lapack import dtrtri
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.hyperparameters import Hyperparameters, not_definite
-from l2m_gtsam.maps.kernel import (
-    kernel_matrix,
-    kernel_to,
-    mean_and_gradient,
-    mean_weights,
-    scaled,
-    training_columns,
-)
+from l2m_gtsam.maps.kernel import kernel_matrix, kernel_to, scaled, training_columns
 from l2m_gtsam.maps.training import TrainingSet
-
-
-@dataclass(frozen=True)
-class KernelRows:
-    """The kernel between points and training readings.
-
-    Attributes
-    ----------
-    x
-        Scaled points, shape (N, 3).
-    K
-        Kernel in square microtesla, shape (N, M).
-    """
-
-    x: FloatArray
-    K: FloatArray
 
 
 @dataclass(frozen=True)
@@ -50,8 +27,8 @@ class Posterior:
         Origin of the scaled points in metres, shape (3,).
     y
         Scaled training points, shape (M, 3).
-    weights
-        Of ``mean_weights``, shape (M, 12).
+    alpha
+        Weights of the training readings per axis in 1/uT, shape (M, 3).
     noise_variance
         Of each reading in square microtesla, shape (M,).
     whitener
@@ -63,7 +40,7 @@ class Posterior:
     hyperparameters: Hyperparameters
     centre: FloatArray
     y: FloatArray
-    weights: FloatArray
+    alpha: FloatArray
     noise_variance: FloatArray
     whitener: FloatArray | None
 
@@ -72,28 +49,25 @@ class Posterior:
         """Of ``training_columns``, shape (5, M)."""
         return training_columns(self.y, self.hyperparameters.signal)
 
-    def rows(self, points: FloatArray) -> KernelRows:
-        """Return the kernel rows of points in metres, shape (N, 3)."""
-        x = scaled(points, self.centre, self.hyperparameters.length_scale)
-        return KernelRows(x, kernel_to(x, self.columns))
+    def rows(self, points: FloatArray) -> FloatArray:
+        """Return the kernel between points in metres, (N, 3), and readings in uT^2, (N, M)."""
+        return kernel_to(
+            scaled(points, self.centre, self.hyperparameters.length_scale), self.columns
+        )
 
-    def mean_and_gradient(self, rows: KernelRows) -> tuple[FloatArray, FloatArray]:
-        """Return the residual's mean (N, 3) in uT and its gradient (N, 3, 3) in uT/m."""
-        return mean_and_gradient(rows.K, self.weights, rows.x, self.hyperparameters.length_scale)
-
-    def variance(self, rows: KernelRows) -> FloatArray:
-        """Return the posterior variance of each axis in square microtesla, shape (N,)."""
+    def variance(self, K: FloatArray) -> FloatArray:
+        """Return the posterior variance of each axis in square microtesla, from rows, (N,)."""
         whitener = self.whitener
         if whitener is None:
             whitener = inverted(factorise(self.y, self.noise_variance, self.hyperparameters))
-        V = dtrmm(1.0, whitener, rows.K.T, lower=1)
+        V = dtrmm(1.0, whitener, K.T, lower=1)
         explained = np.einsum("mn,mn->n", V, V)
         return np.asarray(np.maximum(self.hyperparameters.signal**2 - explained, 0.0))
 
-    def within(self, rows: KernelRows, reach: float) -> BoolArray:
+    def within(self, K: FloatArray, reach: float) -> BoolArray:
         """Return whether the nearest reading lies within ``reach`` length scales, shape (N,)."""
         least = self.hyperparameters.signal**2 * np.exp(-0.5 * reach**2)
-        return np.asarray(rows.K.max(axis=1) >= least)
+        return np.asarray(K.max(axis=1) >= least)
 
     def without_whitener(self) -> "Posterior":
         """Return the same posterior in less memory."""
@@ -125,8 +99,7 @@ def condition(
     noise_variance = hyperparameters.noise**2 / readings.weight
     factor = factorise(y, noise_variance, hyperparameters)
     alpha = cho_solve((factor, True), readings.field - mean, check_finite=False)
-    weights, whitener = mean_weights(alpha, y), inverted(factor)
-    return Posterior(hyperparameters, centre, y, weights, noise_variance, whitener)
+    return Posterior(hyperparameters, centre, y, alpha, noise_variance, inverted(factor))
 
 
 def factorise(

@@ -17,7 +17,7 @@ def test_the_block_of_a_point_is_the_nearest_in_x_or_y(seed: int) -> None:
     middle = grid.centres[rng.integers(0, len(grid), 100)]
     borders = middle + rng.choice([-0.5, 0.0, 0.5], (100, 2)) * grid.size
     around = grid.centres.mean(axis=0) + rng.uniform(-8, 8, (300, 2)) * grid.size
-    far = rng.choice([-1.0, 1.0], (20, 2)) * 10.0 ** rng.uniform(2, 8, (20, 2))
+    far = rng.choice([-1.0, 1.0], (20, 2)) * 10.0 ** rng.uniform(2, 300, (20, 2))
     points = np.column_stack([np.concatenate([borders, around, far]), np.zeros(420)])
 
     away = np.abs(points[:, None, :2] - grid.centres).max(axis=2)
