@@ -4,10 +4,9 @@ What a map is worth at a place, its variance, costs a triangular solve with hund
 forty times its field. A calibration comes back to the places of a drive, where sensors start and
 where they were found, to test ranks, to compare models and to judge residuals. Within a solve one
 step after the other asks for the field where the last one ended, of all readings or of those that
-count: the last few answers are remembered, too.
+count: the last answer is remembered, too.
 """
 
-from collections import deque
 from dataclasses import dataclass
 from threading import Lock
 from typing import Any
@@ -19,7 +18,6 @@ from l2m_gtsam.graph.view import QueryableMap
 
 MOST = 500_000  # places that are remembered: 100 MB
 VALUES = 15  # field, gradient and variance
-RECENT = 2  # answers without variances that are remembered
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class RememberedMap:
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
-        self._recent: deque[Answer] = deque(maxlen=RECENT)
+        self._last = Answer(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def __getattr__(self, name: str) -> Any:
         if name == "_map":  # before there is one, as when another process unpacks it
@@ -57,36 +55,25 @@ class RememberedMap:
         return RememberedMap, (self._map,)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return field and gradient; those of the last few questions are remembered."""
+        """Return field and gradient; those of the last question are remembered."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-        fresh = np.ones(len(points), dtype=np.bool_)
         with self._lock:
-            recent = tuple(self._recent)
-        for answer in reversed(recent):
-            if not fresh.any():
-                break
-            ask = np.flatnonzero(fresh)
-            at = rows_among(answer.points, points[ask])
-            told = ask[at >= 0]
-            field[told], gradient[told] = answer.field[at[at >= 0]], answer.gradient[at[at >= 0]]
-            fresh[told] = False
-        if fresh.any():
-            field[fresh], gradient[fresh] = self._map.field_and_gradient(points[fresh])
-            self._remember(points, field, gradient)
+            last = self._last
+        at = rows_among(last.points, points)
+        told = at >= 0
+        if told.all():
+            return last.field[at], last.gradient[at]
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        field[told], gradient[told] = last.field[at[told]], last.gradient[at[told]]
+        field[~told], gradient[~told] = self._map.field_and_gradient(points[~told])
+        with self._lock:
+            self._last = Answer(points.copy(), field.copy(), gradient.copy())
         return field, gradient
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
         with self._lock:
-            sample = self._recalled(points)
-        self._remember(points, sample.field, sample.gradient)
-        return sample
-
-    def _remember(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> None:
-        with self._lock:
-            self._recent.append(Answer(points.copy(), field.copy(), gradient.copy()))
+            return self._recalled(np.ascontiguousarray(points, dtype=np.float64))
 
     def _recalled(self, points: FloatArray) -> FieldSample:
         names = points.view(f"V{points.itemsize * points.shape[1]}").ravel().tolist()

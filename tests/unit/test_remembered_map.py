@@ -19,9 +19,10 @@ class Counting:
     """A world with a made-up variance that counts the places it is asked for."""
 
     def __init__(self) -> None:
-        self.world, self.asked = dipole_world(1), 0
+        self.world, self.asked, self.fields = dipole_world(1), 0, 0
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        self.fields += len(points)
         return self.world.field_and_gradient(points)
 
     def query(self, points: FloatArray, /) -> FieldSample:
@@ -45,6 +46,27 @@ def test_answers_are_the_maps_own_and_places_are_asked_once(rows: list[list[int]
         asked = counting.asked
         remembered.query(at)
         assert counting.asked == asked
+
+
+@settings(max_examples=30)
+@given(rows=st.lists(st.lists(st.integers(0, 30), max_size=20), min_size=1, max_size=6))
+def test_fields_of_the_last_question_are_asked_once(rows: list[list[int]]) -> None:
+    """Of the same places, some of them or more, in any order, to the last bit."""
+    places = np.random.default_rng(0).normal(size=(31, 3))
+    counting, last = Counting(), set[int]()
+    remembered = RememberedMap(counting)
+    for chosen in rows:
+        at, before = places[np.array(chosen, dtype=np.int64)], counting.fields
+        own_field, own_gradient = Counting().field_and_gradient(at)
+        for again in (False, True):
+            field, gradient = remembered.field_and_gradient(at)
+            np.testing.assert_array_equal(field, own_field)
+            np.testing.assert_array_equal(gradient, own_gradient)
+            field[:], gradient[:] = np.nan, np.nan  # whoever asked may do what it likes with them
+            if not again:
+                assert counting.fields - before == sum(row not in last for row in chosen)
+                last = set(chosen) if counting.fields > before else last
+        assert counting.fields - before <= len(chosen)
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
