@@ -285,7 +285,7 @@ def settle(
         if not now.view.sensors:
             return Joint(readings, estimate, whole, now.weights, None, ending, settled=False)
         problem = joint_problem(now.view, field_map, estimate, options)
-        step = joint_step(problem, estimate, options)
+        step = joint_step(problem, estimate, options, exact=now.final)
         moved = float(np.abs(step.estimate.t - estimate.t).max())
         late = float(np.abs(step.estimate.offset - estimate.offset).max())
         quiet = moved < SETTLED_M and late < SETTLED_S and step.estimate.same_noise(estimate)
