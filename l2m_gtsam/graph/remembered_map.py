@@ -55,7 +55,7 @@ class RememberedMap:
         return RememberedMap, (self._map,)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return field and gradient; those of the last question are remembered."""
+        """Return field and gradient; those of the last question or query are remembered."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         with self._lock:
             last = self._last
@@ -72,8 +72,12 @@ class RememberedMap:
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
         with self._lock:
-            return self._recalled(np.ascontiguousarray(points, dtype=np.float64))
+            sample = self._recalled(points)
+            inside = sample.inside
+            self._last = Answer(points[inside], sample.field[inside], sample.gradient[inside])
+        return sample
 
     def _recalled(self, points: FloatArray) -> FieldSample:
         names = points.view(f"V{points.itemsize * points.shape[1]}").ravel().tolist()

@@ -69,6 +69,19 @@ def test_fields_of_the_last_question_are_asked_once(rows: list[list[int]]) -> No
         assert counting.fields - before <= len(chosen)
 
 
+def test_fields_of_a_query_are_those_inside() -> None:
+    """Outside a query says nothing where the field itself goes on."""
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    places = np.random.default_rng(0).normal(size=(31, 3))
+    remembered.query(places)
+    field, gradient = remembered.field_and_gradient(places)
+    own_field, own_gradient = Counting().field_and_gradient(places)
+    np.testing.assert_array_equal(field, own_field)
+    np.testing.assert_array_equal(gradient, own_gradient)
+    assert 0 < counting.fields == (places[:, 0] <= 0).sum()
+
+
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond it all is forgotten, and answers stay right."""
     monkeypatch.setattr(remembered_map, "MOST", 10)
