@@ -8,6 +8,7 @@ a straight line of the map.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -29,8 +30,15 @@ class PoseMotion:
     twist_lidar: FloatArray
     offset: FloatArray
 
+    @cached_property
+    def at_rest(self) -> bool:
+        """Whether the lidar moves at no reading."""
+        return not self.twist_lidar.any()
+
     def after(self, offset: FloatArray) -> "PoseMotion":
         """Return the motion at other time offsets, shape (N,): the frame of ``v`` has turned."""
+        if self.at_rest:
+            return replace(self, offset=offset)
         turn = rotation_matrices(-self._angle(offset))
         v = np.einsum("nij,nj->ni", turn, self.twist_lidar[:, 3:])
         return replace(self, twist_lidar=np.hstack([self.twist_lidar[:, :3], v]), offset=offset)
@@ -53,6 +61,8 @@ def moved(
     offset
         Where they are wanted, seconds, shape (N,).
     """
+    if motion.at_rest:
+        return R_map_lidar, p_map_lidar
     later = (offset - motion.offset)[:, None]
     R = R_map_lidar @ rotation_matrices(motion.twist_lidar[:, :3] * later)
     way = np.einsum("nij,nj->ni", R_map_lidar, motion.twist_lidar[:, 3:])

@@ -162,7 +162,7 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
         For each reading of the batch the matrix W that makes the noise of ``W e`` white with unit
         variance, in 1/uT, shape (N, 3, 3).
     """
-    rows = batch.rows_of(sensor)
+    rows = _span(batch.rows_of(sensor))
     W = whitening[rows]
 
     def error(
@@ -171,8 +171,15 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
         residuals = batch.residuals(values, sensor)
         if jacobians is not None:
             for slot, jacobian in enumerate(batch.jacobians(residuals)):
-                jacobians[slot] = (W @ jacobian[rows]).reshape(3 * len(rows), -1)
+                jacobians[slot] = (W @ jacobian[rows]).reshape(3 * len(W), -1)
         return np.asarray(np.einsum("nij,nj->ni", W, residuals.residual[rows]).ravel())
 
-    unit = gtsam.noiseModel.Unit.Create(3 * len(rows))
+    unit = gtsam.noiseModel.Unit.Create(3 * len(W))
     return gtsam.CustomFactor(unit, batch.keys_of(sensor), error)
+
+
+def _span(rows: npt.NDArray[np.int64]) -> npt.NDArray[np.int64] | slice:
+    """Return rows that follow each other as a slice, which copies nothing."""
+    if len(rows) and rows[-1] - rows[0] == len(rows) - 1:
+        return slice(int(rows[0]), int(rows[-1]) + 1)
+    return rows

@@ -138,7 +138,7 @@ def field_rate(
     motion
         Of the lidar; none is rest.
     """
-    if motion is None:
+    if motion is None or motion.at_rest:
         return np.zeros_like(b_lidar)
     w, v = motion.twist_lidar[:, :3], motion.twist_lidar[:, 3:]
     sweep = v + np.cross(w, t)

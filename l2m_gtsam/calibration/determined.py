@@ -45,12 +45,12 @@ def determinacies(
         The scales of the test.
     """
     alone = {sensor: timed_determinacy(J, options) for sensor, J in jacobians.items()}
-    few = {sensor: np.asarray(np.linalg.qr(J, mode="r")) for sensor, J in jacobians.items()}
     held = frozenset(sensor for sensor, test in alone.items() if not test.offset)
     linear, tests = priors.graph(jacobians).linearize(values), dict(alone)
     for sensors in clusters_of(linear, list(jacobians)):
         known = Priors(priors.among(sensors))
         if known.each:
+            few = {each: np.asarray(np.linalg.qr(jacobians[each], mode="r")) for each in sensors}
             cluster = Cluster(sensors, few, held, values, options)
             tests |= {each: with_priors(each, cluster, known) for each in sensors}
     return tests

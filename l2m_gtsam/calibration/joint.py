@@ -37,7 +37,8 @@ from l2m_gtsam.solve.noise import (
 )
 from l2m_gtsam.solve.rank import Determinacy
 
-# Of each round; two rounds at least are made, and each step shortens what remains fourfold.
+# Of each round whose weights may be the last; two of these at least are made, and each step
+# shortens what remains fourfold.
 POLISHING_STEPS = 2
 OWN = np.arange(SENSOR)  # where a sensor that shares no error stands among its variables
 
@@ -150,8 +151,9 @@ def joint_problem(
     """Build the joint graph at an estimate: rank test first, undetermined directions held."""
     sensor, C = view.readings.sensor, estimate.C()[view.readings.sensor]
     share = map_covariance(C, view.readings.R_map_lidar, view.map_variance)
-    by_pose = C @ error_of_poses(view.readings, field_map, estimate)
-    share += by_pose @ by_pose.transpose(0, 2, 1)
+    if view.readings.pose_root is not None:
+        by_pose = C @ error_of_poses(view.readings, field_map, estimate)
+        share += by_pose @ by_pose.transpose(0, 2, 1)
     covariance = reading_covariance(estimate.noise[sensor], share, view.trust)
     batch = batch_readings(view.readings, field_map)
     values, W = estimate.values(view.sensors), whitening(covariance)
@@ -162,12 +164,19 @@ def joint_problem(
     return JointProblem(view, batch, share, covariance, tests, graph)
 
 
-def joint_step(problem: JointProblem, estimate: Estimate, options: OneKeyOptions) -> JointStep:
-    """Optimise T(i), D(i), S(i) of all sensors, then the noise from the residuals that remain."""
+def joint_step(
+    problem: JointProblem, estimate: Estimate, options: OneKeyOptions, *, exact: bool
+) -> JointStep:
+    """Optimise T(i), D(i), S(i) of all sensors, then the noise from the residuals that remain.
+
+    ``exact`` goes to where the gradient vanishes; where the weights are those of a stage on the way
+    a step less is enough.
+    """
     sensors = problem.view.sensors
     start = estimate.values(sensors)
     optimised = optimise(problem.graph, start, options.optimizer, options.joint_iterations)
-    values = polish(problem.graph, optimised.values, POLISHING_STEPS).values
+    steps = POLISHING_STEPS if exact else POLISHING_STEPS - 1
+    values = polish(problem.graph, optimised.values, steps).values
     after = estimate.updated(values, sensors)
     most = options.largest_offset_s
     after = replace(after, offset=np.clip(after.offset, -most, most))

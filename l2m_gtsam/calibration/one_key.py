@@ -30,11 +30,12 @@ from l2m_gtsam.calibration.joint import (
 )
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.remembered_map import RememberedMap
+from l2m_gtsam.calibration.remembered_map import RememberedMap, remembered
 from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
 from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings, Trajectory
+from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
@@ -177,6 +178,7 @@ class Finish:
     shared: SharedFinish
 
 
+@one_blas_thread()
 def _solved(
     readings: Readings,
     field_map: QueryableMap,
@@ -187,6 +189,7 @@ def _solved(
     priors: Priors,
     finish: Finish,
 ) -> OneKeySolution:
+    field_map = remembered(field_map)
     good = readings.select(plausible(readings, field_map, t_start, options.robust))
     start = start_estimate(t_start, options, priors)
     near = alternate(good, field_map, start, options, tell)
@@ -311,7 +314,7 @@ def settle(
             weights = now.weights
             return Joint(readings, estimate, asked, whole, weights, None, ending, settled=False)
         problem = joint_problem(now.view, field_map, estimate, options)
-        step = joint_step(problem, estimate, options)
+        step = joint_step(problem, estimate, options, exact=now.final)
         moved = float(np.abs(step.estimate.t - estimate.t).max())
         late = float(np.abs(step.estimate.offset - estimate.offset).max())
         quiet = moved < SETTLED_M and late < SETTLED_S and step.estimate.same_noise(estimate)

@@ -2,9 +2,12 @@
 
 What a map is worth at a place, its variance, costs a triangular solve with hundreds of weights:
 forty times its field. A calibration comes back to the places of a drive, where sensors start and
-where they were found, to test ranks, to compare models and to judge residuals.
+where they were found, to test ranks, to compare models and to judge residuals. Within a solve one
+step after the other asks for the field where the last one ended, of all readings or of those that
+count: the last answer is remembered, too.
 """
 
+from dataclasses import dataclass
 from threading import Lock
 from typing import Any
 
@@ -15,6 +18,15 @@ from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 
 MOST = 500_000  # places that are remembered: 100 MB
 VALUES = 15  # field, gradient and variance
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Field (N, 3) in uT and gradient (N, 3, 3) in uT/m at points (N, 3) in metres."""
+
+    points: FloatArray
+    field: FloatArray
+    gradient: FloatArray
 
 
 class RememberedMap:
@@ -32,7 +44,7 @@ class RememberedMap:
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
-        self._last = np.empty((0, 3)), (np.empty((0, 3)), np.empty((0, 3, 3)))
+        self._last = Answer(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def __getattr__(self, name: str) -> Any:
         if name == "_map":  # before there is one, as when another process unpacks it
@@ -43,23 +55,29 @@ class RememberedMap:
         return RememberedMap, (self._map,)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return field and gradient, to be read only.
-
-        They cost little, and only the last answer is remembered: a round of the solve asks for
-        residuals, for their derivatives and for what errors of the poses do at the same places.
-        """
-        asked, answer = self._last
-        if not np.array_equal(points, asked):
-            answer = self._map.field_and_gradient(points)
-            for each in answer:
-                each.setflags(write=False)
-            self._last = points.copy(), answer
-        return answer
+        """Return field and gradient; those of the last question or query are remembered."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        with self._lock:
+            last = self._last
+        at = rows_among(last.points, points)
+        told = at >= 0
+        if told.all():
+            return last.field[at], last.gradient[at]
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+        field[told], gradient[told] = last.field[at[told]], last.gradient[at[told]]
+        field[~told], gradient[~told] = self._map.field_and_gradient(points[~told])
+        with self._lock:
+            self._last = Answer(points.copy(), field.copy(), gradient.copy())
+        return field, gradient
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
         with self._lock:
-            return self._recalled(np.ascontiguousarray(points, dtype=np.float64))
+            sample = self._recalled(points)
+            inside = sample.inside
+            self._last = Answer(points[inside], sample.field[inside], sample.gradient[inside])
+        return sample
 
     def remember(self, points: FloatArray, sample: FieldSample) -> None:
         """Take what is known of places, shape (N, 3), from elsewhere for the map's own answer."""
@@ -99,3 +117,32 @@ class RememberedMap:
 def _names(points: FloatArray) -> list[bytes]:
     """Return the bits of each point."""
     return points.view(f"V{points.itemsize * points.shape[1]}").ravel().tolist()
+
+
+def remembered(field_map: QueryableMap) -> RememberedMap:
+    """Return a map with a memory; the map itself if it has one."""
+    return field_map if isinstance(field_map, RememberedMap) else RememberedMap(field_map)
+
+
+def rows_among(known: FloatArray, wanted: FloatArray) -> IntArray:
+    """Return in which row of known places each wanted one is, -1 where in none, shape (M,).
+
+    Parameters
+    ----------
+    known, wanted
+        Places, shapes (N, 3) and (M, 3); equal to the last bit or not at all.
+    """
+    if np.array_equal(known, wanted):
+        return np.arange(len(known))
+    numbers, wanted_numbers = _numbers(known), _numbers(wanted)
+    if not len(np.intersect1d(numbers, wanted_numbers)):  # as most often: the sensor has moved
+        return np.full(len(wanted), -1)
+    order = np.argsort(numbers)
+    at = np.searchsorted(numbers, wanted_numbers, sorter=order)
+    found = order[np.minimum(at, len(known) - 1)]
+    return np.asarray(np.where((known[found] == wanted).all(axis=1), found, -1))
+
+
+def _numbers(places: FloatArray) -> FloatArray:
+    """Return a number for each place that hardly any other has, shape (N,)."""
+    return np.asarray(places[:, 0] + np.pi * places[:, 1] + np.e * places[:, 2])

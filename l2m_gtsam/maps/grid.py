@@ -45,8 +45,25 @@ class Grid:
         points
             Metres, shape (N, 3).
         """
-        _, nearest = cKDTree(self.centres).query(points[:, :2], p=np.inf)
-        return np.asarray(nearest, dtype=np.int64)
+        block = self._own(points)
+        outside = np.flatnonzero(block < 0)
+        if len(outside):
+            _, nearest = cKDTree(self.centres).query(points[outside, :2], p=np.inf)
+            block[outside] = nearest
+        return block
+
+    def _own(self, points: FloatArray) -> IntArray:
+        """Return the block in which each point lies, -1 if in none, shape (N,)."""
+        lowest, highest = self.cells.min(axis=0), self.cells.max(axis=0)
+        # To the middle of one cell more on each side, which is for all that is outside.
+        nearest, furthest = (lowest - 0.5) * self.size, (highest + 1.5) * self.size
+        along = np.clip(points[:, :2] - self.origin, nearest, furthest)
+        cells = np.floor(along / self.size).astype(np.int64) - lowest
+        width = highest[1] - lowest[1] + 3
+        names = (self.cells - lowest) @ (width, 1)  # in order, as the cells are
+        wanted = cells @ (width, 1)
+        found = np.minimum(np.searchsorted(names, wanted), len(names) - 1)
+        return np.asarray(np.where(names[found] == wanted, found, -1))
 
     def members(self, points: FloatArray, margin: float) -> list[IntArray]:
         """Return the rows of the points in each block grown by a margin in metres."""

@@ -4,10 +4,7 @@
 
 All points here are *scaled*: taken from a centre near the data and divided by the length scale,
 so that k = s^2 exp(x.y - |x|^2 / 2 - |y|^2 / 2). The exponent is one matrix product of five
-features per point, and value and gradient of a posterior mean are a second one:
-
-    mean_i     = sum_j k_j alpha_ji
-    dmean_i/dx = -(1/l) sum_j (x - y_j) k_j alpha_ji = (1/l) (K [alpha_i y] - x mean_i)
+features per point.
 
 The three axes of the field share the kernel, hence one matrix is factorised instead of three and
 the variance is isotropic: the vertical axis is usually the roughest and the sigmas of the three
@@ -49,52 +46,30 @@ def kernel_matrix(x: FloatArray, y: FloatArray, signal: float) -> FloatArray:
     signal
         Prior standard deviation s in uT.
     """
-    rows = np.column_stack([x, -0.5 * np.sum(x * x, axis=1), np.ones(len(x))])
-    offset = 2 * np.log(signal) - 0.5 * np.sum(y * y, axis=1)
-    columns = np.column_stack([y, np.ones(len(y)), offset])
-    K = rows @ columns.T
-    np.exp(K, out=K)
-    return np.asarray(K)
+    return kernel_to(x, training_columns(y, signal))
 
 
-def mean_weights(alpha: FloatArray, y: FloatArray) -> FloatArray:
-    """Return [alpha, alpha (x) y], shape (M, 12): what ``mean_and_gradient`` multiplies.
+def training_columns(y: FloatArray, signal: float) -> FloatArray:
+    """Return the features of training points in the exponent, shape (5, M); see ``kernel_matrix``.
 
-    Parameters
-    ----------
-    alpha
-        Weights of the training readings per axis, shape (M, 3).
-    y
-        Scaled training points, shape (M, 3).
+    They stay the same for all points that are asked for.
     """
-    outer = alpha[:, :, None] * y[:, None, :]
-    return np.hstack([alpha, outer.reshape(len(y), 9)])
+    offset = 2 * np.log(signal) - 0.5 * np.einsum("mi,mi->m", y, y)
+    return np.ascontiguousarray(np.column_stack([y, np.ones(len(y)), offset]).T)
 
 
-def mean_and_gradient(
-    K: FloatArray, weights: FloatArray, x: FloatArray, length_scale: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the posterior mean without its constant and its gradient.
+def kernel_to(x: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return the kernel between scaled points, shape (N, 3), and training points, shape (N, M).
 
     Parameters
     ----------
-    K
-        Kernel between the points and the training points, shape (N, M).
-    weights
-        From ``mean_weights``, shape (M, 12).
     x
         Scaled points, shape (N, 3).
-    length_scale
-        Metres.
-
-    Returns
-    -------
-    mean
-        uT, shape (N, 3).
-    gradient
-        ``gradient[n, i, j]`` = dmean_i/dx_j in uT/m, shape (N, 3, 3).
+    columns
+        From ``training_columns``, shape (5, M).
     """
-    sums = K @ weights
-    mean = sums[:, :3]
-    moments = sums[:, 3:].reshape(-1, 3, 3)
-    return mean, (moments - mean[:, :, None] * x[:, None, :]) / length_scale
+    rows = np.empty((len(x), 5))
+    rows[:, :3], rows[:, 3], rows[:, 4] = x, -0.5 * np.einsum("ni,ni->n", x, x), 1.0
+    K = rows @ columns
+    np.exp(K, out=K)
+    return np.asarray(K)

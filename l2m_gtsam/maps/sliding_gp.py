@@ -8,6 +8,7 @@ to the dense process as the margin grows.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -17,6 +18,7 @@ from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.grid import Grid, grid_over
+from l2m_gtsam.maps.kernel_sum import KernelSums
 from l2m_gtsam.maps.posterior import Posterior, condition
 from l2m_gtsam.maps.trained import (
     GPOptions,
@@ -31,8 +33,8 @@ from l2m_gtsam.maps.trained import (
 from l2m_gtsam.maps.training import TrainingSet, checked_points
 
 KIND = "sliding_gp"
-MOST_IN_BLOCK = 6000  # rows; the factor of such a block takes 290 MB
-FACTOR_MEMORY = 1e9  # bytes of factors that are kept for variances
+MOST_IN_BLOCK = 6000  # rows; the whitener of such a block takes 290 MB
+FACTOR_MEMORY = 1e9  # bytes of whiteners that are kept for variances
 BATCH = 256  # points whose kernel rows are in memory, and about in cache, at once
 
 
@@ -148,6 +150,11 @@ class SlidingGP:
         # Factors of all blocks are hundreds of times as large as what they follow from.
         return SlidingGP.condition, (self.trained, self.options)
 
+    @cached_property
+    def sums(self) -> KernelSums:
+        """The means of all blocks."""
+        return KernelSums.of(self.blocks)
+
     @property
     def kind(self) -> str:
         """Name of the map kind."""
@@ -173,24 +180,19 @@ class SlidingGP:
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
         points = checked_points(points)
-        N = len(points)
-        field, gradient = np.empty((N, 3)), np.empty((N, 3, 3))
-        variance, inside = np.empty((N, 3)), np.empty(N, dtype=np.bool_)
+        field, gradient = self.field_and_gradient(points)
+        variance, inside = np.empty((len(points), 3)), np.empty(len(points), dtype=np.bool_)
         for visit in self._visits(points):
             block, at = self.blocks[visit.block], visit.rows
-            rows = block.rows(points[at])
-            field[at], gradient[at] = block.mean_and_gradient(rows)
-            variance[at] = block.variance(rows)[:, None]
-            inside[at] = block.within(rows, self.options.reach)
-        return masked(FieldSample(field + self.mean, gradient, variance, inside))
+            K = block.rows(points[at])
+            variance[at] = block.variance(K)[:, None]
+            inside[at] = block.within(K, self.options.reach)
+        return masked(FieldSample(field, gradient, variance, inside))
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
-        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-        for visit in self._visits(points):
-            block, at = self.blocks[visit.block], visit.rows
-            field[at], gradient[at] = block.mean_and_gradient(block.rows(points[at]))
+        field, gradient = self.sums.mean_and_gradient(points, self.grid.block_of(points))
         return field + self.mean, gradient
 
     def variance(self, points: FloatArray) -> FloatArray:
@@ -218,10 +220,11 @@ class SlidingGP:
         """Yield every point once, block by block and batch by batch."""
         owner = self.grid.block_of(points)
         order = np.argsort(owner, kind="stable")
-        edges = np.flatnonzero(np.diff(owner[order])) + 1
-        for group in np.split(order, edges):
-            for start in range(0, len(group), BATCH):
-                yield Visit(int(owner[group[0]]), group[start : start + BATCH])
+        counts = np.bincount(owner)
+        ends = np.cumsum(counts)
+        for block in np.flatnonzero(counts):
+            for start in range(ends[block] - counts[block], ends[block], BATCH):
+                yield Visit(int(block), order[start : min(start + BATCH, ends[block])])
 
 
 def check_sizes(members: list[IntArray], block: float) -> None:
@@ -235,9 +238,9 @@ def check_sizes(members: list[IntArray], block: float) -> None:
 
 
 def posteriors(trained: Trained, members: list[IntArray]) -> Iterator[Posterior]:
-    """Yield the posterior of each block, with its factor as long as memory lasts."""
+    """Yield the posterior of each block, with its whitener as long as memory lasts."""
     mean, used = trained.readings.mean, 0
     for rows in members:
         posterior = condition(trained.readings[rows], mean, trained.hyperparameters)
         used += 8 * len(rows) ** 2
-        yield posterior if used <= FACTOR_MEMORY else posterior.without_factor()
+        yield posterior if used <= FACTOR_MEMORY else posterior.without_whitener()

@@ -1,6 +1,7 @@
 """The noise of readings: what the map and the sensor contribute, and how large the sensor's is."""
 
 import numpy as np
+from numba import njit
 from scipy.optimize import brentq
 
 from l2m_gtsam.data import FloatArray
@@ -24,7 +25,7 @@ def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatAr
         Variance of the map per axis of the map frame in uT^2, shape (N, 3).
     """
     A = C @ R_map_lidar.transpose(0, 2, 1)
-    return np.asarray(np.einsum("nik,nk,njk->nij", A, map_variance, A))
+    return np.asarray((A * map_variance[:, None, :]) @ A.transpose(0, 2, 1))
 
 
 def reading_covariance(
@@ -46,9 +47,44 @@ def reading_covariance(
 
 
 def whitening(covariance: FloatArray) -> FloatArray:
-    """Return matrices W with ``W S W^T = I``, shape (N, 3, 3)."""
-    lower = np.linalg.cholesky(covariance)
-    return np.asarray(np.linalg.solve(lower, np.broadcast_to(np.eye(3), lower.shape)))
+    """Return lower triangular matrices W with ``W S W^T = I``, shape (N, 3, 3).
+
+    Raises
+    ------
+    LinAlgError
+        If a covariance is not positive definite.
+    """
+    W = np.zeros(covariance.shape)
+    if not write_inverse_roots(np.ascontiguousarray(covariance, dtype=np.float64), W):
+        raise np.linalg.LinAlgError("a reading's covariance is not positive definite")
+    return W
+
+
+@njit(cache=True, nogil=True)
+def write_inverse_roots(covariance: FloatArray, W: FloatArray) -> bool:
+    """Write the inverse Cholesky factors of matrices (N, 3, 3) into zeros; whether all exist.
+
+    In closed form: LAPACK takes ten times as long to be called for each.
+    """
+    for n in range(len(covariance)):
+        S, w = covariance[n], W[n]
+        if not S[0, 0] > 0:
+            return False
+        w[0, 0] = 1 / np.sqrt(S[0, 0])
+        l10, l20 = S[1, 0] * w[0, 0], S[2, 0] * w[0, 0]
+        d1 = S[1, 1] - l10 * l10
+        if not d1 > 0:
+            return False
+        w[1, 1] = 1 / np.sqrt(d1)
+        l21 = (S[2, 1] - l20 * l10) * w[1, 1]
+        d2 = S[2, 2] - l20 * l20 - l21 * l21
+        if not d2 > 0:
+            return False
+        w[2, 2] = 1 / np.sqrt(d2)
+        w[1, 0] = -l10 * w[0, 0] * w[1, 1]
+        w[2, 1] = -l21 * w[1, 1] * w[2, 2]
+        w[2, 0] = -(l20 * w[0, 0] + l21 * w[1, 0]) * w[2, 2]
+    return True
 
 
 def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float) -> float:

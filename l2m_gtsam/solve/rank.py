@@ -96,6 +96,7 @@ def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy
     options
         The scales.
     """
+    jacobian = np.asarray(np.linalg.qr(jacobian, mode="r"))  # a few rows that say the same
     scaled = jacobian * np.append(options.scale(), options.useful_offset_s)
     # A step of one of the 15 counts as one standard deviation of what is known without readings.
     others = np.vstack([scaled, np.eye(15, 16)])

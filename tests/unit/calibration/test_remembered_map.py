@@ -63,18 +63,38 @@ def test_what_is_known_from_elsewhere_is_not_asked() -> None:
     assert found.inside[:3].all()
 
 
-def test_the_last_field_is_not_asked_again() -> None:
-    """To the last bit; what a caller does to its places afterwards changes nothing."""
-    counting, places = Counting(), np.random.default_rng(0).normal(size=(4, 3))
-    remembered, asked = RememberedMap(counting), places.copy()
-    first = remembered.field_and_gradient(asked)
-    asked += 1.0
-    for at in (places, places + 1.0):
-        found = remembered.field_and_gradient(at)
-        for mine, own in zip(found, counting.world.field_and_gradient(at), strict=True):
-            np.testing.assert_array_equal(mine, own)
-    assert counting.fields == 8
-    assert not first[0].flags.writeable
+@settings(max_examples=30)
+@given(rows=st.lists(st.lists(st.integers(0, 30), max_size=20), min_size=1, max_size=6))
+def test_fields_of_the_last_question_are_asked_once(rows: list[list[int]]) -> None:
+    """Of the same places, some of them or more, in any order, to the last bit."""
+    places = np.random.default_rng(0).normal(size=(31, 3))
+    counting, last = Counting(), set[int]()
+    remembered = RememberedMap(counting)
+    for chosen in rows:
+        at, before = places[np.array(chosen, dtype=np.int64)], counting.fields
+        own_field, own_gradient = Counting().field_and_gradient(at)
+        for again in (False, True):
+            field, gradient = remembered.field_and_gradient(at)
+            np.testing.assert_array_equal(field, own_field)
+            np.testing.assert_array_equal(gradient, own_gradient)
+            field[:], gradient[:] = np.nan, np.nan  # whoever asked may do what it likes with them
+            if not again:
+                assert counting.fields - before == sum(row not in last for row in chosen)
+                last = set(chosen) if counting.fields > before else last
+        assert counting.fields - before <= len(chosen)
+
+
+def test_fields_of_a_query_are_those_inside() -> None:
+    """Outside a query says nothing where the field itself goes on."""
+    counting = Counting()
+    remembered = RememberedMap(counting)
+    places = np.random.default_rng(0).normal(size=(31, 3))
+    remembered.query(places)
+    field, gradient = remembered.field_and_gradient(places)
+    own_field, own_gradient = Counting().field_and_gradient(places)
+    np.testing.assert_array_equal(field, own_field)
+    np.testing.assert_array_equal(gradient, own_gradient)
+    assert 0 < counting.fields == (places[:, 0] <= 0).sum()
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

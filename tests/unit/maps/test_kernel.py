@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
-from l2m_gtsam.maps.kernel import kernel_matrix, mean_and_gradient, mean_weights, scaled
+from l2m_gtsam.maps.kernel import kernel_matrix, scaled
 
 # The exponent is a difference of squares of up to 30 length scales, whose digits end at 1e-13.
 ROUNDING = 1e-12
@@ -32,31 +32,6 @@ def test_a_matrix_of_points_with_themselves_is_a_covariance() -> None:
 @pytest.mark.parametrize("distance", [1e3, 1e9, 1e200, 1e308])
 def test_far_away_the_kernel_is_zero_and_never_nan(distance: float) -> None:
     y = np.random.default_rng(1).normal(0, 1, (20, 3))
-    weights = mean_weights(np.ones((20, 3)), y)
     for direction in np.vstack([np.eye(3), -np.eye(3)]):
         x = scaled(distance * direction[None], np.zeros(3), 0.5)
-        mean, gradient = mean_and_gradient(kernel_matrix(x, y, 2.0), weights, x, 0.5)
-        np.testing.assert_array_equal(mean, 0.0)
-        np.testing.assert_array_equal(gradient, 0.0)
-
-
-def test_the_gradient_is_the_derivative_of_the_mean() -> None:
-    rng = np.random.default_rng(2)
-    centre, length_scale = np.array([3.0, -2.0, 1.0]), 0.7
-    y = scaled(centre + rng.normal(0, 1, (80, 3)), centre, length_scale)
-    weights = mean_weights(rng.normal(0, 1, (80, 3)), y)
-    points = centre + rng.normal(0, 1, (25, 3))
-
-    def mean_at(shift: np.ndarray) -> np.ndarray:
-        x = scaled(points + shift, centre, length_scale)
-        return mean_and_gradient(kernel_matrix(x, y, 1.5), weights, x, length_scale)[0]
-
-    x = scaled(points, centre, length_scale)
-    _, gradient = mean_and_gradient(kernel_matrix(x, y, 1.5), weights, x, length_scale)
-    step = 1e-5
-    for j, axis in enumerate(np.eye(3)):
-        slope = (mean_at(step * axis) - mean_at(-step * axis)) / (2 * step)
-        # Central differences err by step^2 / 6 of the third derivative, about 1e-10 of the scale
-        # here, and by rounding / step, about 1e-10 of it too.
-        scale = np.abs(gradient).max()
-        np.testing.assert_allclose(gradient[:, :, j], slope, rtol=0, atol=3e-9 * scale)
+        np.testing.assert_array_equal(kernel_matrix(x, y, 2.0), 0.0)

@@ -157,12 +157,12 @@ def test_the_step_between_blocks_is_below_the_sigma() -> None:
     assert np.sqrt(np.mean(steps**2)) < 0.15
 
 
-def test_variances_do_not_depend_on_the_memory_for_factors(
+def test_variances_do_not_depend_on_the_memory_for_whiteners(
     sliding: SlidingGP, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sliding_gp, "FACTOR_MEMORY", 0)
     lean = SlidingGP.fit(*readings(), OPTIONS)
-    assert all(block.factor is None for block in lean.blocks)
+    assert all(block.whitener is None for block in lean.blocks)
     assert_same(lean.query(queries()), sliding.query(queries()), 0.0)
 
 

@@ -19,6 +19,22 @@ def test_whitening_makes_unit_covariance() -> None:
     )
 
 
+def test_whitening_is_the_inverse_of_the_cholesky_factor() -> None:
+    root = np.random.default_rng(4).normal(size=(50, 3, 3))
+    S = root @ root.transpose(0, 2, 1) + 1e-3 * np.eye(3)
+    # Of condition 1e4 at most.
+    expected = np.tril(np.linalg.inv(np.linalg.cholesky(S)))
+    np.testing.assert_allclose(whitening(S), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_covariance_that_is_none_is_refused(axis: int) -> None:
+    S = np.tile(np.eye(3), (5, 1, 1))
+    S[3, axis, axis] = -1.0
+    with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
+        whitening(S)
+
+
 def test_map_share_is_what_sampling_shows() -> None:
     """Covariance of C R^T d over 200,000 draws of the map's error; sampling error below 1 %."""
     rng = np.random.default_rng(1)
