@@ -116,6 +116,7 @@ class RayCaster:
         met = np.asarray(self._intersector.intersects_first(origins, directions))
         found = np.full(len(origins), np.inf)
         hit = np.flatnonzero(met >= 0)
+        # The distance along the ray to the plane of the triangle that it meets.
         anchor, normal = self._anchor[met[hit]], self._normal[met[hit]]
         height = np.einsum("ni,ni->n", normal, anchor - origins[hit])
         found[hit] = height / np.einsum("ni,ni->n", normal, directions[hit])
