@@ -127,6 +127,7 @@ def _rounded(route: FloatArray, rounding: float) -> FloatArray:
 
 def _speed(options: DriveOptions, travelled: FloatArray, yaw: FloatArray) -> FloatArray:
     """Return the speed in metres per second at each place of a path, shape (P,)."""
+    # The yaw rate is the bend (rad/m) times the speed.
     bend = np.abs(np.gradient(yaw, travelled))
     wanted = options.speed / np.maximum(1.0, bend * options.speed / options.yaw_rate)
     # The least within the smoothing's reach first, so that the mean stays below every limit.
@@ -135,12 +136,14 @@ def _speed(options: DriveOptions, travelled: FloatArray, yaw: FloatArray) -> Flo
     steady = gaussian_filter1d(least, reach / 2, mode="nearest", radius=reach)
     from_end = np.minimum(travelled, travelled[-1] - travelled)
     # A creep of 5 cm/s instead of rest, where the time would not end.
+    # v^2 = 2 a s at constant acceleration.
     ramp = np.sqrt(0.05**2 + 2 * options.acceleration * from_end)
     return np.asarray(np.minimum(steady, ramp))
 
 
 def _sway(options: DriveOptions, time: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return a smooth random signal within -1 and 1 at each time, shape (T,)."""
+    # Amplitudes that add up to one bound the sum of the waves by one.
     share = rng.dirichlet(np.ones(SWAY_WAVES))
     frequency = rng.uniform(options.sway_slowest, options.sway_fastest, SWAY_WAVES)
     phase = rng.uniform(0.0, 2 * np.pi, SWAY_WAVES)

@@ -43,14 +43,6 @@ class HallSurvey:
 
 
 @dataclass(frozen=True)
-class HeldOutField:
-    """Places that no survey has read: points in metres and the true field in uT, (N, 3)."""
-
-    points: FloatArray
-    field: FloatArray
-
-
-@dataclass(frozen=True)
 class CalibrationDrive:
     """A drive with readings of sensors whose truth is known.
 
@@ -108,18 +100,6 @@ def survey(
     points = points[hall.free(points, CLEARANCE_M)]
     field = hall.world.field(points) + noise * rng.standard_normal(points.shape)
     return HallSurvey(points, field, heights, noise)
-
-
-def held_out(
-    hall: SteelHall, seed: int, span: tuple[float, float], count: int = 600
-) -> HeldOutField:
-    """Return random places between lanes and between these heights over the floor."""
-    rng = np.random.default_rng([seed, 4])
-    # More than half of the floor is free.
-    xy = rng.uniform(-HALF_AREA, HALF_AREA, (3 * count, 2))
-    xy = xy[hall.free(xy, CLEARANCE_M)][:count]
-    points = np.column_stack([xy, rng.uniform(*span, len(xy))])
-    return HeldOutField(points, hall.world.field(points))
 
 
 def calibration_drive(

@@ -116,6 +116,7 @@ class RayCaster:
         met = np.asarray(self._intersector.intersects_first(origins, directions))
         found = np.full(len(origins), np.inf)
         hit = np.flatnonzero(met >= 0)
+        # The distance along the ray to the plane of the triangle that it meets.
         anchor, normal = self._anchor[met[hit]], self._normal[met[hit]]
         height = np.einsum("ni,ni->n", normal, anchor - origins[hit])
         found[hit] = height / np.einsum("ni,ni->n", normal, directions[hit])
@@ -178,51 +179,3 @@ def scan_stamps(
     seconds = first + np.arange(count) / options.rate
     within = seconds + options.sweep <= duration
     return np.round(seconds[within] * NANOSECONDS).astype(np.int64)
-
-
-def scans(
-    solids: Solids,
-    options: SpinningLidarOptions,
-    poses_at: PosesAt,
-    stamp_ns: IntArray,
-    seed: int = 0,
-) -> SimulatedScans:
-    """Return the scans that a LiDAR takes of solid boxes, one per stamp.
-
-    Parameters
-    ----------
-    poses_at
-        The true pose of the lidar at any time of the drive.
-    stamp_ns
-        Begin of each scan in nanoseconds, shape (N,).
-    seed
-        Of the ranges' noise.
-
-    Raises
-    ------
-    ConfigError
-        The libraries that cast rays are not installed.
-    """
-    return SimulatedScans(RayCaster(solids), options, poses_at, stamp_ns, seed)
-
-
-def snapshots(
-    solids: Solids, options: SpinningLidarOptions, trajectory: Trajectory, seed: int = 0
-) -> SimulatedScans:
-    """Return one snapshot of solid boxes at every pose of a trajectory.
-
-    Parameters
-    ----------
-    solids, options, seed
-        As in ``scans``; the sweep of the options does not count.
-    trajectory
-        True poses of the lidar in the map.
-    """
-    still = options.model_copy(update={"sweep": 0.0})
-
-    def poses_at(stamp_ns: IntArray) -> Trajectory:
-        row = np.searchsorted(trajectory.stamp_ns, stamp_ns)
-        R, p = trajectory.R[row], trajectory.p[row]
-        return Trajectory(stamp_ns, R, p, trajectory.frame, trajectory.child_frame)
-
-    return scans(solids, still, poses_at, trajectory.stamp_ns, seed)

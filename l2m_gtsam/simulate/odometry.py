@@ -116,8 +116,11 @@ def _step_covariances(
     ahead = steps / np.maximum(distance[:, 0], np.finfo(float).tiny)
     up = R_map_lidar[:, 2]
     Q = np.zeros((len(distance), 6, 6))
+    # Random walks: variances grow in proportion to the distance.
     Q[:, :3, :3] = distance * np.deg2rad(options.yaw_walk) ** 2 * up[:, :, None] * up[:, None]
     Q[:, 3:, 3:] = distance * options.position_walk**2 * np.eye(3)
+    # A scale error s of random sign over pieces of length L: a piece is wrong by s L along the
+    # path, variance s^2 L^2, which as independent steps is s^2 L for each metre.
     along = options.scale**2 * options.scale_length * ahead[:, :, None] * ahead[:, None]
     Q[:, 3:, 3:] += distance * along
     return Q
@@ -128,6 +131,7 @@ def _accumulated(start: FloatArray, R: FloatArray, p: FloatArray, Q: FloatArray)
 
     All steps' errors are moved to the first pose, where they add up, and the sums to each pose.
     """
+    # A right perturbation d at pose T is Ad(T) d at the first pose: Exp(Ad d) T = T Exp(d).
     there, back = _adjoints(R, p - p[0]), _adjoints(*_inverse(R, p - p[0]))
     fresh = np.concatenate([start[None], Q])
     summed = np.cumsum(there @ fresh @ there.swapaxes(1, 2), axis=0)

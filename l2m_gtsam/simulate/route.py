@@ -210,6 +210,7 @@ def _coil(
 ) -> FloatArray:
     """Return circles left of ``x`` that drift from one y to another; negative turns clockwise."""
     share = np.linspace(0.0, 1.0, abs(turns) * POINTS_PER_TURN + 1)
+    # A spiral whose middle drifts: successive circles pass other places of the aisle.
     angle = 2 * np.pi * turns * share
     radius = options.turn_radius
     return np.column_stack(

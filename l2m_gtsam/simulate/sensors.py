@@ -97,6 +97,7 @@ def random_distortion(options: SensorArrayOptions, rng: np.random.Generator) -> 
     R_mag_lidar = Rotation.from_rotvec(
         rng.normal(0.0, np.deg2rad(options.misalignment), 3)
     ).as_matrix()
+    # C = S R with a symmetric S near the identity: positive, so that R is C's polar factor.
     coupling = np.triu(rng.normal(0.0, options.soft_iron, (3, 3)), 1)
     stretch = np.diag(1 + rng.normal(0.0, options.scale, 3)) + coupling + coupling.T
     offset = rng.uniform(-options.offset, options.offset, 3)
@@ -197,6 +198,7 @@ def lasting(white: FloatArray, stamp_ns: IntArray, correlation: float) -> FloatA
         return white
     lapse = np.diff(stamp_ns) / (NANOSECONDS * correlation)
     fresh = np.ones(len(white))
+    # 1 - exp(-2 lapse) without cancellation where poses are frequent.
     fresh[1:] = np.sqrt(-np.expm1(-2 * lapse))
     # x[k] - exp(-lapse[k]) x[k - 1] = fresh[k] white[k], all k at once
     bands = np.ones((2, len(white)))

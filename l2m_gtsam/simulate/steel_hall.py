@@ -263,6 +263,7 @@ class SteelHall:
 
     def _distances(self, points: FloatArray) -> FloatArray:
         """Return signed horizontal distances to all footprints, shape (N, K)."""
+        # Signed distance of a box: outside the length of what is over, inside the least depth.
         over = np.abs(points[:, None, :2] - self._centres()) - self._halves()
         outside = np.linalg.norm(np.maximum(over, 0.0), axis=2)
         return np.asarray(outside + np.minimum(over.max(axis=2), 0.0))

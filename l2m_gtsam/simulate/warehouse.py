@@ -160,8 +160,10 @@ def _induced(
     A box is taken for a spheroid whose demagnetising factors are inverse to its sides: right
     for a cube, and within some ten per cent for long parts, which is well below the remanence.
     """
+    # Demagnetising factors of any ellipsoid add up to one (Osborn, Phys. Rev. 67:351, 1945).
     demagnetising = (1 / dimensions) / np.sum(1 / dimensions, axis=1, keepdims=True)
     effective = options.susceptibility * fill[:, None]
+    # J = chi (B_earth - N J): the body's own poles weaken the field inside it.
     polarisation = effective / (1 + effective * demagnetising) * earth * TESLA_PER_MICROTESLA
     return np.asarray(polarisation)
 

@@ -77,7 +77,9 @@ def published(
         weights = row_weights(sample.variance[keep].mean(axis=1), 0.0, PUBLISHED.weighting)
         found = fit_distortion(b_lidar, b_meas, weights, PUBLISHED).distortion
         residual = found.apply(b_lidar) - b_meas
+        # e = C R' B(R t + p) + H - z, and so de/dt = C R' G R with the map's gradient G.
         J = np.einsum("ij,nkj,nkl,nlm->nim", found.C, R_in, sample.gradient[keep], R_in)
+        # Gauss-Newton without weights, as printed.
         step = np.linalg.lstsq(J.reshape(-1, 3), -residual.ravel(), rcond=None)[0]
         t += step
         if np.abs(step).max() < SETTLED_M:
@@ -190,6 +192,7 @@ def levenberg_marquardt(
     distortion = closed_form(readings, field_map, t_start, options)
     start = Estimate(t_start[None], distortion.vector()[None], np.array([noise]), *np.zeros((2, 1)))
     covariance = reading_covariance(np.full(len(readings), noise), np.zeros((len(readings), 3, 3)))
+    # The map counts as exact: a baseline that does not know its errors.
     graph = reading_graph(batch_readings(readings, field_map), covariance, options.factors)
     end = optimise(graph, start.values([0]), Optimizer.LM, options.joint_iterations)
     return np.asarray(start.updated(end.values, [0]).t[0])
@@ -234,6 +237,7 @@ def numeric_least_squares(
 
     ideal = np.tile(np.concatenate([np.eye(3).ravel(), np.zeros(3)]), (len(t_start), 1))
     start = np.hstack([t_start, ideal])
+    # Columns in metres, ratios and microtesla: scaled by their own lengths.
     end = least_squares(residuals, start.ravel(), x_scale="jac", max_nfev=MOST_STEPS)
     return np.asarray(end.x.reshape(-1, UNKNOWNS))
 
@@ -284,5 +288,7 @@ def soft_iron(C: FloatArray) -> FloatArray:
     -------
     Shape (3, 3).
     """
+    # Left polar decomposition: C = U s V' = (U s U') (U V'), whose first factor is symmetric; the
+    # determinant's cube root takes the scale out.
     U, s, _ = np.linalg.svd(C)
     return np.asarray((U * s) @ U.T / np.cbrt(np.prod(s)))

@@ -127,6 +127,7 @@ def random_place(options: SiteOptions, rng: np.random.Generator) -> FloatArray:
     low, high = np.full(3, -options.radius), np.full(3, options.radius)
     heights = options.scenario.suite.heights
     low[2], high[2] = max(low[2], min(heights)), min(high[2], max(heights))
+    # Rejection from the enclosing box leaves the ball uniform.
     while True:
         place = rng.uniform(low, high)
         if np.linalg.norm(place) <= options.radius:

@@ -86,6 +86,8 @@ def nees(errors: FloatArray, covariances: FloatArray) -> FloatArray:
     # Metres, ratios and microtesla in one matrix: scaled to correlations before factorising.
     sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
     correlation = covariances / (sigma[:, :, None] * sigma[:, None, :])
+    # With P = L L', e' inv(P) e is the squared length of inv(L) e (Bar-Shalom, Li, Kirubarajan,
+    # Estimation with Applications to Tracking and Navigation, 2001, section 5.4).
     white = np.linalg.solve(np.linalg.cholesky(correlation), (errors / sigma)[..., None])
     return np.asarray(np.sum(white[..., 0] ** 2, axis=1))
 
@@ -95,6 +97,7 @@ def chi_square_band(dof: int, count: float, level: float = LEVEL) -> Band:
 
     ``count`` need not be whole: see ``ClusteredMean.effective``.
     """
+    # The sum of independent chi-square variables is one with the sum of their degrees of freedom.
     low, high = (float(chi2.ppf(p, dof * count)) for p in (0.5 - level / 2, 0.5 + level / 2))
     return Band(low / count, high / count)
 
@@ -131,8 +134,11 @@ def clustered_mean(values: FloatArray, groups: IntArray) -> ClusteredMean:
     if number < 2:
         raise ValueError("one group does not show how groups differ; two or more are needed")
     mean = float(np.mean(values))
+    # Liang and Zeger, Biometrika 73:13, 1986: residuals are summed within groups before they are
+    # squared, so that what a group has in common is not averaged away.
     sums = np.bincount(group, values - mean)
     variance = float(sums @ sums) / count**2 * number / (number - 1)
+    # Kish's design effect: the variance of one value over that of the mean.
     alone = float(np.var(values, ddof=1))
     effective = alone / variance if variance > 0 else float(count)
     # The estimate is rough with few groups; it cannot lie beyond what sharing makes possible.

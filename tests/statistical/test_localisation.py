@@ -37,7 +37,7 @@ def one_drive(seed: int) -> FloatArray:
 
 @pytest.mark.study
 def test_stated_errors_of_poses_are_true() -> None:
-    """NEES of 6 is honest. Poses of a drive err together, so that each drive counts as one.
+    """A NEES of 6 is consistent. Poses of a drive err together, so that each drive counts as one.
 
     A drive's mean scatters by several; the mean of twelve stays within 3 and 12 if sigmas are true
     within a factor of 1.4.

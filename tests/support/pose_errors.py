@@ -23,7 +23,7 @@ def position_error(truth: Trajectory, found: Trajectory) -> float:
 
 
 def pose_nees(truth: Trajectory, found: Trajectory) -> FloatArray:
-    """Return the squared pose errors in sigmas; each is 6 in the mean if sigmas are honest."""
+    """Return the squared pose errors in sigmas; consistent sigmas give a mean of 6."""
     assert found.covariance is not None
     rows = np.searchsorted(truth.stamp_ns, found.stamp_ns)
     R_back = found.R.transpose(0, 2, 1)

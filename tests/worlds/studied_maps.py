@@ -10,8 +10,9 @@ import numpy as np
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import MapSummary
-from l2m_gtsam.simulate.hall_drives import HallSurvey, held_out, survey
+from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, HallSurvey, survey
 from l2m_gtsam.simulate.steel_hall import (
+    HALF_AREA,
     MILD,
     STRONG,
     CloudVariant,
@@ -24,6 +25,26 @@ from l2m_gtsam.studies.statistics import interval_coverage, z_scores
 # Of a map's summary.
 NOISE_FACT, VERDICT_FACT = "noise of a reading (uT)", "field"
 DOUBT = "does not explain the field"
+
+
+@dataclass(frozen=True)
+class HeldOutField:
+    """Places that no survey has read: points in metres and the true field in uT, (N, 3)."""
+
+    points: FloatArray
+    field: FloatArray
+
+
+def held_out(
+    hall: SteelHall, seed: int, span: tuple[float, float], count: int = 600
+) -> HeldOutField:
+    """Return random places between lanes and between these heights over the floor."""
+    rng = np.random.default_rng([seed, 4])
+    # More than half of the floor is free.
+    xy = rng.uniform(-HALF_AREA, HALF_AREA, (3 * count, 2))
+    xy = xy[hall.free(xy, CLEARANCE_M)][:count]
+    points = np.column_stack([xy, rng.uniform(*span, len(xy))])
+    return HeldOutField(points, hall.world.field(points))
 
 
 @dataclass(frozen=True)

@@ -215,6 +215,7 @@ def compared(
 
 def gain(before: FloatArray, after: FloatArray) -> Gain | None:
     """Return by how much errors shrank, shapes (R,); pairs with a NaN do not count."""
+    # Paired: both calibrate the same drives, so that what a drive is worth cancels.
     less = before - after
     less = less[np.isfinite(less)]
     if len(less) < FEWEST:

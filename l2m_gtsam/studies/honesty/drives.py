@@ -162,6 +162,7 @@ def driven(drive: CalibrationDrive) -> CalibrationDrive:
     way = np.linalg.norm(np.diff(path.p, axis=0), axis=1) / FASTEST_M_S
     between = path.R[:-1].transpose(0, 2, 1) @ path.R[1:]
     turn = Rotation.from_matrix(between).magnitude() / FASTEST_RAD_S
+    # Each step takes as long as its slower part, moving or turning.
     step = np.maximum(np.maximum(way, turn), 1e-9 * STEP_NS)
     stamps = np.round(1e9 * np.concatenate([[0.0], np.cumsum(step)])).astype(np.int64)
     readings = replace(drive.readings, stamp_ns=stamps[drive.readings.stamp_ns // STEP_NS])
@@ -204,5 +205,6 @@ def lasting(seconds: FloatArray, lasts_s: float, rng: np.random.Generator) -> Fl
     u = rng.standard_normal((len(seconds), 6))
     like = np.exp(-np.diff(seconds) / lasts_s)
     for n, rho in enumerate(like, start=1):
+        # The exact discretisation: fresh noise restores the unit variance.
         u[n] = rho * u[n - 1] + np.sqrt(1 - rho**2) * u[n]
     return u

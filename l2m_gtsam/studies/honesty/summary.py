@@ -274,6 +274,7 @@ def verdict(cells: Sequence[HonestyCell], uncertainty: Uncertainty) -> Consisten
 def parameter_rows(outcomes: Outcomes, at: slice) -> Iterator[ParameterRow]:
     """Yield whether the sigma of each of some parameters is true."""
     for name, z in zip(NAMES[at], standard_scores(outcomes, at).T, strict=True):
+        # z^2 is chi-square of one degree of freedom where sigma is true.
         square = clustered_mean(z**2, outcomes.survey)
         band = chi_square_band(1, square.effective)
         held = clustered_mean(inside_interval(z), outcomes.survey)
@@ -292,6 +293,7 @@ def bound_row(name: str, outcomes: Outcomes, bound: FloatArray) -> BoundRow:
     square = clustered_mean(np.sum(outcomes.error[:, at] ** 2, axis=1), outcomes.survey)
     least = float(np.sqrt(np.trace(bound[:, at, at], axis1=1, axis2=2).mean()))
     error, sure = float(np.sqrt(square.mean)), square.band()
+    # The band is of the mean square; with few surveys it may reach below zero.
     interval = Band(float(np.sqrt(max(sure.low, 0.0))) / least, float(np.sqrt(sure.high)) / least)
     return BoundRow(name, error, least, error / least, interval)
 

@@ -226,6 +226,7 @@ def exponent(points: tuple[Measurement, ...]) -> float | None:
     last = points[-STEEP:]
     if len({each.size for each in last}) < 2:
         return None
+    # t = a n^k is a line of slope k in logarithms.
     size, seconds = np.log([[each.size, each.seconds] for each in last]).T
     return float(np.polyfit(size, seconds, 1)[0])
 

@@ -106,6 +106,7 @@ def processes(stints: list[Stint]) -> set[int]:
 
 def steady_rate(own: list[Stint]) -> float:
     """Return how many calibrations one process computes in a second."""
+    # Times of one process follow each other: their number over the time from first to last.
     in_order = sorted(own, key=lambda each: each.begin)
     counted = in_order[1:] or in_order
     return len(counted) / (counted[-1].end - counted[0].begin)

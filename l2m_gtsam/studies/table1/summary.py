@@ -337,6 +337,7 @@ def rms(rows: Iterable[FloatArray]) -> FloatArray:
 def efficiency(bounds: Sequence[Bound]) -> Efficiency:
     """Return error and bound of t over all drives of a noise level."""
     drives = np.array([bound.drives for bound in bounds])
+    # Mean squares of paths add up with their numbers of drives; roots would not.
     error, bound = (
         float(np.sqrt(np.average(np.square(values), weights=drives)))
         for values in ([each.t_error for each in bounds], [each.t for each in bounds])

@@ -9,13 +9,14 @@ from scipy.spatial import KDTree
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
-from l2m_gtsam.simulate.lidar import SpinningLidarOptions, snapshots
+from l2m_gtsam.simulate.lidar import SpinningLidarOptions
 from l2m_gtsam.simulate.place import CorridorOptions, RouteOptions, SimulatedPlace, corridor, hall
 from l2m_gtsam.simulate.route import CalibrationRouteOptions, MappingRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.simulate.sensors import MappingSuiteOptions, SamplingOptions, SensorArrayOptions
 from l2m_gtsam.simulate.solids import Solids
 from l2m_gtsam.simulate.warehouse import WarehouseOptions
+from tests.worlds.ray_cast import snapshots
 
 EARTH = np.array([20.0, 0.0, -45.0])
 OPTIONS = CorridorOptions()

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.records.scans import Scan
-from l2m_gtsam.simulate.lidar import RayCaster, SpinningLidarOptions, scans, snapshots
+from l2m_gtsam.simulate.lidar import RayCaster, SpinningLidarOptions
 from l2m_gtsam.simulate.solids import Solids
+from tests.worlds.ray_cast import scans, snapshots
 
 ROOM = np.array([8.0, 6.0, 3.0])
 START_NS = 1_700_000_000_000_000_000

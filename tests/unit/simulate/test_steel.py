@@ -10,7 +10,6 @@ from l2m_gtsam.simulate.hall_drives import (
     CLEARANCE_M,
     HallSurvey,
     calibration_drive,
-    held_out,
     survey,
 )
 from l2m_gtsam.simulate.steel_hall import (
@@ -24,6 +23,7 @@ from l2m_gtsam.simulate.steel_hall import (
     hall_cloud,
     steel_hall,
 )
+from tests.worlds.studied_maps import held_out
 
 SEEDS = [0, 1, 2]
 STANDING = {"post", "upright", "rack beam", "box"}
