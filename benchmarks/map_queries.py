@@ -23,7 +23,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import map_from_state
-from l2m_gtsam.maps.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.hyperparameters import KernelHyperparameters
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from l2m_gtsam.maps.training import ThinningOptions
 from tests.worlds.exact import DipoleWorld
@@ -88,7 +88,7 @@ def scattered(count: int, half: FloatArray) -> FloatArray:
     return np.asarray(middle + offset)
 
 
-def whole_map(data: Survey, console: Console) -> Hyperparameters:
+def whole_map(data: Survey, console: Console) -> KernelHyperparameters:
     """Print what the map of the whole warehouse costs."""
     learnt = SlidingGP.fit(data.points, data.field)
     found = learnt.trained.hyperparameters
@@ -135,7 +135,7 @@ def peer_gradient(peer: GaussianProcessRegressor, points: FloatArray) -> FloatAr
     return np.stack(slopes, axis=-1)
 
 
-def against_the_peer(data: Survey, found: Hyperparameters) -> Table:
+def against_the_peer(data: Survey, found: KernelHyperparameters) -> Table:
     """Return times of both on the same part of the survey, and how far they differ."""
     half = float(np.sqrt(PEER_READINGS / READINGS * SIZE.prod()) / 2)
     part = data.within(half)

@@ -2,7 +2,7 @@
 
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.doubt import FieldDoubt, doubt_factor
-from l2m_factors.field_map import FieldMap
+from l2m_factors.field_map import DifferentiableMap
 from l2m_factors.key_pose_readings import (
     Calibrations,
     KeyPoseReadings,
@@ -40,8 +40,8 @@ __all__ = [
     "BatchedReadings",
     "Calibrations",
     "D",
+    "DifferentiableMap",
     "FieldDoubt",
-    "FieldMap",
     "G",
     "KeyPoseReadings",
     "KeyPoseResiduals",

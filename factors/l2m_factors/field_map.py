@@ -8,7 +8,7 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 
 
-class FieldMap(Protocol):
+class DifferentiableMap(Protocol):
     """A magnetic field that can be evaluated anywhere, satisfied by shape and not by descent."""
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.field_map import FieldMap
+from l2m_factors.field_map import DifferentiableMap
 from l2m_factors.key_pose_readings import (
     Calibrations,
     KeyPoseReadings,
@@ -75,7 +75,7 @@ class KeyPoseBatch(ABC):
         """Return whether values have what ``_pose`` needs."""
 
     @abstractmethod
-    def _field(self, values: gtsam.Values) -> FieldMap:
+    def _field(self, values: gtsam.Values) -> DifferentiableMap:
         """Return the field."""
 
     @abstractmethod

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.field_map import FieldMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.motion import PoseMotion, moved, skew
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
 
@@ -143,7 +143,7 @@ class Calibrations:
 
 def key_pose_residuals(
     readings: KeyPoseReadings,
-    field_map: FieldMap,
+    field_map: DifferentiableMap,
     R_map_key: FloatArray,
     p_map_key: FloatArray,
     sensors: Calibrations,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from l2m_factors.field_map import FieldMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import X
@@ -26,7 +26,10 @@ class MapBatch(KeyPoseBatch):
     """
 
     def __init__(
-        self, field_map: FieldMap, readings: KeyPoseReadings, fixed: Calibrations | None = None
+        self,
+        field_map: DifferentiableMap,
+        readings: KeyPoseReadings,
+        fixed: Calibrations | None = None,
     ) -> None:
         super().__init__(readings, fixed)
         self._map = field_map
@@ -63,7 +66,7 @@ class MapBatch(KeyPoseBatch):
     def _is_present(self, values: gtsam.Values, key_pose: int) -> bool:
         return bool(values.exists(X(key_pose)))
 
-    def _field(self, values: gtsam.Values) -> FieldMap:
+    def _field(self, values: gtsam.Values) -> DifferentiableMap:
         return self._map
 
     def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.field_map import FieldMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
 
@@ -32,7 +32,7 @@ class BatchedReadings:
 
     def __init__(
         self,
-        field_map: FieldMap,
+        field_map: DifferentiableMap,
         readings: MagneticReadings,
         distortion: FloatArray | None = None,
     ) -> None:

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.field_map import FieldMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.motion import PoseMotion, moved
 
 
@@ -86,7 +86,7 @@ class ReadingResiduals:
 
 def reading_residuals(
     readings: MagneticReadings,
-    field_map: FieldMap,
+    field_map: DifferentiableMap,
     t: FloatArray,
     distortion: FloatArray,
     offset: FloatArray | None = None,

@@ -21,7 +21,7 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
-from l2m_factors.field_map import FieldMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray
 from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import M, X
@@ -45,7 +45,7 @@ class TileField(Protocol):
 
 
 class WeightedField:
-    """A tile's field with weights that are given: a ``FieldMap`` in the anchor's frame."""
+    """A tile's field with weights that are given: a ``DifferentiableMap`` in the anchor's frame."""
 
     def __init__(self, tile: TileField, weights: FloatArray) -> None:
         self._tile, self._weights = tile, weights
@@ -160,7 +160,7 @@ class TileBatch(KeyPoseBatch):
     def _is_present(self, values: gtsam.Values, key_pose: int) -> bool:
         return key_pose == self._anchor or bool(values.exists(X(key_pose)))
 
-    def _field(self, values: gtsam.Values) -> FieldMap:
+    def _field(self, values: gtsam.Values) -> DifferentiableMap:
         return WeightedField(self._tile, values.atVector(M(self._number)))
 
     def _own_stamp(self, values: gtsam.Values, key_pose: int) -> bytes:

@@ -10,7 +10,7 @@ import numpy as np
 from l2m_factors import (
     BatchedReadings,
     D,
-    FieldMap,
+    DifferentiableMap,
     MagneticReadings,
     PoseMotion,
     S,
@@ -101,7 +101,7 @@ class Estimate:
 
 
 def batch_readings(
-    readings: Readings, field_map: FieldMap, distortion: FloatArray | None = None
+    readings: Readings, field_map: DifferentiableMap, distortion: FloatArray | None = None
 ) -> BatchedReadings:
     """Return the readings as one batch for the factors: on T(i), D(i) and S(i).
 

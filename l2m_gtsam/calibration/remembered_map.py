@@ -21,7 +21,7 @@ VALUES = 15  # field, gradient and variance
 
 
 @dataclass(frozen=True)
-class Answer:
+class LastFields:
     """Field (N, 3) in uT and gradient (N, 3, 3) in uT/m at points (N, 3) in metres."""
 
     points: FloatArray
@@ -44,7 +44,7 @@ class RememberedMap:
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
-        self._last = Answer(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
+        self._last = LastFields(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
 
     def __getattr__(self, name: str) -> Any:
         if name == "_map":  # before there is one, as when another process unpacks it
@@ -67,7 +67,7 @@ class RememberedMap:
         field[told], gradient[told] = last.field[at[told]], last.gradient[at[told]]
         field[~told], gradient[~told] = self._map.field_and_gradient(points[~told])
         with self._lock:
-            self._last = Answer(points.copy(), field.copy(), gradient.copy())
+            self._last = LastFields(points.copy(), field.copy(), gradient.copy())
         return field, gradient
 
     def query(self, points: FloatArray, /) -> FieldSample:
@@ -76,7 +76,7 @@ class RememberedMap:
         with self._lock:
             sample = self._recalled(points)
             inside = sample.inside
-            self._last = Answer(points[inside], sample.field[inside], sample.gradient[inside])
+            self._last = LastFields(points[inside], sample.field[inside], sample.gradient[inside])
         return sample
 
     def remember(self, points: FloatArray, sample: FieldSample) -> None:

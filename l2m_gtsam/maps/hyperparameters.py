@@ -1,4 +1,4 @@
-"""Hyperparameters of the Gaussian process, learnt from the marginal likelihood.
+"""KernelHyperparameters of the Gaussian process, learnt from the marginal likelihood.
 
 The logarithm of the evidence of one neighbourhood of N readings, summed over the three axes that
 share the kernel, with K = s^2 E + n^2 D and r the readings less their mean (Rasmussen and
@@ -35,7 +35,7 @@ BOUND_TOLERANCE = 1e-6  # in the logarithm
 PAIRED = 1500  # readings whose pairs give the start: a million distances
 
 
-class Hyperparameters(Options):
+class KernelHyperparameters(Options):
     """What the Gaussian process assumes of the field and of the sensor."""
 
     length_scale: float = Field(ge=1e-3, le=1e6)
@@ -48,7 +48,7 @@ class Hyperparameters(Options):
     """Standard deviation of one reading, per axis, in microtesla."""
 
 
-class LearningOptions(Options):
+class KernelLearningOptions(Options):
     """How much data the marginal likelihood is computed from."""
 
     neighbourhoods: int = Field(default=12, ge=1, le=50)
@@ -83,8 +83,8 @@ class LikelihoodFit:
         What the optimiser said.
     """
 
-    hyperparameters: Hyperparameters
-    start: Hyperparameters
+    hyperparameters: KernelHyperparameters
+    start: KernelHyperparameters
     log_likelihood: float
     readings: int
     converged: bool
@@ -112,7 +112,7 @@ class Neighbourhood:
 
 
 @dataclass(frozen=True)
-class Likelihood:
+class KernelLikelihood:
     """A log marginal likelihood and its gradient in log(length_scale, signal, noise), (3,)."""
 
     value: float
@@ -125,7 +125,7 @@ def neighbourhood(readings: TrainingSet, mean: FloatArray) -> Neighbourhood:
     return Neighbourhood(squared, readings.field - mean, readings.weight)
 
 
-def log_likelihood(near: Neighbourhood, hyperparameters: Hyperparameters) -> Likelihood:
+def log_likelihood(near: Neighbourhood, hyperparameters: KernelHyperparameters) -> KernelLikelihood:
     """Return the log marginal likelihood of one neighbourhood.
 
     Raises
@@ -154,10 +154,10 @@ def log_likelihood(near: Neighbourhood, hyperparameters: Hyperparameters) -> Lik
             np.sum(np.diag(evidence) * noise),
         ]
     )
-    return Likelihood(float(value), gradient)
+    return KernelLikelihood(float(value), gradient)
 
 
-def not_definite(hyperparameters: Hyperparameters) -> str:
+def not_definite(hyperparameters: KernelHyperparameters) -> str:
     """Return the sentence for readings whose covariance cannot be factorised."""
     return (
         "the covariance of the map's training readings is not positive definite at noise "
@@ -167,7 +167,7 @@ def not_definite(hyperparameters: Hyperparameters) -> str:
 
 
 def learn(
-    readings: TrainingSet, options: LearningOptions, thinning: ThinningOptions
+    readings: TrainingSet, options: KernelLearningOptions, thinning: ThinningOptions
 ) -> LikelihoodFit:
     """Return the hyperparameters that make the readings most likely.
 
@@ -194,7 +194,7 @@ def learn(
     return fit
 
 
-def start_from_pairs(readings: TrainingSet, seed: int) -> Hyperparameters:
+def start_from_pairs(readings: TrainingSet, seed: int) -> KernelHyperparameters:
     """Return a start from half the squared differences of readings against their distance.
 
     For this kernel they are noise^2 + signal^2 (1 - exp(-d^2 / 2 l^2)): the noise at distance
@@ -215,7 +215,7 @@ def start_from_pairs(readings: TrainingSet, seed: int) -> Hyperparameters:
     reached = int(np.argmax(level >= min(0.39 * signal**2, level.max())))
     length_scale = max(float(at[reached]), 1e-3 * extent, SHORTEST)
     noise = float(np.clip(np.sqrt(level[0]), 1e-2 * signal, 0.5 * signal))
-    return Hyperparameters(length_scale=length_scale, signal=signal, noise=noise)
+    return KernelHyperparameters(length_scale=length_scale, signal=signal, noise=noise)
 
 
 def spread(readings: TrainingSet) -> float:
@@ -225,8 +225,8 @@ def spread(readings: TrainingSet) -> float:
 
 def maximise(
     readings: TrainingSet,
-    start: Hyperparameters,
-    options: LearningOptions,
+    start: KernelHyperparameters,
+    options: KernelLearningOptions,
     thinning: ThinningOptions,
 ) -> LikelihoodFit:
     """Return the maximum of the summed likelihood of neighbourhoods drawn at random."""
@@ -255,9 +255,9 @@ def maximise(
     )
 
 
-def from_log(x: FloatArray) -> Hyperparameters:
+def from_log(x: FloatArray) -> KernelHyperparameters:
     """Return hyperparameters from their logarithms, shape (3,)."""
-    return Hyperparameters(**dict(zip(NAMES, np.exp(x).tolist(), strict=True)))
+    return KernelHyperparameters(**dict(zip(NAMES, np.exp(x).tolist(), strict=True)))
 
 
 def log_bounds(readings: TrainingSet) -> FloatArray:
@@ -276,7 +276,7 @@ def log_bounds(readings: TrainingSet) -> FloatArray:
 
 
 def draw_neighbourhoods(
-    readings: TrainingSet, options: LearningOptions
+    readings: TrainingSet, options: KernelLearningOptions
 ) -> tuple[Neighbourhood, ...]:
     """Return random readings around centres drawn at random, or all where they are few.
 

@@ -10,7 +10,7 @@ from scipy.linalg.lapack import dtrtri
 
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.hyperparameters import Hyperparameters, not_definite
+from l2m_gtsam.maps.hyperparameters import KernelHyperparameters, not_definite
 from l2m_gtsam.maps.kernel import kernel_matrix, kernel_to, scaled, training_columns
 from l2m_gtsam.maps.training import TrainingSet
 
@@ -37,7 +37,7 @@ class Posterior:
         variances. A product with it takes a third of the time of a solve with the factor.
     """
 
-    hyperparameters: Hyperparameters
+    hyperparameters: KernelHyperparameters
     centre: FloatArray
     y: FloatArray
     alpha: FloatArray
@@ -75,7 +75,7 @@ class Posterior:
 
 
 def condition(
-    readings: TrainingSet, mean: FloatArray, hyperparameters: Hyperparameters
+    readings: TrainingSet, mean: FloatArray, hyperparameters: KernelHyperparameters
 ) -> Posterior:
     """Return the process conditioned on readings, by one Cholesky factorisation.
 
@@ -103,7 +103,7 @@ def condition(
 
 
 def factorise(
-    y: FloatArray, noise_variance: FloatArray, hyperparameters: Hyperparameters
+    y: FloatArray, noise_variance: FloatArray, hyperparameters: KernelHyperparameters
 ) -> FloatArray:
     """Return the lower Cholesky factor of the covariance of readings, shape (M, M)."""
     K = kernel_matrix(y, y, hyperparameters.signal)

@@ -56,7 +56,7 @@ class SlidingGPOptions(GPOptions):
 
 
 @dataclass(frozen=True)
-class Visit:
+class BlockQuery:
     """Points that one block answers for, as many as fit a batch.
 
     Attributes
@@ -216,7 +216,7 @@ class SlidingGP:
         """Return the map as plain arrays and facts."""
         return trained_to_state(KIND, self.trained, self.options)
 
-    def _visits(self, points: FloatArray) -> Iterator[Visit]:
+    def _visits(self, points: FloatArray) -> Iterator[BlockQuery]:
         """Yield every point once, block by block and batch by batch."""
         owner = self.grid.block_of(points)
         order = np.argsort(owner, kind="stable")
@@ -224,7 +224,7 @@ class SlidingGP:
         ends = np.cumsum(counts)
         for block in np.flatnonzero(counts):
             for start in range(ends[block] - counts[block], ends[block], BATCH):
-                yield Visit(int(block), order[start : min(start + BATCH, ends[block])])
+                yield BlockQuery(int(block), order[start : min(start + BATCH, ends[block])])
 
 
 def check_sizes(members: list[IntArray], block: float) -> None:

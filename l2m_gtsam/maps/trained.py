@@ -12,8 +12,8 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.field_map import MapSummary
 from l2m_gtsam.maps.hyperparameters import (
     NAMES,
-    Hyperparameters,
-    LearningOptions,
+    KernelHyperparameters,
+    KernelLearningOptions,
     LikelihoodFit,
     learn,
 )
@@ -31,10 +31,10 @@ from l2m_gtsam.options import Options
 class GPOptions(Options):
     """What every Gaussian-process map can be told; lengths are in length scales."""
 
-    hyperparameters: Hyperparameters | None = None
+    hyperparameters: KernelHyperparameters | None = None
     """Fixed hyperparameters; learnt from the marginal likelihood where absent."""
 
-    learning: LearningOptions = LearningOptions()
+    learning: KernelLearningOptions = KernelLearningOptions()
     """The sample they are learnt from."""
 
     thinning: ThinningOptions = ThinningOptions()
@@ -49,7 +49,7 @@ AnyOptions = TypeVar("AnyOptions", bound=Options)
 
 
 @dataclass(frozen=True)
-class Origin:
+class TrainingOrigin:
     """Where a trained process came from.
 
     Attributes
@@ -64,7 +64,7 @@ class Origin:
     learning: LikelihoodFit | None
 
 
-ORIGIN = TypeAdapter(Origin)
+ORIGIN = TypeAdapter(TrainingOrigin)
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class Trained:
     """A training set and the hyperparameters to condition it with."""
 
     readings: TrainingSet
-    hyperparameters: Hyperparameters
-    origin: Origin
+    hyperparameters: KernelHyperparameters
+    origin: TrainingOrigin
 
     @property
     def noise_variance(self) -> FloatArray:
@@ -105,7 +105,7 @@ def train(points: FloatArray, field: FloatArray, options: GPOptions) -> Trained:
         learning = learn(readings, options.learning, options.thinning)
         hyperparameters = learning.hyperparameters
     kept = thinned(readings, hyperparameters.length_scale, options.thinning)
-    return Trained(kept, hyperparameters, Origin(len(readings), learning))
+    return Trained(kept, hyperparameters, TrainingOrigin(len(readings), learning))
 
 
 def extended(
@@ -164,7 +164,7 @@ def trained_from_state(state: MapState) -> Trained:
     if values.shape != (len(NAMES),):
         raise MapError(f"map array hyperparameters has shape {values.shape}; (3,) is needed")
     try:
-        hyperparameters = Hyperparameters(**dict(zip(NAMES, values.tolist(), strict=True)))
+        hyperparameters = KernelHyperparameters(**dict(zip(NAMES, values.tolist(), strict=True)))
         origin = ORIGIN.validate_python(state.provenance)
     except ValidationError as error:
         raise MapError(f"map state is damaged: {first_complaint(error)}") from None

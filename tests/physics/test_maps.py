@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.hyperparameters import Hyperparameters, LearningOptions, learn
+from l2m_gtsam.maps.hyperparameters import KernelHyperparameters, KernelLearningOptions, learn
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.maps.training import ThinningOptions, training_set
 from tests.worlds.exact import DipoleWorld, dipole_world
 
-GIVEN = Hyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
+GIVEN = KernelHyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
 KINDS = pytest.mark.parametrize("kind", ["sliding_gp", "dense_gp"])
 ANY_KIND = st.sampled_from(["sliding_gp", "dense_gp"])
 
@@ -98,7 +98,7 @@ def test_a_map_of_a_turned_and_moved_world_is_turned_and_moved(
 def test_stronger_fields_and_noises_scale_the_map(kind: str) -> None:
     points, field = readings(0)
     options = exact_options(kind)
-    stronger = Hyperparameters(length_scale=0.8, signal=12.0, noise=0.6)
+    stronger = KernelHyperparameters(length_scale=0.8, signal=12.0, noise=0.6)
     part = getattr(options, kind).model_copy(update={"hyperparameters": stronger})
     once = smooth(build_map(points, field, options), queries(0))
     thrice = smooth(
@@ -228,7 +228,7 @@ def test_one_optitrack_run_predicts_the_other(shared_data: Path) -> None:
 
 def test_a_uniform_field_leaves_the_hyperparameters_alone() -> None:
     points, field = survey(dipole_world(2), 0, noise=0.1)
-    options = LearningOptions(neighbourhoods=3)
+    options = KernelLearningOptions(neighbourhoods=3)
     one, other = (
         learn(training_set(points, values), options, ThinningOptions()).hyperparameters
         for values in (field, field + np.array([30.0, -20, 10]))

@@ -16,7 +16,7 @@ from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
 from l2m_gtsam.maps.harmonic.places import Places
-from l2m_gtsam.maps.harmonic.potential_grid import Lattice, PotentialGrid, potential_grid
+from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid, PotentialLattice, potential_grid
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import WAVE_NUMBERS
@@ -214,7 +214,7 @@ def with_grid(tile: Tile, terms: TermSum, places: Places, fineness: Fineness) ->
     frame, spacing, radius = tile.basis.frame, fineness.spacing, fineness.radius
     sources = terms.sources
 
-    def potential(lattice: Lattice) -> FloatArray:
+    def potential(lattice: PotentialLattice) -> FloatArray:
         phi = sources.smooth_potential(lattice, radius)
         for family, columns in zip(tile.basis.families, tile.basis.columns, strict=True):
             if isinstance(family, Smooth):

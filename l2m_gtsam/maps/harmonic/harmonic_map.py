@@ -30,7 +30,7 @@ EXACT = 1e-9  # share of the variance between points that may be left out
 
 
 @dataclass(frozen=True)
-class Answer:
+class TileShare:
     """What one tile says of the points that it has a share in.
 
     Attributes
@@ -174,11 +174,11 @@ class HarmonicMap:
         blend, variance = Blend.of(len(points)), np.empty_like(points)
         visits, owner = self.learnt.tiling.visits(points), self.learnt.tiling.grid.block_of(points)
 
-        def answer(visit: Visit) -> Answer:
+        def answer(visit: Visit) -> TileShare:
             # All that a tile is asked at once: it may not stay in memory.
             tile, at = self.tiles[visit.tile], points[visit.rows]
             own = owner[visit.rows] == visit.tile
-            return Answer(tile.field_and_gradient(at), own, tile.variance(at[own]))
+            return TileShare(tile.field_and_gradient(at), own, tile.variance(at[own]))
 
         for visit, found in zip(visits, in_threads(answer, visits), strict=True):
             blend.add(visit.rows, visit.share, found.said)

@@ -19,7 +19,7 @@ from numba import njit
 from scipy.special import binom
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.potential_grid import Lattice
+from l2m_gtsam.maps.harmonic.potential_grid import PotentialLattice
 
 ORDER = 7  # of the polynomial: the smooth part is as smooth as the grid's spline
 TAYLOR = binom(-1.5, np.arange(ORDER + 1))  # of (1 + t)^(-3/2)
@@ -55,7 +55,7 @@ class PointSources:
         strongest = max(strength.max(initial=0.0), np.finfo(float).tiny)
         return np.asarray(radius * np.maximum(strength / strongest, WEAKEST) ** 0.1)
 
-    def smooth_potential(self, lattice: Lattice, radius: float) -> FloatArray:
+    def smooth_potential(self, lattice: PotentialLattice, radius: float) -> FloatArray:
         """Return the smooth part of the potential at the nodes in uT m, shape (nx, ny, nz).
 
         Only columns with a node that is needed are computed, the others are zero.

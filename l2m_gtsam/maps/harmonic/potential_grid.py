@@ -42,7 +42,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Lattice:
+class PotentialLattice:
     """Nodes of a regular grid.
 
     Attributes
@@ -69,7 +69,7 @@ class Lattice:
         return x, y, z
 
 
-Potential = Callable[[Lattice], FloatArray]
+Potential = Callable[[PotentialLattice], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def potential_grid(
     first = np.floor((points - lower - reach - slack) / spacing).astype(np.int64)
     last = np.floor((points - lower + reach + slack) / spacing).astype(np.int64)
     needed = spread(np.maximum(first, 0), np.minimum(last + AROUND, np.array(shape) - 1), shape)
-    lattice = Lattice(lower - (HALF_TAPS + BELOW) * spacing, spacing, needed)
+    lattice = PotentialLattice(lower - (HALF_TAPS + BELOW) * spacing, spacing, needed)
     values = np.where(needed, potential(lattice), np.nan)
     values[~np.isfinite(values)] = np.nan
     coefficients = spline_coefficients(values)

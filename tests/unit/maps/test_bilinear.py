@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2m_factors.field_map import FieldMap as PluginFieldMap
+from l2m_factors.field_map import DifferentiableMap
 from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
@@ -222,7 +222,7 @@ def test_no_points_give_no_answers(ours: BilinearMap) -> None:
 
 def test_maps_satisfy_both_protocols(ours: BilinearMap) -> None:
     application: FieldMap = ours
-    plugin: PluginFieldMap = ours
+    plugin: DifferentiableMap = ours
     assert plugin.field_and_gradient(queries(7))[1].shape == (7, 3, 3)
     assert application.kind == "bilinear"
 

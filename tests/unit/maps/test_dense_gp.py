@@ -7,11 +7,11 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps import dense_gp
 from l2m_gtsam.maps.dense_gp import DenseGP, DenseGPOptions
-from l2m_gtsam.maps.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.hyperparameters import KernelHyperparameters
 from l2m_gtsam.maps.training import ThinningOptions
 from tests.worlds.exact import dipole_world
 
-GIVEN = Hyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
+GIVEN = KernelHyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
 OPTIONS = DenseGPOptions(hyperparameters=GIVEN, thinning=ThinningOptions(spacing=0))
 
 

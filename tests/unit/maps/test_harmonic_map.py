@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from l2m_factors.field_map import FieldMap as PluginFieldMap
+from l2m_factors.field_map import DifferentiableMap
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -143,7 +143,7 @@ def test_a_summary_tells_what_went_in(harmonic: HarmonicMap) -> None:
 def test_maps_satisfy_all_protocols(harmonic: HarmonicMap) -> None:
     """Mostly a statement to the type checker."""
     application: FieldMap = harmonic
-    plugin: PluginFieldMap = harmonic
+    plugin: DifferentiableMap = harmonic
     assert isinstance(harmonic, UncertainMap)
     assert plugin.field_and_gradient(queries(7))[1].shape == (7, 3, 3)
     assert application.kind == "harmonic"

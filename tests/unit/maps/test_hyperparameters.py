@@ -8,8 +8,8 @@ from scipy.stats import multivariate_normal
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.hyperparameters import (
-    Hyperparameters,
-    LearningOptions,
+    KernelHyperparameters,
+    KernelLearningOptions,
     Neighbourhood,
     from_log,
     learn,
@@ -18,11 +18,11 @@ from l2m_gtsam.maps.hyperparameters import (
 )
 from l2m_gtsam.maps.training import ThinningOptions, TrainingSet
 
-TRUTH = Hyperparameters(length_scale=0.6, signal=3.0, noise=0.3)
+TRUTH = KernelHyperparameters(length_scale=0.6, signal=3.0, noise=0.3)
 KEEP_ALL = ThinningOptions(spacing=0)
 
 
-def covariance(near: Neighbourhood, hyperparameters: Hyperparameters) -> FloatArray:
+def covariance(near: Neighbourhood, hyperparameters: KernelHyperparameters) -> FloatArray:
     squared = near.squared_distance / hyperparameters.length_scale**2
     noise = np.diag(hyperparameters.noise**2 / near.weight)
     return np.asarray(hyperparameters.signal**2 * np.exp(-0.5 * squared) + noise)
@@ -68,7 +68,7 @@ def test_the_gradient_is_the_derivative_of_the_value(
         assert end.gradient[j] == pytest.approx(slope, abs=tolerance)
 
 
-def fisher_information(near: Neighbourhood, hyperparameters: Hyperparameters) -> FloatArray:
+def fisher_information(near: Neighbourhood, hyperparameters: KernelHyperparameters) -> FloatArray:
     """Expected curvature of the likelihood of three axes in the logarithms, shape (3, 3)."""
     x = np.log([hyperparameters.length_scale, hyperparameters.signal, hyperparameters.noise])
     step = 1e-5
@@ -82,7 +82,7 @@ def fisher_information(near: Neighbourhood, hyperparameters: Hyperparameters) ->
 
 
 def test_known_hyperparameters_are_recovered_within_their_sampling_error() -> None:
-    options = LearningOptions(readings=400)
+    options = KernelLearningOptions(readings=400)
     scores = []
     for seed in range(8):
         readings = drawn(seed)
@@ -108,7 +108,7 @@ def test_known_hyperparameters_are_recovered_within_their_sampling_error() -> No
 
 def test_neighbourhoods_of_a_large_set_agree_with_the_truth() -> None:
     readings = drawn(3, 1500)
-    fit = learn(readings, LearningOptions(neighbourhoods=6, readings=200), KEEP_ALL)
+    fit = learn(readings, KernelLearningOptions(neighbourhoods=6, readings=200), KEEP_ALL)
     assert fit.converged
     assert fit.readings == 1200
     # 200 readings determine each to some 5-10 %, six overlapping draws to half of that.
@@ -119,13 +119,13 @@ def test_neighbourhoods_of_a_large_set_agree_with_the_truth() -> None:
 
 def test_learning_is_reproducible() -> None:
     readings = drawn(5, 600)
-    options = LearningOptions(neighbourhoods=2, readings=100, seed=11)
+    options = KernelLearningOptions(neighbourhoods=2, readings=100, seed=11)
     assert learn(readings, options, KEEP_ALL) == learn(readings, options, KEEP_ALL)
 
 
 def test_learning_ends_higher_than_it_started() -> None:
     readings = drawn(6, 200)
-    fit = learn(readings, LearningOptions(), KEEP_ALL)
+    fit = learn(readings, KernelLearningOptions(), KEEP_ALL)
     near = neighbourhood(readings, readings.mean)
     assert fit.log_likelihood > log_likelihood(near, fit.start).value
     assert fit.log_likelihood > log_likelihood(near, TRUTH).value
@@ -135,7 +135,7 @@ def test_a_hyperparameter_that_ends_on_a_bound_is_named() -> None:
     rng = np.random.default_rng(7)
     points = rng.uniform(0, [4, 3, 0.6], (150, 3))
     exact = TrainingSet(points, np.sin(points[:, ::-1] / 2), np.ones(150))
-    fit = learn(exact, LearningOptions(), KEEP_ALL)
+    fit = learn(exact, KernelLearningOptions(), KEEP_ALL)
     assert "noise" in fit.at_bound
     assert not fit.converged
 
@@ -145,7 +145,7 @@ def test_pure_noise_is_learnt_as_noise() -> None:
     points = rng.uniform(0, 2, (500, 3))
     fit = learn(
         TrainingSet(points, rng.normal(0, 1, (500, 3)), np.ones(500)),
-        LearningOptions(),
+        KernelLearningOptions(),
         ThinningOptions(),
     )
     found = fit.hyperparameters
@@ -158,12 +158,12 @@ def test_readings_that_do_not_vary_are_refused() -> None:
     points = np.random.default_rng(8).uniform(0, 3, (50, 3))
     still = TrainingSet(points, np.tile([20.0, 0.0, -40.0], (50, 1)), np.ones(50))
     with pytest.raises(MapError, match="all map training readings are equal"):
-        learn(still, LearningOptions(), KEEP_ALL)
+        learn(still, KernelLearningOptions(), KEEP_ALL)
 
 
 def test_a_covariance_that_cannot_be_factorised_is_an_error_that_says_so() -> None:
     twice = TrainingSet(np.zeros((20, 3)), np.zeros((20, 3)), np.ones(20))
-    silent = Hyperparameters(length_scale=1, signal=1, noise=1e-9)
+    silent = KernelHyperparameters(length_scale=1, signal=1, noise=1e-9)
     with pytest.raises(MapError, match=r"not positive definite at noise 1e-09 uT .* larger noise"):
         log_likelihood(neighbourhood(twice, np.zeros(3)), silent)
 
@@ -173,4 +173,4 @@ def test_a_covariance_that_cannot_be_factorised_is_an_error_that_says_so() -> No
 def test_hyperparameters_are_positive_and_finite(name: str, value: float) -> None:
     values = {"length_scale": 1.0, "signal": 1.0, "noise": 1.0, name: value}
     with pytest.raises(ValidationError, match=name):
-        Hyperparameters(**values)
+        KernelHyperparameters(**values)

@@ -7,13 +7,13 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map, map_from_state
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters as HarmonicPrior
-from l2m_gtsam.maps.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.hyperparameters import KernelHyperparameters
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from tests.worlds.exact import dipole_world
 from tests.worlds.quick_maps import QUICK_HARMONIC, quick
 
-GIVEN = Hyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
+GIVEN = KernelHyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
 HEIGHTS = (0.2, 0.5, 0.8)
 OLD = slice(0, 500)
 NEW = slice(500, None)
@@ -86,7 +86,7 @@ def test_a_harmonic_map_is_nearly_that_of_all_readings() -> None:
     options = MapOptions.model_validate({"harmonic": usual_margin})
     updated = build_map(points[OLD], field[OLD], options).updated(points[NEW], field[NEW])
     prior = updated.to_state().arrays["hyperparameters"]
-    names = sorted(HarmonicPrior.model_fields)
+    names = sorted(Hyperparameters.model_fields)
     given = dict(zip(names, prior.tolist(), strict=True))
     options = MapOptions.model_validate({"harmonic": usual_margin | {"hyperparameters": given}})
     at_once = build_map(points, field, options)

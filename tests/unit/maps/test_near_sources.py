@@ -4,7 +4,7 @@ import pytest
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.near_sources import PointSources, near_sources
-from l2m_gtsam.maps.harmonic.potential_grid import Lattice
+from l2m_gtsam.maps.harmonic.potential_grid import PotentialLattice
 
 RADIUS = 0.7
 LOWER, UPPER = np.array([-1.0, -1.3, -0.3]), np.array([2.1, 1.6, 1.2])
@@ -35,7 +35,7 @@ def near(of: PointSources, points: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def smooth(of: PointSources, point: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
     """Return differences of the smooth potential about one point."""
-    lattice = Lattice(point - step, step, np.ones((3, 3, 3), dtype=np.bool_))
+    lattice = PotentialLattice(point - step, step, np.ones((3, 3, 3), dtype=np.bool_))
     phi = of.smooth_potential(lattice, RADIUS)
     slopes = [np.gradient(phi, step, axis=i) for i in range(3)]
     field = np.array([slope[1, 1, 1] for slope in slopes])
@@ -80,7 +80,7 @@ def test_the_near_part_is_symmetric_and_ends_at_the_radius() -> None:
 
 def test_the_smooth_part_is_the_dipole_beyond_the_radius_and_none_at_the_source() -> None:
     of = PointSources(np.array([[0.0, 0.0, 0.0]]), np.array([[0.1, -0.2, 0.3]]))
-    lattice = Lattice(np.full(3, -1.5), 0.1, np.ones((31, 31, 31), dtype=np.bool_))
+    lattice = PotentialLattice(np.full(3, -1.5), 0.1, np.ones((31, 31, 31), dtype=np.bool_))
     phi = of.smooth_potential(lattice, RADIUS)
     nodes = np.stack(np.meshgrid(*lattice.axes, indexing="ij"), axis=-1)
     away = np.linalg.norm(nodes, axis=-1)
@@ -108,7 +108,7 @@ def test_a_weak_source_is_split_nearer() -> None:
 def test_columns_that_are_not_needed_are_left_out() -> None:
     needed = np.zeros((4, 5, 6), dtype=np.bool_)
     needed[2, 3, 1] = True
-    phi = sources().smooth_potential(Lattice(np.zeros(3), 0.1, needed), RADIUS)
+    phi = sources().smooth_potential(PotentialLattice(np.zeros(3), 0.1, needed), RADIUS)
     assert (phi[2, 3] != 0).all()
     phi[2, 3] = 0.0
     assert not phi.any()
@@ -138,5 +138,5 @@ def test_no_sources_add_nothing() -> None:
     assert not field.any()
     assert not gradient.any()
     assert not of.smooth_potential(
-        Lattice(np.zeros(3), 0.1, np.ones((2, 2, 2), dtype=np.bool_)), RADIUS
+        PotentialLattice(np.zeros(3), 0.1, np.ones((2, 2, 2), dtype=np.bool_)), RADIUS
     ).any()

@@ -8,7 +8,12 @@ from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.potential_grid import Box, Lattice, PotentialGrid, potential_grid
+from l2m_gtsam.maps.harmonic.potential_grid import (
+    Box,
+    PotentialGrid,
+    PotentialLattice,
+    potential_grid,
+)
 from l2m_gtsam.maps.harmonic.spline import DEGREE, HALF_TAPS
 
 FIELD_TOLERANCE = 0.005  # uT, what the solvers are promised
@@ -21,7 +26,7 @@ EVERYWHERE = Box(np.full(3, -np.inf), np.full(3, np.inf))
 Potential = Callable[[FloatArray], FloatArray]
 
 
-def nodes_of(lattice: Lattice) -> FloatArray:
+def nodes_of(lattice: PotentialLattice) -> FloatArray:
     """Return all nodes, shape (nx, ny, nz, 3)."""
     return np.stack(np.meshgrid(*lattice.axes, indexing="ij"), axis=-1)
 
@@ -35,7 +40,7 @@ def grid_of(
 ) -> PotentialGrid:
     """Return the grid of a potential that is given point by point."""
 
-    def on(lattice: Lattice) -> FloatArray:
+    def on(lattice: PotentialLattice) -> FloatArray:
         return potential(nodes_of(lattice).reshape(-1, 3)).reshape(lattice.needed.shape)
 
     return potential_grid(on, points, reach, spacing, box)
@@ -263,9 +268,9 @@ def test_scattered_places_are_answered_in_their_own_order() -> None:
 def test_the_potential_is_needed_only_near_the_survey() -> None:
     spacing, reach = 0.1, 0.2
     survey = np.array([[0.0, 0.0, 0.0], [3.0, 2.0, 1.0]])
-    asked: list[Lattice] = []
+    asked: list[PotentialLattice] = []
 
-    def potential(lattice: Lattice) -> FloatArray:
+    def potential(lattice: PotentialLattice) -> FloatArray:
         asked.append(lattice)
         x = nodes_of(lattice)[..., 0]
         return np.where(lattice.needed, x, 1e9)  # what is not needed must not be used

@@ -9,20 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from l2m_factors.field_map import FieldMap as PluginFieldMap
+from l2m_factors.field_map import DifferentiableMap
 from l2m_gtsam.data import FieldSample, FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps import grid, sliding_gp
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map, map_from_state
 from l2m_gtsam.maps.dense_gp import DenseGP, DenseGPOptions
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.hyperparameters import Hyperparameters, LearningOptions
+from l2m_gtsam.maps.hyperparameters import KernelHyperparameters, KernelLearningOptions
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from l2m_gtsam.maps.training import ThinningOptions, thinned, training_set
 from tests.worlds.exact import dipole_world
 from tests.worlds.quick_maps import quick
 
-GIVEN = Hyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
+GIVEN = KernelHyperparameters(length_scale=0.8, signal=4.0, noise=0.2)
 KEEP_ALL = ThinningOptions(spacing=0)
 OPTIONS = SlidingGPOptions(hyperparameters=GIVEN)
 
@@ -172,7 +172,7 @@ def test_readings_that_disagree_at_one_place_are_averaged() -> None:
     offset = np.array([1.0, -2.0, 0.5])
     options = SlidingGPOptions(hyperparameters=GIVEN, thinning=KEEP_ALL)
     ours = SlidingGP.fit(twice, np.vstack([field + offset, field - offset]), options)
-    halved = Hyperparameters(**{**GIVEN.model_dump(), "noise": GIVEN.noise / np.sqrt(2)})
+    halved = KernelHyperparameters(**{**GIVEN.model_dump(), "noise": GIVEN.noise / np.sqrt(2)})
     once = SlidingGP.fit(points, field, options.model_copy(update={"hyperparameters": halved}))
     # Two equally noisy readings are one of half the variance: condition 1e5, digits to 1e-10.
     assert_same(ours.query(queries()), once.query(queries()), 1e-8)
@@ -236,7 +236,7 @@ def test_a_summary_tells_how_learning_ended() -> None:
 def test_maps_satisfy_both_protocols(sliding: SlidingGP) -> None:
     """Mostly a statement to the type checker."""
     application: FieldMap = sliding
-    plugin: PluginFieldMap = sliding
+    plugin: DifferentiableMap = sliding
     field, gradient = plugin.field_and_gradient(queries(7))
     assert field.shape == (7, 3)
     assert gradient.shape == (7, 3, 3)
@@ -295,7 +295,7 @@ def test_too_many_blocks_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_noise_too_small_to_factorise_is_refused() -> None:
-    silent = Hyperparameters(length_scale=5, signal=4, noise=1e-9)
+    silent = KernelHyperparameters(length_scale=5, signal=4, noise=1e-9)
     options = SlidingGPOptions(hyperparameters=silent, thinning=KEEP_ALL)
     with pytest.raises(MapError, match="not positive definite at noise 1e-09 uT"):
         SlidingGP.fit(*readings(), options)
@@ -353,6 +353,6 @@ def test_damaged_options_and_provenance_are_refused(sliding: SlidingGP) -> None:
 def test_hyperparameters_on_a_bound_are_told() -> None:
     points, _ = readings(200)
     exact = np.sin(points[:, ::-1] / 2)
-    learning = LearningOptions(readings=100)
+    learning = KernelLearningOptions(readings=100)
     ours = SlidingGP.fit(points, exact, SlidingGPOptions(learning=learning, thinning=KEEP_ALL))
     assert "not determined by the data: noise" in ours.summary.facts["hyperparameters"]
