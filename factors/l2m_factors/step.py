@@ -45,17 +45,17 @@ class StepError:
 
     def residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``G d`` in uT, shape (n, 3)."""
-        off = gtsam.Pose3.Logmap(self.step.between(self._way(values)))
+        off = gtsam.Pose3.Logmap(self.step.between(self._motion(values)))
         return np.asarray(self.slope @ off)
 
     def jacobians(self, values: gtsam.Values) -> list[FloatArray]:
         """Return its derivatives by the two key poses, shape (n, 3, 6) each."""
-        way = self._way(values)
-        off = self.step.between(way)
+        motion = self._motion(values)
+        off = self.step.between(motion)
         by_next = self.slope @ gtsam.Pose3.LogmapDerivative(off)
-        return [-by_next @ way.inverse().AdjointMap(), by_next]
+        return [-by_next @ motion.inverse().AdjointMap(), by_next]
 
-    def _way(self, values: gtsam.Values) -> gtsam.Pose3:
+    def _motion(self, values: gtsam.Values) -> gtsam.Pose3:
         before, after = (values.atPose3(key) for key in self.keys)
         return before.between(after)
 

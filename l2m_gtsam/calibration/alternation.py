@@ -63,7 +63,7 @@ class OneKeyOptions(Options):
     """A sensor with fewer readings inside the map is not solved; five have 15 components."""
     largest_offset_s: float = Field(default=0.25, ge=0, le=10)
     """How far a sensor's clock may be off the lidar's, seconds. The time offset is part of the
-    solve where the drive tells it from the position; 0 takes all clocks for one."""
+    solve where the drive separates it from the position; 0 takes all clocks for one."""
     pose_noise: PoseNoiseOptions = PoseNoiseOptions()
     """How wrong the lidar's poses are. With `uncertainty: independent` each reading has a pose
     error of its own."""

@@ -124,12 +124,12 @@ def calibrated(
     )
     outcome = solve_moving(problem, t_start)
     solution = outcome.solution
-    told = explained(outcome.readings, solver_map, t_start, solution, options.solve)
+    explanations = explained(outcome.readings, solver_map, t_start, solution, options.solve)
     drive = SolvedDrive(
         synchronised=synchronised,
         readings=alive,
         outcome=outcome,
-        told=told,
+        explained=explanations,
         starts=tuple(found),
         moved=movement(recording.trajectory.R, recording.trajectory.p),
     )

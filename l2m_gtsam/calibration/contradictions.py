@@ -14,8 +14,8 @@ from l2m_gtsam.calibration.marginals import JointCovariance
 from l2m_gtsam.calibration.priors import Prior, prior_rows
 
 LARGEST = 4.0  # sigmas
-# Share of a prior's variance that is not its own doing; with less nothing else tells about it.
-TOLD = 1e-3
+# Share of a prior's variance that is not its own doing; with less nothing else informs about it.
+INFORMED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -49,5 +49,5 @@ def sigmas(prior: Prior, values: gtsam.Values, covariance: JointCovariance) -> f
     """Return by how many standard deviations all else differs from a prior, in its worst row."""
     jacobian, b = prior_rows(prior, values, prior.sensors)
     own = np.einsum("ij,jk,ik->i", jacobian, covariance(prior.sensors), jacobian)
-    told = 1 - own > TOLD
-    return float(np.max(np.abs(b[told]) / np.sqrt(1 - own[told]), initial=0.0))
+    informed = 1 - own > INFORMED
+    return float(np.max(np.abs(b[informed]) / np.sqrt(1 - own[informed]), initial=0.0))

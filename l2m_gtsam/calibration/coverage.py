@@ -178,14 +178,14 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
     if readings.pose_root is not None:
         knots = PoseKnots.over(seconds, correlation_s, readings.drive)
     segment = np.zeros(len(x), dtype=np.int64) if knots is None else knots.segment(seconds)
-    told = errors.errors_over(x)
-    owner, rest, groups = told.owner(x), np.empty_like(x), []
+    map_errors = errors.errors_over(x)
+    owner, rest, groups = map_errors.owner(x), np.empty_like(x), []
 
     def asked(tile: int) -> tuple[IntArray, FloatArray]:
         rows = np.flatnonzero(owner == tile)
-        return rows, told.features(x[rows], tile)
+        return rows, map_errors.features(x[rows], tile)
 
-    tiles = list(told.sizes())
+    tiles = list(map_errors.sizes())
     for tile, (rows, features) in zip(tiles, in_threads(asked, tiles), strict=True):
         shared = np.einsum("nir,nir->ni", features, features)
         rest[rows] = np.maximum(view.map_variance[rows] - shared, 0.0)
@@ -193,8 +193,8 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
             first = rows[own[0]]
             where = int(readings.sensor[first]), tile, int(segment[first])
             groups.append(Group(*where, rows[own], features[own]))
-    lower = cholesky(told.covariance, lower=True, check_finite=False)
-    return Coverage(tuple(groups), rest, told.sizes(), lower, knots, seconds)
+    lower = cholesky(map_errors.covariance, lower=True, check_finite=False)
+    return Coverage(tuple(groups), rest, map_errors.sizes(), lower, knots, seconds)
 
 
 def together(

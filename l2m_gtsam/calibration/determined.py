@@ -67,7 +67,7 @@ class Cluster:
     jacobians
         Rows on each sensor that say what its readings do, shape (M, 16).
     held
-        Sensors whose readings do not tell their time offset: in the graph it is held.
+        Sensors whose readings do not determine their time offset: in the graph it is held.
     values
         Where priors are linearised.
     options

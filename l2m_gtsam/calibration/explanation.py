@@ -67,7 +67,7 @@ def explained(
         return {}
     noise, priors = solution.estimate.noise, solution.estimate.priors
     tests = rank_tests(readings, field_map, t_start, noise, options, priors)
-    used, told = solution.readings.select(solution.used), {}
+    used, explanations = solution.readings.select(solution.used), {}
     for found in solution.solved:
         s, after = found.sensor, found.determinacy
         before, own = tests.get(s, after), used.select(used.sensor == s)
@@ -77,8 +77,8 @@ def explained(
         open_ = replace(before, offset=after.offset)
         covariance = with_infinities(found.joint_covariance, open_)
         found = replace(found, joint_covariance=covariance)
-        told[s] = Explained(found, words, held_offset(after), from_priors(before, after))
-    return told
+        explanations[s] = Explained(found, words, held_offset(after), from_priors(before, after))
+    return explanations
 
 
 def from_priors(*tests: Determinacy) -> tuple[str, ...]:

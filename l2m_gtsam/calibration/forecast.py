@@ -22,7 +22,7 @@ from l2m_gtsam.solve.rank import Determinacy
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a drive would tell of ideal sensors.
+    """What a drive would determine of ideal sensors.
 
     Attributes
     ----------

@@ -169,8 +169,8 @@ def joint_step(
 ) -> JointStep:
     """Optimise T(i), D(i), S(i) of all sensors, then the noise from the residuals that remain.
 
-    ``exact`` goes to where the gradient vanishes; where the weights are those of a stage on the way
-    a step less is enough.
+    ``exact`` goes to where the gradient vanishes; with the weights of an intermediate stage a step
+    less is enough.
     """
     sensors = problem.view.sensors
     start = estimate.values(sensors)
@@ -244,8 +244,8 @@ def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
 
 def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
     """Return the covariance without the made-up figures of directions that were held."""
-    honest, touched = covariance.copy(), np.append(test.touched, not test.offset)
-    honest[touched, :] = 0.0
-    honest[:, touched] = 0.0
-    honest[touched, touched] = np.inf
-    return honest
+    determined, touched = covariance.copy(), np.append(test.touched, not test.offset)
+    determined[touched, :] = 0.0
+    determined[:, touched] = 0.0
+    determined[touched, touched] = np.inf
+    return determined

@@ -6,8 +6,8 @@ moves the sensors, with the same weights inside and outside. The *joint* graph o
 ``D(i)`` then finishes both, with the full covariance of each reading, and its marginals are the
 uncertainty. All sensors are in one graph and share one evaluation of the map.
 
-Where the lidar's motion tells a sensor's time offset from its place, ``S(i)`` is a variable, too;
-the readings' poses are taken anew as it moves.
+Where the lidar's motion separates a sensor's time offset from its place, ``S(i)`` is a variable,
+too; the readings' poses are taken anew as it moves.
 """
 
 from collections.abc import Callable, Mapping
@@ -184,7 +184,7 @@ def _solved(
     field_map: QueryableMap,
     t_start: FloatArray,
     options: OneKeyOptions,
-    tell: Progress,
+    progress: Progress,
     trajectory: Trajectory | None,
     priors: Priors,
     finish: Finish,
@@ -192,8 +192,8 @@ def _solved(
     field_map = remembered(field_map)
     good = readings.select(plausible(readings, field_map, t_start, options.robust))
     start = start_estimate(t_start, options, priors)
-    near = alternate(good, field_map, start, options, tell)
-    joint = settle(readings, field_map, near.estimate, options, tell, trajectory)
+    near = alternate(good, field_map, start, options, progress)
+    joint = settle(readings, field_map, near.estimate, options, progress, trajectory)
     outcome = OneKeySolution(
         readings=joint.readings,
         estimate=joint.estimate,
@@ -296,7 +296,7 @@ def settle(
     field_map: QueryableMap,
     estimate: Estimate,
     options: OneKeyOptions,
-    tell: Progress,
+    progress: Progress,
     trajectory: Trajectory | None,
 ) -> Joint:
     """Solve the joint graph again and again, until the weights are those of its result.
@@ -308,7 +308,7 @@ def settle(
     last: Trusted | None = None
     problem: JointProblem | None = None
     for round_ in range(MAX_ROUNDS):
-        tell("joint graph", round_ / MAX_ROUNDS)
+        progress("joint graph", round_ / MAX_ROUNDS)
         now = trusted(whole, field_map, estimate, options, round_, last)
         if not now.view.sensors:
             weights = now.weights
@@ -327,7 +327,7 @@ def settle(
         if moved > REOBSERVE_M or late > SETTLED_S:
             whole = observe(readings, field_map, estimate, options.min_readings)
             asked = estimate.t
-    tell("joint graph", 1.0)
+    progress("joint graph", 1.0)
     if last is None or not settled:  # the last round's weights are not those of its result
         last = trusted(whole, field_map, estimate, options, MAX_ROUNDS, None)
         problem = joint_problem(last.view, field_map, estimate, options)

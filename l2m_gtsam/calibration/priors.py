@@ -62,7 +62,7 @@ class Difference:
 
     @property
     def rigid(self) -> bool:
-        """Whether it tells the place of one sensor from that of the other."""
+        """Whether it separates the place of one sensor from that of the other."""
         return bool(np.isfinite(self.sigma).all())
 
 

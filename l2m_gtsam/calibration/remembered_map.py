@@ -60,12 +60,12 @@ class RememberedMap:
         with self._lock:
             last = self._last
         at = rows_among(last.points, points)
-        told = at >= 0
-        if told.all():
+        known = at >= 0
+        if known.all():
             return last.field[at], last.gradient[at]
         field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-        field[told], gradient[told] = last.field[at[told]], last.gradient[at[told]]
-        field[~told], gradient[~told] = self._map.field_and_gradient(points[~told])
+        field[known], gradient[known] = last.field[at[known]], last.gradient[at[known]]
+        field[~known], gradient[~known] = self._map.field_and_gradient(points[~known])
         with self._lock:
             self._last = LastFields(points.copy(), field.copy(), gradient.copy())
         return field, gradient

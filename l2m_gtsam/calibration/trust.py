@@ -27,8 +27,8 @@ from l2m_gtsam.solve.robust import (
 GRADUATION = (1.0, 10.0, float("inf"))
 # From this round on the same readings count: one at the very limit would come and go for ever.
 FREEZE = 6
-NOTHING = 1e-6  # a weight that is as good as none
-FEWEST = 12  # readings: with fewer no distortion can be told from outliers
+NOTHING = 1e-6  # below this a reading counts as rejected
+FEWEST = 12  # readings: with fewer a distortion cannot be separated from outliers
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ class SolvedDrive:
         Those that the solve was given.
     outcome
         Of the solve.
-    told
+    explained
         Solutions of the solved sensors, with what they leave open.
     starts
         Where the search found each sensor; none where it was not looked for or not found.
@@ -58,7 +58,7 @@ class SolvedDrive:
     synchronised: Synchronised
     readings: Readings
     outcome: MovingSolution
-    told: dict[int, Explained]
+    explained: dict[int, Explained]
     starts: tuple[FoundStart | None, ...]
     moved: Movement
 
@@ -131,7 +131,7 @@ def _with_neighbours(
     names = [other.sensor for other in others if _at_one_point(sensor, other)]
     if not names:
         return sensor
-    place = f"its place is not told apart from {', '.join(names)}"
+    place = f"its place is not distinguishable from {', '.join(names)}"
     return replace(sensor, message=f"{sensor.message}; {place}")
 
 
@@ -147,7 +147,7 @@ def _at_one_point(one: SensorCalibration, other: SensorCalibration) -> bool:
 
 def _assess(drive: SolvedDrive, options: CalibrationOptions) -> tuple[SensorCalibration, ...]:
     """Return what the solve itself says of every sensor."""
-    alive, solution, solved = drive.readings, drive.outcome.solution, drive.told
+    alive, solution, solved = drive.readings, drive.outcome.solution, drive.explained
     outside = np.bincount(alive.sensor[~solution.inside], minlength=len(alive.sensors))
     rejected = np.bincount(alive.sensor[solution.rejected], minlength=len(alive.sensors))
     sensors = []
@@ -184,16 +184,16 @@ def _with_rejected(sensor: SensorCalibration, rejected: int) -> SensorCalibratio
 
 def _solved(
     name: str,
-    told: Explained,
+    explained: Explained,
     solution: OneKeySolution,
     counts: SyncCounts,
     outside: int,
     options: OneKeyOptions,
 ) -> SensorCalibration:
-    found = told.solution
+    found = explained.solution
     vector = solution.estimate.distortion[found.sensor]
     distortion = Distortion.from_vector(vector)
-    status, message = _verdict(told, solution, options)
+    status, message = _verdict(explained, solution, options)
     rotation = _no_rotation()
     axis = dead_axis(distortion.C)
     # what is not determined may be short without a fault of the sensor
@@ -218,29 +218,29 @@ def _solved(
         rotation_covariance=rotation.covariance,
         noise=float(solution.estimate.noise[found.sensor]),
         residuals=found.figures,
-        undetermined=told.words,
+        undetermined=explained.words,
         sync=counts,
         outside_map=outside,
-        time_offset=_time_offset(told, solution),
-        from_priors=told.from_priors,
+        time_offset=_time_offset(explained, solution),
+        from_priors=explained.from_priors,
         unmodelled=found.unmodelled,
     )
 
 
-def _time_offset(told: Explained, solution: OneKeySolution) -> TimeOffset:
-    found = told.solution
+def _time_offset(explained: Explained, solution: OneKeySolution) -> TimeOffset:
+    found = explained.solution
     return TimeOffset(
-        seconds=0.0 if told.held else float(solution.estimate.offset[found.sensor]),
+        seconds=0.0 if explained.held else float(solution.estimate.offset[found.sensor]),
         sigma=found.offset_sigma,
         cross_covariance=found.offset_covariance,
-        held=told.held,
+        held=explained.held,
     )
 
 
 def _verdict(
-    told: Explained, solution: OneKeySolution, options: OneKeyOptions
+    explained: Explained, solution: OneKeySolution, options: OneKeyOptions
 ) -> tuple[SensorStatus, str]:
-    found, words = told.solution, ". ".join(told.words)
+    found, words = explained.solution, ". ".join(explained.words)
     open_ = f"this drive and map leave open: {words}" if words else ""
     because = f"; {open_}" if words else ""
     if abs(solution.estimate.offset[found.sensor]) >= options.largest_offset_s > 0:
@@ -259,7 +259,7 @@ def _verdict(
         )
     if words:
         return SensorStatus.UNDETERMINED, open_
-    known = f"; from priors: {', '.join(told.from_priors)}" if told.from_priors else ""
+    known = f"; from priors: {', '.join(explained.from_priors)}" if explained.from_priors else ""
     return SensorStatus.SOLVED, f"converged on {found.figures.readings} readings{known}"
 
 

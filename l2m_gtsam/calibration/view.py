@@ -23,7 +23,7 @@ class QueryableMap(Protocol):
 
 @runtime_checkable
 class Compilable(Protocol):
-    """A map that has a faster form for solvers, equal within what no reading can tell."""
+    """A map that has a faster form for solvers, equal to within far less than any noise."""
 
     def compile(self) -> QueryableMap:
         """Return that form."""

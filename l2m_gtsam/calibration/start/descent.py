@@ -37,7 +37,7 @@ class Basin:
 
 
 @dataclass(frozen=True)
-class Terrain:
+class StartProblem:
     """What descents go by.
 
     Attributes
@@ -61,12 +61,12 @@ class Terrain:
     good: float
 
 
-def descend(terrain: Terrain, sensor: IntArray, t: FloatArray) -> list[Basin | None]:
+def descend(problem: StartProblem, sensor: IntArray, t: FloatArray) -> list[Basin | None]:
     """Return the minimum that each place leads to; none where too little is known about it.
 
     Parameters
     ----------
-    terrain
+    problem
         Readings and map.
     sensor
         Whose cost falls along each of D descents, shape (D,).
@@ -76,43 +76,43 @@ def descend(terrain: Terrain, sensor: IntArray, t: FloatArray) -> list[Basin | N
     basins: list[Basin | None] = []
     for start in range(0, len(t), ABREAST):
         at = slice(start, start + ABREAST)
-        basins += descend_abreast(terrain, sensor[at], t[at])
+        basins += refine_batch(problem, sensor[at], t[at])
     return basins
 
 
-def descend_abreast(terrain: Terrain, sensor: IntArray, t: FloatArray) -> list[Basin | None]:
+def refine_batch(problem: StartProblem, sensor: IntArray, t: FloatArray) -> list[Basin | None]:
     """Return the same, all places in step."""
     begun = [
-        Descent.begin(terrain.snapshots, *each) for each in zip(sensor.tolist(), t, strict=True)
+        Descent.begin(problem.snapshots, *each) for each in zip(sensor.tolist(), t, strict=True)
     ]
-    told = terrain.predict(np.concatenate([each.places for each in begun]))
-    fields, inside = (split(part, begun) for part in told)
+    predicted = problem.predict(np.concatenate([each.places for each in begun]))
+    fields, inside = (split(part, begun) for part in predicted)
     begun = [each.starting(*at) for each, *at in zip(begun, fields, inside, strict=True)]
-    go_down(terrain, [each for each in begun if each.leads_on])
+    gauss_newton(problem, [each for each in begun if each.leads_on])
     ends = np.stack([each.t for each in begun])
-    left = misfits(terrain.snapshots, terrain.predict, ends, terrain.good).rms
+    left = misfits(problem.snapshots, problem.predict, ends, problem.good).rms
     return [
         Basin(each.t, float(rms[each.sensor])) if each.leads_on else None
         for each, rms in zip(begun, left, strict=True)
     ]
 
 
-def go_down(terrain: Terrain, active: list["Descent"]) -> None:
+def gauss_newton(problem: StartProblem, active: list["Descent"]) -> None:
     """Take Gauss-Newton steps until all descents have settled."""
     for _ in range(STEPS):
         if not active:
             break
         places = np.concatenate([each.places for each in active])
-        asked = terrain.field_map.field_and_gradient(places)
+        asked = problem.field_map.field_and_gradient(places)
         answers = zip(*(split(part, active) for part in asked), strict=True)
         for each, (field, gradient) in zip(active, answers, strict=True):
-            each.go_on(linearised(field, gradient, each.R, each.z), terrain.longest)
+            each.go_on(linearised(field, gradient, each.R, each.z), problem.longest)
         active = [each for each in active if np.linalg.norm(each.step) > SETTLED]
 
 
 @dataclass
 class Descent:
-    """The way of one sensor from a place to a minimum of its cost.
+    """The path of one sensor from a place to a minimum of its cost.
 
     Attributes
     ----------

@@ -14,7 +14,7 @@ from scipy.ndimage import minimum_filter
 
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.start.candidates import Candidates
-from l2m_gtsam.calibration.start.descent import Basin, Terrain, descend
+from l2m_gtsam.calibration.start.descent import Basin, StartProblem, descend
 from l2m_gtsam.calibration.start.rigid_groups import Bounds, Rigid, bounded, pooled, rigid_groups
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
@@ -26,7 +26,7 @@ from l2m_gtsam.records.calibration import FoundStart
 from l2m_gtsam.solve.profile import Prediction, Snapshots, misfits, snapshots_of
 
 BATCH = 256  # candidates at a time
-FIRST = 10  # poses that tell whether a candidate lies in the map at all
+FIRST = 10  # poses that decide whether a candidate lies in the map at all
 STRIDE = 1.9  # steps of the grid: places nearer to a better one are not followed
 TINY = np.finfo(float).tiny
 
@@ -137,66 +137,66 @@ def starts_of(
     coarse = coarse_prediction(field_map, options)
     balls = [Candidates.around(centre, options.search_radius, options.step) for centre in centres]
     union = Candidates.union(balls)
-    left = look(snapshots, coarse, union, options)
+    left = screen(snapshots, coarse, union, options)
     left = pooled(bounded(left, union.axes(), bounds), groups, options.step)
-    hopes = [
-        hopes_of(ball, np.where(ball.within, part, np.inf), sensor, options)
+    candidates = [
+        start_candidates(ball, np.where(ball.within, part, np.inf), sensor, options)
         for ball in balls
         for sensor, part in enumerate(np.moveaxis(left[ball.slices_of(union)], -1, 0))
     ]
     fine = fine_prediction(field_map, coarse)
-    terrain = Terrain(snapshots, fine, field_map, options.step, 1 - options.outliers)
-    followed = follow(terrain, hopes, options.step, bounds)
+    problem = StartProblem(snapshots, fine, field_map, options.step, 1 - options.outliers)
+    followed = follow(problem, candidates, options.step, bounds)
     sensors, starts = left.shape[-1], []
-    for row in range(0, len(hopes), sensors):
-        own = hopes[row : row + sensors]
+    for row in range(0, len(candidates), sensors):
+        own = candidates[row : row + sensors]
         found = [found_start(each, reached(each, followed), options) for each in own]
         for group in groups:
-            place_group(group, terrain, own, followed, options, found)
+            place_group(group, problem, own, followed, options, found)
         starts.append(found)
     return starts
 
 
 def follow(
-    terrain: Terrain, hopes: list["Hopes"], step: float, bounds: Bounds
+    problem: StartProblem, candidates: list["StartCandidates"], step: float, bounds: Bounds
 ) -> dict[Node, Basin]:
-    """Return the minimum that each node of any hopes leads to, of those that lead anywhere.
+    """Return the minimum that each node of any candidates leads to, of those that lead anywhere.
 
     One beyond the bounds is taken to their edge, and what is left there counts.
     """
-    nodes = sorted({node for each in hopes for node in each.nodes})
+    nodes = sorted({node for each in candidates for node in each.nodes})
     sensors = np.array([node[0] for node in nodes], dtype=np.int64)
     t = step * np.array([node[1:] for node in nodes]).reshape(-1, 3)
-    ends = descend(terrain, sensors, t)
+    ends = descend(problem, sensors, t)
     return {
-        node: within(end, node[0], terrain, bounds)
+        node: within(end, node[0], problem, bounds)
         for node, end in zip(nodes, ends, strict=True)
         if end is not None
     }
 
 
-def within(basin: Basin, sensor: int, terrain: Terrain, bounds: Bounds) -> Basin:
+def within(basin: Basin, sensor: int, problem: StartProblem, bounds: Bounds) -> Basin:
     """Return a sensor's basin, or the nearest place where the sensor can be."""
     t = np.clip(basin.t, bounds.low[sensor], bounds.high[sensor])
     if (t == basin.t).all():
         return basin
-    left = misfits(terrain.snapshots, terrain.predict, t[None], terrain.good).rms
+    left = misfits(problem.snapshots, problem.predict, t[None], problem.good).rms
     return Basin(t, float(left[0, sensor]))
 
 
-def reached(hopes: "Hopes", followed: dict[Node, Basin]) -> list[Basin]:
-    """Return the basins that hopes led to."""
-    return [followed[node] for node in hopes.nodes if node in followed]
+def reached(candidates: "StartCandidates", followed: dict[Node, Basin]) -> list[Basin]:
+    """Return the basins that candidates led to."""
+    return [followed[node] for node in candidates.nodes if node in followed]
 
 
 def found_start(
-    hopes: "Hopes", reached: Sequence[Basin], options: StartOptions
+    candidates: "StartCandidates", reached: Sequence[Basin], options: StartOptions
 ) -> FoundStart | None:
-    """Return the best of the basins that a sensor's hopes led to, beside the second best."""
+    """Return the best of the basins that a sensor's candidates led to, beside the second best."""
     basins = distinct(reached, options.apart)
     if not basins:
         return None
-    best, margin, runner_up = basins[0], hopes.margin, hopes.runner_up
+    best, margin, runner_up = basins[0], candidates.margin, candidates.runner_up
     if len(basins) > 1 and (ratio := basins[1].rms / max(best.rms, TINY)) < margin:
         margin, runner_up = ratio, basins[1].t
     return FoundStart(best.t, float(margin), runner_up)
@@ -204,8 +204,8 @@ def found_start(
 
 def place_group(
     group: Rigid,
-    terrain: Terrain,
-    hopes: list["Hopes"],
+    problem: StartProblem,
+    candidates: list["StartCandidates"],
     followed: dict[Node, Basin],
     options: StartOptions,
     found: list[FoundStart | None],
@@ -218,19 +218,19 @@ def place_group(
     places = [
         basin.t - offset
         for sensor, offset in zip(group.sensors, group.offset, strict=True)
-        for basin in reached(hopes[sensor], followed)
+        for basin in reached(candidates[sensor], followed)
     ]
     if not places:
         return
     left = [
-        misfits(terrain.snapshots, terrain.predict, np.array(places) + offset, terrain.good).rms[
+        misfits(problem.snapshots, problem.predict, np.array(places) + offset, problem.good).rms[
             :, sensor
         ]
         for sensor, offset in zip(group.sensors, group.offset, strict=True)
     ]
     mean = np.exp(np.mean(np.log(np.maximum(left, TINY)), axis=0))
     basins = [Basin(t, float(rms)) for t, rms in zip(places, mean, strict=True)]
-    start = found_start(hopes[group.sensors[0]], basins, options)
+    start = found_start(candidates[group.sensors[0]], basins, options)
     for sensor, offset in zip(group.sensors, group.offset, strict=True):
         found[sensor] = None if start is None else start.moved(offset)
 
@@ -259,7 +259,7 @@ def fine_prediction(field_map: QueryableMap, coarse: Prediction) -> Prediction:
     return predict
 
 
-def look(
+def screen(
     snapshots: Snapshots, predict: Prediction, grid: Candidates, options: StartOptions
 ) -> FloatArray:
     """Return the misfits in uT of all nodes and sensors, shape (nx, ny, nz, S).
@@ -283,7 +283,7 @@ def look(
 
 
 @dataclass(frozen=True)
-class Hopes:
+class StartCandidates:
     """Places to follow to their minima, for one sensor.
 
     Attributes
@@ -302,7 +302,9 @@ class Hopes:
     runner_up: FloatArray | None
 
 
-def hopes_of(grid: Candidates, left: FloatArray, sensor: int, options: StartOptions) -> Hopes:
+def start_candidates(
+    grid: Candidates, left: FloatArray, sensor: int, options: StartOptions
+) -> StartCandidates:
     """Return the places of a ball that could, seen finely, lead to the best.
 
     Beside minima these are nodes some steps from better ones: the coarse map knows little of
@@ -321,8 +323,8 @@ def hopes_of(grid: Candidates, left: FloatArray, sensor: int, options: StartOpti
     away = np.linalg.norm(places[:, None] - places[picked], axis=2).min(axis=1, initial=np.inf)
     rest = np.flatnonzero(lowest & (away >= apart))
     if not len(rest):
-        return Hopes(chosen, float("inf"), None)
-    return Hopes(chosen, float(ratio[rest[0]]), places[rest[0]])
+        return StartCandidates(chosen, float("inf"), None)
+    return StartCandidates(chosen, float(ratio[rest[0]]), places[rest[0]])
 
 
 def spread_out(places: FloatArray, apart: float, most: int) -> list[int]:

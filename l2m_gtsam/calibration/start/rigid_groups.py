@@ -95,8 +95,8 @@ def placed(t: FloatArray, given: Collection[int], priors: Priors) -> FloatArray:
         if each.sensors[0] not in given:
             t[each.sensors[0], each.axis] = each.value
     for group in rigid_groups(priors, range(len(t))):
-        told = [sum(each.sensors[0] == sensor for each in measured) for sensor in group.sensors]
-        first = max(range(len(told)), key=lambda row: (group.sensors[row] in given, told[row]))
+        counts = [sum(each.sensors[0] == sensor for each in measured) for sensor in group.sensors]
+        first = max(range(len(counts)), key=lambda row: (group.sensors[row] in given, counts[row]))
         base = t[group.sensors[first]] - group.offset[first]
         for sensor, offset in zip(group.sensors, group.offset, strict=True):
             if sensor not in given:

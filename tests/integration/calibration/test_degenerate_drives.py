@@ -163,7 +163,7 @@ def test_two_sensors_at_one_point() -> None:
     for sensor, neighbour in ((one, "mag_1"), (other, "mag_0")):
         assert sensor.status is SensorStatus.SOLVED
         assert np.abs(deviations(sensor, places)).max() < 5
-        assert f"not told apart from {neighbour}" in sensor.message
+        assert f"not distinguishable from {neighbour}" in sensor.message
 
 
 def test_two_sensors_apart_are_not_said_to_be_at_one_point() -> None:

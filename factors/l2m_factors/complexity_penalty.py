@@ -18,7 +18,7 @@ where the tile was laid, has the right slope there, and after a few rounds the m
 
 Where the noise has but a share r of the variance that it is taken to have, weights take up no more
 than ``r p / 2`` of cost, and more than that pushes poses away from the sources. Mallows takes the
-noise from the residuals; so does who asks for a share of the doubt.
+noise from the residuals; so does who asks for a share of the penalty.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ from l2m_factors.tile import TileBatch
 
 
 @dataclass(frozen=True)
-class FieldDoubt:
+class ComplexityPenalty:
     """What n readings contribute to the number of parameters of the field that they teach.
 
     Attributes
@@ -49,21 +49,23 @@ class FieldDoubt:
     value: FloatArray
     slope: FloatArray
 
-    def __getitem__(self, rows: npt.NDArray[np.int64]) -> "FieldDoubt":
-        return FieldDoubt(self.at[rows], self.value[rows], self.slope[rows])
+    def __getitem__(self, rows: npt.NDArray[np.int64]) -> "ComplexityPenalty":
+        return ComplexityPenalty(self.at[rows], self.value[rows], self.slope[rows])
 
     @property
     def parameters(self) -> float:
         """How many parameters the readings teach."""
         return float(self.value @ self.value)
 
-    def share(self, of_noise: float) -> "FieldDoubt":
-        """Return the doubt where noise has this share of the variance that it was taken to have."""
+    def share(self, of_noise: float) -> "ComplexityPenalty":
+        """Return the penalty where the noise has this share of its assumed variance."""
         root = float(np.sqrt(of_noise))
-        return FieldDoubt(self.at, root * self.value, root * self.slope)
+        return ComplexityPenalty(self.at, root * self.value, root * self.slope)
 
 
-def doubt_factor(batch: TileBatch, key_pose: int, doubt: FieldDoubt) -> gtsam.CustomFactor | None:
+def effective_parameters_factor(
+    batch: TileBatch, key_pose: int, penalty: ComplexityPenalty
+) -> gtsam.CustomFactor | None:
     """Return the factor of a key pose's n readings; none where it depends on nothing.
 
     Parameters
@@ -72,7 +74,7 @@ def doubt_factor(batch: TileBatch, key_pose: int, doubt: FieldDoubt) -> gtsam.Cu
         The readings.
     key_pose
         Number k of the key pose.
-    doubt
+    penalty
         Of its readings.
     """
     keys = batch.place_keys_of(key_pose)
@@ -85,7 +87,9 @@ def doubt_factor(batch: TileBatch, key_pose: int, doubt: FieldDoubt) -> gtsam.Cu
         where = batch.places(values, key_pose)
         if jacobians is not None:
             for slot, block in enumerate(batch.place_jacobians(key_pose, where)):
-                jacobians[slot] = np.einsum("ni,nij->nj", doubt.slope, block)
-        return np.asarray(doubt.value + np.einsum("ni,ni->n", doubt.slope, where.x - doubt.at))
+                jacobians[slot] = np.einsum("ni,nij->nj", penalty.slope, block)
+        return np.asarray(
+            penalty.value + np.einsum("ni,ni->n", penalty.slope, where.x - penalty.at)
+        )
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(doubt.value)), keys, error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(penalty.value)), keys, error)
