@@ -1,7 +1,7 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
 from l2m_factors.check import assert_jacobians_match
-from l2m_factors.doubt import FieldDoubt, doubt_factor
+from l2m_factors.complexity import ComplexityPenalty, effective_parameters_factor
 from l2m_factors.field_map import DifferentiableMap
 from l2m_factors.key_pose_readings import (
     Calibrations,
@@ -39,9 +39,9 @@ from l2m_factors.whitening import Whitening
 __all__ = [
     "BatchedReadings",
     "Calibrations",
+    "ComplexityPenalty",
     "D",
     "DifferentiableMap",
-    "FieldDoubt",
     "G",
     "KeyPoseReadings",
     "KeyPoseResiduals",
@@ -68,7 +68,7 @@ __all__ = [
     "block_factor",
     "distance_prior",
     "distortion_prior",
-    "doubt_factor",
+    "effective_parameters_factor",
     "field_rate",
     "held_directions",
     "key_pose_factor",

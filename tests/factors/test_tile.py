@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_factors import (
-    FieldDoubt,
+    ComplexityPenalty,
     KeyPoseReadings,
     M,
     MapBatch,
@@ -15,7 +15,7 @@ from l2m_factors import (
     WeightedField,
     X,
     assert_jacobians_match,
-    doubt_factor,
+    effective_parameters_factor,
     key_pose_factor,
     tile_factor,
 )
@@ -110,13 +110,13 @@ def test_derivatives_of_doubt_are_those_of_finite_differences(seed: int, free: b
     batch = batch_of(readings, 0, None if free else values)
     for k in batch.key_poses:
         x = batch.places(values, k).x
-        doubt = FieldDoubt(x - 0.1, rng.uniform(size=len(x)), rng.normal(size=(len(x), 3)))
-        factor = doubt_factor(batch, k, doubt)
+        penalty = ComplexityPenalty(x - 0.1, rng.uniform(size=len(x)), rng.normal(size=(len(x), 3)))
+        factor = effective_parameters_factor(batch, k, penalty)
         if factor is None:
             assert (k, free) == (0, False)  # at the anchor nothing moves
             continue
         assert_jacobians_match(factor, values)
-        linear = doubt.value + 0.1 * doubt.slope.sum(axis=1)
+        linear = penalty.value + 0.1 * penalty.slope.sum(axis=1)
         np.testing.assert_allclose(factor.unwhitenedError(values), linear, atol=1e-12)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import M, TileBatch, Whitening, X, doubt_factor, tile_factor
+from l2m_factors import M, TileBatch, Whitening, X, effective_parameters_factor, tile_factor
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings
@@ -95,14 +95,14 @@ class TileReadings:
             white = Whitening.independent(self.whitening[batch.rows_of(k)])
             yield tile_factor(batch, k, white)
 
-    def doubts(self, drive: Drive, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
+    def penalties(self, drive: Drive, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the penalties of the parameters that the readings determine (Mallows' C_p)."""
         if not len(self.chosen):
             return
         batch, x = self._batch(drive), self.laid.placed.x[self.chosen]
-        doubt = self.laid.field.doubt(x, self.variance, tile.taught)
+        penalty = self.laid.field.penalty(x, self.variance, tile.past_information)
         for k in batch.key_poses:
-            factor = doubt_factor(batch, k, doubt[batch.rows_of(k)])
+            factor = effective_parameters_factor(batch, k, penalty[batch.rows_of(k)])
             if factor is not None:
                 yield factor
 
@@ -156,7 +156,7 @@ class OpenSection:
         graph = self._factors(int(new[0]), stages[-1])
         for each in self._counted:
             tile = self._tiles[each.laid.number]
-            for factor in each.doubts(self._drive, tile):
+            for factor in each.penalties(self._drive, tile):
                 graph.add(factor)
         self._solve(graph, self._options.max_iterations)
         return self._belief()
@@ -167,7 +167,9 @@ class OpenSection:
         tiles = list(self._tiles)
         for each in self._counted:
             tile = tiles[each.laid.number]
-            tiles[tile.number] = replace(tile, taught=tile.taught + each.information())
+            tiles[tile.number] = replace(
+                tile, past_information=tile.past_information + each.information()
+            )
         let_go = {X(self._first)} - {X(tile.anchor) for tile in tiles} - {X(self._last)}
         kept = [key for key in known.sizes if key not in let_go]
         return FieldMemory(known.marginal(kept), tuple(tiles))

@@ -7,11 +7,11 @@ import numpy as np
 
 from l2m_factors import (
     Calibrations,
-    FieldDoubt,
+    ComplexityPenalty,
     KeyPoseReadings,
     M,
     TileBatch,
-    doubt_factor,
+    effective_parameters_factor,
     tile_factor,
 )
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
@@ -58,12 +58,12 @@ class OccupiedTile:
         b = self.placed.field(sensors)
         return self.field.robust_weights(self.placed.x, b, variance)
 
-    def doubt(self, rows: IntArray, noise: FloatArray) -> FieldDoubt:
+    def penalty(self, rows: IntArray, noise: FloatArray) -> ComplexityPenalty:
         """Return the penalty of the parameters that some of its readings determine."""
         own = np.searchsorted(self.rows, rows)
         x = self.placed.x[own]
         variance = noise[self.placed.readings.sensor[own], None] ** 2 + self.field.unresolved(x)
-        return self.field.doubt(x, variance)
+        return self.field.penalty(x, variance)
 
     def prediction(self, weights: FloatArray, sensors: KnownSensors) -> MapPrediction:
         """Return the tile's prediction of its readings, in the anchor's frame."""
@@ -147,9 +147,9 @@ class TiledDrive:
         parts = [tile.prediction(values.atVector(M(tile.number)), sensors) for tile in tiles]
         return MapPrediction.joined(parts, [tile.rows for tile in tiles])
 
-    def doubts(
+    def penalties(
         self, noise: FloatArray, weights: FloatArray, squared: FloatArray
-    ) -> tuple[FieldDoubt, ...]:
+    ) -> tuple[ComplexityPenalty, ...]:
         """Return each tile's penalty by the readings that count, with the noise that they show.
 
         Parameters
@@ -162,16 +162,16 @@ class TiledDrive:
             Squared lengths of their residuals, whitened by noise and unresolved waves, shape (N,).
         """
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
-        whole = [tile.doubt(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
+        whole = [tile.penalty(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
         freedom = AXES * weights.sum() - sum(each.parameters for each in whole)
-        share = weights @ squared / freedom if freedom > 0 else 1.0
+        noise_share = weights @ squared / freedom if freedom > 0 else 1.0
         # A share above 1 is due to poses that have not converged, not to noise.
-        return tuple(each.share(min(share, 1.0)) for each in whole)
+        return tuple(each.scaled(min(noise_share, 1.0)) for each in whole)
 
     def graph(
         self,
         motions: RelativeMotions,
-        doubts: tuple[FieldDoubt, ...],
+        penalties: tuple[ComplexityPenalty, ...],
         whitening: FloatArray,
         by_lidar: FloatArray,
         chosen: IntArray,
@@ -183,7 +183,7 @@ class TiledDrive:
         ----------
         motions
             Relative motions when the drive was partitioned.
-        doubts
+        penalties
             Penalty of each tile.
         whitening
             Of the residuals of all N readings, without odometry's errors, 1/uT, (N, 3, 3).
@@ -195,7 +195,7 @@ class TiledDrive:
             Calibrations where they are constants; None where they are variables.
         """
         graph = gtsam.NonlinearFactorGraph()
-        for tile, doubt in zip(self.tiles, doubts, strict=True):
+        for tile, penalty in zip(self.tiles, penalties, strict=True):
             rows = np.intersect1d(tile.rows, chosen)
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
             graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
@@ -206,7 +206,7 @@ class TiledDrive:
                     own = rows[batch.rows_of(k)]
                     white = motions.whitening(own, whitening[own], by_lidar[own])
                     graph.add(tile_factor(batch, k, white, motions.step_error(own, by_lidar[own])))
-                    factor = doubt_factor(batch, k, doubt[batch.rows_of(k)])
+                    factor = effective_parameters_factor(batch, k, penalty[batch.rows_of(k)])
                     if factor is not None:
                         graph.add(factor)
         return graph

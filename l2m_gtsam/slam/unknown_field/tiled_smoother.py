@@ -180,11 +180,11 @@ class TiledProblem:
         robust = self._options.robust
         r2 = predicted.squared(noise)
         weights = np.asarray(WEIGHTS[robust.loss](r2, robust.largest, mu))
-        doubts = tiled.doubts(noise, weights, predicted.prediction.squared(own))
+        penalties = tiled.penalties(noise, weights, predicted.prediction.squared(own))
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         fixed = None if self._free else self._drive.sensors.fixed()
         W, by_lidar = own * np.sqrt(weights)[:, None, None], predicted.prediction.by_lidar
-        graph = tiled.graph(motions, doubts, W, by_lidar, chosen, fixed)
+        graph = tiled.graph(motions, penalties, W, by_lidar, chosen, fixed)
         graph.push_back(self._odometry)
         graph.push_back(self._links)
         if self._free:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import FieldDoubt
+from l2m_factors import ComplexityPenalty
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.frame import TileFrame
@@ -191,13 +191,13 @@ class WaveTile:
         return weights
 
     def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
-        """Return the readings' information about the weights, (m, m); arguments as of ``doubt``."""
+        """Return the readings' information about the weights, (m, m); see ``penalty``."""
         F = (self.features(points) / np.sqrt(variance)[:, :, None]).reshape(-1, len(self))
         return np.asarray(F.T @ F)
 
-    def doubt(
-        self, points: FloatArray, variance: FloatArray, taught: FloatArray | None = None
-    ) -> FieldDoubt:
+    def penalty(
+        self, points: FloatArray, variance: FloatArray, past_information: FloatArray | None = None
+    ) -> ComplexityPenalty:
         """Return each reading's share of the effective number of parameters (Mallows' C_p).
 
         Parameters
@@ -210,7 +210,9 @@ class WaveTile:
             Information of other readings about the weights, shape (m, m).
         """
         known = np.eye(len(self)) + self.information(points, variance)
-        lower = cholesky(known if taught is None else known + taught, lower=True)
+        lower = cholesky(
+            known if past_information is None else known + past_information, lower=True
+        )
         spread = cho_solve((lower, True), np.eye(len(self)))
         root = 1 / np.sqrt(variance)[:, :, None]
         share = root * (self.features(points) @ spread)
@@ -222,7 +224,7 @@ class WaveTile:
             for step in (*steps, *-steps)
         ]
         slope = (np.stack(slopes[:AXES], axis=1) - np.stack(slopes[AXES:], axis=1)) / (2 * SIDE_M)
-        return FieldDoubt(points, value, slope)
+        return ComplexityPenalty(points, value, slope)
 
 
 @dataclass(frozen=True)

@@ -46,10 +46,10 @@ def counted(drawn: DrawnDrive, stated: float, spoilt: FloatArray, weights: Float
     noise = np.full(len(drive.sensors.names), stated)
     prediction = tiled.prediction(tiled.weights(drive.sensors, noise), drive.sensors)
     squared = spoilt + prediction.squared(prediction.whitening(noise))
-    of_noise = sum(each.parameters for each in tiled.doubts(noise, weights, squared))
+    of_noise = sum(each.parameters for each in tiled.penalties(noise, weights, squared))
     chosen = np.flatnonzero(weights)
     as_stated = (
-        tile.doubt(np.intersect1d(tile.rows, chosen), noise).parameters for tile in tiled.tiles
+        tile.penalty(np.intersect1d(tile.rows, chosen), noise).parameters for tile in tiled.tiles
     )
     return of_noise / sum(as_stated)
 
