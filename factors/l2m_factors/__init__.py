@@ -1,7 +1,7 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
 from l2m_factors.check import assert_jacobians_match
-from l2m_factors.complexity_penalty import ComplexityPenalty, effective_parameters_factor
+from l2m_factors.complexity import ComplexityPenalty, effective_parameters_factor
 from l2m_factors.field_map import DifferentiableMap
 from l2m_factors.key_pose_readings import (
     Calibrations,

@@ -46,7 +46,7 @@ for _command in (
 def main() -> None:
     """Run the command line; an error that a user can mend is one line and exit code 2."""
     # Blocks of a few hundred readings are too small for threads, which then only wait for each
-    # other; has to be said before numpy is imported.
+    # other; has to be set before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     try:

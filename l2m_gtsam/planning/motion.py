@@ -21,7 +21,7 @@ class MotionOptions(Options):
     heave_m: float = Field(default=0.2, gt=0)
     """Up and down by so much."""
     tilt_deg: float = Field(default=5.0, gt=0, lt=45)
-    """Roll and pitch by so much either way."""
+    """Roll and pitch by so much to either side."""
     loop_m: float = Field(default=0.5, gt=0)
     """Radius of a loop where the gradient is strong."""
     turn_rad_s: float = Field(default=0.5, gt=0)
@@ -37,7 +37,7 @@ class PlanOptions(Options):
     """Readings per second of sensors that the bag does not have yet."""
     noise_ut: float = Field(default=0.2, gt=0)
     """Standard deviation of the sensors' noise in microtesla, where neither
-    `calibration.solve.sensor_noise_ut` nor the map says one: a map that learns it gives that of
+    `calibration.solve.sensor_noise_ut` nor the map has one: a map that learns it gives that of
     the mapping suite."""
     motion: MotionOptions = MotionOptions()
     """Extra motions that are tried."""
@@ -65,12 +65,13 @@ class ExtraMotion:
     @property
     def twist(self) -> FloatArray:
         """Angular velocity in rad/s and linear velocity in m/s, lidar frame, shape (N, 6)."""
+        # Central differences, one-sided at both ends; rotations by their rotation vector.
         rows = np.arange(len(self.p))
         before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(rows) - 1)
         between = np.maximum(self.seconds[after] - self.seconds[before], np.finfo(float).tiny)
         turn = Rotation.from_matrix(self.R[before].transpose(0, 2, 1) @ self.R[after]).as_rotvec()
-        way = np.einsum("nji,nj->ni", self.R, self.p[after] - self.p[before])
-        return np.asarray(np.hstack([turn, way]) / between[:, None])
+        step = np.einsum("nji,nj->ni", self.R, self.p[after] - self.p[before])
+        return np.asarray(np.hstack([turn, step]) / between[:, None])
 
 
 def extra_motions(drive: ExtraMotion, options: MotionOptions) -> tuple[ExtraMotion, ...]:

@@ -72,7 +72,7 @@ class Task:
     priors: Priors
 
     def forecast(self, readings: Readings) -> Forecast:
-        """Return what a solve would say."""
+        """Return the covariances that a solve would have."""
         options = self.options.solve
         return forecast(readings, self.field_map, self.t, self.noise, options, self.priors)
 
@@ -124,9 +124,9 @@ def plan(
     noise = _noise(field_map, options, planning)
     priors = priors_of(options.priors, readings.sensors)
     task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)
-    progress("what the drive tells", 0.0)
+    progress("what the drive determines", 0.0)
     found = task.forecast(readings)
-    progress("what the drive tells", 1.0)
+    progress("what the drive determines", 1.0)
     if not found.view.inside.any():
         raise CalibrationError(f"the map does not cover the drive {recording.source.path}")
     sensors = _sensor_plans(synchronised, recording.trajectory, found, task)

@@ -92,7 +92,7 @@ def compared_halves(
 
     Each starts where the whole was found, with its time offsets and without priors: what a half
     leaves open takes no part. Readings that the whole rejected are looked at again: of a sensor
-    that moved on the way they are one half.
+    that moved on the drive they are one half.
 
     Parameters
     ----------

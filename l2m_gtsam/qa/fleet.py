@@ -200,6 +200,7 @@ def expected_deviation(value: FloatArray, sigma: FloatArray) -> FloatArray:
     of the values' spread, which is what drives differ by for reasons that no sigma knows. The
     latter from the median absolute deviation, which half of all values cannot move.
     """
+    # Of N normal values the median has pi / 2 times the variance of the mean.
     of_median = MEDIAN * np.median(sigma) ** 2 / len(value)
     spread = float(median_abs_deviation(value, scale="normal"))
     smallest = np.finfo(float).tiny  # values that are exact and all alike

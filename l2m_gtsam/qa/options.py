@@ -74,7 +74,7 @@ class ValidationOptions(Options):
     """
 
     chance: float = Field(default=1e-3, gt=0, lt=0.1)
-    """Share of unchanged sensors of which it may be said, by chance, that something changed."""
+    """Share of unchanged sensors in which a change may be found by chance."""
     place_m: Limit = Limit(warn=0.01, fail=0.03)
     """Change of a sensor's place, metres. A change counts if chance does not explain it."""
     rotation_deg: Limit = Limit(warn=0.3, fail=1.0)
@@ -112,8 +112,7 @@ class SlamQaOptions(Options):
     """Normalised squared error of the poses against the truth, if one is given, per degree of
     freedom; 1 is consistent. Pose errors of a drive are correlated: a drive counts as one case."""
     chance: float = Field(default=1e-3, gt=0, lt=0.1)
-    """Share of true calibrations of which it may be said, by chance, that refining them changed
-    them by more than they allow."""
+    """Share of true calibrations that may, by chance, be reported as changed by refining them."""
 
 
 class QaOptions(Options):
@@ -127,7 +126,7 @@ class QaOptions(Options):
     """Largest standard deviation of H, microtesla."""
     unexplained: Limit = Limit(warn=0.5, fail=0.75)
     """What the calibration leaves of the readings beside what a uniform field would leave (0 is
-    all explained, 1 nothing): more says that the map does not fit the drive."""
+    all explained, 1 nothing): above it the map does not fit the drive."""
     rejected: Limit = Limit(warn=0.02, fail=0.4)
     """Share of the readings inside the map that no distortion explains."""
     outside_map: Limit = Limit(warn=0.3, fail=0.9)

@@ -99,7 +99,7 @@ def sensor_figures(
 def _of_readings(value: float, freedom: int, sensor: SensorCalibration) -> ChiSquare:
     """Return the sum over readings; the noise that it counts in was itself estimated from others.
 
-    Then it is Fisher's distribution that says what chance does, not chi-square's.
+    The ratio of two estimated variances is then distributed as Fisher's F, not as chi-square.
     """
     if sensor.residuals is None:
         return _chi_square(value, freedom)

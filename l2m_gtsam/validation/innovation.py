@@ -77,6 +77,7 @@ class ChangeLikelihood:
         """Return how much less that is with these parameters free."""
         if not columns:
             return 0.0
+        # The projection of the white innovation on the columns' range: what least squares removes.
         Q, s, _ = np.linalg.svd(self.root[:, columns], full_matrices=False)
         seen = Q[:, s > 1e-9 * max(float(s[0]), 1e-300)].T @ self.white
         return float(seen @ seen)
@@ -267,7 +268,7 @@ def changes_of(C: FloatArray) -> FloatArray:
     """Return what a change of each part does to (t, C row by row, H, time offset), (16, 16).
 
     Columns are those of ``COLUMNS``: metres; degrees by which the sensor turns about its own axes,
-    R_lidar_mag to R_lidar_mag exp(d), so that field vectors turn the other way in it and C becomes
+    R_lidar_mag to R_lidar_mag exp(d), so that field vectors turn by -d in it and C becomes
     exp(-d) C; relative gains; degrees by which the angles x y, y z, z x between axes become
     smaller; microtesla; seconds.
     """

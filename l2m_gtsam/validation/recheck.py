@@ -141,6 +141,7 @@ def _followed(
     used = usable(drive, field_map, known, options)
     last, here = np.empty(0), known
     parts: tuple[CalibrationPart, ...] = ()
+    # Gauss-Newton: linearise about the changed calibration, test and estimate the change anew.
     for _ in range(ROUNDS):
         likelihood = _about(drive, field_map, here, known, used, options)
         likelihood = marginalise_calibration(likelihood, spread, basis)

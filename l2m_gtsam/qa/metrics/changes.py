@@ -68,6 +68,7 @@ class CalibrationDifference:
         if not sigma.all():
             same = not self.value[known][sigma == 0].any()
             return ChangeTest(name, 0.0, 0, 1.0) if same else ChangeTest(name, np.inf, 1, 0.0)
+        # Wald's test, in units of sigmas; directions that both share exactly carry no information.
         d = self.value[known] / sigma
         S = self.covariance[np.ix_(known, known)] / np.outer(sigma, sigma)
         values, axes = np.linalg.eigh(S)
@@ -182,6 +183,7 @@ def rotation_difference(new: SensorCalibration, old: SensorCalibration) -> Calib
 def through(J: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return ``J covariance J^T``; what rests on an infinite variance is infinite itself."""
     unknown = ~np.isfinite(np.diag(covariance))
+    # The delta method; 0 * inf is no number, so that infinite variances are propagated apart.
     finite = np.where(unknown[:, None] | unknown, 0.0, covariance)
     result = J @ finite @ J.T
     open_ = np.abs(J[:, unknown]).max(axis=1, initial=0.0) > 1e-9  # zero but for rounding
@@ -200,6 +202,7 @@ def shape_derivatives(C: FloatArray) -> FloatArray:
         J[k, 3 * k : 3 * k + 3] = axes[k]
     for k, (i, j) in enumerate(PAIRS):
         cosine = float(axes[i] @ axes[j])
+        # d asin(c) = dc / sqrt(1 - c^2), and c depends on the direction of each row alone.
         steep = np.rad2deg(1 / np.sqrt(max(1 - cosine**2, 1e-12)))
         J[3 + k, 3 * i : 3 * i + 3] = steep * (axes[j] - cosine * axes[i]) / length[i]
         J[3 + k, 3 * j : 3 * j + 3] = steep * (axes[i] - cosine * axes[j]) / length[j]
@@ -215,7 +218,7 @@ def _changes(
 
     All parts and the whole are tested: each gets its share of the chance to be wrong.
     """
-    least = chance / (len(parts) + 1)
+    least = chance / (len(parts) + 1)  # Bonferroni
     named = [part for part in parts if tests[part.value].chance < least]
     named.sort(key=lambda part: -tests[part.value].chi_square / max(tests[part.value].freedom, 1))
     return tuple(

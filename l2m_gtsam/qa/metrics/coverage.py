@@ -20,6 +20,7 @@ def directions(evidence: SensorEvidence) -> Directions:
     unit = b / np.linalg.norm(b, axis=1, keepdims=True)
     away, _ = cKDTree(unit).query(sphere(SPHERE))
     elevation = np.rad2deg(np.arcsin(np.clip(unit[:, 2], -1, 1)))
+    # Singular values of centred rows over sqrt(N): standard deviations along principal axes.
     spread = np.linalg.svd(b - b.mean(axis=0), compute_uv=False) / np.sqrt(len(b))
     return Directions(
         covered=float(np.mean(away < 2 * np.sin(np.deg2rad(NEAR_DEG) / 2))),
@@ -30,6 +31,8 @@ def directions(evidence: SensorEvidence) -> Directions:
 
 def sphere(count: int) -> FloatArray:
     """Return directions spread evenly over all of space, shape (count, 3): a golden spiral."""
+    # Equal steps of z cut a sphere into zones of equal area (Archimedes); the golden angle keeps
+    # neighbours of successive turns apart.
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     r = np.sqrt(1 - z**2)

@@ -88,6 +88,7 @@ def sensor_evidence(
     own, place, sample = own[whole.inside], place[whole.inside], _where_inside(whole)
     readings, C = drive.readings[own], sensor.distortion.C
     R = readings.R_map_lidar
+    # e = C R^T B(R t + p) + H - z, with covariance noise^2 I + C R^T V R C^T + the poses' share.
     b = np.einsum("nji,nj->ni", R, sample.field)
     residual = sensor.distortion.apply(b) - readings.field
     map_share = map_covariance(np.broadcast_to(C, R.shape), R, sample.variance)
@@ -107,7 +108,7 @@ def sensor_evidence(
 
 
 def _where_inside(sample: FieldSample) -> FieldSample:
-    """Return what a map says about the points that it has data for."""
+    """Return a sample without the points that the map has no data for."""
     there = sample.inside
     return FieldSample(
         sample.field[there], sample.gradient[there], sample.variance[there], sample.inside[there]
@@ -127,6 +128,8 @@ def _pose_share(
     if readings.pose_root is None:
         return np.zeros((len(b), 3, 3))
     R = readings.R_map_lidar
+    # A pose T Exp(w, v) turns the sensor by w and moves it by v - t x w, in the lidar frame:
+    # db = (b x - G t x) w + G v with G = R^T dB/dp R.
     G = np.einsum("nji,njk,nkl->nil", R, sample.gradient, R)
     turned = cross(b) - G @ cross(sensor.t_lidar_mag[None])
     A = sensor.distortion.C @ np.concatenate([turned, G], axis=2) @ readings.pose_root

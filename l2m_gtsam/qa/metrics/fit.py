@@ -48,6 +48,7 @@ def normalised_figures(evidence: SensorEvidence) -> Normalised:
     white = evidence.white[evidence.used]
     squared = np.sum(white**2, axis=1)
     edges = np.linspace(0, quantile(0.999, 3), BINS + 1)
+    # White residuals of three axes: their squared length is chi-square of three.
     counts, _ = np.histogram(np.minimum(squared, edges[-1]), edges)
     return Normalised(
         std=row(white.std(axis=0), 4),
@@ -81,6 +82,7 @@ def correlation(series: FloatArray, lags: int, drive: IntArray | None = None) ->
     """
     centred = series - series.mean(axis=0)
     of = np.zeros(len(series)) if drive is None else drive
+    # Wiener-Khinchin: the inverse transform of the power spectrum is the autocorrelation.
     power = np.zeros(lags + 1)
     for own in np.split(centred, np.flatnonzero(np.diff(of)) + 1):
         # Twice as long as both are, so that nothing wraps.
@@ -94,6 +96,7 @@ def lasting(rho: FloatArray) -> float:
 
     Up to where it first falls below zero: beyond that it is noise.
     """
+    # The integrated autocorrelation time; its window is the initial positive sequence (Geyer 1992).
     below = np.flatnonzero(rho < 0)
     end = int(below[0]) if len(below) else len(rho)
     return float(1 + 2 * rho[1:end].sum())

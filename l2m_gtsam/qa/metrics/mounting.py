@@ -62,6 +62,7 @@ def axis_order(C: FloatArray) -> AxisOrder:
     That with the largest sum of cosines: an assignment problem.
     """
     axes = sensor_axes(C)
+    # Each axis of the lidar once: the largest sum of |cosines| over all permutations.
     _, chosen = linear_sum_assignment(-np.abs(axes))
     cosine = axes[np.arange(3), chosen]
     sign = np.where(cosine < 0, -1.0, 1.0)

@@ -38,6 +38,7 @@ class Compared:
 
     def squared(self, covariance: FloatArray) -> FloatArray:
         """Return squared errors in units of covariances, shape (N, 6, 6), as (N,): NEES."""
+        # e^T P^-1 e, six in the mean if P is true (Bar-Shalom et al. 2001, sec. 5.4).
         e = self.right[:, :, None]
         return np.asarray((e * np.linalg.solve(covariance, e)).sum(axis=(1, 2)))
 
@@ -49,6 +50,7 @@ class Compared:
 
 def compared(truth: Trajectory, found: Trajectory) -> Compared:
     """Return how far poses are from true ones with the same stamps."""
+    # Log(T^-1 T_true), whose translation is R^T (p_true - p) to first order in the rotation.
     R_back = found.R.transpose(0, 2, 1)
     turn = Rotation.from_matrix(R_back @ truth.R).as_rotvec()
     shift = np.einsum("nij,nj->ni", R_back, truth.p - found.p)

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.storage.files import atomic_path
 
-# Colours that stand for variables of the page's style, so that a figure follows light and dark.
+# Placeholders for variables of the page's style, so that a figure follows light and dark.
 INK, MUTED, GRID, PAPER = "#010203", "#040506", "#070809", "#0a0b0c"
 X, Y, Z = "#0b0a01", "#0b0a02", "#0b0a03"
 GOOD, FAIR, BAD = "#0b0a04", "#0b0a05", "#0b0a06"

@@ -127,7 +127,7 @@ def _start(path: LocalisedTrajectory, options: SlamQaOptions) -> list[Reason]:
     """Return that a drive does not begin at the start that was given."""
     position, heading = np.maximum(path.odometry_sigma[0, [0, HEADING]], EXACT)
     squared = (path.apart[0] / position) ** 2 + (path.turned[0] / heading) ** 2
-    # Distance and angle stand for three coordinates each: chi-square of six.
+    # Distance and angle are of three coordinates each: chi-square of six.
     if chance_beyond(squared, POSE_FREEDOM) >= options.chance:
         return []
     text = (

@@ -76,7 +76,7 @@ def ending(case: Case) -> list[Reason]:
         if fits_elsewhere(case.others, case.options):
             text = (
                 f"{sensor.rejected} of its readings fit no calibration that explains the others, "
-                "while other sensors fit the map: something about this sensor changed on the way."
+                "while other sensors fit the map: something about this sensor changed on the drive."
             )
             return [Reason(Level.FAIL, text)]
         if sensor.rejected:

@@ -272,7 +272,7 @@ class RememberedTile:
     number: int
     anchor: int
     field: WaveTile
-    taught: FloatArray
+    past_information: FloatArray
 
     @classmethod
     def new(cls, number: int, anchor: int, field: WaveTile) -> "RememberedTile":

@@ -100,7 +100,7 @@ class TileReadings:
         if not len(self.chosen):
             return
         batch, x = self._batch(drive), self.laid.placed.x[self.chosen]
-        penalty = self.laid.field.penalty(x, self.variance, tile.taught)
+        penalty = self.laid.field.penalty(x, self.variance, tile.past_information)
         for k in batch.key_poses:
             factor = effective_parameters_factor(batch, k, penalty[batch.rows_of(k)])
             if factor is not None:
@@ -167,7 +167,9 @@ class OpenSection:
         tiles = list(self._tiles)
         for each in self._counted:
             tile = tiles[each.laid.number]
-            tiles[tile.number] = replace(tile, taught=tile.taught + each.information())
+            tiles[tile.number] = replace(
+                tile, past_information=tile.past_information + each.information()
+            )
         let_go = {X(self._first)} - {X(tile.anchor) for tile in tiles} - {X(self._last)}
         kept = [key for key in known.sizes if key not in let_go]
         return FieldMemory(known.marginal(kept), tuple(tiles))

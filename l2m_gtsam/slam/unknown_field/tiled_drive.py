@@ -164,9 +164,9 @@ class TiledDrive:
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         whole = [tile.penalty(np.intersect1d(tile.rows, chosen), noise) for tile in self.tiles]
         freedom = AXES * weights.sum() - sum(each.parameters for each in whole)
-        share = weights @ squared / freedom if freedom > 0 else 1.0
+        noise_share = weights @ squared / freedom if freedom > 0 else 1.0
         # A share above 1 is due to poses that have not converged, not to noise.
-        return tuple(each.share(min(share, 1.0)) for each in whole)
+        return tuple(each.scaled(min(noise_share, 1.0)) for each in whole)
 
     def graph(
         self,

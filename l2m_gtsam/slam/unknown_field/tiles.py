@@ -196,7 +196,7 @@ class WaveTile:
         return np.asarray(F.T @ F)
 
     def penalty(
-        self, points: FloatArray, variance: FloatArray, taught: FloatArray | None = None
+        self, points: FloatArray, variance: FloatArray, past_information: FloatArray | None = None
     ) -> ComplexityPenalty:
         """Return each reading's share of the effective number of parameters (Mallows' C_p).
 
@@ -210,7 +210,9 @@ class WaveTile:
             Information of other readings about the weights, shape (m, m).
         """
         known = np.eye(len(self)) + self.information(points, variance)
-        lower = cholesky(known if taught is None else known + taught, lower=True)
+        lower = cholesky(
+            known if past_information is None else known + past_information, lower=True
+        )
         spread = cho_solve((lower, True), np.eye(len(self)))
         root = 1 / np.sqrt(variance)[:, :, None]
         share = root * (self.features(points) @ spread)

@@ -38,7 +38,7 @@ LEVEL = "the vehicle changes height by 0.00 m and tilts by 0.0 deg at most"
 
 
 def options(places: FloatArray) -> CalibrationOptions:
-    """Sensors start where they are: what is asked is what the drive tells, not the search."""
+    """Sensors start where they are: the question is what the drive determines, not the search."""
     start = {f"mag_{i}": tuple(place) for i, place in enumerate(places.tolist())}
     return CalibrationOptions(start=start, solve=SOLVE)
 

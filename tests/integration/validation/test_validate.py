@@ -1,5 +1,6 @@
 """Calibrations on other drives: each gets the verdict and the reason that a specialist would."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -369,6 +370,17 @@ def test_a_validation_comes_back_as_it_was(whole: Validation, tmp_path: Path) ->
     back = read_validation(tmp_path / "first.json")
     write_validation(tmp_path / "second.json", back)
     assert (tmp_path / "first.json").read_bytes() == (tmp_path / "second.json").read_bytes()
+
+
+def test_keys_of_the_file_are_those_of_earlier_versions(whole: Validation, tmp_path: Path) -> None:
+    path = tmp_path / "validation.json"
+    write_validation(path, whole)
+    content = json.loads(path.read_text())["validation"]
+    assert set(content["verdict"]) == {"level", "remarks", "sensors"}
+    assert set(content["verdict"]["sensors"][0]) == {"sensor", "level", "remarks"}
+    assert set(content["verdict"]["sensors"][0]["remarks"][0]) == {"level", "text"}
+    assert "noticeable" in content["drive"]["sensors"][0]
+    assert read_validation(path).verdict == whole.verdict
 
 
 @pytest.mark.parametrize(

@@ -176,7 +176,7 @@ def _bars(
     height: FloatArray,
     **style: Any,
 ) -> None:
-    """Draw bars that stand on a line; up is down on this axis."""
+    """Draw bars upwards from a line; values grow downwards on this axis."""
     feet = np.broadcast_to(foot, height.shape)
     steps = np.append(feet, feet[-1]), np.append(feet - height, feet[-1] - height[-1])
     axes.fill_between(edges, *steps, step="post", linewidth=0, **style)

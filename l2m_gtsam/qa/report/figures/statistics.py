@@ -67,6 +67,7 @@ def autocorrelation_figure(sensor: SensorMetrics) -> Drawing:
     """Draw the autocorrelation of residuals over the number of readings between them."""
     found = sensor.autocorrelation
     lags, correlation = np.array(found.lags, dtype=float), np.array(found.correlation)
+    # Of white noise the autocorrelation is normal with variance 1 / N (Bartlett 1946).
     bound = 1.96 / np.sqrt(max(sensor.fit.readings, 1))
     room = 0.05 * float(np.ptp(lags)) if len(lags) > 1 else 1.0
     ends = (float(lags.min()) - room, float(lags.max()) + room) if len(lags) else (0.0, 1.0)

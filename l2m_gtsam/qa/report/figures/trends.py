@@ -139,7 +139,7 @@ def _draw(axes: Axes, trend: Trend, k: int) -> None:
         markeredgewidth=1.6,
         **hollow,
     )
-    axes.tick_params(bottom=False, left=False)  # the grid says where
+    axes.tick_params(bottom=False, left=False)  # the grid shows them
     axes.set_ylim(low, high)
 
 

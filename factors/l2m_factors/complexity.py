@@ -1,7 +1,7 @@
-r"""What keeps poses from being drawn to where an unknown field takes up more noise.
+r"""Complexity penalty: poses are not biased to where an unknown field fits more of the noise.
 
-Poses X and the m weights of a tile are estimated together. At given poses the best weights take up
-the noise of so many readings' components as they have parameters in effect,
+Poses X and the m weights of a tile are estimated together. At given poses the best weights fit the
+noise of as many components of readings as they have effective parameters,
 
 .. math::
     p(X) = \mathrm{tr}(K \Sigma), \quad K = F^T F / \sigma^2, \quad \Sigma = (K + I)^{-1}
@@ -12,13 +12,13 @@ where features are larger and more of them can be fitted. So ``p / 2`` is added,
 .. math::
     d p = \mathrm{tr}(\Sigma \, dK \, \Sigma) = d \sum_i |\Sigma F(x_i)^T|^2 / \sigma_i^2
 
-with Sigma held: a residual ``|Sigma F(x)^T| / sigma`` of each reading, linear in its place about
-where the tile was laid, has the right slope there, and after a few rounds the mode is right.
-(Mallows' C_p, 1973, counts parameters in the same way.)
+with Sigma held constant: a residual ``|Sigma F(x)^T| / sigma`` of each reading, linear in its
+position about that when the tile was made, has the right gradient there, and after a few rounds the
+mode is right. (C. Mallows, Technometrics 15, 1973, counts parameters in this way.)
 
-Where the noise has but a share r of the variance that it is taken to have, weights take up no more
-than ``r p / 2`` of cost, and more than that pushes poses away from the sources. Mallows takes the
-noise from the residuals; so does who asks for a share of the penalty.
+Where the noise has only a share r of the assumed variance, the weights reduce the cost by no more
+than ``r p / 2``, and a larger penalty pushes poses away from the sources. Mallows estimates the
+noise from the residuals; ``ComplexityPenalty.scaled`` is for that.
 """
 
 from dataclasses import dataclass
@@ -33,14 +33,14 @@ from l2m_factors.tile import TileBatch
 
 @dataclass(frozen=True)
 class ComplexityPenalty:
-    """What n readings contribute to the number of parameters of the field that they teach.
+    """Shares of n readings in the effective number of parameters of a field.
 
     Attributes
     ----------
     at
-        Places in the anchor's frame where they hold, metres, shape (n, 3).
+        Positions in the anchor's frame at which they were linearised, metres, shape (n, 3).
     value
-        Roots of the contributions, shape (n,).
+        Roots of the shares, shape (n,).
     slope
         Their gradients in 1/m, shape (n, 3).
     """
@@ -54,11 +54,11 @@ class ComplexityPenalty:
 
     @property
     def parameters(self) -> float:
-        """How many parameters the readings teach."""
+        """Effective number of parameters."""
         return float(self.value @ self.value)
 
-    def share(self, of_noise: float) -> "ComplexityPenalty":
-        """Return the penalty where the noise has this share of its assumed variance."""
+    def scaled(self, of_noise: float) -> "ComplexityPenalty":
+        """Return the penalty for noise with this share of the assumed variance."""
         root = float(np.sqrt(of_noise))
         return ComplexityPenalty(self.at, root * self.value, root * self.slope)
 
@@ -66,16 +66,16 @@ class ComplexityPenalty:
 def effective_parameters_factor(
     batch: TileBatch, key_pose: int, penalty: ComplexityPenalty
 ) -> gtsam.CustomFactor | None:
-    """Return the factor of a key pose's n readings; none where it depends on nothing.
+    """Return the penalty's factor of a key pose's n readings; None where it has no variables.
 
     Parameters
     ----------
     batch
-        The readings.
+        Readings of a tile.
     key_pose
         Number k of the key pose.
     penalty
-        Of its readings.
+        Of the n readings.
     """
     keys = batch.place_keys_of(key_pose)
     if not keys:
