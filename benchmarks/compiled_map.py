@@ -6,8 +6,6 @@ All maps answer the same places, up to half a metre from the readings, in the sa
 OPENBLAS_NUM_THREADS=1: the compiled map uses two threads of its own.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +13,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.map_queries import Survey, seconds, survey, warehouse
+from benchmarks.map_queries import Survey, survey, warehouse
+from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.compiled import CompiledMap
@@ -61,13 +60,6 @@ def places(exact: HarmonicMap, count: int) -> FloatArray:
     return np.asarray(readings[rng.integers(0, len(readings), count)] + offset)
 
 
-def once(work: Callable[[], object]) -> float:
-    """Return the time of one run in seconds."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
 def rate(field_map: FieldMap, points: FloatArray, repeats: int) -> float:
     """Return fields with gradients per second."""
     return len(points) / seconds(partial(field_map.field_and_gradient, points), repeats)
@@ -77,7 +69,7 @@ def report(title: str, maps: Maps) -> Table:
     """Return rates, what compiling costs, and the largest errors."""
     few, many = places(maps.exact, FEW), places(maps.exact, MANY)
     maps.compiled.field_and_gradient(few[:10])  # loads the compiled code
-    first = once(lambda: maps.exact.compile().field_and_gradient(many))
+    first = seconds(lambda: maps.exact.compile().field_and_gradient(many), 1)
     fast = rate(maps.compiled, many, 9)
     compiling, tiles = first - MANY / fast, len(maps.exact.tiles)
     errors = [

@@ -14,8 +14,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.compiled_map import once
 from benchmarks.map_queries import READINGS, SIZE, survey, warehouse
+from benchmarks.timing import seconds
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.mapping.map_building import suite_readings
@@ -67,21 +67,23 @@ def warehouse_with_structure() -> Place:
 def row(place: Place) -> list[str]:
     """Return what one map costs, as the cells of the table."""
     made: list[HarmonicMap] = []
-    learn = once(lambda: made.append(HarmonicMap.fit(place.points, place.field, cloud=place.cloud)))
-    solve = once(made[0].tiles.solve_all)
+    learn = seconds(
+        lambda: made.append(HarmonicMap.fit(place.points, place.field, cloud=place.cloud)), 1
+    )
+    solve = seconds(made[0].tiles.solve_all, 1)
     tiles, fast = made[0].tiles, CompiledTiles.of(made[0])
     indices = range(len(tiles))
-    compiling = once(lambda: in_threads(lambda i: fast.compiled(i, tiles[i]), indices))
+    compiling = seconds(lambda: in_threads(lambda i: fast.compiled(i, tiles[i]), indices), 1)
     with TemporaryDirectory() as folder:
         kept = made[0].with_store(TileFolder(Path(folder), PLENTY))
-        together = once(lambda: kept.make_tiles(lambda _done, _total: None))
+        together = seconds(lambda: kept.make_tiles(lambda _done, _total: None), 1)
         size = sum(path.stat().st_size for path in Path(folder).iterdir())
-        read = once(lambda: kept.make_tiles(lambda _done, _total: None))
-    sliding = once(lambda: SlidingGP.fit(place.points, place.field))
+        read = seconds(lambda: kept.make_tiles(lambda _done, _total: None), 1)
+    sliding = seconds(lambda: SlidingGP.fit(place.points, place.field), 1)
     rng = np.random.default_rng(0)
     middle = place.points[np.abs(place.points[:, 0] - SIZE[0] / 2) < SIZE[0] / 2]
     asked = middle[rng.integers(0, len(middle), ASKED)]
-    query = once(lambda: made[0].query(asked))
+    query = seconds(lambda: made[0].query(asked), 1)
     return [
         f"{len(place.points):,}",
         f"{len(made[0].tiles)}",

@@ -5,15 +5,15 @@ Gauss-Newton steps; both start where sensors are to within millimetres, without 
 map. Processor seconds, one BLAS thread, growth with the readings and with the sensors.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from time import process_time
 
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.one_key import NOISE, hall, survey
+from benchmarks.timing import seconds
 from l2m_factors import map_weights_prior
 from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm
@@ -122,22 +122,13 @@ def case(field_map: CompiledMap, count: int, each: int) -> Case:
     return Case(problem, rows, values, coverage.sizes, view.sensors)
 
 
-def seconds(work: Callable[[], object], repeats: int = 1) -> float:
-    """Return the shortest processor time of so many runs."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return min(times)
-
-
 def row(field_map: CompiledMap, count: int, each: int) -> str:
     """Return what a round and the covariances cost, old and new."""
     now = case(field_map, count, each)
     now.round()  # tiles are compiled when first asked
     old, new, old_part, new_part = (
-        seconds(work) for work in (now.old_round, now.round, now.old_covariances, now.marginals)
+        seconds(work, 1, process_time)
+        for work in (now.old_round, now.round, now.old_covariances, now.marginals)
     )
     return (
         f"{f'{count} x {each:,}':>12} {sum(now.sizes.values()):8,} {old:8.2f} {new:8.2f} "

@@ -10,8 +10,6 @@ On matrices of this size BLAS threads gain little on idle cores and lose much on
 OPENBLAS_NUM_THREADS=1 is the setting to compare figures with.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -21,6 +19,7 @@ from rich.table import Table
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
+from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.hyperparameters import KernelHyperparameters
@@ -68,16 +67,6 @@ def survey(world: DipoleWorld) -> Survey:
     parts = np.array_split(points, len(points) // 500)  # 500 points times 630 dipoles at once
     field = np.concatenate([world.field_and_gradient(part)[0] for part in parts])
     return Survey(points, field + rng.normal(0, NOISE, field.shape))
-
-
-def seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    """Return the shortest time of several runs."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def scattered(count: int, half: FloatArray) -> FloatArray:

@@ -6,7 +6,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.one_key import NOISE, hall, seconds, survey
+from benchmarks.one_key import NOISE, hall, survey
+from benchmarks.timing import seconds
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap

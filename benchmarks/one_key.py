@@ -6,8 +6,6 @@ readings and the same hyperparameters. Its answer is another by as much as it we
 otherwise, which the last table shows step by step.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,6 +17,7 @@ from scipy.optimize import least_squares
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
+from benchmarks.timing import seconds
 from l2m_factors import BatchedReadings, D, MagneticReadings, T, block_factor, reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import solve_one_key
@@ -53,16 +52,6 @@ def survey(world: DipoleWorld, count: int) -> Survey:
     points = rng.uniform([-5.5, -5.5, -0.6], [5.5, 5.5, 1.6], (count, 3))
     field, _ = world.field_and_gradient(points)
     return Survey(points, field + rng.normal(0, NOISE, field.shape))
-
-
-def seconds(work: Callable[[], object], repeats: int = 3) -> float:
-    """Return the shortest time of several runs."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
 
 
 def factor_costs() -> Table:

@@ -3,15 +3,15 @@
 Processor time. BLAS threads that wait for each other count as work: set OPENBLAS_NUM_THREADS=1.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
+from time import process_time
 
 import gtsam
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.timing import seconds
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.belief import kalman_gain
@@ -20,16 +20,6 @@ from l2m_gtsam.slam.unknown_field.field_memory import JointGaussian, prior_facto
 from tests.reference.dense_newton import newton
 
 STEPS = 3  # of a section's last stage, as measured
-
-
-def seconds(work: Callable[[], object], repeats: int = 5) -> float:
-    """Return the shortest processor time of several runs."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return min(times)
 
 
 @dataclass(frozen=True)
@@ -94,8 +84,14 @@ def open_section(tiles: int, weights: int) -> list[str]:
         found = levenberg_marquardt(whole, given.start, colamd_ordering(whole), STEPS, 0.0)
         joint_covariance(whole.linearize(found.values), [last])
 
-    dense = seconds(lambda: newton(given.graph, given.known, given.start, given.sizes, STEPS), 3)
-    return [f"{sum(given.sizes.values()):,}", f"{seconds(by_gtsam, 3):.3f}", f"{dense:.3f}"]
+    dense = seconds(
+        lambda: newton(given.graph, given.known, given.start, given.sizes, STEPS), 3, process_time
+    )
+    return [
+        f"{sum(given.sizes.values()):,}",
+        f"{seconds(by_gtsam, 3, process_time):.3f}",
+        f"{dense:.3f}",
+    ]
 
 
 def kalman(count: int, seen: int) -> list[str]:
@@ -115,7 +111,11 @@ def kalman(count: int, seen: int) -> list[str]:
         tree = graph.eliminateMultifrontal()
         _ = tree.optimize(), tree.marginalCovariance(0)
 
-    return [f"{count}", f"{1e3 * seconds(by_gtsam):.2f}", f"{1e3 * seconds(own):.2f}"]
+    return [
+        f"{count}",
+        f"{1e3 * seconds(by_gtsam, 5, process_time):.2f}",
+        f"{1e3 * seconds(own, 5, process_time):.2f}",
+    ]
 
 
 def main() -> None:

@@ -43,8 +43,7 @@ def test_shared_folders_hold_no_tests(repository: Path) -> None:
 def test_folders_of_tests_are_packages_of_the_library(repository: Path, kind: str) -> None:
     """And a file beside them tests the module of its name."""
     library = repository / "l2m_gtsam"
-    for entry in (repository / "tests" / kind).iterdir():
-        if entry.is_dir() and entry.name != "__pycache__":
-            assert (library / entry.name / "__init__.py").is_file(), entry
-        elif entry.name.startswith("test_"):
-            assert (library / entry.name.removeprefix("test_")).is_file(), entry
+    entries = [e for e in (repository / "tests" / kind).iterdir() if not e.name.startswith("__")]
+    tested = {e: library / e.name.removeprefix("test_") for e in entries}
+    wrong = [e for e, of in tested.items() if not (of.is_file() or (of / "__init__.py").is_file())]
+    assert not wrong

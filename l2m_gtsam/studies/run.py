@@ -148,11 +148,16 @@ def conclude(
     content = StudyFile(FORMAT, study.name, made, options, summary)
     plain = file_type(study).dump_python(content, mode="json")
     write_text(out / STUDY_FILE, json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    read = read_study(study, out / STUDY_FILE)
-    for name, figure in study.figures(read.summary).items():
-        save_figure(figure, out / f"{name}.png")
-    write_text(out / f"{study.name}.md", whole_page(study, read))
-    return read
+    return render(study, out)
+
+
+def render(study: Study[Opts, Any, Summary], folder: Path) -> StudyFile[Opts, Summary]:
+    """Write page and figures from the ``study.json`` of a folder; return what was read."""
+    content = read_study(study, folder / STUDY_FILE)
+    for name, figure in study.figures(content.summary).items():
+        save_figure(figure, folder / f"{name}.png")
+    write_text(folder / f"{study.name}.md", whole_page(study, content))
+    return content
 
 
 def read_study(study: Study[Opts, Any, Summary], path: Path) -> StudyFile[Opts, Summary]:
