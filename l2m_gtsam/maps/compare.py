@@ -3,7 +3,7 @@
 The area is cut into square patches, which are dealt out to folds. The maps of a fold are built
 without its patches and asked there. Readings next to each other share the field and the errors of
 one passage, so that readings left out one by one would praise every map alike; a patch left out
-shows what a map makes of a gap, and whether its variance says so.
+shows what a map makes of a gap, and whether its variance reflects it.
 
 Noise of a reading: a tenth of the training readings, drawn at random, is kept from every map of a
 fold. The noise that makes these most likely, given the map's own variance there, is added to its
@@ -34,7 +34,7 @@ from l2m_gtsam.options import Options
 COMPARED = tuple(kind for kind in KINDS if kind != "dense_gp")  # that one only checks another
 LARGEST_FOLD, LEAST_FOLD, SMALLER = 1.5, 0.1, 0.8  # metres, and the step between
 PATCHES_IN_FOLD = 4  # fewer, and the luck of the deal decides
-ASIDE = 0.1  # of the training readings, which tell the noise
+ASIDE = 0.1  # of the training readings, which determine the noise
 LEAST_NOISE = 1e-3  # uT, finer than magnetometers resolve: no map may claim to be exact
 Z_95 = 1.959964  # of a Gaussian, 95 % lie within as many standard deviations
 
@@ -85,7 +85,8 @@ class KindFigures:
         The same over the readings inside of every kind that works: to compare kinds by; NaN where
         there are none.
     z_std
-        Standard deviation about zero of error / sigma over readings and axes inside: 1 is honest.
+        Root mean square of error / sigma over readings and axes inside, without unit: consistent
+        if 1.
     coverage
         Share of errors inside within the 95 % interval.
     noise
@@ -155,7 +156,7 @@ class MapComparison:
 
 @dataclass(frozen=True)
 class Fold:
-    """Rows of the readings that a map is built from, that tell the noise, and that judge it."""
+    """Rows of the readings that build a map, that determine the noise, and that judge it."""
 
     training: IntArray
     aside: IntArray
@@ -164,7 +165,7 @@ class Fold:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What maps said of readings, as errors.
+    """Predictions of readings by maps, as errors.
 
     Attributes
     ----------
@@ -305,7 +306,7 @@ def fold_without(held_out: BoolArray, rng: np.random.Generator) -> Fold:
 def predicted(
     readings: TrainingSet, folds: tuple[Fold, ...], kind: str, build: Build
 ) -> Prediction:
-    """Return what maps of a kind say of each reading, without having seen its patch.
+    """Return what maps of a kind predict for each reading, built without its patch.
 
     Raises
     ------
@@ -330,7 +331,7 @@ def predicted(
 
 
 def predicted_fold(readings: TrainingSet, fold: Fold, kind: str, build: Build) -> Prediction:
-    """Return what the map of one fold says of the readings held out of it."""
+    """Return what the map of one fold predicts for the readings held out of it."""
     training, held_out = readings[fold.training], readings[fold.held_out]
     start = perf_counter()
     field_map = build(training.points, training.field, kind)

@@ -40,7 +40,7 @@ class MapSummary:
 
 @runtime_checkable
 class Summarised(Protocol):
-    """A map that can say what it is worth."""
+    """A map that can summarise its quality."""
 
     @property
     def summary(self) -> MapSummary:
@@ -134,7 +134,7 @@ def unknown(count: int) -> FieldSample:
 
 
 def masked(sample: FieldSample) -> FieldSample:
-    """Return a sample that says nothing where the map has no data: NaN and infinite variance."""
+    """Return a sample with no values where the map has no data: NaN and infinite variance."""
     inside = sample.inside
     return FieldSample(
         np.where(inside[:, None], sample.field, np.nan),

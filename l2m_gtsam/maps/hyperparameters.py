@@ -80,7 +80,7 @@ class LikelihoodFit:
     at_bound
         Names of hyperparameters that ended on a bound: the data do not determine them.
     message
-        What the optimiser said.
+        Status text of the optimiser.
     """
 
     hyperparameters: KernelHyperparameters

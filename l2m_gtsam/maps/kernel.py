@@ -32,6 +32,7 @@ def scaled(points: FloatArray, centre: FloatArray, length_scale: float) -> Float
     length_scale
         Metres.
     """
+    # Points at infinity would give inf - inf in the exponent.
     furthest = FURTHEST * length_scale
     return np.clip(points - centre, -furthest, furthest) / length_scale
 
@@ -54,6 +55,7 @@ def training_columns(y: FloatArray, signal: float) -> FloatArray:
 
     They stay the same for all points that are asked for.
     """
+    # s^2 as a summand of the exponent saves one pass over the matrix.
     offset = 2 * np.log(signal) - 0.5 * np.einsum("mi,mi->m", y, y)
     return np.ascontiguousarray(np.column_stack([y, np.ones(len(y)), offset]).T)
 

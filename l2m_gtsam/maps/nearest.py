@@ -7,7 +7,7 @@ from l2m_gtsam.maps.training import TrainingSet
 
 
 class NearestReadings:
-    """A map that costs nothing to make, to look for the region where a better one is asked.
+    """A map that costs nothing to make, to find the region where a better one is evaluated.
 
     Parameters
     ----------

@@ -60,12 +60,14 @@ class Posterior:
         whitener = self.whitener
         if whitener is None:
             whitener = inverted(factorise(self.y, self.noise_variance, self.hyperparameters))
+        # k(x, x) - k^T K^-1 k (Rasmussen and Williams 2006, equation 2.26) as a sum of squares.
         V = dtrmm(1.0, whitener, K.T, lower=1)
         explained = np.einsum("mn,mn->n", V, V)
         return np.asarray(np.maximum(self.hyperparameters.signal**2 - explained, 0.0))
 
     def within(self, K: FloatArray, reach: float) -> BoolArray:
         """Return whether the nearest reading lies within ``reach`` length scales, shape (N,)."""
+        # The kernel falls with distance: its largest value belongs to the nearest reading.
         least = self.hyperparameters.signal**2 * np.exp(-0.5 * reach**2)
         return np.asarray(K.max(axis=1) >= least)
 
@@ -94,6 +96,7 @@ def condition(
         If the covariance of the readings is not positive definite.
     """
     lower, upper = readings.points.min(axis=0), readings.points.max(axis=0)
+    # The exponent loses digits with the square of the distance from the centre.
     centre = 0.5 * (lower + upper)
     y = scaled(readings.points, centre, hyperparameters.length_scale)
     noise_variance = hyperparameters.noise**2 / readings.weight

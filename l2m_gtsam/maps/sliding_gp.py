@@ -131,6 +131,7 @@ class SlidingGP:
         grid = grid_over(readings.points, options.block * unit, options.reach * unit)
         members = grid.members(readings.points, options.margin * unit)
         check_sizes(members, grid.size)
+        # One prior mean for all blocks: far from readings neighbours tend to the same field.
         blocks = tuple(posteriors(trained, members))
         return cls(trained, options, readings.mean, grid, blocks)
 
@@ -219,6 +220,7 @@ class SlidingGP:
     def _visits(self, points: FloatArray) -> Iterator[BlockQuery]:
         """Yield every point once, block by block and batch by batch."""
         owner = self.grid.block_of(points)
+        # Sorted by block: each whitener is read, or computed again, for whole batches of points.
         order = np.argsort(owner, kind="stable")
         counts = np.bincount(owner)
         ends = np.cumsum(counts)

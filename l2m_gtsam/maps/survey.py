@@ -5,7 +5,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.training import TrainingSet
 
-NARROW = 0.1  # metres; a drive this close to one line says nothing of the field beside it
+NARROW = 0.1  # metres; a drive this close to one line does not determine the field beside it
 SAME_PLACE = 0.05  # metres; edge of a cube in which all readings should agree
 # In microtesla; a gradient of 200 uT/m would be needed, which is found at steel only.
 DISAGREE = 10.0

@@ -29,7 +29,7 @@ from l2m_gtsam.options import Options
 
 
 class GPOptions(Options):
-    """What every Gaussian-process map can be told; lengths are in length scales."""
+    """Options common to all Gaussian-process maps; lengths are in length scales."""
 
     hyperparameters: KernelHyperparameters | None = None
     """Fixed hyperparameters; learnt from the marginal likelihood where absent."""

@@ -1,4 +1,4 @@
-"""The readings that a map is trained on: checked, and thinned to what they can tell."""
+"""The readings that a map is trained on: checked, and thinned to what they determine."""
 
 from dataclasses import dataclass
 from functools import cached_property

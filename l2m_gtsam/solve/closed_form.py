@@ -99,6 +99,7 @@ def row_weights(
         case Weighting.LIKELIHOOD:
             return 1.0 / (map_variance + sensor_variance)
         case Weighting.PAPER:
+            # An exact map has variance zero; the floor keeps its weights finite and equal.
             floor = np.finfo(float).eps * max(float(map_variance.max(initial=0.0)), 1.0)
             return 1.0 / np.maximum(map_variance, floor) ** 2
         case _:
@@ -141,10 +142,14 @@ def fit_distortion(
     C0 = np.eye(3) if C0 is None else C0
     method = options.method
     w = weights if method is Method.W_RRTLS else np.ones(len(b_lidar))
+    # H is the intercept: centring eliminates it exactly, without truncation or ridge (mixed LS-TLS,
+    # Van Huffel and Vandewalle, "The Total Least Squares Problem", 1991).
     mean_l, mean_m = np.average(np.stack([b_lidar, b_meas]), axis=1, weights=w)
     rows = np.sqrt(w / w.mean())[:, None] * np.hstack([b_lidar - mean_l, b_meas - mean_m])
+    # R has the singular values, right singular vectors and normal equations of all N rows.
     factor = np.asarray(np.linalg.qr(rows, mode="r"))
     kept = factor if method is Method.OLS else _truncated(factor)
+    # The unknown is C - C0, so that the ridge and the smallest solution lead to C0, not to zero.
     X, Y = kept[:, :3], kept[:, 3:] - kept[:, :3] @ C0.T
     ridge = 0.0
     if method in (Method.RRTLS, Method.W_RRTLS):
@@ -175,6 +180,7 @@ def _unit(X: FloatArray) -> float:
 
 def _truncated(factor: FloatArray) -> FloatArray:
     """Return the nearest matrix of rank 3."""
+    # Eckart and Young 1936. In rank 3 the readings lie in the span of the field, as TLS asks.
     U, s, Vt = np.linalg.svd(factor, full_matrices=False)
     return np.asarray((U[:, :3] * s[:3]) @ Vt[:3])
 
@@ -194,6 +200,7 @@ def _ridge(
 
 def _solve_ridge(X: FloatArray, Y: FloatArray, strength: float) -> FloatArray:
     """Return the minimiser of ``||X A - Y||^2 + strength ||A||^2``, smallest where open."""
+    # Rows below X instead of X^T X + strength I, which would square the condition number.
     regressors = np.vstack([X, np.sqrt(strength) * np.eye(3)])
     observations = np.vstack([Y, np.zeros((3, 3))])
     return np.asarray(np.linalg.lstsq(regressors, observations, rcond=1e-12)[0])

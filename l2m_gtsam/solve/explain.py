@@ -15,7 +15,7 @@ from l2m_gtsam.solve.rank import Determinacy, RankOptions, members
 AXES = ("x", "y", "z")
 COLUMNS = ("first", "second", "third")
 ALONG = 0.95  # cosine from which a direction is called after the lidar's axis
-# A vehicle within these did not drive: what its poses still tell is their own noise.
+# A vehicle within these did not drive: what its poses still show is their own noise.
 REST_M, REST_DEG = 0.1, 3.0
 A_MOMENT_S = 0.01  # a usual time offset
 RESOLVED_MM, RESOLVED_DEG = 0.05, 0.005  # what is not spelt out
@@ -51,12 +51,12 @@ class Movement:
 
     @property
     def rest(self) -> str:
-        """The sentence that says so."""
+        """Sentence on a vehicle that did not move."""
         return f"the vehicle did not move ({self.extent:.2f} m, {self.turn:.1f} deg)"
 
     @property
     def upright(self) -> str:
-        """The sentence that says how little it heaved and tilted."""
+        """Sentence on the small changes of height and tilt."""
         return (
             f"the vehicle changes height by {self.heights:.2f} m and tilts by {self.tilt:.1f} deg "
             "at most"
@@ -118,7 +118,7 @@ def drive_facts(
 
 
 def held_offset(test: Determinacy) -> str:
-    """Return why a time offset is held at zero; empty if it is told apart."""
+    """Return why a time offset is held at zero; empty if it is observable."""
     if test.offset:
         return ""
     C = A_MOMENT_S * test.imitation[3:].reshape(3, 3)
@@ -206,7 +206,7 @@ def _distortion(rows: FloatArray, drive: DriveFacts, _: RankOptions) -> tuple[st
 
 
 def _both(rows: FloatArray, drive: DriveFacts, options: RankOptions) -> tuple[str, str]:
-    """Say that t and the distortion are not told apart: what a step of both would show."""
+    """Describe a trade between t and the distortion: what a step of both would show."""
     steps = rows / np.linalg.norm(rows, axis=1)[:, None] * options.scale()
     t, C, H = steps[:, :3], steps[:, 3:12].reshape(-1, 3, 3), steps[:, 12:]
     change = drive.slope @ t.T + (C @ drive.b_lidar.T).transpose(2, 1, 0) + H.T

@@ -114,15 +114,15 @@ def reason_of(choice: Choice, trials: list[Trial]) -> str:
     why = f"{chosen.model} predicts held-out segments best"
     if chosen is not best:
         why = f"{chosen.model} predicts held-out segments as well as {best.model} does"
-        why += f" ({_told(best, chosen)})"
+        why += f" ({_deficit(best, chosen)})"
     simpler = [t for t in trials if t.fit.parameters < chosen.fit.parameters]
     if not simpler:
         return why
     next_ = max(simpler, key=lambda trial: trial.fit.parameters)
     above = next_.above(choice.least)
-    return f"{why}; {next_.model} is {_told(best, next_)}, its BIC {above:.0f} above the least"
+    return f"{why}; {next_.model} is {_deficit(best, next_)}, its BIC {above:.0f} above the least"
 
 
-def _told(best: Trial, trial: Trial) -> str:
+def _deficit(best: Trial, trial: Trial) -> str:
     behind, error = best.lead(trial)
     return f"{behind:.2g} per reading behind, with a standard error of {error:.2g}"

@@ -15,7 +15,7 @@ taken together.
    criteria", 2010): many times where its regressor varies as slowly as the map's errors, once where
    it is quick. Differences are divided by that factor to read as odds.
 
-``model_choice`` says how the two decide.
+``model_choice`` states how the two decide.
 """
 
 from collections.abc import Sequence
@@ -110,7 +110,7 @@ def check_samples(samples: Samples, options: ModelOptions) -> None:
     Raises
     ------
     CalibrationError
-        One line that says what is wrong.
+        One line that states what is wrong.
     """
     parts = {"readings": samples.z, "predicted fields": samples.b, "rates": samples.db_dt}
     parts |= {f"regressor {name!r}": samples.q[:, k] for k, name in enumerate(samples.names)}
@@ -123,7 +123,7 @@ def check_samples(samples: Samples, options: ModelOptions) -> None:
     needed = max(PER_COLUMN * (1 + columns), PER_SEGMENT * options.segments)
     if len(samples) < needed:
         raise CalibrationError(
-            f"models: {len(samples)} readings cannot tell models of {columns} columns apart in "
+            f"models: {len(samples)} readings cannot distinguish models of {columns} columns in "
             f"{options.segments} segments, at least {needed} are needed"
         )
 
@@ -138,7 +138,7 @@ def correlation_of(residual: FloatArray, drives: Sequence[slice] = ONE_DRIVE) ->
     residual
         Weighted, in order of time, shape (N, 3).
     drives
-        Rows of each drive: nothing is said of readings of two drives.
+        Rows of each drive: readings of two drives count as uncorrelated.
     """
     covariance = np.zeros(len(residual))
     for rows in drives:

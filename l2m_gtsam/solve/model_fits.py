@@ -127,6 +127,7 @@ def compress(samples: Samples) -> Compressed:
     # Centring leaves the rounding of a column that does not vary.
     centred[:, spread <= ROUNDING * np.abs(X).max(axis=0)] = 0.0
     size = _sizes(spread)
+    # QR instead of the normal equations, which would square the condition number.
     root = np.sqrt(w)[:, None]
     Q, R = np.linalg.qr(root * np.column_stack([np.ones(len(X)), centred / size]))
     Y = Q.T @ (root * samples.z)
@@ -170,6 +171,7 @@ def _linear(model: Model, compressed: Compressed) -> Solution:
     P = len(compressed.R)
     used = np.ones(P, dtype=np.bool_)
     used[4:-3], used[-3:] = model.has_regressors, model.has_eddy
+    # Steps from the rotation: the smallest step leaves directions without data there.
     A = _rotated(compressed).A
     A[used] += np.linalg.lstsq(compressed.R[:, used], compressed.left(A), rcond=ROUNDING)[0]
     tangent = np.eye(3 * P).reshape(P, 3, P, 3)[used]
@@ -190,6 +192,7 @@ class ScaledRotation:
 
     def moved(self, step: FloatArray) -> "ScaledRotation":
         """Return it turned by the first three of six numbers, its scales changed by the others."""
+        # On the rotation's left, as ``derivatives`` takes it: d exp([w]x) R / dw = [e]x R at w = 0.
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         return ScaledRotation(self.scale + step[3:], turn @ self.rotation)
 
@@ -218,6 +221,7 @@ def _rotated(compressed: Compressed) -> Solution:
 def _nearest_rotation(compressed: Compressed, mirror: float) -> FloatArray:
     """Return the rotation that, times 1 or -1, explains most (W. Kabsch 1976)."""
     U, _, Vt = np.linalg.svd(mirror * compressed.Y[1:4].T @ compressed.R[1:4, 1:4])
+    # The direction of the least singular value costs least to flip where det would be -1.
     U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
     return np.asarray(U @ Vt)
 
@@ -250,7 +254,7 @@ def _scaled(compressed: Compressed) -> Solution:
 def inflation(
     compressed: Compressed, correlation: FloatArray, drives: Sequence[slice] = ONE_DRIVE
 ) -> FloatArray:
-    r"""Return by how much correlated residuals spread what the columns tell, a root, shape (P, P).
+    r"""Return a root of the covariance inflation by correlated residuals, shape (P, P).
 
     Residuals with the correlation matrix :math:`\rho` have a covariance :math:`Q^T \rho Q` along
     the columns Q instead of I. Where it is less than that it counts as I.
@@ -264,6 +268,7 @@ def inflation(
     drives
         Rows of each drive: residuals of two drives are independent.
     """
+    # Toeplitz products by FFT: N log N, without an N x N matrix.
     parts = [compressed.Q[rows] for rows in drives]
     along = np.sum([Q.T @ matmul_toeplitz(correlation[: len(Q)], Q) for Q in parts], axis=0)
     value, vector = np.linalg.eigh(along)
@@ -276,6 +281,7 @@ def spread_of(fit: Fit, compressed: Compressed, root: FloatArray) -> Spread:
     They are those of ordinary least squares under a covariance that it does not know (H. White
     1980): the weights stay those of the readings.
     """
+    # Sandwich J^+ S J^+T with J^+ = V s^-1 U^T and S = root^T root along the columns.
     J, P = _jacobian(fit.solution, compressed), len(root)
     U, s, Vt = np.linalg.svd(J, full_matrices=False)
     strong = s > ROUNDING * s[0]

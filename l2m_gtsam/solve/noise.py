@@ -9,7 +9,7 @@ from l2m_gtsam.data import FloatArray
 # Search range for a sensor's noise in uT: from below the resolution of any vehicle's magnetometer
 # to above the Earth's field.
 NOISE_RANGE = (1e-4, 1e3)
-HALF = 0.5  # readings that count for less tell nothing of the noise
+HALF = 0.5  # below this weight a reading counts as rejected
 
 
 def map_covariance(C: FloatArray, R_map_lidar: FloatArray, map_variance: FloatArray) -> FloatArray:
@@ -54,6 +54,7 @@ def whitening(covariance: FloatArray) -> FloatArray:
     LinAlgError
         If a covariance is not positive definite.
     """
+    # W = L^-1 for S = L L^T; the upper triangle stays zero.
     W = np.zeros(covariance.shape)
     if not write_inverse_roots(np.ascontiguousarray(covariance, dtype=np.float64), W):
         raise np.linalg.LinAlgError("a reading's covariance is not positive definite")
@@ -108,6 +109,7 @@ def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float)
     left = max(residual.size - taken, residual.size / 2)
     e2, v = residual**2 * (residual.size / left), map_variance[:, None]
 
+    # Derivative of -2 log likelihood by sigma^2; over log sigma, as the range spans seven decades.
     def score(log_sigma: float) -> float:
         total = np.exp(2 * log_sigma) + v
         return float(np.sum(1 / total - e2 / total**2))

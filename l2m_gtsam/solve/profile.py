@@ -271,10 +271,10 @@ def write_left(
     left[:] = 0.0
     for c in range(3):
         for k in range(len(left)):
-            told = 0.0
+            explained = 0.0
             for i in range(REGRESSORS):
-                told += regressors[i, k] * X[i, c]
-            e = z[c, k] - inside[k] * told
+                explained += regressors[i, k] * X[i, c]
+            e = z[c, k] - inside[k] * explained
             left[k] += e * e
 
 

@@ -52,11 +52,11 @@ class Determinacy:
     touched
         Parameters that take part in an undetermined direction, shape (15,).
     offset
-        Whether the time offset is told apart from all of these; if not it is held, and they are
+        Whether the time offset is observable beside all of these; if not it is held, and they are
         judged as if it were known.
     imitation
-        How t and C row by row would have to change to look like a time offset that is not told
-        apart, per second of it, shape (12,).
+        How t and C row by row would have to change to look like an unobservable time offset,
+        per second of it, shape (12,).
     borrowed
         By name the parameters that the readings leave open and priors do not, with what is known
         beforehand that decides.
@@ -85,7 +85,7 @@ class Determinacy:
 def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
     """Test the rank of a whitened Jacobian with the time offset in it.
 
-    The offset is told apart if its sigma, with all other parameters known no better than is of
+    The offset is observable if its sigma, with all other parameters known no better than is of
     use, is itself of use. Then the others are tested with it unknown, and else with it known.
 
     Parameters
@@ -96,15 +96,19 @@ def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy
     options
         The scales.
     """
-    jacobian = np.asarray(np.linalg.qr(jacobian, mode="r"))  # a few rows that say the same
+    jacobian = np.asarray(np.linalg.qr(jacobian, mode="r"))  # same J^T J in 16 rows
     scaled = jacobian * np.append(options.scale(), options.useful_offset_s)
     # A step of one of the 15 counts as one standard deviation of what is known without readings.
     others = np.vstack([scaled, np.eye(15, 16)])
     triangular = np.asarray(np.linalg.qr(others, mode="r"))
+    # The last diagonal entry of R is the length of the offset's column beside all others, hence one
+    # over its sigma (in useful ones) with the others marginalised.
     if abs(triangular[-1, -1]) < 1.0:
+        # Regression of the offset's column on the others: the step of these that it looks like.
         like = solve_triangular(triangular[:15, :15], triangular[:15, 15])
         imitation = (options.scale() * like / options.useful_offset_s)[:12]
         return replace(determinacy(jacobian[:, :15], options), imitation=imitation)
+    # Schur complement of the offset: J^T J of the others with the offset marginalised.
     by_offset = jacobian[:, 15] / np.linalg.norm(jacobian[:, 15])
     apart = jacobian[:, :15] - np.outer(by_offset, by_offset @ jacobian[:, :15])
     return replace(determinacy(apart, options), offset=True)
@@ -140,6 +144,8 @@ def _simple_basis(rows: FloatArray) -> FloatArray:
     """Return a basis of the same space in which each row has one parameter to itself."""
     if not len(rows):
         return rows
+    # Pivoting picks the parameters that the space moves most, so that the solve is well
+    # conditioned.
     _, triangular, order = qr(rows, mode="economic", pivoting=True)
     basis = np.empty_like(rows)
     basis[:, order] = np.linalg.solve(triangular[:, : len(rows)], triangular)

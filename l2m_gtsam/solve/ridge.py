@@ -10,6 +10,8 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 
+# Times the largest squared singular value: from rounding to a solution of next to nothing, 20 a
+# decade.
 GRID = np.logspace(-14, 2, 321)
 
 
@@ -46,9 +48,12 @@ def ridge_path(X: FloatArray, Y: FloatArray, unexplained: float = 0.0) -> RidgeP
         Squared residual that was removed from X and Y beforehand (by truncation).
     """
     U, s, _ = np.linalg.svd(X, full_matrices=False)
+    # In the basis of the SVD each direction is shrunk by s^2 / (s^2 + lambda) (filter factors;
+    # Hansen, "Rank-Deficient and Discrete Ill-Posed Problems", 1998, chapter 4).
     beta = np.sum((U.T @ Y) ** 2, axis=1)
     strength = GRID * s[0] ** 2
     shrink = s**2 / (s**2 + strength[:, None])
+    # What lies outside the range of X; rounding may leave it below zero.
     floor = max(float(np.sum(Y**2) - beta.sum()), 0.0) + unexplained
     residual = floor + (1 - shrink) ** 2 @ beta
     scaled = np.divide(beta, s**2, out=np.zeros_like(s), where=s > 0)
@@ -65,6 +70,7 @@ def generalised_cross_validation(path: RidgePath, observations: int) -> float:
     observations
         Number of rows that the problem had before it was compressed.
     """
+    # The trace of the influence matrix is the freedom; constant factors do not move the minimum.
     score = path.residual / (observations - path.freedom) ** 2
     return float(path.strength[np.argmin(score)])
 
@@ -72,6 +78,7 @@ def generalised_cross_validation(path: RidgePath, observations: int) -> float:
 def l_curve(path: RidgePath) -> float:
     """Return the strength at the corner of log residual against log size (Hansen 1992)."""
     tiny = np.finfo(float).tiny
+    # Half the logarithm of a square is that of the norm, which the L-curve is drawn over.
     x = np.log(np.maximum(path.residual, tiny)) / 2
     y = np.log(np.maximum(path.size, tiny)) / 2
     dx, dy = np.gradient(x), np.gradient(y)

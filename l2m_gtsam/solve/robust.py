@@ -26,7 +26,7 @@ from l2m_gtsam.solve.noise import NOISE_RANGE
 
 AXES = 3
 MEDIAN = float(quantile(0.5, AXES))  # of r^2 where only noise is left
-TINY = 1e-12  # a squared length of a whitened residual that is as good as none
+TINY = 1e-12  # squared length of a whitened residual: keeps the division finite
 FIRST_ROUNDS = 10  # of least absolute deviations: an outlier pulls no more than a good reading
 TRIMMINGS = 30
 WINDOWS = (9, 25)  # readings of a mean
@@ -78,6 +78,8 @@ def truncated_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
     """
     if np.isinf(mu):
         return np.asarray(r2 <= largest, dtype=float)
+    # Above one up to the lower threshold and negative beyond the upper one: clipping gives all
+    # three.
     between = np.sqrt(largest * mu * (mu + 1) / np.maximum(r2, TINY)) - mu
     return np.clip(between, 0.0, 1.0)
 
@@ -97,6 +99,7 @@ def equal_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
     return np.ones_like(r2)
 
 
+# Weights psi(r) / r of iteratively reweighted least squares.
 WEIGHTS: dict[Loss, Callable[[FloatArray, float, float], FloatArray]] = {
     Loss.TRUNCATED: truncated_weights,
     Loss.HUBER: huber_weights,
@@ -115,6 +118,7 @@ def median_noise(residual: FloatArray, map_variance: FloatArray) -> float:
     map_variance
         Mean variance of the map's prediction in uT^2, shape (N,).
     """
+    # A median holds while fewer than half of the readings are wrong; a mean of squares does not.
     e2 = np.einsum("ni,ni->n", residual, residual)
 
     def excess(log_sigma: float) -> float:
@@ -148,12 +152,17 @@ def consistent(
     largest
         Largest squared length of a whitened residual that passes for noise.
     """
+    # Centred: beside a field of 50 uT the constant would otherwise be nearly collinear.
     regressors = np.column_stack([np.ones(len(columns)), columns - columns.mean(axis=0)])
     e = deviations(regressors, field, np.ones(len(field)))
+    # Weights 1 / |e| make least squares minimise the sum of lengths (Schlossmacher 1973); the floor
+    # keeps a reading that is fitted exactly from taking all the weight.
     for _ in range(FIRST_ROUNDS):
         length = np.linalg.norm(e, axis=1)
         e = deviations(regressors, field, 1 / np.maximum(length, SMALL * np.median(length)))
     keep = np.ones(len(field), dtype=np.bool_)
+    # Refits of the readings kept, as the concentration steps of least trimmed squares (Rousseeuw
+    # and Van Driessen 2006).
     for _ in range(TRIMMINGS):
         variance = median_noise(e, map_variance) ** 2 + map_variance
         before, keep = keep, np.einsum("ni,ni->n", e, e) <= largest * variance
@@ -195,6 +204,7 @@ def grown(
         total = [windowed(np.where(rejected, 0.0, axis), window) for axis in residual.T]
         mean = np.stack(total, axis=1) / np.maximum(count, 1)[:, None]
         m2 = np.einsum("ni,ni->n", mean, mean)
+        # The sensor's noise averages out over a window; the map's error is common to neighbours.
         common = windowed(map_variance, window) / windowed(np.ones(len(mean)), window)
         variance = noise**2 / np.maximum(count, 1) + common
         # A map that errs everywhere, and along the drive, makes no stretch: half of all means pass.

@@ -147,7 +147,7 @@ class BilinearMap:
 
         The old readings are known by the averages of their cells, so that layers are sorted anew
         by these. Their squares about the new interpolant are those about the old one, corrected
-        by what the averages say: exact where the two differ by a constant over a cell.
+        by what the averages give: exact where the two differ by a constant over a cell.
         """
         new = additional_set(points, field)
         old = self.readings

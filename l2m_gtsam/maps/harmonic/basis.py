@@ -92,6 +92,7 @@ class Basis:
                 for family, columns in zip(self.families, self.columns, strict=True)
             ]
             field[at] = sum(part[0] for part in parts) @ R.T
+            # A gradient turns with the field's components and with the direction of the derivative.
             gradient[at] = R @ sum(part[1] for part in parts) @ R.T
         return field, gradient
 

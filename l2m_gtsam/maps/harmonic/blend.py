@@ -1,4 +1,4 @@
-"""What several tiles say of the same places, blended."""
+"""Predictions of several tiles at the same points, blended."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class Blend:
-    """Sums of what tiles say, each times its share: complete when all have been heard.
+    """Sums of the tiles' predictions, each times its share: normalised once every tile is added.
 
     Attributes
     ----------
@@ -28,8 +28,8 @@ class Blend:
         """Return the sums over no tiles yet, of this many points."""
         return cls(np.zeros((count, 3)), np.zeros((count, 3, 3)))
 
-    def add(self, rows: IntArray, share: FloatArray, said: tuple[FloatArray, FloatArray]) -> None:
-        """Add what one tile says of some points.
+    def add(self, rows: IntArray, share: FloatArray, values: tuple[FloatArray, FloatArray]) -> None:
+        """Add what one tile predicts at some points.
 
         Parameters
         ----------
@@ -37,10 +37,10 @@ class Blend:
             Their indices, shape (K,).
         share
             Of the tile in each, shape (K,) or longer.
-        said
+        values
             Field (K, 3) in uT and gradient (K, 3, 3) in uT/m.
         """
-        add_shares(rows, share, *said, self.field, self.gradient)
+        add_shares(rows, share, *values, self.field, self.gradient)
 
 
 @njit(cache=True, nogil=True)
@@ -52,7 +52,7 @@ def add_shares(
     field: FloatArray,
     gradient: FloatArray,
 ) -> None:
-    """Add what one tile says, times its share, to the rows of field and gradient."""
+    """Add what one tile predicts, times its share, to the rows of field and gradient."""
     for n in range(len(rows)):
         for i in range(3):
             field[rows[n], i] += share[n] * part_field[n, i]

@@ -1,4 +1,4 @@
-"""What a compiled tile says of places, times its share, added up in one go.
+"""Predictions of a compiled tile at points, times its share, added up in one pass.
 
 A drive asks hundreds of tiles for some tens of places each: calls and arrays in between took as
 long as the sums.

@@ -76,7 +76,7 @@ class CompiledTile:
         return blend.field, blend.gradient
 
     def add_to(self, blend: Blend, points: FloatArray, rows: IntArray, share: FloatArray) -> None:
-        """Add what the tile says, times its share, to what others say.
+        """Add what the tile predicts, times its share, to the sums over the others.
 
         Parameters
         ----------
@@ -104,8 +104,8 @@ class CompiledTile:
         if count:
             left = missing[:count]
             local = self.tile.clipped(frame.localise(points[rows[left]]))
-            said = in_map(frame, *self.terms.field_and_gradient(local))
-            blend.add(rows[left], share[left], said)
+            values = in_map(frame, *self.terms.field_and_gradient(local))
+            blend.add(rows[left], share[left], values)
 
 
 def in_map(

@@ -1,4 +1,4 @@
-r"""Sources at places where steel stands: point dipoles, in combinations that readings can see.
+r"""Sources at the positions of steel: point dipoles, in combinations that readings can see.
 
 .. math::
     \phi = -\frac{m \cdot r}{r^3}, \quad B = \frac{3 r (m \cdot r)}{r^5} - \frac{m}{r^3}

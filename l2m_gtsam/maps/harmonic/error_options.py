@@ -1,4 +1,4 @@
-"""How finely the map's error over a drive is told."""
+"""How finely the map's error over a drive is resolved."""
 
 from pydantic import Field
 
@@ -6,7 +6,7 @@ from l2m_gtsam.options import Options
 
 
 class ErrorOptions(Options):
-    """How finely the map's error is told."""
+    """How finely the map's error is resolved."""
 
     places: int = Field(default=100, ge=10)
     """The most places of a tile that its modes are chosen at, spread over the drive."""

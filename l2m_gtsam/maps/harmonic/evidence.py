@@ -104,6 +104,7 @@ def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise
     K = whitened_factor(part, D, noise)
     right = np.column_stack([normal.FF[np.ix_(gone, kept)], normal.Fy[gone]]) * D[:, None] / noise
     half = solve_triangular(K, right, lower=True, check_finite=False)
+    # Schur complement of the block that is integrated out.
     known = half.T @ half
     return Normal(
         normal.FF[np.ix_(kept, kept)] - known[:-1, :-1],
@@ -134,6 +135,7 @@ class Weights:
 
     def root(self, features: FloatArray) -> FloatArray:
         """Return ``F L`` for features F, both of shape (J, m)."""
+        # L = D K^-T, hence the rows of (F L)^T are K^-1 D F^T: one triangular solve.
         white = np.multiply(features.T, self.prior_sigma[:, None], order="C")
         self.factor.solve_rows(white)
         return np.asarray(white.T)
@@ -240,6 +242,9 @@ class EvidenceSlopes:
         slopes
             Derivatives of the logarithms of the prior variances by these numbers, shape (p, m).
         """
+        # Fisher information tr(P S_i P S_j) / 2 of a Gaussian's covariance: for the log variances
+        # of two weights it is half the square of an entry of I - A^-1, of which one triangle is
+        # stored.
         known = -np.tril(self.unknown)
         known[np.diag_indices_from(known)] += 1.0
         known *= known
@@ -253,6 +258,8 @@ def evidence(normal: Normal, log_variance: FloatArray, noise: float) -> Evidence
     K = whitened_factor(normal, D, noise)
     u = D * normal.Fy / noise**2
     v = cho_solve((K, True), u, check_finite=False)
+    # Inverse and determinant of the readings' covariance by the lemmas of Woodbury and Sylvester
+    # (Rasmussen and Williams 2006, A.9 and A.10): m x m instead of 3N x 3N.
     log_det = 2 * float(np.log(np.diag(K)).sum())
     chi2 = normal.yy / noise**2 - float(u @ v)
     log_noise = normal.rows * np.log(2 * np.pi * noise**2) - normal.log_weight

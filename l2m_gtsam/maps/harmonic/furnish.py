@@ -1,4 +1,4 @@
-"""From a box to its basis: modes as fine as needed, and the sources that stand in it."""
+"""From a box to its basis: modes as fine as needed, and the sources in it."""
 
 from collections.abc import Sequence
 

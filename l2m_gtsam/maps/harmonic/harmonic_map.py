@@ -31,17 +31,17 @@ EXACT = 1e-9  # share of the variance between points that may be left out
 
 @dataclass(frozen=True)
 class TileShare:
-    """What one tile says of the points that it has a share in.
+    """What one tile predicts at the points that it has a share in.
 
     Attributes
     ----------
-    said
-        Field and gradient of all these points, shapes (N, 3) and (N, 3, 3).
+    values
+        Field in uT and gradient in uT/m of all these points, shapes (N, 3) and (N, 3, 3).
     own, variance
         Which of the points lie in the tile's core, shape (N,), and the variance there, (K, 3).
     """
 
-    said: tuple[FloatArray, FloatArray]
+    values: tuple[FloatArray, FloatArray]
     own: BoolArray
     variance: FloatArray
 
@@ -142,9 +142,9 @@ class HarmonicMap:
         """Return the map that keeps its tiles in a store, and takes from it those that it has."""
         return replace(self, tiles=Tiles(self.learnt, self.tiles.solved, store))
 
-    def make_tiles(self, told: Count) -> int:
+    def make_tiles(self, progress: Count) -> int:
         """Have all tiles in the store, as far as it takes them; see ``make_all``."""
-        return make_all(CompiledTiles.of(self), told)
+        return make_all(CompiledTiles.of(self), progress)
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""
@@ -181,7 +181,7 @@ class HarmonicMap:
             return TileShare(tile.field_and_gradient(at), own, tile.variance(at[own]))
 
         for visit, found in zip(visits, in_threads(answer, visits), strict=True):
-            blend.add(visit.rows, visit.share, found.said)
+            blend.add(visit.rows, visit.share, found.values)
             variance[visit.rows[found.own]] = found.variance
         return blend.field, blend.gradient, variance
 
@@ -202,7 +202,7 @@ class HarmonicMap:
             In the map frame in metres, shape (N, 3).
         answers
             Gives field, gradient and variance of points. It is asked about those near a reading
-            alone: what it says of others would not be used.
+            alone: values at others would not be used.
         """
         points = checked_points(points)
         away, _ = self.learnt.readings.tree.query(points, distance_upper_bound=self.options.reach)
@@ -217,8 +217,8 @@ class HarmonicMap:
         points = checked_points(points)
         blend = Blend.of(len(points))
         for visit in self.learnt.tiling.visits(points):
-            said = self.tiles[visit.tile].field_and_gradient(points[visit.rows])
-            blend.add(visit.rows, visit.share, said)
+            values = self.tiles[visit.tile].field_and_gradient(points[visit.rows])
+            blend.add(visit.rows, visit.share, values)
         return blend.field, blend.gradient
 
     def variance(self, points: FloatArray) -> FloatArray:

@@ -133,6 +133,7 @@ def learn(
         finest = resolution_of(end.hyperparameters, density, share)
         needed = affordable(finest, tiling, options.modes)
         guess = end.hyperparameters
+        # Finer modes than those in the windows would have changed their likelihood.
         if needed.floor < FINER * looked_at.floor and needed.ceiling < FINER * looked_at.ceiling:
             break
     return replace(end, roughest=tuple(own(each, end.hyperparameters) for each in windows.rough))
@@ -186,12 +187,15 @@ def window_of(
 def maximise(windows: Sequence[Window], start: Hyperparameters) -> LearningEnd:
     """Return the maximum of the windows' summed likelihood, from a start."""
     names = learnable(windows)
+    # Logarithms: all are positive and act by their ratio.
     x0 = np.log([getattr(start, name) for name in names])
     low, high = np.log([BOUNDS[name] for name in names]).T
     low, high = np.maximum(low, x0 - FURTHEST), np.minimum(high, x0 + FURTHEST)
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
         trial = start.model_copy(update=dict(zip(names, np.exp(x).tolist(), strict=True)))
+        # Windows count as independent, so that likelihoods add (composite likelihood; Varin, Reid
+        # and Firth 2011).
         parts = in_threads(lambda window: log_likelihood(window, trial), windows)
         gradient = np.sum(
             [[part.slopes.get(name, 0.0) for name in names] for part in parts], axis=0

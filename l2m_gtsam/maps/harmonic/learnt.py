@@ -36,7 +36,7 @@ from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import TrainingSet, joined, merged
 from l2m_gtsam.options import Options
 
-KNOWN = 0.5  # of the readings' variance: a map that says less might as well say their mean
+KNOWN = 0.5  # of the readings' variance: a map that explains less is no better than their mean
 
 
 class HarmonicOptions(Options):
@@ -55,7 +55,7 @@ class HarmonicOptions(Options):
     tiling: TilingOptions = TilingOptions()
     """The surroundings of a tile."""
     errors: ErrorOptions = ErrorOptions()
-    """How finely the map's error over a drive is told."""
+    """How finely the map's error over a drive is resolved."""
     sensor_noise: float | None = Field(default=None, gt=0)
     """Standard deviation of the survey's sensors per axis in uT, from the data sheet, to judge
     the learnt noise by; not used otherwise."""

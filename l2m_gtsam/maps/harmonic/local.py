@@ -16,9 +16,11 @@ from l2m_gtsam.options import Options
 NAMES = ("floor_scale", "floor_depth", "ceiling_scale", "ceiling_depth")
 LEAST_GAIN = 1.0  # information of the readings over that of the prior
 SCALES = ("floor_scale", "ceiling_scale")
-# Where scales are far above those of the map, waves tell of them that told nothing before.
+# Where scales rise far above those of the map, more waves become informative: choose them again.
 PASSES, RISE = 3, 0.7
-SMALL = 0.1  # in the logarithm of a scale or depth: a fraction of how well one tile tells it
+SMALL = (
+    0.1  # in the logarithm of a scale or depth: a fraction of its standard deviation from one tile
+)
 LONGEST = 1.5  # of a step in the logarithm of a scale or depth
 
 
@@ -73,9 +75,9 @@ def scored(
     start: Hyperparameters,
     options: LocalOptions,
 ) -> Hyperparameters:
-    """Return where Fisher scoring leads from a start, over the waves that tell something there."""
-    telling = telling_waves(basis, normal, start)
-    slopes = telling.prior(start).slopes
+    """Return where Fisher scoring leads from a start, over the waves that are informative there."""
+    informative = informative_modes(basis, normal, start)
+    slopes = informative.prior(start).slopes
     names = [name for name in NAMES if name in slopes and slopes[name].any()]
     if not names:
         return start
@@ -83,8 +85,8 @@ def scored(
     low, high = np.log([BOUNDS[name] for name in names]).T
     best, highest, step = x, -np.inf, np.zeros_like(centre)
     for left in range(options.steps, -1, -1):
-        prior = telling.prior(moved(start, names, x))
-        found = evidence(telling.normal, prior.log_variance, shared.noise)
+        prior = informative.prior(moved(start, names, x))
+        found = evidence(informative.normal, prior.log_variance, shared.noise)
         value = found.value - 0.5 * float(np.sum(((x - centre) / options.spread) ** 2))
         if value <= highest:
             step = 0.5 * step
@@ -100,15 +102,15 @@ def scored(
 
 
 @dataclass(frozen=True)
-class Telling:
-    """The waves of a tile that tell something of scales and depths.
+class InformativeModes:
+    """The waves of a tile that carry information on scales and depths.
 
     Attributes
     ----------
     waves
-        All waves.
+        All waves of the tile.
     rows
-        Those that tell something.
+        Indices of the informative ones, shape (k,).
     normal
         Sums over the readings for these, all other weights integrated out.
     """
@@ -124,18 +126,20 @@ class Telling:
         return WeightPrior(prior.log_variance[self.rows], slopes)
 
 
-def telling_waves(basis: Basis, normal: Normal, given: Hyperparameters) -> Telling:
+def informative_modes(basis: Basis, normal: Normal, given: Hyperparameters) -> InformativeModes:
     """Return the waves that could be known better than from their prior.
 
-    Short waves hardly reach the readings. They say next to nothing of scale and depth, and are
-    half of all.
+    Short waves hardly reach the readings. They carry almost no information on scale and depth,
+    and are half of all.
     """
     waves, columns = basis.of_kind(Modes)
     log_variance = basis.prior(given).log_variance
+    # Ratio of the information on each weight alone to that of its prior.
     gain = np.exp(log_variance) * normal.FF.diagonal() / given.noise**2
     rows = np.flatnonzero(gain[columns] > LEAST_GAIN)
     # All else stays as it is: integrated out once, not at each step.
-    return Telling(waves, rows, marginalised(normal, columns[rows], log_variance, given.noise))
+    kept = marginalised(normal, columns[rows], log_variance, given.noise)
+    return InformativeModes(waves, rows, kept)
 
 
 def scoring_step(
@@ -152,6 +156,7 @@ def scoring_step(
     away, spread
         How far it is from the middle of its own prior, shape (p,), and the width of that.
     """
+    # Expected instead of observed information: positive definite also far from the maximum.
     information = slopes.information(by) + np.eye(len(by)) / spread**2
     step = np.linalg.solve(information, by @ slopes.by_log_variance - away / spread**2)
     return np.asarray(step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300)))

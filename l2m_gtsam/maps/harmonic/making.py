@@ -8,7 +8,7 @@ from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count
 
 
-def make_all(compiled: CompiledTiles, told: Count) -> int:
+def make_all(compiled: CompiledTiles, progress: Count) -> int:
     """Have all tiles of a map in its store, solved and compiled, and nothing else.
 
     A store that is full ends it: the other tiles are made when they are needed. None is held in
@@ -18,7 +18,7 @@ def make_all(compiled: CompiledTiles, told: Count) -> int:
     ----------
     compiled
         The tiles, and with their map its store.
-    told
+    progress
         Called with the number of tiles that are done and that of all.
 
     Returns
@@ -42,7 +42,7 @@ def make_all(compiled: CompiledTiles, told: Count) -> int:
         compiled.compiled(index, tiles.made(index))
         with lock:
             done += 1
-            told(done, len(indices))
+            progress(done, len(indices))
         return tiles.store.takes_more
 
     return sum(in_threads(make, indices))

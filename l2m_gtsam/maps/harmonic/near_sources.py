@@ -5,7 +5,7 @@ r"""Sources so near that a grid cannot hold their field: each is split into two 
 
 S is the Taylor polynomial of ``s^(-3/2)`` about ``r0^2`` for ``s < r0^2``, and ``s^(-3/2)``
 itself beyond. The first part is smooth everywhere, also at the source, and goes into a grid. The
-second is zero beyond ``r0`` and is added to what the grid says, source by source. The split is
+second is zero beyond ``r0`` and is added to the grid's value, source by source. The split is
 exact.
 
 What a grid makes of the first part errs by the moment over the tenth power of ``r0``: a source a

@@ -1,4 +1,4 @@
-"""Tiles that stand for a whole survey: spread over it, and those where the field is roughest."""
+"""Tiles that represent a whole survey: spread over it, and those where the field is roughest."""
 
 from collections.abc import Sequence
 

@@ -24,7 +24,8 @@ class SearchOptions(Options):
     """The search for sources without a point cloud; lengths in metres."""
 
     rounds: int = Field(default=12, ge=0)
-    """The most rounds; 0 searches nothing. A round takes the best sources that stand apart."""
+    """The most rounds; 0 searches nothing. A round takes the best sources that
+    lie far enough apart."""
     pitch: float = Field(default=0.4, gt=0.05)
     """Edge of the lattice of places that are tried."""
     clearance: float = Field(default=0.2, gt=0)

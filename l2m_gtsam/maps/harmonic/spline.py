@@ -123,7 +123,7 @@ def covered_places(
 def spline_weights(fraction: FloatArray, weights: FloatArray) -> None:
     """Write the weights of a stencil along x, y and z and two derivatives, shape (3, 3 WIDTH).
 
-    ``fraction``, shape (3 WIDTH,), says which part of its cell a point has passed: one loop over
+    ``fraction``, shape (3 WIDTH,), holds the position of a point within its cell: one loop over
     all axes runs in vector registers.
     """
     for k in range(3 * WIDTH):

@@ -17,7 +17,7 @@ from l2m_gtsam.options import Options
 MOST_SOURCES = 200_000
 MOST_REACH = 2.0  # metres; tiles see no structure further away
 # Metres beside a tile's box, which itself ends 0.75 m beyond the readings. Without the strong
-# posts that stand 1.3 m from its outermost readings a tile takes their field for that of those it
+# posts 1.3 m from its outermost readings a tile takes their field for that of those it
 # has; strengths of a hundred were learnt.
 SIGHT = 0.5
 
@@ -27,7 +27,7 @@ class StructureOptions(Options):
 
     edge: float = Field(default=0.12, gt=0.01)
     """Edge of the voxels; each holds one source. Sources this close make any field half a metre
-    away, also that of a post a few centimetres beside. At 0.2 m strong posts were told with
+    away, also that of a post a few centimetres beside. At 0.2 m strong posts were estimated with
     twice the error that the map claimed."""
     reach: float = Field(default=MOST_REACH, gt=0, le=MOST_REACH)
     """Structure further than this from every reading is left to floor and ceiling modes."""
@@ -160,9 +160,9 @@ def lowest_nearby(points: FloatArray, edge: float) -> FloatArray:
 def rises(centres: FloatArray, seen: FloatArray, edge: float) -> BoolArray:
     """Return which voxels are higher than a ramp could lead to from the points around, (K,).
 
-    Readings alone cannot tell: those of a drive along a ramp's foot, or across it, know nothing
-    of how the floor goes on beside them. In a cloud without floor a beam little higher than the
-    sensors is taken for one.
+    Readings alone do not determine it: those of a drive along a ramp's foot, or across it, carry
+    no information on how the floor goes on beside them. In a cloud without floor a beam little
+    higher than the sensors is taken for one.
 
     Parameters
     ----------

@@ -41,8 +41,8 @@ def described(learnt: Learnt) -> str:
     shown, given = int(np.count_nonzero(learnt.strengths)), len(learnt.strengths)
     if learnt.origin.searched:
         return (
-            f"{shown} found without a point cloud: sigmas are less sure; --structure tells where "
-            "steel stands"
+            f"{shown} found without a point cloud: sigmas are less sure; --structure "
+            "gives the positions of steel"
         )
     if not given:
         return "floor and ceiling only"
@@ -50,13 +50,13 @@ def described(learnt: Learnt) -> str:
 
 
 def doubts(learnt: Learnt) -> tuple[str, ...]:
-    """Return what speaks against the map, a sentence each."""
+    """Return reasons to doubt the map, a sentence each."""
     origin, parts = learnt.origin, learnt.tiling.parts
     found = [each for each in (*origin.survey, narrow(learnt.readings.points)) if each]
     if origin.explanation.reasons:
         found.append(judged(origin.explanation))
     if not origin.explanation.judged:
-        found.append("there are too few places to say whether the map explains the field")
+        found.append("there are too few places to determine whether the map explains the field")
     if origin.searched:
         found.append(
             "sources were searched for, for want of a point cloud of the structure: sigmas are "

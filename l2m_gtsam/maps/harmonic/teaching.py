@@ -29,7 +29,7 @@ from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
 from l2m_gtsam.parallel.threads import in_threads
 
-# Tiles whose held-out places say whether the field is explained, and those of them where the
+# Tiles whose held-out places show whether the field is explained, and those of them where the
 # readings are roughest.
 JUDGED, JUDGED_ROUGH = 12, 4
 GROWTH = 1.5  # of the sources, after which the prior is learnt anew
@@ -130,7 +130,7 @@ def found_in_tiles(plain: Learnt, tiles: list[int], options: HarmonicOptions) ->
     """Return the places of one round of the search in the cores of tiles, shape (K, 3)."""
     members, grid = plain.members, plain.tiling.grid
 
-    def look(tile: int) -> list[Found]:
+    def search(tile: int) -> list[Found]:
         rows = evenly(members[tile], MOST_READINGS)
         basis, readings = plain.basis(tile, rows, COARSE), plain.readings[rows]
         places = unvisited(readings.points, options.search)
@@ -138,14 +138,14 @@ def found_in_tiles(plain: Learnt, tiles: list[int], options: HarmonicOptions) ->
         residuals = residuals_of(basis, readings, plain.hyperparameters)
         return look_for_sources(residuals, places, options.search)
 
-    found = [each for part in in_threads(look, tiles) for each in part]
+    found = [each for part in in_threads(search, tiles) for each in part]
     # Neighbouring tiles may have seen the same steel.
     kept = apart(found, options.search.apart)
     return np.array([each.position for each in kept]).reshape(-1, 3)
 
 
 def with_strengths(plain: Learnt) -> Learnt:
-    """Return the same with the strength of every structure, learnt in the tile it stands in."""
+    """Return the same with the strength of every structure, learnt in the tile that holds it."""
     middles = plain.sources.middles
     if not len(middles):
         return plain

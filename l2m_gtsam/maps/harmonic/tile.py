@@ -13,12 +13,12 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import left_out
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 
-NEAREST = 0.9  # of the way from the lowest (highest) reading to the sheet of sources
+NEAREST = 0.9  # of the distance from the lowest (highest) reading to the sheet of sources
 
 
 @dataclass(frozen=True)
 class Tile:
-    """What a tile knows of the field.
+    """Posterior of the field in one tile.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Tile:
         """Return points moved into the box, and no nearer to the sheets of sources than it.
 
         Beyond, waves repeat themselves or grow without bound. So far from the readings nothing is
-        known of the field; the variance at the box's walls says so.
+        known of the field; the variance at the box's walls is the prior's.
         """
         frame = self.basis.frame
         local = frame.localise(points)
@@ -80,7 +80,7 @@ class Tile:
         return self.weights.root_rows(self.basis, self.within(points))
 
     def unwhitened(self, directions: FloatArray) -> FloatArray:
-        """Return the weights that directions of the posterior's root stand for, both (m, r)."""
+        """Return the weights of directions of the posterior's root, both (m, r)."""
         return self.weights.unwhitened(directions)
 
     def variance(self, points: FloatArray) -> FloatArray:
@@ -100,5 +100,7 @@ class Tile:
         vertical = vertical + left_out(
             h.ceiling_scale, h.ceiling_depth, self.resolution.ceiling, over
         )
+        # As kx^2 + ky^2 = k^2, both horizontal axes together have the variance of the vertical one.
         local = vertical[:, None] * np.array([0.5, 0.5, 1.0])
+        # Diagonal of R diag(v) R^T; correlations between axes are left out.
         return np.asarray(local @ (self.basis.frame.R_map_tile.T**2))

@@ -49,7 +49,7 @@ class Resolution:
 
 
 def resolution_of(hyperparameters: Hyperparameters, density: float, share: float) -> Resolution:
-    """Return which modes readings of a density can tell something about.
+    """Return which modes readings of a density carry information on.
 
     A mode's prior variance over the variance with which the readings alone would determine it is
     ``4 pi s^2 (2h)^3 k exp(-2 k h) density / sigma^2``, at the height of the lowest (highest)
@@ -150,7 +150,7 @@ class Tiling:
         return int(connected_components(graph, directed=False)[0])
 
     def shares(self, points: FloatArray, tile: int | IntArray) -> FloatArray:
-        """Return how much a tile would say at points, before it is set against the others.
+        """Return the weight of a tile at points, before all tiles' weights are normalised.
 
         Parameters
         ----------

@@ -16,7 +16,7 @@ class UniformField:
     Attributes
     ----------
     sigma
-        Prior standard deviation per axis in microtesla; wide, the data say what it is.
+        Prior standard deviation per axis in microtesla; wide, so that the data determine the field.
     """
 
     sigma: float

@@ -22,7 +22,7 @@ class Visit:
     rows
         Indices of the points, shape (K,).
     share
-        How much the tile says at each; over all tiles they sum to one, shape (K,).
+        Weight of the tile in the blend at each point, shape (K,); over all tiles they sum to one.
     """
 
     tile: int
@@ -75,7 +75,7 @@ def write_shares(
     for n in range(len(points)):
         for axis in range(2):
             place = (points[n, axis] - origin[axis]) * per_size
-            # Far away there is no tile: what is so far need not be told apart.
+            # Far away there is no tile: clipping keeps the cell's number an integer.
             place = min(max(place, low[axis] - 2.0), high[axis] + 3.0)
             own[axis, 0] = int(np.floor(place))
             own[axis, 1] = own[axis, 0] + (1 if place - own[axis, 0] >= 0.5 else -1)
@@ -108,7 +108,7 @@ def write_shares(
 
 @njit(cache=True, nogil=True)
 def ramp(within: float) -> float:
-    """Return a share along one axis, twice differentiable, at a part of the way into the band."""
+    """Return a share along one axis, twice differentiable, at a fraction of the band's width."""
     r = min(max(within, 0.0), 1.0)
     return float(r * r * r * (10 + r * (6 * r - 15)))
 

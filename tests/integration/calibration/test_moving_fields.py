@@ -212,6 +212,6 @@ def test_a_sensor_with_few_readings_says_why_there_is_no_comparison() -> None:
     sensor = calibrate(drive.recording, WORLD, options(drive)).sensors[0]
     assert sensor.models is None
     assert sensor.not_compared == (
-        "models: 31 readings cannot tell models of 7 columns apart in 8 segments, at least 32 are "
+        "models: 31 readings cannot distinguish models of 7 columns in 8 segments, at least 32 are "
         "needed"
     )

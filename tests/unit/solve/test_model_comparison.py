@@ -203,7 +203,7 @@ FAULTS = {
     "number": "models: regressor 'amp': some are not finite; leave these readings out",
     "reading": "models: readings: some are not finite; leave these readings out",
     "weight": "models: every reading needs a finite weight above 0",
-    "few": "models: 31 readings cannot tell models of 7 columns apart in 8 segments, at least 32 "
+    "few": "models: 31 readings cannot distinguish models of 7 columns in 8 segments, at least 32 "
     "are needed",
 }
 
