@@ -48,8 +48,8 @@ def ridge_path(X: FloatArray, Y: FloatArray, unexplained: float = 0.0) -> RidgeP
         Squared residual that was removed from X and Y beforehand (by truncation).
     """
     U, s, _ = np.linalg.svd(X, full_matrices=False)
-    # In the basis of the SVD each direction is shrunk by s^2 / (s^2 + lambda) (filter factors;
-    # Hansen, "Rank-Deficient and Discrete Ill-Posed Problems", 1998, chapter 4).
+    # In the basis of the SVD each direction is shrunk by s^2 / (s^2 + lambda) (filter factors:
+    # Hansen, "Rank-Deficient and Discrete Ill-Posed Problems", 1998).
     beta = np.sum((U.T @ Y) ** 2, axis=1)
     strength = GRID * s[0] ** 2
     shrink = s**2 / (s**2 + strength[:, None])
