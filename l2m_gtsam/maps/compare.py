@@ -113,7 +113,7 @@ class KindResult:
     Attributes
     ----------
     kind
-        Its name.
+        Name of the map kind, a key of ``KINDS``.
     figures
         How it did, absent where it failed.
     reason
@@ -134,7 +134,7 @@ class MapComparison:
     kinds
         One result per kind, in the order that was asked for.
     readings
-        Readings, each held out once.
+        Number of readings; each is held out once.
     fold
         Edge of a patch in metres.
     patches, folds
@@ -142,7 +142,7 @@ class MapComparison:
     recommended
         The kind of highest log-likelihood, absent where all failed.
     reason
-        A sentence why.
+        Why that kind is recommended, one sentence.
     """
 
     kinds: tuple[KindResult, ...]
@@ -372,7 +372,7 @@ def figures_of(prediction: Prediction, shared: BoolArray) -> KindFigures:
     Parameters
     ----------
     prediction
-        Of all readings.
+        Errors and sigmas in uT at all N readings.
     shared
         Which of them are inside of every map, shape (N,).
     """

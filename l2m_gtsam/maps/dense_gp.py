@@ -43,9 +43,9 @@ class DenseGP:
     Attributes
     ----------
     trained
-        Training readings and hyperparameters.
+        Training readings (map frame, metres and uT) and hyperparameters.
     options
-        Effective options.
+        Options of the process, lengths in length scales.
     mean
         Prior mean per axis in microtesla, shape (3,).
     factor

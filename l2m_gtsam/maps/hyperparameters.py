@@ -68,13 +68,13 @@ class LikelihoodFit:
     Attributes
     ----------
     hyperparameters
-        Where the likelihood is largest.
+        Length scale in metres, signal and noise in uT, of largest likelihood.
     start
         Where the search started, from the pairwise differences of readings.
     log_likelihood
         Sum over the neighbourhoods at the end.
     readings
-        Readings in all neighbourhoods.
+        Number of readings in all neighbourhoods.
     converged
         Whether the search ended at a maximum inside the bounds.
     at_bound
@@ -174,7 +174,7 @@ def learn(
     Parameters
     ----------
     readings
-        The readings, not yet thinned.
+        Readings, not yet thinned, map frame, metres and uT.
     options
         Size of the sample that is looked at.
     thinning

@@ -30,7 +30,7 @@ def scaled(points: FloatArray, centre: FloatArray, length_scale: float) -> Float
         Position in metres, shape (3,), close to the data: the exponent loses digits with the
         square of the distance to it.
     length_scale
-        Metres.
+        Length scale of the kernel in metres.
     """
     # Points at infinity would give inf - inf in the exponent.
     furthest = FURTHEST * length_scale

@@ -34,7 +34,7 @@ class KernelSums:
     Attributes
     ----------
     length_scale
-        Metres.
+        Length scale of the kernel in metres.
     centres
         Origins of the blocks' scaled points in metres, shape (B, 3).
     first

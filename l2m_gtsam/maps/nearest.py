@@ -12,7 +12,7 @@ class NearestReadings:
     Parameters
     ----------
     readings
-        In the map frame.
+        Readings in the map frame, metres and uT.
     reach
         A place further from all readings is not known, metres.
     """

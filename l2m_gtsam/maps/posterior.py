@@ -22,7 +22,7 @@ class Posterior:
     Attributes
     ----------
     hyperparameters
-        Kernel and noise.
+        Length scale in metres, signal and noise in uT.
     centre
         Origin of the scaled points in metres, shape (3,).
     y
@@ -88,7 +88,7 @@ def condition(
     mean
         Prior mean per axis in microtesla, shape (3,).
     hyperparameters
-        Kernel and noise.
+        Length scale in metres, signal and noise in uT.
 
     Raises
     ------

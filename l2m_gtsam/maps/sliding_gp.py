@@ -62,7 +62,7 @@ class BlockQuery:
     Attributes
     ----------
     block
-        Index of the block.
+        Index of the block in the grid, counted from 0.
     rows
         Indices of the points, shape (K,).
     """
@@ -78,13 +78,13 @@ class SlidingGP:
     Attributes
     ----------
     trained
-        Training readings and hyperparameters.
+        Training readings (map frame, metres and uT) and hyperparameters.
     options
-        Effective options.
+        Options of the process, lengths in length scales.
     mean
         Prior mean per axis in microtesla, shape (3,).
     grid
-        Where the blocks lie.
+        Square blocks in x and y of the map frame, metres.
     blocks
         One posterior per block of the grid.
     """

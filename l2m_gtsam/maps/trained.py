@@ -55,7 +55,7 @@ class TrainingOrigin:
     Attributes
     ----------
     readings
-        Readings before thinning.
+        Number of readings before thinning.
     learning
         How learning ended; absent where the hyperparameters were given.
     """
@@ -91,7 +91,7 @@ def train(points: FloatArray, field: FloatArray, options: GPOptions) -> Trained:
     field
         Readings in the map frame in microtesla, shape (N, 3).
     options
-        Of the map.
+        Options of the map, lengths in length scales.
 
     Raises
     ------
@@ -119,13 +119,13 @@ def extended(
     Parameters
     ----------
     trained
-        What the map knew.
+        Training readings and hyperparameters of the map so far.
     points
         Positions of the new readings in the map frame in metres, shape (N, 3).
     field
         New readings in the map frame in microtesla, shape (N, 3).
     options
-        Of the map.
+        Options of the map, lengths in length scales.
 
     Raises
     ------

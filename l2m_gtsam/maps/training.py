@@ -168,7 +168,7 @@ def thinned(readings: TrainingSet, length_scale: float, options: ThinningOptions
     readings
         Readings; those of a map that is given more of them have been averaged before.
     length_scale
-        Metres.
+        Length scale of the kernel in metres.
     options
         Edge of the cubes and the most that one is worth.
     """
@@ -189,7 +189,7 @@ def merged(readings: TrainingSet, edge: float, independent: int) -> TrainingSet:
     readings
         Readings as they were taken, or averages of earlier ones.
     edge
-        Of the cubes in metres.
+        Edge of the cubes that readings are merged in, metres.
     independent
         The most that the readings of one cube are worth.
     """

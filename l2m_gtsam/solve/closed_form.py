@@ -72,7 +72,7 @@ class DistortionFit:
     Attributes
     ----------
     distortion
-        C and H.
+        C without unit, shape (3, 3), and H in uT, shape (3,), lidar to sensor.
     ridge
         Strength relative to the spread of the field (`ridge_unit`); 0 where the method has none.
     """
@@ -124,7 +124,7 @@ def fit_distortion(
     weights
         Weight of each reading's squared residual, shape (N,); used by `w_rrtls` only.
     options
-        The closed form.
+        Method, weighting and ridge.
     C0
         Where the ridge pulls to, and where directions without any data stay; identity by default.
 

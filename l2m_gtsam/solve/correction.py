@@ -19,7 +19,7 @@ def corrected(
         z of one sensor in microtesla, shape (N, 3). One with a NaN axis is not known: every axis
         of the lidar may hold a part of it.
     distortion
-        C and H.
+        C without unit, shape (3, 3), and H in uT, shape (3,).
     covariance
         Of C row by row and H, in uT, shape (12, 12).
     variance

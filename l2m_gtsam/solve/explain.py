@@ -70,7 +70,7 @@ class DriveFacts:
     Attributes
     ----------
     movement
-        Of the vehicle.
+        Extent of the vehicle's motion in metres and degrees.
     b_lidar
         Field in the lidar frame in uT, shape (N, 3).
     slope
@@ -140,11 +140,11 @@ def explain(test: Determinacy, drive: DriveFacts, options: RankOptions) -> tuple
     Parameters
     ----------
     test
-        The directions that are open.
+        Undetermined directions of the 15 parameters, K of them.
     drive
-        What the sensor met.
+        Field, slope and motion along the drive, N readings.
     options
-        The scales of the test.
+        Largest useful sigmas of t (m), C and H (uT).
     """
     if test.touched.all() and drive.movement.at_rest:
         return (f"everything ({'; '.join(test.names)}): {drive.movement.rest}",)

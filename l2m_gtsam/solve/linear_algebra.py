@@ -14,7 +14,7 @@ def covariance_root(covariance: FloatArray, sigma: FloatArray | float = 1.0) -> 
     Parameters
     ----------
     covariance
-        Shape (n, n).
+        Symmetric matrix, shape (n, n), in squared units.
     sigma
         Scale of each component, shape (n,), by which rows and columns are divided before the
         decomposition: rad beside uT would lose the smaller ones' digits.

@@ -69,11 +69,11 @@ class Choice:
     Attributes
     ----------
     chosen
-        The recommended one.
+        Recommended model.
     best
         Of those that the BIC admits, the one that predicts held-out segments best.
     least
-        The one of least BIC.
+        Model of least BIC.
     """
 
     chosen: Trial

@@ -50,9 +50,9 @@ def compare_models(samples: Samples, options: ModelOptions) -> ModelComparison:
     Parameters
     ----------
     samples
-        Readings in order of time.
+        N readings of one sensor in uT, in order of time.
     options
-        How.
+        Number of segments and BIC difference that rejects a model.
 
     Raises
     ------

@@ -66,7 +66,7 @@ class Solution:
     Attributes
     ----------
     A
-        Shape (P, 3).
+        Coefficients of the divided columns in uT, shape (P, 3).
     tangent
         Derivatives by the parameters, shape (M, P, 3).
     """
@@ -82,9 +82,9 @@ class Fit:
     Attributes
     ----------
     solution
-        In terms of the columns.
+        Coefficients of the centred and divided columns.
     coefficients
-        In their units.
+        The same for b in uT, q and db/dt in their own units.
     parameters
         Number of those that the readings determine.
     squares
@@ -262,7 +262,7 @@ def inflation(
     Parameters
     ----------
     compressed
-        The columns.
+        QR of the N x P columns.
     correlation
         Of weighted residuals no, one, two, ... readings apart, shape (N,).
     drives

@@ -40,7 +40,7 @@ class Snapshots:
     Attributes
     ----------
     R_map_lidar
-        Shape (K, 3, 3).
+        Rotations from lidar to map, shape (K, 3, 3).
     p_map_lidar
         Metres, shape (K, 3).
     field
@@ -133,11 +133,11 @@ def misfits(snapshots: Snapshots, predict: Prediction, t: FloatArray, good: floa
     Parameters
     ----------
     snapshots
-        Readings at common poses.
+        Readings in uT of all sensors at common poses.
     predict
-        The map.
+        Map: field in uT and whether inside, of positions (N, 3) in metres.
     t
-        Candidates in metres.
+        Candidate positions in the lidar frame in metres, shape (G, 3).
     good
         Share of the readings that counts.
     """
@@ -337,7 +337,7 @@ def linearised(
     field, gradient
         Of the map at the sensor's K places, uT (K, 3) and uT/m (K, 3, 3), in the map frame.
     R_map_lidar
-        Shape (K, 3, 3).
+        Rotations from lidar to map, shape (K, 3, 3).
     z
         Readings in uT, shape (K, 3).
     """

@@ -94,7 +94,7 @@ def timed_determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy
         Derivatives of whitened residuals by the 15 parameters and the time offset in seconds,
         shape (M, 16).
     options
-        The scales.
+        Largest useful sigmas of t (m), C, H (uT) and the offset (s).
     """
     jacobian = np.asarray(np.linalg.qr(jacobian, mode="r"))  # same J^T J in 16 rows
     scaled = jacobian * np.append(options.scale(), options.useful_offset_s)
@@ -125,7 +125,7 @@ def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
     jacobian
         Derivatives of whitened residuals by the 15 parameters, shape (M, 15).
     options
-        The scales.
+        Largest useful sigmas of t (m), C, H (uT) and the offset (s).
     """
     triangular = np.asarray(np.linalg.qr(jacobian * options.scale(), mode="r"))
     square = np.zeros((15, 15))

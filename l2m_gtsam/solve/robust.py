@@ -72,7 +72,7 @@ def truncated_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
     r2
         Squared lengths of whitened residuals, shape (N,).
     largest
-        c^2.
+        c^2, without unit.
     mu
         Small for a loss that is nearly convex; infinite for the truncated loss itself.
     """
@@ -194,7 +194,7 @@ def grown(
     residual
         Of all readings in uT, shape (N, 3).
     noise
-        Of the sensor in uT.
+        Standard deviation of the sensor's noise per axis in uT.
     map_variance
         Mean variance of the map's prediction in uT^2, shape (N,).
     """

@@ -42,11 +42,11 @@ class BilinearMap:
     Attributes
     ----------
     cells
-        Averages of the readings.
+        Averages of the readings: M cells, map frame, metres and uT.
     options
-        Effective options.
+        Options of the grid, lengths in metres.
     lattice
-        Values at the nodes.
+        Field at the nodes in uT, map frame.
     spread
         Mean square of the readings about the interpolant per axis in square microtesla.
     """

@@ -126,13 +126,13 @@ def layer_values(
     Parameters
     ----------
     cells
-        Averages of all layers.
+        Averages of all layers, map frame, metres and uT.
     layer
-        Which one.
+        Number of the layer, counted from the lowest.
     plane
         Nodes in x and y in metres, shape (K, 2).
     options
-        How far averages reach.
+        Spacing and reach of averages in metres.
     """
     own = cells.layer == layer
     centre, field = cells.points[own, :2], cells.field[own]

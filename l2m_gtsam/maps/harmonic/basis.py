@@ -22,9 +22,9 @@ class Basis:
     Attributes
     ----------
     frame
-        The tile's box.
+        The tile's box and axes in the map frame, metres.
     families
-        Each with its own prior.
+        Families of features, m weights in total, each with its own prior.
     """
 
     frame: TileFrame
@@ -63,7 +63,7 @@ class Basis:
         points
             In the map frame in metres, shape (N, 3).
         units
-            Shape (m,).
+            Factor of each weight's field, shape (m,).
 
         Returns
         -------

@@ -91,7 +91,7 @@ class CompiledTiles:
     Attributes
     ----------
     exact
-        The map.
+        Map whose tiles are compiled.
     made
         Compiled tiles by index, the one used last at the end.
     locks
@@ -161,9 +161,9 @@ class CompiledMap:
     Attributes
     ----------
     exact
-        The map itself.
+        Map that it approximates, which answers far from readings.
     tiles
-        Its tiles, compiled.
+        Tiles of that map, compiled on first use.
     """
 
     exact: ExactMap

@@ -51,7 +51,7 @@ def add_compiled(
     Returns
     -------
     int
-        How many these are.
+        Number of rows that the grid does not cover.
     """
     corner, R = frame
     local, count = np.empty((len(rows), 3)), 0

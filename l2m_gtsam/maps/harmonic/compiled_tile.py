@@ -50,11 +50,11 @@ class CompiledTile:
     Attributes
     ----------
     tile
-        The exact one.
+        Tile with its posterior, of which this is the fast form.
     grid
         The smooth part of the potential in the tile's frame.
     near
-        What the grid leaves out.
+        Near parts of the sources that the grid leaves out, tile frame, uT m^3.
     terms
         All of the exact tile; they answer where the grid does not reach.
     """
@@ -81,11 +81,11 @@ class CompiledTile:
         Parameters
         ----------
         blend
-            Of all N points.
+            Sums of field (uT) and gradient (uT/m) over all N points; added to.
         points
             In the map frame in metres, shape (N, 3).
         rows, share
-            As of ``Blend.add``.
+            Indices of the tile's points and its share in each, shape (K,).
         """
         frame, grid, near = self.tile.basis.frame, self.grid, self.near
         missing = np.empty(len(rows), dtype=np.int64)
@@ -131,7 +131,7 @@ class Fineness:
     Attributes
     ----------
     spacing
-        Of the grid in metres.
+        Distance of the grid's nodes in metres.
     radius
         Within which sources are summed one by one, in metres.
     """

@@ -40,7 +40,7 @@ class TileModes:
     Attributes
     ----------
     tile
-        What the tile knows.
+        Tile with the posterior of its m weights.
     weights
         L U: the tile's weights for one unit of each beta, shape (m, r).
     """
@@ -107,11 +107,11 @@ def error_modes(
     Parameters
     ----------
     learnt, tiles
-        The map.
+        Prior and readings of the map, and its solved tiles.
     points
         Where a drive reads the field, metres, shape (N, 3).
     options
-        How finely.
+        Number of places and share of variance left out.
     """
     owner = learnt.tiling.grid.block_of(points)
     crossed = np.unique(owner).tolist()
@@ -181,9 +181,9 @@ def shared_readings(
     Parameters
     ----------
     members
-        Readings of each tile.
+        Rows of the readings of each tile, T arrays.
     count
-        Number of all readings.
+        Number N of all readings.
     """
     tile = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
     reading = np.concatenate([np.empty(0, dtype=np.int64), *members])

@@ -92,7 +92,7 @@ def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise
     Parameters
     ----------
     normal
-        Sums over the readings.
+        Sums over the readings, for m weights.
     kept
         Columns of the weights that stay, shape (k,).
     log_variance, noise
@@ -122,11 +122,11 @@ class Weights:
     Attributes
     ----------
     mean
-        Shape (m,).
+        Posterior mean, shape (m,).
     prior_sigma
         Diagonal of D: prior standard deviations, shape (m,).
     factor
-        K.
+        Cholesky factor K, lower triangular, (m, m).
     """
 
     mean: FloatArray
@@ -188,7 +188,7 @@ class Evidence:
     Attributes
     ----------
     value
-        Nats.
+        Log marginal likelihood in nats.
     factor
         K, lower triangular, shape (m, m).
     mean
@@ -196,7 +196,7 @@ class Evidence:
     misfit
         ``|y - F w|^2 / sigma^2`` at the posterior mean.
     rows
-        Number of values.
+        Number of values: three per reading.
     """
 
     value: float

@@ -39,7 +39,7 @@ class Explanation:
     worst
         The same of the tile where it is largest.
     surprises
-        Share of them beyond three.
+        Share of these ratios above three, 0 to 1.
     noise
         Learnt standard deviation of a reading in uT.
     sensor_noise

@@ -46,9 +46,9 @@ class Family(Protocol):
         Parameters
         ----------
         points
-            Shape (N, 3).
+            In the tile's frame in metres, shape (N, 3).
         units
-            Shape (m,).
+            Factor of each weight's field, shape (m,).
         rows
             For the field in uT, one weight after the other, shape (m, 3, N), in C order.
         """

@@ -36,11 +36,11 @@ def basis_of(
     Parameters
     ----------
     readings
-        Of the box.
+        Readings in the box, map frame, metres and uT.
     centre, edge
-        Of the box in metres.
+        Centre (x, y) of the box in the map frame, shape (2,), and its edge, metres.
     resolution
-        Largest wave numbers.
+        Largest wave numbers of floor and ceiling in 1/m.
     structures, strengths
         Structures in or near the box, and the strength of each.
     visible

@@ -53,9 +53,9 @@ class HarmonicMap:
     Attributes
     ----------
     learnt
-        Readings, prior, sources and tiling.
+        Readings (map frame, metres and uT), prior, sources and tiling.
     options
-        Effective options.
+        Options of the map, lengths in metres.
     tiles
         One for each cell of the tiling, solved when first needed.
     """

@@ -56,11 +56,11 @@ class LearningEnd:
     Attributes
     ----------
     hyperparameters
-        Where the likelihood is largest.
+        Scales in uT and depths in metres of largest likelihood.
     log_likelihood
         Sum over the windows, nats; absent where the hyperparameters were given.
     readings
-        Readings in all windows.
+        Number of readings in all windows.
     converged
         Whether the search ended at a maximum inside the bounds.
     at_bound
@@ -114,15 +114,15 @@ def learn(
     Parameters
     ----------
     readings
-        Of the whole survey.
+        Readings of the whole survey, map frame, metres and uT.
     sources
-        Candidate sources.
+        Candidate sources, map frame, metres.
     tiling
-        Surroundings of the windows.
+        Overlap and margin around the windows in metres.
     share
-        Of ``resolution_of``.
+        Ratio of variances below which a mode is left out; see ``resolution_of``.
     options
-        Of the windows.
+        Number and size of the windows.
     """
     density = float(readings.weight.sum()) / surveyed_area(readings.points)
     guess = starting_point(readings)

@@ -86,7 +86,7 @@ class Origin:
     Attributes
     ----------
     readings
-        Readings before they were merged.
+        Number of readings before they were merged.
     learning
         How learning ended.
     searched
@@ -114,21 +114,21 @@ class Learnt:
     Attributes
     ----------
     readings
-        Training readings, merged.
+        Training readings, merged, map frame, metres and uT.
     hyperparameters
         Of the prior of the whole map.
     sources
-        Candidate sources.
+        Candidate sources, map frame, metres.
     strengths
         Of each structure among them; 0 where the readings show none.
     tiling
-        Where the tiles lie.
+        Square tiles in x and y of the map frame, metres.
     resolution
-        Largest wave numbers of the modes.
+        Largest wave numbers of floor and ceiling modes in 1/m.
     local
         How far the prior of a tile may differ.
     origin
-        For the record.
+        How it was learnt; does not enter predictions.
     """
 
     readings: TrainingSet

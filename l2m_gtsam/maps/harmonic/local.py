@@ -51,11 +51,11 @@ def local_hyperparameters(
     Parameters
     ----------
     basis
-        Of the tile.
+        Features of the tile, m weights.
     normal
-        Sums over its readings.
+        Sums over the tile's readings, for m weights.
     shared
-        Of the map.
+        Scales in uT and depths in metres of the map.
     options
         Spread of the prior, and the number of steps.
     """
@@ -108,7 +108,7 @@ class InformativeModes:
     Attributes
     ----------
     waves
-        All waves of the tile.
+        All floor and ceiling modes of the tile.
     rows
         Indices of the informative ones, shape (k,).
     normal
@@ -150,7 +150,7 @@ def scoring_step(
     Parameters
     ----------
     slopes
-        Of the likelihood.
+        Derivatives of the log likelihood by the log prior variances.
     by
         Derivatives of the logarithms of the prior variances by what is sought, shape (p, m).
     away, spread

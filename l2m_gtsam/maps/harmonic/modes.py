@@ -35,7 +35,7 @@ class Modes:
     Attributes
     ----------
     side
-        FLOOR or CEILING.
+        Side of the sources: FLOOR (below) or CEILING (above).
     size
         Edges of the box in metres, shape (2,).
     z

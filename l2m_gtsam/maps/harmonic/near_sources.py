@@ -63,7 +63,7 @@ class PointSources:
         Parameters
         ----------
         lattice
-            The nodes.
+            Nodes of the grid in the tile's frame, metres.
         radius
             At which the strongest source is split, in metres.
         """
@@ -116,7 +116,7 @@ def near_sources(
     Parameters
     ----------
     sources
-        All of them.
+        K dipoles in the tile's frame, metres and uT m^3.
     lower, upper
         Corners of the box in which they will be asked for, metres, shape (3,).
     radius
@@ -154,7 +154,7 @@ def count_near(
     edge
         Squared radii of the sources in m^2, shape (K,).
     counts
-        Shape (nx, ny, nz).
+        Number of sources per cell, shape (nx, ny, nz); added to.
     """
     nx, ny, nz = counts.shape
     for k in range(len(edge)):
@@ -181,7 +181,7 @@ def fill_near(
     Parameters
     ----------
     x, y, z, edge
-        As there.
+        Squared gaps and radii in m^2, shapes as in ``count_near``.
     positions, moments
         Of the sources, shape (K, 3).
     free

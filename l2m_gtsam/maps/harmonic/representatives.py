@@ -34,13 +34,13 @@ def rough_tiles(
     Parameters
     ----------
     readings
-        Of the whole survey.
+        Readings of the whole survey, map frame, metres and uT.
     members
         Rows of the readings that take part in each tile.
     number
         How many are wanted; there may be fewer.
     besides
-        Tiles that are not wanted.
+        Indices of tiles that are chosen already.
     """
     rough = np.array([roughness(readings[rows]) for rows in members])
     rough[list(besides)] = 0.0

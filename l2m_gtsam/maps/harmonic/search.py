@@ -47,7 +47,7 @@ class Residuals:
     basis, weights
         What explains the readings so far.
     readings
-        Of the tile.
+        Readings of the tile, map frame, metres and uT.
     noise
         Standard deviation of a reading of weight one in uT.
     """
@@ -94,7 +94,7 @@ class Search:
     Parameters
     ----------
     residuals
-        Of the tile.
+        Readings of the tile and what its m weights leave of them, uT.
     """
 
     def __init__(self, residuals: Residuals) -> None:

@@ -33,9 +33,9 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
     basis
         With the structures at the strength to start from.
     normal
-        Sums over the readings.
+        Sums over the readings, for m weights.
     hyperparameters
-        Of the map.
+        Scales in uT, depths in metres and noise in uT of the map.
     """
     structures = [
         (np.arange(columns.start, columns.stop), family.strength)

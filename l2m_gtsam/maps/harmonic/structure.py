@@ -98,7 +98,7 @@ def candidate_sources(
     readings
         Where the survey read the field, metres, shape (N, 3).
     options
-        Of the voxels.
+        Edge of the voxels and distances in metres.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def rises(centres: FloatArray, seen: FloatArray, edge: float) -> BoolArray:
     seen
         Centres of all voxels, and the readings, under which there is floor too, shape (N, 3).
     edge
-        Of the voxels in metres.
+        Edge of a voxel in metres.
     """
     ground = lowest_of_cells(seen, GROUND_CELL * edge)
     away, which = cKDTree(ground[:, :2]).query(centres[:, :2], k=GROUND_CELLS)

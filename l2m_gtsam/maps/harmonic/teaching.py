@@ -43,9 +43,9 @@ def learn_map(raw: TrainingSet, sources: Sources, options: HarmonicOptions) -> L
     raw
         Readings in the map frame as they were taken.
     sources
-        Where steel can be.
+        Candidate positions of steel, map frame, metres.
     options
-        Of the map.
+        Options of the map, lengths in metres.
 
     Raises
     ------

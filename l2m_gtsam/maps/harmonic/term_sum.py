@@ -33,7 +33,7 @@ class Waves:
     kz
         Growth with height in 1/m, shape (m,).
     weights
-        Shape (m,).
+        Weight of each mode, shape (m,).
     """
 
     steps: FloatArray
@@ -64,9 +64,9 @@ class TermSum:
     Attributes
     ----------
     waves
-        Floor and ceiling.
+        Floor and ceiling modes with their weights.
     sources
-        All dipoles.
+        All dipoles, tile frame, metres and uT m^3.
     others
         Families that are neither, with their weights.
     """

@@ -23,11 +23,11 @@ class Tile:
     Attributes
     ----------
     basis
-        Features.
+        Features of the tile, m weights.
     weights
-        Their posterior.
+        Posterior of the m weights.
     hyperparameters
-        Of the prior.
+        Scales in uT and depths in metres of the prior.
     resolution
         Modes that were kept; those left out count as variance.
     """

@@ -26,9 +26,9 @@ class Tiles:
     Parameters
     ----------
     learnt
-        What the tiles follow from.
+        Readings, prior, sources and tiling of the map.
     kept
-        Tiles that are solved already.
+        Tiles solved already, by index.
     store
         Keeps tiles from run to run.
     """

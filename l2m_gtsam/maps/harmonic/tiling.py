@@ -58,7 +58,7 @@ def resolution_of(hyperparameters: Hyperparameters, density: float, share: float
     Parameters
     ----------
     hyperparameters
-        Scales, depths and noise.
+        Scales and noise in uT, depths in metres.
     density
         Readings per square metre.
     share
@@ -118,7 +118,7 @@ class Tiling:
     Attributes
     ----------
     grid
-        Cores of the tiles.
+        Cores of the tiles in x and y of the map frame, metres.
     overlap
         Readings this far around a tile's core take part in it, metres.
     margin
@@ -203,9 +203,9 @@ def tiling_of(
     points
         Positions of the readings in metres, shape (N, 3).
     resolution
-        Modes to be kept.
+        Largest wave numbers to be kept in 1/m.
     options
-        Overlap and margin.
+        Overlap and margin of the tiles in metres.
     budget
         The most modes of one tile.
     reach

@@ -19,7 +19,7 @@ class Block(NamedTuple):
     Attributes
     ----------
     rows
-        Which.
+        Rows of K in the block, b of them.
     before
         K left of the diagonal block, shape (b, rows.start), in Fortran order.
     inverse
@@ -41,7 +41,7 @@ class TriangularFactor:
     Attributes
     ----------
     size
-        m.
+        Number m of rows.
     values
         ``before`` and ``inverse`` of each block side by side in Fortran order, block after block,
         shape (``count(m)``,).

@@ -18,7 +18,7 @@ class Visit:
     Attributes
     ----------
     tile
-        Index of the tile.
+        Index of the tile in the grid, counted from 0.
     rows
         Indices of the points, shape (K,).
     share
@@ -42,7 +42,7 @@ def shares_of(
     points
         Metres, shape (N, 3).
     grid
-        Cores of the tiles.
+        Cores of the tiles in x and y of the map frame, metres.
     blend
         Half the width in metres of the band in which neighbours blend.
     """

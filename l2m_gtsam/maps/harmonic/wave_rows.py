@@ -49,7 +49,7 @@ def write_wave_rows(
     factors
         Of each mode's field along x, y and z, shape (3, m).
     rows
-        Shape (m, 3, N).
+        Field in uT, shape (m, 3, N).
     """
     for m in range(len(numbers)):
         p, q = numbers[m, 0], numbers[m, 1]
