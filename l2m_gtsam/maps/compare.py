@@ -1,8 +1,8 @@
 """Kinds of maps compared on the same readings, in places that none of them has seen.
 
 The area is cut into square patches, which are dealt out to folds. The maps of a fold are built
-without its patches and asked there. Readings next to each other share the field and the errors of
-one passage, so that readings left out one by one would praise every map alike; a patch left out
+without its patches and evaluated there. Readings next to each other share the field and the errors
+of one passage, so that readings left out one by one would praise every map alike; a patch left out
 shows what a map makes of a gap, and whether its variance reflects it.
 
 Noise of a reading: a tenth of the training readings, drawn at random, is kept from every map of a

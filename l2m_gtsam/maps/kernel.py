@@ -53,7 +53,7 @@ def kernel_matrix(x: FloatArray, y: FloatArray, signal: float) -> FloatArray:
 def training_columns(y: FloatArray, signal: float) -> FloatArray:
     """Return the features of training points in the exponent, shape (5, M); see ``kernel_matrix``.
 
-    They stay the same for all points that are asked for.
+    They stay the same for all points that are evaluated.
     """
     # s^2 as a summand of the exponent saves one pass over the matrix.
     offset = 2 * np.log(signal) - 0.5 * np.einsum("mi,mi->m", y, y)

@@ -6,7 +6,7 @@ readings on the predicted field leaves,
 .. math::
     \min_{C, H} \sum_k | C R_k^T B(R_k t + p_k) + H - z_k |^2 .
 
-All sensors are regressed on the same predictions: the map is asked once for all of them.
+All sensors are regressed on the same predictions: the map is evaluated once for all of them.
 """
 
 from collections.abc import Callable

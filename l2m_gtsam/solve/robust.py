@@ -30,7 +30,7 @@ TINY = 1e-12  # squared length of a whitened residual: keeps the division finite
 FIRST_ROUNDS = 10  # of least absolute deviations: an outlier pulls no more than a good reading
 TRIMMINGS = 30
 WINDOWS = (9, 25)  # readings of a mean
-# Beside readings that are wrong for certain a mean is believed to be wrong sooner.
+# Beside rejected readings a mean is taken for wrong at a lower threshold.
 LEAST_TOGETHER = float(quantile(0.99, AXES))
 SEEDS = 3  # readings wrong by themselves that make a stretch of what lies about them
 SMALL = 1e-3  # of the median length: residuals shorter than that weigh alike

@@ -26,7 +26,7 @@ from l2m_gtsam.parallel.threads import in_threads
 MEMORY = 1_000_000_000  # bytes of grids that are kept
 SHARES = 4  # that points are divided into, for as many threads at most
 PIECE = 65_536  # about the most points of a share
-AT_ONCE = 4_096  # points asked of a tile: its answers stay in the processor's cache
+AT_ONCE = 4_096  # points that a tile is evaluated at: its answers stay in the processor's cache
 BLOCK = 0.5  # metres: what a map knows of a square of this size fits the processor's cache
 SERIAL = 6_000  # fewer points than this are not worth threads
 
@@ -135,7 +135,7 @@ class CompiledTiles:
         return found
 
     def places(self, index: int) -> Places:
-        """Return where a tile is asked."""
+        """Return where a tile is evaluated."""
         tiling = self.exact.learnt.tiling
         return Places.around(
             self.exact.learnt.readings.points,

@@ -64,6 +64,7 @@ def tile_frame(points: FloatArray, centre: FloatArray, size: float) -> TileFrame
 def floor_axes(points: FloatArray) -> FloatArray:
     """Return the axes of the readings' plane if they follow one that is not level, (3, 3)."""
     centred = points - points.mean(axis=0)
+    # Least squares in z: a floor is never near vertical.
     slope, *_ = np.linalg.lstsq(centred[:, :2], centred[:, 2], rcond=None)
     left = centred[:, 2] - centred[:, :2] @ slope
     level = not LEAST_SLOPE <= np.linalg.norm(slope) <= MOST_SLOPE

@@ -175,7 +175,7 @@ class HarmonicMap:
         visits, owner = self.learnt.tiling.visits(points), self.learnt.tiling.grid.block_of(points)
 
         def answer(visit: Visit) -> TileShare:
-            # All that a tile is asked at once: it may not stay in memory.
+            # All points of a tile at once: it may not stay in memory.
             tile, at = self.tiles[visit.tile], points[visit.rows]
             own = owner[visit.rows] == visit.tile
             return TileShare(tile.field_and_gradient(at), own, tile.variance(at[own]))
@@ -201,7 +201,7 @@ class HarmonicMap:
         points
             In the map frame in metres, shape (N, 3).
         answers
-            Gives field, gradient and variance of points. It is asked about those near a reading
+            Gives field, gradient and variance of points. It is called for those near a reading
             alone: values at others would not be used.
         """
         points = checked_points(points)

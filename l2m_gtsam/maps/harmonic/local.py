@@ -18,9 +18,7 @@ LEAST_GAIN = 1.0  # information of the readings over that of the prior
 SCALES = ("floor_scale", "ceiling_scale")
 # Where scales rise far above those of the map, more waves become informative: choose them again.
 PASSES, RISE = 3, 0.7
-SMALL = (
-    0.1  # in the logarithm of a scale or depth: a fraction of its standard deviation from one tile
-)
+SMALL = 0.1  # in the logarithm of a scale or depth: a fraction of its sigma from one tile
 LONGEST = 1.5  # of a step in the logarithm of a scale or depth
 
 

@@ -73,6 +73,7 @@ class Modes:
         scale = getattr(hyperparameters, f"{self.side}_scale")
         h = getattr(hyperparameters, f"{self.side}_depth")
         k = np.abs(self.kz)
+        # In logarithms: exp(-2 k h) of the finest modes may underflow.
         log_variance = 2 * np.log(scale) + 3 * np.log(2 * h) - 2 * k * h - np.log(k)
         return WeightPrior(
             log_variance + self._log_share,
@@ -141,6 +142,7 @@ class Modes:
             np.cos(np.pi * place[:, None] / self.size[axis] * np.arange(most[axis]))
             for axis, place in ((0, x), (1, y))
         )
+        # Separable: one axis after the other instead of all modes at all nodes.
         along_y = (cos_y @ table).reshape(most[0], -1)
         return np.asarray((cos_x @ along_y).reshape(len(x), len(y), len(z)))
 
@@ -157,6 +159,7 @@ def half_waves(along_x: float, along_y: float, k_max: float) -> IntArray:
     highest = np.floor(k_max * size / np.pi).astype(np.int64)
     p, q = np.meshgrid(np.arange(highest[0] + 1), np.arange(highest[1] + 1), indexing="ij")
     k = np.pi * np.hypot(p / size[0], q / size[1])
+    # k = 0 is a constant potential, which has no field.
     chosen = (k <= k_max) & (k > 0)
     numbers = np.column_stack([p[chosen], q[chosen]])
     numbers.setflags(write=False)
@@ -179,5 +182,6 @@ def left_out(scale: float, depth: float, k_max: float, away: FloatArray) -> Floa
         more than -depth.
     """
     b = 2 * (depth + away)
+    # Spectrum of Bz, integrated by parts: k^2 exp(-k b) from k_max to infinity.
     tail = k_max**2 / b + 2 * k_max / b**2 + 2 / b**3
     return np.asarray(scale**2 * (2 * depth) ** 3 * np.exp(-k_max * b) * tail)

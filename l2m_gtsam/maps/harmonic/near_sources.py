@@ -118,7 +118,7 @@ def near_sources(
     sources
         K dipoles in the tile's frame, metres and uT m^3.
     lower, upper
-        Corners of the box in which they will be asked for, metres, shape (3,).
+        Corners of the box in which they will be evaluated, metres, shape (3,).
     radius
         At which the strongest source is split, in metres.
     """

@@ -1,4 +1,4 @@
-"""Where the compiled form of a tile is asked."""
+"""Where the compiled form of a tile is evaluated."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from l2m_gtsam.maps.harmonic.potential_grid import Box
 
 @dataclass(frozen=True)
 class Places:
-    """Where a tile is asked.
+    """Where a tile is evaluated.
 
     Attributes
     ----------

@@ -52,6 +52,7 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
     start = np.log([strength for _, strength in structures])
 
     def cost(x: FloatArray) -> tuple[float, FloatArray]:
+        # A prior variance goes with the square of the strength, hence the factors of two.
         result = evidence(alone, given + 2 * (x - start)[owner], noise)
         slope = np.bincount(owner, result.slopes().by_log_variance).astype(np.float64)
         return -result.value, -2 * slope
@@ -66,6 +67,7 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
         options={"maxiter": STEPS, "ftol": 1e-7},
     )
     determined = determined_weights(alone, given + 2 * (end.x - start)[owner], noise)
+    # Effective number of weights that the readings determine (MacKay 1992), by structure.
     count = np.bincount(owner, determined)
     return [
         float(np.exp(x)) if c >= LEAST_DETERMINED else 0.0

@@ -116,7 +116,7 @@ def candidate_sources(
     keep = near & (centres[:, 2] >= lowest - options.below)
     above = np.flatnonzero(near & (centres[:, 2] >= lowest))
     above = above[rises(centres[above], np.concatenate([centres, readings]), options.edge)]
-    keep = keep & stands(voxels, above)
+    keep = keep & is_standing(voxels, above)
     if np.count_nonzero(keep) > MOST_SOURCES:
         raise MapError(
             f"the structure cloud suggests {np.count_nonzero(keep)} sources within "
@@ -181,7 +181,7 @@ def rises(centres: FloatArray, seen: FloatArray, edge: float) -> BoolArray:
     return np.asarray(centres[:, 2] > lowest + 1.5 * edge)
 
 
-def stands(voxels: IntArray, above: IntArray) -> BoolArray:
+def is_standing(voxels: IntArray, above: IntArray) -> BoolArray:
     """Return which voxels share their column with one of those numbered ``above``, shape (K,)."""
     column = cells_of(voxels, 1.0)
     standing = np.zeros(len(voxels), dtype=bool)  # by column; there are no more than voxels

@@ -66,7 +66,7 @@ class Tile:
 
     @cached_property
     def walls(self) -> tuple[FloatArray, FloatArray]:
-        """Lowest and highest coordinates in the tile's frame where it is asked, metres, (3,)."""
+        """Lowest and highest coordinates of evaluation in the tile's frame, metres, (3,)."""
         frame, h = self.basis.frame, self.hyperparameters
         low = np.array([0.0, 0.0, -NEAREST * h.floor_depth])
         return low, np.append(frame.size, frame.height + NEAREST * h.ceiling_depth)
