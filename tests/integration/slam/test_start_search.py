@@ -166,9 +166,9 @@ def test_a_longer_window_decides() -> None:
     assert away(grown, lost[1].truth.p[0])[0] < 0.2
 
 
-def test_a_map_that_does_not_tell_its_places_is_refused() -> None:
+def test_a_map_without_a_survey_is_refused() -> None:
     sensors, drive = lost_drive(dipole_world(1), 1, seconds=3)
-    with pytest.raises(MapError, match="does not tell where it has data"):
+    with pytest.raises(MapError, match="does not state where it has data"):
         localise(drive.recording, dipole_world(1), calibrated(sensors), searching(), silent)
 
 
