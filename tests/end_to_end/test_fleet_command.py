@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -81,17 +82,19 @@ def table(out: Path) -> list[dict[str, str]]:
 def test_every_bag_is_a_row(run: Run) -> None:
     rows = table(run.out)
     assert [(row["vehicle"], row["bag"], row["verdict"]) for row in rows] == [
-        ("truck_1", "day_0.bag", "pass"),
-        ("truck_1", "day_9.mcap", "pass"),
+        ("truck_1", "day_0.bag", "warn"),
+        ("truck_1", "day_9.mcap", "warn"),
         ("truck_2", HOSTILE, "error"),
         ("truck_2", "day_1.bag", "error"),
-        ("truck_2", "day_0.bag", "pass"),
+        ("truck_2", "day_0.bag", "warn"),
     ]
     assert [row["date"] for row in rows[:2]] == ["2023-11-14T22:13:20Z", "2023-11-23T22:13:20Z"]
     for row in rows:
         if row["verdict"] == "error":
             assert "not a readable bag" in row["reason"]
         else:
+            # A sliding GP counts errors of readings in one place as independent: drives find out.
+            assert "Parts of the drive disagree" in row["reason"]
             # where the vehicle carries it, to five of its sigmas
             assert abs(float(row["t_x_m"]) - 0.2) < 5 * float(row["t_x_sigma_m"])
     parquet = pq.read_table(run.out / "fleet.parquet").to_pylist()
@@ -100,7 +103,9 @@ def test_every_bag_is_a_row(run: Run) -> None:
 
 def test_one_line_sums_up_and_failures_are_named(run: Run) -> None:
     lines = run.said.out.splitlines()
-    assert lines[0].startswith("5 drives of 2 vehicles: 3 calibrated, 2 not; sensors: 3 pass")
+    assert lines[0].startswith(
+        "5 drives of 2 vehicles: 3 calibrated, 2 not; sensors: 0 pass, 3 warn"
+    )
     assert sum(line.startswith("not calibrated: truck_2, ") for line in lines) == 2
     assert lines[-1].startswith("written: ")
 
@@ -114,12 +119,26 @@ def test_the_page_links_to_reports_that_are_there(run: Run) -> None:
     assert "&lt;img src=x" in page
 
 
+NUMBER = re.compile(r"(?<![\w#])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
+
+
 def test_a_drive_has_what_calibrate_writes(run: Run, tmp_path: Path) -> None:
     bag = run.bags / "truck_1" / "day_0.bag"
     l2m("calibrate", bag, "--map", run.place.map, "--config", run.place.config, "--out", tmp_path)
     assert {each.name for each in tmp_path.iterdir()} == set(RESULTS)
     for name in RESULTS:
-        assert (run.out / "truck_1/day_0" / name).read_bytes() == (tmp_path / name).read_bytes()
+        ours, own = ((folder / name) for folder in (run.out / "truck_1/day_0", tmp_path))
+        if ours.suffix == ".png":
+            assert ours.stat().st_size > 10_000
+            continue
+        assert NUMBER.sub("#", ours.read_text()) == NUMBER.sub("#", own.read_text())
+        # Another process, another memory: BLAS kernels round by the alignment of their arrays, and
+        # t differs by 1e-11 m on some machines. Pictures in pages have coordinates of a few digits.
+        if ours.suffix != ".html":
+            found, wanted = (
+                np.array(NUMBER.findall(each.read_text()), dtype=np.float64) for each in (ours, own)
+            )
+            np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-8)
 
 
 Spoil = Callable[[Run], None]
