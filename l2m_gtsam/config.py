@@ -1,5 +1,6 @@
 """One configuration composed of the options beside each algorithm, read from YAML."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar, get_origin
 
@@ -80,6 +81,42 @@ def with_uncertainty(config: Config, name: str | None) -> Config:
     solve = config.calibration.solve.model_copy(update={"uncertainty": Uncertainty(name)})
     calibration = config.calibration.model_copy(update={"solve": solve})
     return config.model_copy(update={"calibration": calibration})
+
+
+def with_poses(
+    config: Config, logs: Sequence[Path], poses: Sequence[Path], times: Path | None = None
+) -> Config:
+    """Return the configuration with the poses of drives in files; as it is where none is given.
+
+    Parameters
+    ----------
+    config
+        The configuration.
+    logs
+        The drives.
+    poses
+        A file for each of them, in their order.
+    times
+        Times of KITTI's poses.
+
+    Raises
+    ------
+    ConfigError
+        There are not as many files as drives, or times without poses.
+    """
+    if not poses:
+        if times is not None:
+            raise ConfigError("--pose-times: goes with --poses, a file of KITTI")
+        return config
+    if len(poses) != len(logs):
+        raise ConfigError(
+            f"--poses: {len(poses)} files for {len(logs)} drives; give one for each, in their order"
+        )
+    paths = {str(log): path for log, path in zip(logs, poses, strict=True)}
+    given = {"paths": paths, "path": None} | ({} if times is None else {"times": times})
+    pose_file = config.bag.pose_file.model_copy(update=given)
+    bag = config.bag.model_copy(update={"pose_file": pose_file})
+    return config.model_copy(update={"bag": bag})
 
 
 def _explain(path: Path, error: ValidationError, model: type[BaseModel]) -> str:

@@ -166,7 +166,7 @@ def plan_bag(
         Whatever is wrong with the input, in one line.
     """
     saved, calibration = SavedMap.read(map_path), config.calibration
-    if at or not has_fields(bag):
+    if at or not has_fields(bag, config.bag):
         names = {_named(place): place for place in at or [(0.0, 0.0, 0.0)]}
         trajectory, source = read_trajectory(bag, config.bag), source_file(bag)
         recording = assumed_recording(trajectory, source, tuple(names), config.plan.rate_hz)

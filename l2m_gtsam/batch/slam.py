@@ -39,13 +39,9 @@ from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.files import atomic_path, source_file
 from l2m_gtsam.storage.point_cloud2 import has_clouds
+from l2m_gtsam.storage.pose_files import read_tum
 from l2m_gtsam.storage.record_files import write_slam
-from l2m_gtsam.storage.trajectory_files import (
-    LocalisedMotion,
-    read_tum,
-    write_trajectory_bag,
-    write_tum,
-)
+from l2m_gtsam.storage.trajectory_files import LocalisedMotion, write_trajectory_bag, write_tum
 
 # Along what a scan does not show a fix says nothing, nor do some hundreds of them; more than this
 # beside the millimetres of what it shows would drown in rounding.

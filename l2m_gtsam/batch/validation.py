@@ -10,7 +10,7 @@ from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, saved_
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.calibration.calibrate import VERSIONED
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.config import Config, load_config
+from l2m_gtsam.config import Config, load_config, with_poses
 from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.progress import Progress
@@ -25,7 +25,7 @@ from l2m_gtsam.records.validation import (
     NamedSource,
     Validation,
 )
-from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import atomic_path, source_file
 from l2m_gtsam.storage.record_files import write_validation
@@ -52,6 +52,8 @@ class ValidationRequest:
         Configuration; what the calibration was computed with if absent.
     out
         Folder for `validation.json` and `validation.html`; nothing is written without.
+    poses, pose_times
+        File with the poses of the drive, if they are not in it, and KITTI's times.
     """
 
     calibration: Path
@@ -60,6 +62,8 @@ class ValidationRequest:
     compare: Path | None = None
     config: Path | None = None
     out: Path | None = None
+    poses: tuple[Path, ...] = ()
+    pose_times: Path | None = None
 
 
 def validate_calibration(asked: ValidationRequest, progress: Progress) -> Validation:
@@ -79,7 +83,8 @@ def validate_calibration(asked: ValidationRequest, progress: Progress) -> Valida
     """
     _check_request(asked)
     new = read_sound_calibration(asked.calibration)
-    config = _config(asked, new)
+    drives = [] if asked.bag is None else [asked.bag]
+    config = with_poses(_config(asked, new), drives, asked.poses, asked.pose_times)
     sources = [_source("calibration", asked.calibration)]
     drive, comparison = None, None
     if asked.compare is not None:
@@ -160,8 +165,11 @@ def _config(asked: ValidationRequest, new: CalibrationResult) -> Config:
     if asked.config is not None:
         return load_config(asked.config)
     path, options = asked.calibration, new.options
+    bag = saved_options(path, options, BagOptions, "bag")
+    # Poses in a file are those of the old drive.
+    bag = bag.model_copy(update={"pose_file": PoseFileOptions()})
     return Config(
-        bag=saved_options(path, options, BagOptions, "bag"),
+        bag=bag,
         calibration=saved_options(path, options, CalibrationOptions, "calibration"),
         qa=saved_options(path, options, QaOptions, "qa"),
     )

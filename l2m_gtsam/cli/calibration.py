@@ -10,6 +10,8 @@ from l2m_gtsam.cli.terminal import (
     ConfigOption,
     MapOption,
     OutOption,
+    PosesOption,
+    PoseTimesOption,
     SchedulerOption,
     WorkersOption,
     print_table,
@@ -22,18 +24,28 @@ if TYPE_CHECKING:
     from l2m_gtsam.records.calibration import CalibrationResult
 
 
-def inspect(bag: BagArgument, config: ConfigOption = None) -> None:
-    """Say what is in a bag and what would be used of it, and why."""
+def inspect(
+    bag: BagArgument,
+    config: ConfigOption = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
+) -> None:
+    """Say what is in a log and what would be used of it, and why; exit code 1 if nothing can be."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import inspect_file
         from l2m_gtsam.cli.tables.drives import bag_table
-        from l2m_gtsam.config import load_config
+        from l2m_gtsam.config import load_config, with_poses
 
-        report = inspect_file(bag, load_config(config), progress)
+        chosen = with_poses(load_config(config), [bag], poses or (), times)
+        report = inspect_file(bag, chosen, progress)
     print_table(bag_table(report))
+    for note in report.notes:
+        typer.echo(note)
     for obstacle in report.obstacles:
         typer.echo(f"cannot be calibrated as it is: {obstacle}")
     typer.echo("clock: record time less header stamp, median; |B|: lowest - median - highest")
+    if report.obstacles:
+        raise typer.Exit(1)
 
 
 def plan(
@@ -48,6 +60,8 @@ def plan(
             "the bag; may be repeated.",
         ),
     ] = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Say what a drive will determine, how well, and which extra motion would help most.
 
@@ -62,10 +76,11 @@ def plan(
             motion_table,
             plan_table,
         )
-        from l2m_gtsam.config import load_config
+        from l2m_gtsam.config import load_config, with_poses
         from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
-        chosen, places = load_config(config), [_place(text) for text in at or []]
+        chosen = with_poses(load_config(config), [bag], poses or (), times)
+        places = [_place(text) for text in at or []]
         found = plan_bag(bag, map_path, chosen, places, progress)
     print_table(plan_table(found))
     if held := held_plan_note(found):
@@ -100,14 +115,16 @@ def calibrate(
         list[Path] | None,
         typer.Argument(
             metavar="BAG...",
-            help="ROS1 .bag, ROS2 folder, .db3 or .mcap; several of one vehicle are calibrated "
-            "together and compared.",
+            help="ROS1 .bag, ROS2 folder, .db3, .mcap, .csv or .ulg; several of one vehicle are "
+            "calibrated together and compared.",
         ),
     ] = None,
     more: Annotated[
         list[Path] | None, typer.Option("--bag", metavar="BAG", help="The same; may be repeated.")
     ] = None,
     config: ConfigOption = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
     uncertainty: Annotated[
         str | None,
         typer.Option(
@@ -133,10 +150,11 @@ def calibrate(
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
         from l2m_gtsam.batch.reports import REPORT_FILE, report_calibration
-        from l2m_gtsam.config import load_config, with_uncertainty
+        from l2m_gtsam.config import load_config, with_poses, with_uncertainty
 
-        chosen = with_uncertainty(load_config(config), uncertainty)
         drives = [*(bags or ()), *(more or ())]
+        chosen = with_poses(load_config(config), drives, poses or (), times)
+        chosen = with_uncertainty(chosen, uncertainty)
         found = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
         verdict = report_calibration(out, found, chosen.qa, progress)
     _print_calibration(found.result, models)

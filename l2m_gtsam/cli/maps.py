@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from l2m_gtsam.cli.terminal import ConfigOption, print_table, shown_progress, warn
+from l2m_gtsam.cli.terminal import (
+    ConfigOption,
+    PosesOption,
+    PoseTimesOption,
+    print_table,
+    shown_progress,
+    warn,
+)
 
 map_app = typer.Typer(
     help="Build, update, compare, describe and draw magnetic maps; calibrate a mapping suite.",
@@ -53,6 +60,8 @@ def suite(
             help="What is known of the sensors; ideal ones at the lidar's origin if not given.",
         ),
     ] = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Calibrate a mapping suite from its own drive, before there is any map.
 
@@ -62,9 +71,10 @@ def suite(
     with shown_progress() as progress:
         from l2m_gtsam.batch.survey import calibrate_suite_file
         from l2m_gtsam.cli.tables.calibration import calibration_table
-        from l2m_gtsam.config import load_config
+        from l2m_gtsam.config import load_config, with_poses
 
-        found = calibrate_suite_file(bags, out, load_config(config), known, progress)
+        chosen = with_poses(load_config(config), bags, poses or (), times)
+        found = calibrate_suite_file(bags, out, chosen, known, progress)
     print_table(calibration_table(found))
     warn(found.doubts)
     typer.echo(f"written: {out}")
@@ -86,15 +96,18 @@ def map_build(
         ),
     ] = False,
     tiles: TilesOption = True,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Build a map from one or several bags of a calibrated mapping suite."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import make_tiles
         from l2m_gtsam.batch.maps import build_map_file
         from l2m_gtsam.cli.tables.maps import map_table
-        from l2m_gtsam.config import load_config
+        from l2m_gtsam.config import load_config, with_poses
 
-        built = build_map_file(bags, out, load_config(config), suite, progress, structure, lidar)
+        chosen = with_poses(load_config(config), bags, poses or (), times)
+        built = build_map_file(bags, out, chosen, suite, progress, structure, lidar)
         if tiles:
             make_tiles(built.field_map, out, progress)
     print_table(map_table(built.description))
@@ -110,6 +123,8 @@ def map_update(
     config: ConfigOption = None,
     suite: SuiteOption = None,
     tiles: TilesOption = True,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Add bags to a map, which keeps its kind, its options and the prior of the whole map.
 
@@ -119,9 +134,10 @@ def map_update(
         from l2m_gtsam.batch.files import make_tiles
         from l2m_gtsam.batch.maps import update_map_file
         from l2m_gtsam.cli.tables.maps import map_table
-        from l2m_gtsam.config import load_config
+        from l2m_gtsam.config import load_config, with_poses
 
-        updated = update_map_file(map_path, bags, out, load_config(config), suite, progress)
+        chosen = with_poses(load_config(config), bags, poses or (), times)
+        updated = update_map_file(map_path, bags, out, chosen, suite, progress)
         if tiles:
             make_tiles(updated.field_map, out, progress)
     print_table(map_table(updated.description))
@@ -135,14 +151,17 @@ def map_compare(
     config: ConfigOption = None,
     suite: SuiteOption = None,
     structure: StructureOption = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Say which kind of map predicts places best that it has not seen."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.maps import compare_map_kinds
         from l2m_gtsam.cli.tables.maps import comparison_table
-        from l2m_gtsam.config import load_config
+        from l2m_gtsam.config import load_config, with_poses
 
-        comparison = compare_map_kinds(bags, load_config(config), suite, structure, progress)
+        chosen = with_poses(load_config(config), bags, poses or (), times)
+        comparison = compare_map_kinds(bags, chosen, suite, structure, progress)
     print_table(comparison_table(comparison))
 
 

@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from l2m_gtsam.cli.terminal import CalibrationOption, print_table, shown_progress, warn
+from l2m_gtsam.cli.terminal import (
+    CalibrationOption,
+    PosesOption,
+    PoseTimesOption,
+    print_table,
+    shown_progress,
+    warn,
+)
 from l2m_gtsam.errors import ConfigError
 
 LidarFrameOption = Annotated[
@@ -59,6 +66,8 @@ def validate(
         Path | None,
         typer.Option("--out", help="Folder for validation.json and validation.html."),
     ] = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Say whether a calibration still holds: on another drive and map, or beside an older one.
 
@@ -74,7 +83,9 @@ def validate(
         from l2m_gtsam.cli.tables.validation import change_table, validation_table
         from l2m_gtsam.records.verdict import Level
 
-        asked = ValidationRequest(calibration, bag, map_path, compare, config, out)
+        asked = ValidationRequest(
+            calibration, bag, map_path, compare, config, out, tuple(poses or ()), times
+        )
         found = validate_calibration(asked, progress)
     if found.drive is not None:
         print_table(validation_table(found.drive, found.verdict))

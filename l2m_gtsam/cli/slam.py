@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from l2m_gtsam.cli.terminal import CalibrationOption, OutOption, print_table, shown_progress
+from l2m_gtsam.cli.terminal import (
+    CalibrationOption,
+    OutOption,
+    PosesOption,
+    PoseTimesOption,
+    print_table,
+    shown_progress,
+)
 
 
 def slam(
@@ -26,6 +33,8 @@ def slam(
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML configuration; see `slam` in it.")
     ] = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
     with shown_progress() as progress:
@@ -37,10 +46,11 @@ def slam(
             start_lines,
             truth_lines,
         )
-        from l2m_gtsam.config import load_config
+        from l2m_gtsam.config import load_config, with_poses
 
+        chosen = with_poses(load_config(config), [bag], poses or (), times)
         given = SlamInput(bag, map_path, calibration, truth)
-        done = slam_bag(given, load_config(config), out, progress)
+        done = slam_bag(given, chosen, out, progress)
     print_table(slam_table(done.result))
     lines = (
         *start_lines(done.result.start),

@@ -17,7 +17,19 @@ STARTING = "starting"
 ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
 
 BagArgument = Annotated[
-    Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3 or .mcap.")
+    Path, typer.Argument(metavar="BAG", help="ROS1 .bag, ROS2 folder, .db3, .mcap, .csv or .ulg.")
+]
+PosesOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--poses",
+        metavar="FILE",
+        help="Poses in a file of their own: TUM, KITTI or .csv; one for each log, in their order.",
+    ),
+]
+PoseTimesOption = Annotated[
+    Path | None,
+    typer.Option("--pose-times", metavar="FILE", help="Times of KITTI's poses in seconds."),
 ]
 MapOption = Annotated[Path, typer.Option("--map", help="Map file made by `l2m map build`.")]
 ConfigOption = Annotated[

@@ -11,27 +11,27 @@ from l2m_gtsam.data import FieldSeries, Recording, Trajectory
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.geometry import moved
 from l2m_gtsam.progress import Count
-from l2m_gtsam.storage.bag_options import (
-    MICROTESLA_PER,
-    BagOptions,
-    Stamps,
-    TfChain,
-    fault,
-    is_turning,
-    strength,
-)
+from l2m_gtsam.storage.bag_options import BagOptions, Stamps, TfChain
 from l2m_gtsam.storage.clocks import check_clocks, check_stamps, clock_notes
+from l2m_gtsam.storage.field_types import FieldSource, is_field
 from l2m_gtsam.storage.files import source_file
+from l2m_gtsam.storage.log import Log, Message
 from l2m_gtsam.storage.messages import (
-    FIELD_TYPE,
+    ALL_POSE_TYPES,
+    PATH_TYPE,
     POSE_TYPES,
     TF_TYPES,
     FieldBuffer,
     PoseBuffer,
     StampBuffer,
+    frame_of,
     header_ns,
+    stamp_of,
 )
-from l2m_gtsam.storage.open_bag import Bag, Message, open_bag
+from l2m_gtsam.storage.open_bag import Bag
+from l2m_gtsam.storage.open_log import open_log
+from l2m_gtsam.storage.path_topic import path_trajectory
+from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import (
     select_fields,
     select_poses,
@@ -39,6 +39,7 @@ from l2m_gtsam.storage.selection import (
     several_frames,
 )
 from l2m_gtsam.storage.tf import Link, ancestors, compose
+from l2m_gtsam.storage.units import field_fault, microtesla_per
 
 
 @dataclass
@@ -75,14 +76,20 @@ def read_recording(path: Path, options: BagOptions, progress: Count | None = Non
     UnitsError
         A field's strength does not fit its unit.
     """
-    with open_bag(path) as bag:
+    apart = options.pose_file.of(path)
+    with open_log(path, options.columns) as bag:
         fields = select_fields(bag, options)
-        poses = select_poses(bag, options)
-        buffers = _read(bag, [*fields, *poses], options, progress)
+        poses = [] if apart is not None else select_poses(bag, options)
+        buffers = _read(bag, fields, poses, options, progress)
+        paths = _path_poses(bag, poses, progress)
     series = _all_series(path, buffers, fields, options)
-    trajectory = _trajectory(path, buffers, options)
+    trajectory = _trajectory(path, buffers, options, paths)
     check_clocks(path, trajectory, series)
-    return Recording(trajectory, series, source_file(path), notes=_clocks(path, buffers, options))
+    notes = _clocks(path, buffers, options)
+    if apart is not None:
+        found = source_file(apart)
+        notes = (*notes, f"{path}: poses are those of {apart} (sha256 {found.sha256})")
+    return Recording(trajectory, series, source_file(path), notes=notes)
 
 
 def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:
@@ -95,13 +102,13 @@ def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:
     UnitsError
         A field's strength does not fit its unit.
     """
-    with open_bag(path) as bag:
+    with open_log(path, options.columns) as bag:
         fields = select_fields(bag, options)
-        buffers = _read(bag, fields, options, None)
+        buffers = _read(bag, fields, [], options, None)
     return _all_series(path, buffers, fields, options)
 
 
-def has_fields(path: Path) -> bool:
+def has_fields(path: Path, options: BagOptions) -> bool:
     """Return whether a bag has any topic of a magnetometer.
 
     Raises
@@ -109,8 +116,8 @@ def has_fields(path: Path) -> bool:
     BagError
         The bag cannot be opened.
     """
-    with open_bag(path) as bag:
-        return any(connection.msgtype == FIELD_TYPE for connection in bag.connections)
+    with open_log(path, options.columns) as bag:
+        return any(is_field(connection) for connection in bag.connections)
 
 
 def has_poses(path: Path, options: BagOptions) -> bool:
@@ -121,10 +128,11 @@ def has_poses(path: Path, options: BagOptions) -> bool:
     BagError
         The bag cannot be opened.
     """
-    if options.poses is not None or options.tf is not None:
+    named = options.poses is not None or options.tf is not None
+    if named or options.pose_file.of(path) is not None:
         return True
-    with open_bag(path) as bag:
-        return any(connection.msgtype in POSE_TYPES for connection in bag.connections)
+    with open_log(path, options.columns) as bag:
+        return any(connection.msgtype in ALL_POSE_TYPES for connection in bag.connections)
 
 
 def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
@@ -135,19 +143,33 @@ def read_trajectory(path: Path, options: BagOptions) -> Trajectory:
     BagError
         The bag has no usable poses.
     """
-    with open_bag(path) as bag:
-        buffers = _read(bag, select_poses(bag, options), options, None)
-    return _trajectory(path, buffers, options)
+    if options.pose_file.of(path) is not None:
+        return _trajectory(path, Buffers(), options)
+    with open_log(path, options.columns) as bag:
+        poses = select_poses(bag, options)
+        buffers = _read(bag, [], poses, options, None)
+        paths = _path_poses(bag, poses, None)
+    return _trajectory(path, buffers, options, paths)
 
 
 def _read(
-    bag: Bag, connections: list[Connection], options: BagOptions, progress: Count | None
+    bag: Log,
+    fields: list[FieldSource],
+    poses: list[Connection],
+    options: BagOptions,
+    progress: Count | None,
 ) -> Buffers:
     """Make one pass over the bag."""
     buffers = Buffers()
-    for message in bag.messages(connections, progress):
-        if message.connection.msgtype == FIELD_TYPE:
-            _add_field(buffers, message, options)
+    sources: dict[int, list[FieldSource]] = {}
+    for source in fields:
+        sources.setdefault(source.connection.id, []).append(source)
+    single = [c for c in poses if c.msgtype != PATH_TYPE and c.id not in sources]
+    wanted = {c.id: c for c in (*(f.connection for f in fields), *single)}
+    for message in bag.messages(list(wanted.values()), progress):
+        if message.connection.id in sources:
+            for source in sources[message.connection.id]:
+                _add_field(bag.path, buffers, message, source, options)
         elif message.connection.msgtype in TF_TYPES:
             _add_transforms(buffers, message, options)
         else:
@@ -155,25 +177,39 @@ def _read(
     return buffers
 
 
-def _add_field(buffers: Buffers, message: Message, options: BagOptions) -> None:
-    content, topic = message.content, message.connection.topic
-    frame = content.header.frame_id
-    if (topic, frame) not in buffers.fields:
-        buffers.fields[topic, frame] = FieldBuffer(topic, frame)
-    buffers.field_times.setdefault(topic, StampBuffer()).add(header_ns(content), message.record_ns)
-    buffer = buffers.fields[topic, frame]
-    buffer.add(_stamp(message, content, options), content.magnetic_field)
+def _path_poses(bag: Log, poses: list[Connection], progress: Count | None) -> Trajectory | None:
+    """Return the poses of a topic with paths, if the poses come from one."""
+    paths = [c for c in poses if c.msgtype == PATH_TYPE]
+    return path_trajectory(bag, paths, progress) if paths and isinstance(bag, Bag) else None
+
+
+def _add_field(
+    path: Path, buffers: Buffers, message: Message, source: FieldSource, options: BagOptions
+) -> None:
+    content, label, frame = message.content, source.label, frame_of(message.content)
+    if (label, frame) not in buffers.fields:
+        buffers.fields[label, frame] = FieldBuffer(label, frame, source.unit)
+    times = buffers.field_times.setdefault(label, StampBuffer())
+    times.add(stamp_of(content, message.record_ns), message.record_ns)
+    try:
+        reading = source.reading(content)
+    except ValueError as error:
+        raise BagError(
+            f"{path}: {source.connection.msgtype} on {source.connection.topic} {error}"
+        ) from error
+    buffers.fields[label, frame].add(message.stamp_ns(options.stamps), reading)
 
 
 def _add_pose(buffers: Buffers, message: Message, options: BagOptions) -> None:
     content = message.content
     pose = POSE_TYPES[message.connection.msgtype](content)
-    ends = content.header.frame_id, pose.child_frame or "lidar"
+    frame = frame_of(content) if hasattr(content, "header") else "map"
+    ends = frame, pose.child_frame or "lidar"
     if ends not in buffers.poses:
         buffers.poses[ends] = PoseBuffer(*ends)
-    buffers.pose_times.setdefault(ends, StampBuffer()).add(header_ns(content), message.record_ns)
-    buffer = buffers.poses[ends]
-    stamp = _stamp(message, content, options)
+    times = buffers.pose_times.setdefault(ends, StampBuffer())
+    times.add(stamp_of(content, message.record_ns), message.record_ns)
+    buffer, stamp = buffers.poses[ends], message.stamp_ns(options.stamps)
     buffer.add(stamp, pose.position, pose.orientation, pose.covariance)
 
 
@@ -204,10 +240,18 @@ def _stamp(message: Message, stamped: object, options: BagOptions) -> int:
     return message.record_ns if options.stamps is Stamps.RECORD else header_ns(stamped)
 
 
-def _trajectory(path: Path, buffers: Buffers, options: BagOptions) -> Trajectory:
-    """Return the poses of the lidar."""
+def _trajectory(
+    path: Path, buffers: Buffers, options: BagOptions, paths: Trajectory | None = None
+) -> Trajectory:
+    """Return the poses of the lidar: from a file, from paths, from tf or from single poses."""
+    apart = options.pose_file.of(path)
     try:
-        tracked = _composed(path, buffers, options.tf) if options.tf else _single(path, buffers)
+        if apart is not None:
+            tracked = read_poses(apart, options.pose_file)
+        elif paths is not None:
+            tracked = paths
+        else:
+            tracked = _composed(path, buffers, options.tf) if options.tf else _single(path, buffers)
     except ValueError as error:
         raise BagError(f"{path}: poses: {error}") from error
     check_stamps(path, "poses", tracked.stamp_ns)
@@ -261,11 +305,11 @@ def _needed(buffers: Buffers, chain: TfChain) -> set[str]:
 
 
 def _all_series(
-    path: Path, buffers: Buffers, fields: list[Connection], options: BagOptions
+    path: Path, buffers: Buffers, fields: list[FieldSource], options: BagOptions
 ) -> tuple[FieldSeries, ...]:
     """Return every sensor's readings, in order of name; also of topics without messages."""
     received = {topic for topic, _ in buffers.fields}
-    empty = {(c.topic, ""): FieldBuffer(c.topic, "") for c in fields if c.topic not in received}
+    empty = {(s.label, ""): FieldBuffer(s.label, "") for s in fields if s.label not in received}
     found = {**buffers.fields, **empty}
     if not options.split_by_frame:
         _check_frames(path, list(found))
@@ -290,8 +334,9 @@ def _check_frames(path: Path, keys: list[tuple[str, str]]) -> None:
 def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> FieldSeries:
     """Return one sensor's readings in uT, in order of time."""
     order = np.argsort(buffer.stamps(), kind="stable")
-    stamps, values = buffer.stamps()[order], buffer.field()[order] * MICROTESLA_PER[options.units]
+    stamps, written = buffer.stamps()[order], buffer.field()[order]
     check_stamps(path, f"topic {buffer.topic}", stamps)
-    if wrong := fault(strength(values), is_turning(values), options.units):
+    if wrong := field_fault(written, options.units, buffer.unit):
         raise UnitsError(f"{path}: topic {buffer.topic}: {wrong}")
+    values = written * microtesla_per(options.units, buffer.unit)
     return FieldSeries(name, buffer.topic, buffer.frame, stamps, values)

@@ -12,17 +12,12 @@ from l2m_gtsam.data import CorrectedField, FloatArray, IntArray
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_copy import BagCopy
-from l2m_gtsam.storage.bag_options import (
-    MICROTESLA_PER,
-    BagOptions,
-    Stamps,
-    fault,
-    is_turning,
-    strength,
-)
-from l2m_gtsam.storage.messages import FIELD_TYPE, FieldBuffer, header_ns
+from l2m_gtsam.storage.bag_options import BagOptions, Stamps
+from l2m_gtsam.storage.field_types import FIELD_TYPE
+from l2m_gtsam.storage.messages import FieldBuffer, header_ns
 from l2m_gtsam.storage.open_bag import Bag, Codec, RawMessage
 from l2m_gtsam.storage.selection import select_fields, sensor_names, several_frames
+from l2m_gtsam.storage.units import Unit, field_fault, microtesla_per
 
 Correct = Callable[[FloatArray, IntArray], CorrectedField]
 """What corrects readings in microtesla, shape (N, 3), of times in nanoseconds, shape (N,)."""
@@ -49,7 +44,7 @@ class SensorTopic:
     topic
         Of the corrected readings.
     sample
-        Its first readings in microtesla, shape (N, 3).
+        Its first readings as they are written, shape (N, 3).
     """
 
     sensor: str
@@ -66,27 +61,34 @@ def sensor_topics(bag: Bag, options: BagOptions, progress: Count | None) -> dict
         No such topic, or one of several sensors that cannot be distinguished.
     """
     buffers: dict[Key, FieldBuffer] = {}
-    for message in bag.messages(select_fields(bag, options), progress):
+    connections = [source.connection for source in select_fields(bag, options)]
+    if other := [c for c in connections if c.msgtype != FIELD_TYPE]:
+        raise BagError(
+            f"{bag.path}: topic {other[0].topic} is of type {other[0].msgtype}; corrected readings "
+            f"are written beside {FIELD_TYPE} only; `l2m export --format json` has C and H"
+        )
+    for message in bag.messages(connections, progress):
         key = (message.connection.topic, message.content.header.frame_id)
         buffer = buffers.setdefault(key, FieldBuffer(*key))
         if len(buffer.stamp_ns) < MOST_JUDGED:
-            buffer.add(message.record_ns, message.content.magnetic_field)
+            vector = message.content.magnetic_field
+            buffer.add(message.record_ns, (vector.x, vector.y, vector.z))
     frames: dict[str, list[str]] = defaultdict(list)
     for topic, frame in buffers:
         frames[topic].append(frame)
     for topic, several in frames.items():
         if len(several) > 1 and not options.split_by_frame:
             raise BagError(f"{bag.path}: {several_frames(topic, several)}")
-    names, unit = sensor_names(buffers, options), MICROTESLA_PER[options.units]
+    names = sensor_names(buffers, options)
     return {
-        key: SensorTopic(names[key], _topic(key, frames), buffer.field() * unit)
+        key: SensorTopic(names[key], _topic(key, frames), buffer.field())
         for key, buffer in buffers.items()
     }
 
 
 def check_units(bag: Bag, key: Key, found: SensorTopic, options: BagOptions) -> None:
     """Raise a UnitsError if a sensor's readings are not in the unit that they are said to be in."""
-    if wrong := fault(strength(found.sample), is_turning(found.sample), options.units):
+    if wrong := field_fault(found.sample, options.units, Unit.TESLA):
         raise UnitsError(f"{bag.path}: topic {key[0]}: {wrong}")
 
 
@@ -176,7 +178,7 @@ class Calibrator:
                 key = (message.connection.topic, contents[row].header.frame_id)
                 rows[key].append(row)
         found: dict[int, tuple[str, bytes]] = {}
-        unit = MICROTESLA_PER[self.options.units]
+        unit = microtesla_per(self.options.units, Unit.TESLA)
         for key, new in self.topics.items():
             stamps = [self._stamp(block[row], contents[row]) for row in rows[key]]
             field_ut = unit * _readings([contents[row] for row in rows[key]])

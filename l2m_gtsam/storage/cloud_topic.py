@@ -15,8 +15,9 @@ from l2m_gtsam.progress import Count
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.cloud import VoxelMeans, located
+from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.messages import header_ns
-from l2m_gtsam.storage.open_bag import Message, open_bag
+from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.point_cloud2 import cloud_connections, points_of, times_of
 from l2m_gtsam.storage.point_table import MAX_POINTS
 from l2m_gtsam.storage.tf import Link

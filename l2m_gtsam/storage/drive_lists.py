@@ -20,7 +20,7 @@ from l2m_gtsam.errors import BagError, ConfigError
 from l2m_gtsam.options import Options
 from l2m_gtsam.storage.yaml_file import read_yaml
 
-FILES = (".bag", ".mcap", ".db3")
+FILES = (".bag", ".mcap", ".db3", ".ulg")
 ROS2_HEADER = "metadata.yaml"
 
 
@@ -130,7 +130,7 @@ class ManifestEntry(Options):
     model_config = ConfigDict(coerce_numbers_to_str=True)
 
     bag: Path
-    """ROS1 .bag, ROS2 folder, .db3 or .mcap."""
+    """ROS1 .bag, ROS2 folder, .db3, .mcap, .csv or .ulg."""
     vehicle: str = Field(min_length=1, max_length=200)
     """Name or number of the vehicle."""
     map: Path | None = None

@@ -8,10 +8,39 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TextIO
 
 from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import L2MError, OutputError
+
+MAX_TEXT_BYTES = 500_000_000  # a day of poses at 50 Hz
+
+
+@contextmanager
+def open_text(path: Path, error: type[L2MError], most: int = MAX_TEXT_BYTES) -> Iterator[TextIO]:
+    """Open a text of others for reading, line by line.
+
+    Parameters
+    ----------
+    path
+        A regular file in UTF-8.
+    error
+        What to raise, with one line that names the file, if it cannot be read.
+    most
+        Bytes that are accepted.
+    """
+    try:
+        if not path.is_file():
+            kind = "not a regular file" if path.exists() else "no such file"
+            raise error(f"{path}: {kind}")
+        if path.stat().st_size > most:
+            raise error(f"{path}: larger than {most // 1_000_000} MB; give a shorter one")
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            yield file
+    except UnicodeDecodeError as reason:
+        raise error(f"{path}: cannot be read: it is no text") from reason
+    except OSError as reason:
+        raise error(f"{path}: cannot be read: {reason.strerror or reason}") from reason
 
 
 @contextmanager

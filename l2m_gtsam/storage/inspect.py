@@ -1,5 +1,6 @@
 """Say what is in a bag, and what would be used of it and why."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,28 +11,41 @@ from rosbags.interfaces import Connection
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.progress import Count
-from l2m_gtsam.storage.bag_options import (
-    MICROTESLA_PER,
-    BagOptions,
-    Stamps,
-    Strength,
-    fault,
-    is_turning,
-    strength,
+from l2m_gtsam.storage.bag_options import BagOptions, Stamps
+from l2m_gtsam.storage.field_types import (
+    FIELD_TYPES,
+    VECTOR_TYPE,
+    FieldSource,
+    field_source,
+    is_field,
 )
+from l2m_gtsam.storage.log import Log
 from l2m_gtsam.storage.messages import (
-    FIELD_TYPE,
+    ALL_POSE_TYPES,
+    PATH_TYPE,
     POSE_TYPES,
     TF_TYPES,
     CovarianceBuffer,
     FieldBuffer,
     StampBuffer,
-    header_ns,
+    frame_of,
+    stamp_of,
 )
-from l2m_gtsam.storage.open_bag import Bag, open_bag
+from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
+from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
+from l2m_gtsam.storage.units import (
+    PLAUSIBLE_UT,
+    Strength,
+    Unit,
+    field_fault,
+    is_turning,
+    microtesla_per,
+    strength,
+)
 
+POSE_FILE = "file"
 BY_CLOUDS = "a map made with `l2m map build --lidar` gives poses to its point clouds"
 
 
@@ -59,7 +73,7 @@ class TopicReport:
     nan_share
         Share of readings with a NaN axis; NaN for other types.
     strength
-        |B| in uT, for magnetic fields.
+        |B| in uT, for magnetic fields in a unit that is known.
     use
         What would be used of it, and why, or why not.
     """
@@ -79,11 +93,12 @@ class TopicReport:
 
 @dataclass(frozen=True)
 class BagReport:
-    """What is in a bag: its topics, and what prevents its use, if anything."""
+    """What is in a bag: its topics, what prevents its use, if anything, and what else to know."""
 
     path: Path
     topics: tuple[TopicReport, ...]
     obstacles: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass
@@ -92,6 +107,15 @@ class _TopicBuffers:
     frames: set[str] = field(default_factory=set)
     readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
     covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
+    fault: str = ""
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether there are readings, and not always the same; a single one may be."""
+        written = self.readings.field()
+        if len(written) == 1:
+            return bool(np.isfinite(written).all())
+        return is_turning(written) or not strength(written).is_constant
 
 
 def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) -> BagReport:
@@ -111,15 +135,16 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
     BagError
         The bag cannot be opened or read.
     """
-    with open_bag(path) as bag:
+    notes = []
+    apart = options.pose_file.of(path)
+    with open_log(path, options.columns) as bag:
         fields, no_fields = _selected(select_fields, bag, options)
-        poses, no_poses = _selected(select_poses, bag, options)
-        usable = [c for c in bag.connections if _is_usable(c)]
-        collected: dict[str, _TopicBuffers] = {}
-        for message in bag.messages(usable, progress):
-            into = collected.setdefault(message.connection.topic, _TopicBuffers())
-            _collect(into, message.content, message.connection.msgtype, message.record_ns)
-        uses = {c.topic: "magnetic readings" for c in fields}
+        poses, no_poses = ([], "") if apart is not None else _selected(select_poses, bag, options)
+        sources = {c.id: field_source(c) for c in bag.connections if c.msgtype in FIELD_TYPES}
+        sources |= {each.connection.id: each for each in fields}
+        usable = [c for c in bag.connections if _is_usable(c) or c.id in sources]
+        collected = _collected(bag, usable, sources, progress)
+        uses = {each.connection.topic: "magnetic readings" for each in fields}
         uses |= {c.topic: f"poses ({_why_poses(options)})" for c in poses}
         topics, duration = _by_topic(bag), max(bag.duration_s, 1e-9)
         reports = [
@@ -127,17 +152,54 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
             for topic, connections in topics.items()
         ]
     if no_poses and any(report.msgtype == CLOUD_TYPE for report in reports):
-        no_poses = f"{no_poses}; {BY_CLOUDS}"
+        notes.append(f"{no_poses}; {BY_CLOUDS}")
+        no_poses = ""
+    if apart is not None:
+        reports.append(_pose_file(apart, options))
     obstacles = [reason for reason in (no_fields, no_poses) if reason]
-    obstacles += [
-        f"{r.topic}: {r.use}" for r in reports if r.use.startswith("refused") and r.topic in uses
-    ]
-    fields_used = [r for r in reports if r.topic in uses and r.strength is not None]
-    if fields_used and not any(r.strength.readings for r in fields_used if r.strength):
-        obstacles.append("no finite reading in any of the magnetic topics")
+    obstacles += [f"{r.topic}: {r.use}" for r in reports if "refused" in r.use and r.topic in uses]
+    used = [collected.get(each.connection.topic) for each in fields]
+    if fields and not any(each is not None and each.is_alive for each in used):
+        obstacles.append("no magnetic topic has readings that change")
     # a static transform holds from any time on
-    used = [r for r in reports if r.topic in uses and "tf_static" not in r.topic]
-    return BagReport(path, tuple(reports), (*obstacles, *_clock_obstacles(used, options)))
+    timed = [r for r in reports if r.topic in uses or r.msgtype == POSE_FILE]
+    timed = [r for r in timed if "tf_static" not in r.topic]
+    found = (*obstacles, *_clock_obstacles(timed, options))
+    return BagReport(path, tuple(reports), found, tuple(notes))
+
+
+def _collected(
+    bag: Log,
+    usable: list[Connection],
+    sources: dict[int, FieldSource],
+    progress: Count | None,
+) -> dict[str, "_TopicBuffers"]:
+    """Return what the messages on usable topics say."""
+    collected: dict[str, _TopicBuffers] = {}
+    for message in bag.messages(usable, progress):
+        into = collected.setdefault(message.connection.topic, _TopicBuffers())
+        source = sources.get(message.connection.id)
+        _collect(into, message.content, message.connection.msgtype, message.record_ns, source)
+    return collected
+
+
+def _pose_file(path: Path, options: BagOptions) -> TopicReport:
+    """Return what is known of a file with the poses."""
+    found = read_poses(path, options.pose_file)
+    gaps = np.diff(found.stamp_ns).astype(np.float64) * 1e-9
+    return TopicReport(
+        topic=str(path),
+        msgtype=POSE_FILE,
+        frames=(options.frame or found.frame,),
+        count=len(found),
+        rate_hz=_rate(gaps, len(found), 0.0),
+        longest_gap_s=float(gaps.max()),
+        span_s=_span(found.stamp_ns),
+        clock_offset_s=float("nan"),
+        nan_share=float("nan"),
+        strength=None,
+        use="poses (of --poses)",
+    )
 
 
 def _clock_obstacles(used: list[TopicReport], options: BagOptions) -> list[str]:
@@ -160,7 +222,7 @@ def _clock_obstacles(used: list[TopicReport], options: BagOptions) -> list[str]:
     return found
 
 
-def _selected(select: Any, bag: Bag, options: BagOptions) -> tuple[list[Connection], str]:
+def _selected(select: Any, bag: Log, options: BagOptions) -> tuple[list[Any], str]:
     """Return what a selection chooses, or why it cannot."""
     try:
         return select(bag, options), ""
@@ -169,7 +231,7 @@ def _selected(select: Any, bag: Bag, options: BagOptions) -> tuple[list[Connecti
 
 
 def _is_usable(connection: Connection) -> bool:
-    return connection.msgtype in (FIELD_TYPE, *POSE_TYPES, *TF_TYPES)
+    return connection.msgtype in (*FIELD_TYPES, *ALL_POSE_TYPES, *TF_TYPES)
 
 
 def _why_poses(options: BagOptions) -> str:
@@ -178,21 +240,36 @@ def _why_poses(options: BagOptions) -> str:
     return "named by bag.poses" if options.poses is not None else "the only topic of its kind"
 
 
-def _by_topic(bag: Bag) -> dict[str, list[Connection]]:
+def _by_topic(bag: Log) -> dict[str, list[Connection]]:
     topics: dict[str, list[Connection]] = {}
     for connection in sorted(bag.connections, key=lambda c: c.topic):
         topics.setdefault(connection.topic, []).append(connection)
     return topics
 
 
-def _collect(into: _TopicBuffers, content: Any, msgtype: str, record_ns: int) -> None:
-    for stamped in content.transforms if msgtype in TF_TYPES else (content,):
-        into.stamps.add(header_ns(stamped), record_ns)
-        into.frames.add(stamped.header.frame_id)
-    if msgtype == FIELD_TYPE:
-        into.readings.add(record_ns, content.magnetic_field)
+def _collect(
+    into: _TopicBuffers, content: Any, msgtype: str, record_ns: int, source: FieldSource | None
+) -> None:
+    for stamped in _stamped(content, msgtype):
+        into.stamps.add(stamp_of(stamped, record_ns), record_ns)
+        into.frames.add(frame_of(stamped))
+    if source is not None and not into.fault:
+        into.readings.unit = source.unit
+        try:
+            into.readings.add(record_ns, source.reading(content))
+        except ValueError as error:
+            into.fault = str(error)
     if msgtype in POSE_TYPES and (pose := POSE_TYPES[msgtype](content)).covariance is not None:
         into.covariances.add(pose.covariance)
+
+
+def _stamped(content: Any, msgtype: str) -> Sequence[Any]:
+    """Return what has stamps in a message: of a path the poses, which are all there is of one."""
+    if msgtype in TF_TYPES:
+        return tuple(content.transforms)
+    if msgtype == PATH_TYPE:
+        return tuple(content.poses[-1:])
+    return (content,)
 
 
 def _report(
@@ -210,23 +287,30 @@ def _report(
     header, record = found.stamps.header(), found.stamps.record()
     gaps = np.diff(np.unique(header)).astype(np.float64) * 1e-9
     count = sum(c.msgcount for c in connections)
-    values = found.readings.field() * MICROTESLA_PER[options.units]
-    measured = strength(values) if msgtype == FIELD_TYPE else None
+    written = found.readings.field()
     return TopicReport(
         topic=topic,
         msgtype=msgtype,
-        frames=tuple(sorted(found.frames)),
+        frames=tuple(sorted(found.frames - {""})),
         count=count,
         rate_hz=_rate(gaps, count, duration_s),
         longest_gap_s=float(gaps.max()) if len(gaps) else float("nan"),
         span_s=_span(header),
         clock_offset_s=float(np.median(record - header)) * 1e-9 if len(header) else float("nan"),
-        nan_share=float(np.mean(~np.isfinite(values).all(axis=1))) if len(values) else float("nan"),
-        strength=measured,
-        use=f"refused: {several_frames(topic, found.frames)}"
-        if msgtype == FIELD_TYPE and len(found.frames) > 1 and not options.split_by_frame
-        else _use(use, measured, is_turning(values), options, msgtype),
+        nan_share=float(np.mean(~np.isfinite(written).all(axis=1)))
+        if len(written)
+        else float("nan"),
+        strength=_strength(found, options),
+        use=_use(use, connections[0], found, options),
     )
+
+
+def _strength(found: _TopicBuffers, options: BagOptions) -> Strength | None:
+    """Return the strength of readings in microtesla, if there are any in a unit that is known."""
+    written, own = found.readings.field(), found.readings.unit
+    if not len(written) or (own is None and options.units is Unit.AUTO):
+        return None
+    return strength(written * microtesla_per(options.units, own))
 
 
 def _rate(gaps: FloatArray, count: int, duration_s: float) -> float:
@@ -242,22 +326,46 @@ def _span(stamps: IntArray) -> tuple[float, float]:
     return (float(stamps.min()) * 1e-9, float(stamps.max()) * 1e-9)
 
 
-def _use(
-    use: str | None, measured: Strength | None, turning: bool, options: BagOptions, msgtype: str
-) -> str:
-    if measured is not None:
-        wrong = fault(measured, turning, options.units)
-        if wrong:
-            return f"refused: {wrong}"
+def _use(use: str | None, connection: Connection, found: _TopicBuffers, options: BagOptions) -> str:
+    """Return what would be used of a topic, and why, or why not."""
+    if len(found.readings.stamp_ns) or found.fault:
+        return _field_use(use, connection, found, options)
     if use is not None:
-        dead = measured is not None and not measured.readings
-        return f"{use}, but none is finite: the sensor is dead" if dead else use
-    if msgtype == FIELD_TYPE:
-        return "not chosen by bag.fields"
-    if msgtype in POSE_TYPES:
+        return use
+    if connection.msgtype in FIELD_TYPES:
+        return "a magnetometer's topic without messages"
+    if connection.msgtype == PATH_TYPE:
+        return "paths, not used: another topic has poses, or choose it with `bag.poses`"
+    if connection.msgtype in ALL_POSE_TYPES:
         return "poses, not used: another topic is preferred or must be chosen with bag.poses"
-    if msgtype in TF_TYPES:
+    if connection.msgtype in TF_TYPES:
         return "transforms, used when bag.tf names a chain"
-    if msgtype == CLOUD_TYPE:
+    if connection.msgtype == CLOUD_TYPE:
         return "point clouds: a map's with --lidar, poses where there are no others"
     return "not needed"
+
+
+def _field_use(
+    use: str | None, connection: Connection, found: _TopicBuffers, options: BagOptions
+) -> str:
+    """Return what would be used of a topic with readings."""
+    if use is None and not is_field(connection) and connection.msgtype == VECTOR_TYPE:
+        return "vectors: of a magnetometer if `bag.fields` names them"
+    if found.fault:
+        return f"refused: it {found.fault}"
+    if len(found.frames) > 1 and not options.split_by_frame:
+        return f"refused: {several_frames(connection.topic, found.frames)}"
+    written, own = found.readings.field(), found.readings.unit
+    if wrong := field_fault(written, options.units, own):
+        return f"refused: {wrong}"
+    use = use or "magnetic readings, not chosen by bag.fields"
+    if not np.isfinite(written).all(axis=1).any():
+        return f"{use}, but none is finite: the sensor is dead"
+    if found.is_alive:
+        return use
+    constant = written[np.isfinite(written).all(axis=1)][0]
+    text = ", ".join(f"{value:.4g}" for value in constant)
+    size = float(np.linalg.norm(constant)) * microtesla_per(options.units, own)
+    low, high = PLAUSIBLE_UT
+    no_field = "" if low <= size <= high else f", and {size:.3g} uT is no field on Earth"
+    return f"{use}, but all are ({text}) as written: the sensor is stuck{no_field}"

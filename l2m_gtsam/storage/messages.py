@@ -3,7 +3,7 @@
 from array import array
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Trajectory
 from l2m_gtsam.geometry import from_ros
 from l2m_gtsam.storage.tf import Link
+from l2m_gtsam.storage.units import Unit
 
 SIZE = 36
 # Asymmetry and negative eigenvalues that rounding explains, also in single precision, relative
@@ -101,9 +102,30 @@ def usable(covariance: FloatArray) -> BoolArray:
     return found
 
 
-FIELD_TYPE = "sensor_msgs/msg/MagneticField"
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")
+
+
+PATH_TYPE = "nav_msgs/msg/Path"
+PX4_POSE_TYPE = "px4_msgs/msg/VehicleOdometry"
+CSV_POSE_TYPE = "csv/Pose"
+
+
+class Position(NamedTuple):
+    """A position in metres."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Orientation(NamedTuple):
+    """A quaternion."""
+
+    x: float
+    y: float
+    z: float
+    w: float
 
 
 @dataclass(frozen=True)
@@ -128,13 +150,57 @@ POSE_TYPES: dict[str, Callable[[Any], RawPose]] = {
     "geometry_msgs/msg/TransformStamped": lambda m: RawPose(
         m.transform.translation, m.transform.rotation, m.child_frame_id
     ),
+    CSV_POSE_TYPE: lambda m: RawPose(m.position, m.orientation, ""),
+    PX4_POSE_TYPE: lambda m: px4_pose(m.position, m.q),
 }
+# A path comes last: some repeat where a vehicle was, others are plans of where it shall go.
+ALL_POSE_TYPES = (*POSE_TYPES, PATH_TYPE)
+
+
+def px4_pose(position: Any, q: Any) -> RawPose:
+    """Return a pose of PX4 in the axes of ROS (REP-103): east, north, up; forward, left, up.
+
+    ``R_enu_flu = E R_ned_frd F`` with half turns E about the horizontal (1, 1, 0) and F about x.
+
+    Parameters
+    ----------
+    position
+        North, east, down, or forward, right, down, in metres.
+    q
+        From the body's axes forward, right, down; w first.
+    """
+    north, east, down = (float(value) for value in position)
+    w, x, y, z = (float(value) for value in q)
+    half = 0.5**0.5
+    turned = Orientation(half * (x + y), half * (x - y), half * (w - z), half * (w + z))
+    return RawPose(Position(east, north, -down), turned, "")
 
 
 def header_ns(message: Any) -> int:
     """Return the header's stamp in nanoseconds."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def stamp_of(message: Any, record_ns: int) -> int:
+    """Return the stamp of a message in nanoseconds: its header's, or PX4's.
+
+    Parameters
+    ----------
+    message
+        Of any type.
+    record_ns
+        When it was recorded, which counts where it has no stamp.
+    """
+    if hasattr(getattr(message, "header", None), "stamp"):
+        return header_ns(message)
+    taken_us = getattr(message, "timestamp_sample", 0) or getattr(message, "timestamp", 0)
+    return 1000 * int(taken_us) if isinstance(taken_us, int) and taken_us else record_ns
+
+
+def frame_of(message: Any) -> str:
+    """Return the frame of a message's header; empty where it has none."""
+    return str(getattr(getattr(message, "header", None), "frame_id", ""))
 
 
 @dataclass
@@ -160,17 +226,18 @@ class StampBuffer:
 
 @dataclass
 class FieldBuffer:
-    """Readings of one sensor as they come."""
+    """Readings of one sensor as they come; ``unit`` is the one that their type prescribes."""
 
     topic: str
     frame: str
+    unit: Unit | None = None
     stamp_ns: "array[int]" = field(default_factory=lambda: array("q"))
     values: "array[float]" = field(default_factory=lambda: array("d"))
 
-    def add(self, stamp_ns: int, vector: Any) -> None:
-        """Append one reading."""
+    def add(self, stamp_ns: int, reading: tuple[float, float, float]) -> None:
+        """Append one reading as it is written."""
         self.stamp_ns.append(stamp_ns)
-        self.values.extend((vector.x, vector.y, vector.z))
+        self.values.extend(reading)
 
     def stamps(self) -> IntArray:
         """Return the stamps, shape (N,)."""

@@ -20,21 +20,13 @@ from rosbags.typesys.store import Typestore
 
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
+from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
 
-ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3 or an .mcap file"
+ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3, .mcap, .csv or .ulg file"
 # mcap counts nanoseconds unsigned, everything else in 63 bits.
 LATEST_NS = (1 << 63) - 1
 PROGRESS_EVERY = 2000
-
-
-@dataclass(frozen=True)
-class Message:
-    """A decoded message, its connection and when it was recorded (nanoseconds)."""
-
-    connection: Connection
-    record_ns: int
-    content: Any
 
 
 @dataclass(frozen=True)

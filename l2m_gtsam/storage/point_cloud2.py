@@ -16,6 +16,7 @@ from l2m_gtsam.records.scans import Scan, ScanOptions
 from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.messages import header_ns
 from l2m_gtsam.storage.open_bag import Bag, open_bag
+from l2m_gtsam.storage.open_log import is_table
 from l2m_gtsam.storage.point_table import stacked
 from l2m_gtsam.storage.selection import listed
 
@@ -207,6 +208,8 @@ def has_clouds(path: Path) -> bool:
     BagError
         The bag cannot be opened.
     """
+    if is_table(path):
+        return False
     with open_bag(path) as bag:
         return any(connection.msgtype == CLOUD_TYPE for connection in bag.connections)
 

@@ -1,5 +1,6 @@
 """Which topics of a bag are used, and what they are called."""
 
+import re
 from collections import Counter
 from collections.abc import Iterable
 from fnmatch import fnmatchcase
@@ -8,29 +9,58 @@ from rosbags.interfaces import Connection
 
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import BagOptions
-from l2m_gtsam.storage.messages import FIELD_TYPE, POSE_TYPES, TF_TYPES
-from l2m_gtsam.storage.open_bag import Bag
+from l2m_gtsam.storage.field_types import (
+    FIELD_TYPE,
+    FIELD_TYPES,
+    VECTOR_TYPE,
+    FieldSource,
+    field_source,
+    is_field,
+    named_source,
+)
+from l2m_gtsam.storage.log import Log
+from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
+
+ROS_POSE_TYPES = tuple(each for each in ALL_POSE_TYPES if not each.startswith("csv/"))
+GLOB = re.compile(r"[*?\[]")
 
 
-def select_fields(bag: Bag, options: BagOptions) -> list[Connection]:
-    """Return the connections whose readings are used.
+def select_fields(bag: Log, options: BagOptions) -> list[FieldSource]:
+    """Return where the readings that are used stand.
+
+    Of a pattern that matches topics of several types only those of the most immediate type are
+    taken; a topic whose name is given counts whatever its type is known for.
 
     Raises
     ------
     BagError
         A pattern matches nothing, or a topic of another type.
     """
-    available = [c for c in bag.connections if c.msgtype == FIELD_TYPE]
-    chosen: list[Connection] = []
+    chosen: list[FieldSource] = []
     for pattern in options.fields:
-        found = [c for c in available if matches(c.topic, pattern)]
+        found = _of_pattern(bag, pattern)
         if not found:
-            raise BagError(_no_field(bag, pattern, available))
-        chosen.extend(c for c in found if c not in chosen)
+            raise BagError(_no_field(bag, pattern))
+        labels = {(each.label, each.connection.id) for each in chosen}
+        chosen.extend(s for s in found if (s.label, s.connection.id) not in labels)
     return chosen
 
 
-def select_poses(bag: Bag, options: BagOptions) -> list[Connection]:
+def _of_pattern(bag: Log, pattern: str) -> list[FieldSource]:
+    """Return the readings that a pattern names."""
+    topic, colon, path = pattern.partition(":")
+    if colon:
+        return [named_source(c, path) for c in bag.connections if matches(c.topic, topic)]
+    if not GLOB.search(pattern):
+        named = [c for c in bag.connections if matches(c.topic, pattern)]
+        return [field_source(c) for c in named if c.msgtype in FIELD_TYPES]
+    fitting = [c for c in bag.connections if is_field(c) and matches(c.topic, pattern)]
+    filled = [c for c in fitting if c.msgcount] or fitting
+    lowest = min((FIELD_TYPES[c.msgtype].rank for c in filled), default=0)
+    return [field_source(c) for c in fitting if FIELD_TYPES[c.msgtype].rank == lowest]
+
+
+def select_poses(bag: Log, options: BagOptions) -> list[Connection]:
     """Return the connections that the poses come from.
 
     Raises
@@ -43,10 +73,10 @@ def select_poses(bag: Bag, options: BagOptions) -> list[Connection]:
         if not chosen:
             raise BagError(f"{bag.path}: no /tf in the bag, but `bag.tf` asks for a chain")
         return chosen
-    available = [c for c in bag.connections if c.msgtype in POSE_TYPES]
+    available = [c for c in bag.connections if c.msgtype in ALL_POSE_TYPES]
     if options.poses is not None:
         return _named_poses(bag, options.poses, available)
-    for msgtype in POSE_TYPES:
+    for msgtype in ALL_POSE_TYPES:
         topics = sorted({c.topic for c in available if c.msgtype == msgtype})
         if len(topics) == 1:
             return [c for c in available if c.topic == topics[0]]
@@ -56,9 +86,9 @@ def select_poses(bag: Bag, options: BagOptions) -> list[Connection]:
                 f"{', '.join(topics)}"
             )
     raise BagError(
-        f"{bag.path}: no poses in the bag; needed is a topic of one of the types "
-        f"{', '.join(POSE_TYPES)}, or a /tf chain named by `bag.tf`; there are: "
-        f"{listed(bag.connections)}"
+        f"{bag.path}: no poses in it; needed is a topic of one of the types "
+        f"{', '.join(ROS_POSE_TYPES)}, a /tf chain named by `bag.tf`, or a file with `--poses`; "
+        f"there are: {listed(bag.connections)}"
     )
 
 
@@ -103,19 +133,29 @@ def sensor_names(
     }
 
 
-def _no_field(bag: Bag, pattern: str, available: list[Connection]) -> str:
-    others = [c for c in bag.connections if matches(c.topic, pattern)]
-    if others and pattern != "*":
+def _no_field(bag: Log, pattern: str) -> str:
+    topic, colon, _ = pattern.partition(":")
+    others = [] if GLOB.search(topic) else [c for c in bag.connections if matches(c.topic, topic)]
+    available = [c for c in bag.connections if is_field(c)]
+    if others and not colon:
         return (
-            f"{bag.path}: topic {others[0].topic} is of type {others[0].msgtype}, magnetic "
-            f"readings must be {FIELD_TYPE}; of that type there are: {listed(available)}"
+            f"{bag.path}: topic {others[0].topic} is of type {others[0].msgtype}, in which no "
+            f"magnetic reading is known; name the vector in it, `{pattern}:PATH`, or another "
+            f"topic; with readings there are: {listed(available)}"
         )
-    asked = "" if pattern == "*" else f" that matches {pattern!r}"
-    there = available or bag.connections
-    return f"{bag.path}: no topic of type {FIELD_TYPE}{asked}; there are: {listed(there)}"
+    asked = "" if pattern == "*" else f" that matches {topic!r}"
+    if colon or available:
+        there = available or bag.connections
+        return f"{bag.path}: no topic of a magnetometer{asked}; there are: {listed(there)}"
+    vectors = [c for c in bag.connections if c.msgtype == VECTOR_TYPE]
+    hint = f"; if {vectors[0].topic} has one, say so with `bag.fields`" if vectors else ""
+    return (
+        f"{bag.path}: no topic of a magnetometer ({FIELD_TYPE} or a driver's own){asked}{hint}; "
+        f"there are: {listed(bag.connections)}"
+    )
 
 
-def _named_poses(bag: Bag, name: str, available: list[Connection]) -> list[Connection]:
+def _named_poses(bag: Log, name: str, available: list[Connection]) -> list[Connection]:
     chosen = [c for c in available if matches(c.topic, name)]
     if chosen:
         return chosen
@@ -123,7 +163,7 @@ def _named_poses(bag: Bag, name: str, available: list[Connection]) -> list[Conne
     if others:
         raise BagError(
             f"{bag.path}: topic {others[0].topic} is of type {others[0].msgtype}, poses must be "
-            f"one of {', '.join(POSE_TYPES)}"
+            f"one of {', '.join(ROS_POSE_TYPES)}"
         )
     raise BagError(
         f"{bag.path}: no topic {name!r} for the poses; with poses there are: {listed(available)}"

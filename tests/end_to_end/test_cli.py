@@ -19,7 +19,7 @@ from tests.support.browsing import (
     check_silence,
     look,
 )
-from tests.support.command_line import Demo, complaint_here, l2m, l2m_process, one_line
+from tests.support.command_line import Demo, complaint_here, ended, l2m, l2m_process, one_line
 
 
 def test_help_loads_nothing_heavy() -> None:
@@ -88,9 +88,10 @@ def test_inspect_escapes_what_a_bag_says(tmp_path: Path) -> None:
     make = ros("ros1")
     reading = make.magnetic(1, [2e-5, 0, -4e-5], "[bold red]frame[/]")
     entry = Entry("/[link=x]mag", "sensor_msgs/MagneticField", 1, reading)
-    out = l2m("inspect", write(tmp_path, "ros1", [entry])).out
-    assert "[link=x]mag" in out
-    assert "[bold red]frame[/]" in out
+    run = ended("inspect", write(tmp_path, "ros1", [entry]))
+    assert run.code == 1  # no poses
+    assert "[link=x]mag" in run.out
+    assert "[bold red]frame[/]" in run.out
 
 
 def test_bad_bags_and_topics(demo: Demo, tmp_path: Path) -> None:

@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import Recording
 from l2m_gtsam.errors import BagError, L2MError, UnitsError
 from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
-from l2m_gtsam.storage.bag_options import BagOptions, FixedTransform, Stamps, TfChain, Unit
+from l2m_gtsam.storage.bag_options import BagOptions, FixedTransform, Stamps, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
+from l2m_gtsam.storage.units import Unit
 from tests.drives.bags import KINDS, Entry, ros, write
 
 START = 1_700_000_000_000_000_000
@@ -209,12 +210,12 @@ def faulty(kind: str, name: str) -> tuple[list[Entry], BagOptions]:
 
 
 FAULTS = {
-    "missing topic": r"no topic of type .* matches '/compass'; there are: /mag ",
-    "wrong type": r"/pose is of type geometry_msgs/msg/PoseStamped, .* there are: /mag ",
-    "no magnetometer": r"no topic of type sensor_msgs/msg/MagneticField; there are: /pose ",
+    "missing topic": r"no topic of a magnetometer that matches '/compass'; there are: /mag ",
+    "wrong type": r"/pose is of type geometry_msgs/msg/PoseStamped.* with readings there are: /mag",
+    "no magnetometer": r"no topic of a magnetometer \(sensor_msgs/msg/MagneticField or .*: /pose ",
     "missing poses": r"no topic '/odometry' for the poses; with poses there are: /pose ",
     "poses of wrong type": r"/mag is of type .*, poses must be one of nav_msgs/msg/Odometry",
-    "no poses": r"no poses in the bag; needed is .* there are: /mag ",
+    "no poses": r"no poses in it; needed is .*`--poses`; there are: /mag ",
     "several poses": r"choose one with `bag.poses`: /other, /pose",
     "no tf": r"no /tf in the bag, but `bag.tf` asks",
     "all NaN": r"no finite reading in /mag",
@@ -320,7 +321,7 @@ def test_inspect_reports_instead_of_refusing(tmp_path: Path) -> None:
         e for e in entries("mcap", field=lambda k: 1e4 * EARTH * (1 + k / 100)) if e.topic == "/mag"
     ]
     report = inspect_bag(write(tmp_path, "mcap", content), BagOptions())
-    assert any("no poses in the bag" in line for line in report.obstacles)
+    assert any("no poses in it" in line for line in report.obstacles)
     assert any("units: gauss" in line for line in report.obstacles)
 
 
@@ -386,7 +387,7 @@ def test_topics_without_a_leading_slash(shared_data: Path) -> None:
 
 @pytest.mark.parametrize("name", ["imu_tools_ardrone_imu.bag", "imu_tools_sparkfun_razor.bag"])
 def test_directions_of_real_drivers_are_refused(shared_data: Path, name: str) -> None:
-    with pytest.raises(UnitsError, match=r"0.0001 long, as read in tesla.*no unit at all"):
+    with pytest.raises(UnitsError, match=r"0.0001 long, as written.*no unit at all"):
         read_fields(shared_data / "bags" / name, BagOptions())
 
 

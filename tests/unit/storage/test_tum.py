@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.errors import BagError
-from l2m_gtsam.storage.trajectory_files import read_tum, tum_text, write_tum
+from l2m_gtsam.storage.pose_files import read_tum
+from l2m_gtsam.storage.trajectory_files import tum_text, write_tum
 
 LINE = "1700000000.5 1 2 3 0 0 0 1"
 LATER = "1700000001.5 1 2 3 0 0 0 1"

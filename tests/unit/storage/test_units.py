@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.storage.bag_options import MICROTESLA_PER, Unit, fault, is_turning, strength
+from l2m_gtsam.storage.units import MICROTESLA_PER, Unit, field_fault, strength
 
 
 def turning_field(strength_ut: float, noise: float, count: int = 200) -> FloatArray:
@@ -18,7 +18,8 @@ def turning_field(strength_ut: float, noise: float, count: int = 200) -> FloatAr
 
 
 def judged(field: FloatArray, unit: Unit = Unit.AUTO) -> str | None:
-    return fault(strength(field), is_turning(field), unit)
+    """Return what is wrong with readings that were written in tesla."""
+    return field_fault(field * 1e-6, unit, Unit.TESLA)
 
 
 @given(st.floats(11, 199))

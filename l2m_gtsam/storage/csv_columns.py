@@ -1,0 +1,259 @@
+"""Which columns of a table are what, by their names or as the options say."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from l2m_gtsam.storage.bag_options import ColumnOptions, TimeUnit
+from l2m_gtsam.storage.units import Unit
+
+AXES = {"x": "xyz", "0": "012"}
+# Endings of names, in brackets or after an underscore.
+FIELD_UNITS = {
+    "t": Unit.TESLA,
+    "tesla": Unit.TESLA,
+    "mt": Unit.MILLITESLA,
+    "ut": Unit.MICROTESLA,
+    "µt": Unit.MICROTESLA,
+    "μt": Unit.MICROTESLA,
+    "microtesla": Unit.MICROTESLA,
+    "nt": Unit.NANOTESLA,
+    "nanotesla": Unit.NANOTESLA,
+    "g": Unit.GAUSS,
+    "ga": Unit.GAUSS,
+    "gs": Unit.GAUSS,
+    "gauss": Unit.GAUSS,
+    "mg": Unit.MILLIGAUSS,
+    "mgauss": Unit.MILLIGAUSS,
+    "milligauss": Unit.MILLIGAUSS,
+}
+TIME_UNITS = {
+    **{each.value: each for each in TimeUnit if each is not TimeUnit.AUTO},
+    "sec": TimeUnit.SECONDS,
+    "secs": TimeUnit.SECONDS,
+    "seconds": TimeUnit.SECONDS,
+    "msec": TimeUnit.MILLISECONDS,
+    "usec": TimeUnit.MICROSECONDS,
+    "µs": TimeUnit.MICROSECONDS,
+    "nsec": TimeUnit.NANOSECONDS,
+    "nsecs": TimeUnit.NANOSECONDS,
+}
+# In order of preference; what ends in one of the first is a message's own stamp.
+STAMPS = ("header.stamp", "header/stamp", "timestamp_sample", "timestamp", "stamp", "__time")
+MORE_STAMPS = ("time", "t", "datetime", "seconds_elapsed", "elapsed")
+BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*((?:[^\d\])][^\])]*)?)\s*[\])]\s*$")
+AXIS = re.compile(r"^(.*?)[\s._/\-]*([wxyz])$")
+INDEX = re.compile(r"^(.*?)\[([0-2])\]$")
+WORDS = re.compile(r"[\s._/\-]+")
+FIELDS = ("b", "m", "h")
+POSITIONS = ("p", "pos", "position", "t", "trans", "translation", "")
+
+
+@dataclass(frozen=True)
+class Name:
+    """The name of a column: what it is called, and the unit that it states."""
+
+    text: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class FieldColumns:
+    """Columns x, y and z of a magnetometer, and the unit that they state."""
+
+    columns: tuple[int, int, int]
+    unit: Unit | None
+
+
+@dataclass(frozen=True)
+class Roles:
+    """What the columns of a table are.
+
+    Attributes
+    ----------
+    stamp
+        Column of the times; two for seconds and nanoseconds.
+    time_unit
+        Of the times, as their name has it.
+    fields
+        Magnetometers by name.
+    position, orientation
+        Columns of poses, if there are any: x, y, z and x, y, z, w.
+    """
+
+    stamp: tuple[int, ...]
+    time_unit: TimeUnit
+    fields: Mapping[str, FieldColumns]
+    position: tuple[int, int, int] | None
+    orientation: tuple[int, int, int, int] | None
+
+
+def column_roles(names: Sequence[str], options: ColumnOptions, stem: str) -> Roles:
+    """Return what columns are.
+
+    Parameters
+    ----------
+    names
+        As they stand in the first line.
+    options
+        What is known of them.
+    stem
+        Of the file's name: that of a magnetometer whose columns are x, y and z only.
+
+    Raises
+    ------
+    ValueError
+        A column that the options name is missing, or none has the times.
+    """
+    parts = [_parts(name) for name in names]
+    stamp, unit = _stamp(names, parts, options)
+    vectors = _vectors(parts)
+    orientation = _orientation(names, vectors, options)
+    return Roles(
+        stamp,
+        unit if options.time_unit is TimeUnit.AUTO else options.time_unit,
+        _fields(names, parts, vectors, options, stem),
+        _position(names, vectors, options, stem),
+        orientation,
+    )
+
+
+def _parts(name: str) -> Name:
+    """Return a name without decoration, and the unit in brackets after it."""
+    plain = name.strip().strip("\ufeff#%\"' ").strip()
+    with_unit = BRACKETS.match(plain)
+    text, unit = (with_unit[1], with_unit[2]) if with_unit else (plain, "")
+    return Name(text.lower(), unit.strip().lower())
+
+
+def _place(names: Sequence[str], wanted: str) -> int:
+    """Return the column of a name that the options give."""
+    plain = [name.strip().strip("\ufeff") for name in names]
+    if wanted not in plain:
+        raise ValueError(f"no column {wanted!r}; there are: {', '.join(plain[:30])}")
+    return plain.index(wanted)
+
+
+def _stamp(
+    names: Sequence[str], parts: Sequence[Name], options: ColumnOptions
+) -> tuple[tuple[int, ...], TimeUnit]:
+    if options.stamp is not None:
+        column = _place(names, options.stamp)
+        return (column,), _time_unit(parts[column])
+    for ending in STAMPS:
+        found = [k for k, part in enumerate(parts) if _timeless(part.text).endswith(ending)]
+        if found:
+            return (found[0],), _time_unit(parts[found[0]])
+    for base in ("stamp.", "stamp/", "stamp_"):
+        seconds, rest = (
+            [k for k, part in enumerate(parts) if part.text.endswith(base + ending)]
+            for ending in ("sec", "nanosec")
+        )
+        if seconds and rest:
+            return (seconds[0], rest[0]), TimeUnit.SECONDS
+    for wanted in MORE_STAMPS:
+        for k, part in enumerate(parts):
+            if _timeless(part.text) == wanted:
+                return (k,), _time_unit(part)
+    raise ValueError(
+        "no column with times is known by its name; name it with `columns.stamp`; there are: "
+        f"{', '.join(part.text for part in parts[:30])}"
+    )
+
+
+def _timeless(text: str) -> str:
+    """Return a name without a unit of time after an underscore: stamp_ns."""
+    head, _, ending = text.rpartition("_")
+    return head if head and ending in TIME_UNITS else text
+
+
+def _time_unit(name: Name) -> TimeUnit:
+    ending = name.text.rpartition("_")[2]
+    return TIME_UNITS.get(name.unit) or TIME_UNITS.get(ending) or TimeUnit.AUTO
+
+
+def _vectors(parts: Sequence[Name]) -> dict[str, dict[str, int]]:
+    """Return columns by what stands before their axis, and the axis."""
+    found: dict[str, dict[str, int]] = {}
+    for k, part in enumerate(parts):
+        if match := INDEX.match(part.text):
+            found.setdefault(match[1], {}).setdefault("xyz"[int(match[2])], k)
+        elif match := AXIS.match(_without_unit(part.text)):
+            found.setdefault(match[1], {}).setdefault(match[2], k)
+    return {base: axes for base, axes in found.items() if {"x", "y", "z"} <= set(axes)}
+
+
+def _without_unit(text: str) -> str:
+    """Return a name without a unit of field after an underscore: mag_x_ut."""
+    head, _, ending = text.rpartition("_")
+    return head if head and ending in FIELD_UNITS and AXIS.match(head) else text
+
+
+def _last(base: str) -> str:
+    """Return the last word of a name."""
+    return WORDS.split(base)[-1] if base else ""
+
+
+def _fields(
+    names: Sequence[str],
+    parts: Sequence[Name],
+    vectors: Mapping[str, Mapping[str, int]],
+    options: ColumnOptions,
+    stem: str,
+) -> dict[str, FieldColumns]:
+    if options.fields:
+        given = {}
+        for label, (x, y, z) in options.fields.items():
+            columns = (_place(names, x), _place(names, y), _place(names, z))
+            given[label] = FieldColumns(columns, _field_unit(parts[columns[0]]))
+        return given
+    found = {}
+    for base, axes in vectors.items():
+        if "w" not in axes and _is_magnetic(base, stem):
+            columns = (axes["x"], axes["y"], axes["z"])
+            label = "_".join(filter(None, WORDS.split(base))) or stem
+            found[label] = FieldColumns(columns, _field_unit(parts[columns[0]]))
+    return found
+
+
+def _is_magnetic(base: str, stem: str) -> bool:
+    if "cov" in base:
+        return False
+    if base == "":
+        return "mag" in stem.lower()
+    return "mag" in base or _last(base) in FIELDS
+
+
+def _field_unit(name: Name) -> Unit | None:
+    ending = name.text.rpartition("_")[2] if _without_unit(name.text) != name.text else ""
+    if name.text.startswith(("magnetometer_ga",)):
+        return Unit.GAUSS
+    return FIELD_UNITS.get(name.unit) or FIELD_UNITS.get(ending)
+
+
+def _position(
+    names: Sequence[str],
+    vectors: Mapping[str, Mapping[str, int]],
+    options: ColumnOptions,
+    stem: str,
+) -> tuple[int, int, int] | None:
+    if options.position is not None:
+        x, y, z = options.position
+        return _place(names, x), _place(names, y), _place(names, z)
+    for base, axes in vectors.items():
+        likely = _last(base) in POSITIONS or base.startswith("p_")
+        if likely and "w" not in axes and not _is_magnetic(base, stem):
+            return axes["x"], axes["y"], axes["z"]
+    return None
+
+
+def _orientation(
+    names: Sequence[str], vectors: Mapping[str, Mapping[str, int]], options: ColumnOptions
+) -> tuple[int, int, int, int] | None:
+    if options.orientation is not None:
+        x, y, z, w = options.orientation
+        return _place(names, x), _place(names, y), _place(names, z), _place(names, w)
+    for axes in vectors.values():
+        if "w" in axes:
+            return axes["x"], axes["y"], axes["z"], axes["w"]
+    return None

@@ -1,0 +1,116 @@
+"""Where magnetic readings are in messages: a table of types, or a path that the options name."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from operator import attrgetter
+from typing import Any
+
+from rosbags.interfaces import Connection
+
+from l2m_gtsam.storage.message_paths import steps_of, vector_at
+from l2m_gtsam.storage.units import Unit
+
+FIELD_TYPE = "sensor_msgs/msg/MagneticField"
+VECTOR_TYPE = "geometry_msgs/msg/Vector3Stamped"
+PX4_TYPE = "px4_msgs/msg/VehicleMagnetometer"
+PX4_RAW_TYPE = "px4_msgs/msg/SensorMag"
+CSV_FIELD_TYPE = "csv/Field"
+
+
+@dataclass(frozen=True)
+class FieldType:
+    """A type of message with a magnetic reading in it.
+
+    Attributes
+    ----------
+    path
+        Where the vector is; empty where the message itself has x, y and z.
+    unit
+        Unit that the type prescribes; absent where it prescribes none.
+    rank
+        Unless topics are named, those of the lowest rank in a log are read: of one device, a
+        driver often publishes several.
+    by_name
+        Whether a topic is only taken for a magnetometer's if its name says so.
+    """
+
+    path: str
+    unit: Unit | None
+    rank: int
+    by_name: bool = False
+
+
+FIELD_TYPES: dict[str, FieldType] = {
+    FIELD_TYPE: FieldType("magnetic_field", Unit.TESLA, 0),
+    PX4_TYPE: FieldType("magnetometer_ga", Unit.GAUSS, 1),
+    "vectornav_msgs/msg/CommonGroup": FieldType("magpres_mag", Unit.GAUSS, 1),
+    "sbg_driver/msg/SbgMag": FieldType("mag", None, 1),
+    CSV_FIELD_TYPE: FieldType("field", None, 1),
+    PX4_RAW_TYPE: FieldType("", Unit.GAUSS, 2),
+    "vectornav_msgs/msg/ImuGroup": FieldType("mag", Unit.GAUSS, 2),
+    VECTOR_TYPE: FieldType("vector", None, 3, by_name=True),
+}
+"""The types that are known, by ROS' name of each."""
+
+
+@dataclass(frozen=True)
+class FieldSource:
+    """A topic with magnetic readings, and where they are in its messages.
+
+    Attributes
+    ----------
+    connection
+        Of the log.
+    label
+        What it is called: the topic, with the path after it where the options name one.
+    path
+        Where the vector is in a message.
+    unit
+        Unit that its type prescribes, if it does.
+    """
+
+    connection: Connection
+    label: str
+    path: str
+    unit: Unit | None
+
+    @cached_property
+    def _vector(self) -> Callable[[Any], Any]:
+        return attrgetter(self.path) if self.path and "[" not in self.path else _itself
+
+    def reading(self, content: Any) -> tuple[float, float, float]:
+        """Return the reading of a message; a ValueError if it has none there."""
+        try:
+            vector = self._vector(content)
+            return vector.x, vector.y, vector.z
+        except AttributeError:
+            return vector_at(content, steps_of(self.path))
+
+
+def _itself(content: Any) -> Any:
+    return content
+
+
+def field_source(connection: Connection) -> FieldSource:
+    """Return where the readings of a topic of a known type are."""
+    kind = FIELD_TYPES[connection.msgtype]
+    unit = stated_unit(connection) or kind.unit
+    return FieldSource(connection, connection.topic, kind.path, unit)
+
+
+def stated_unit(connection: Connection) -> Unit | None:
+    """Return the unit that a log states for a topic, as columns of a table may."""
+    stated = getattr(connection.ext, "unit", None)
+    return stated if isinstance(stated, Unit) else None
+
+
+def named_source(connection: Connection, path: str) -> FieldSource:
+    """Return where the readings of a topic of any type are, by a path."""
+    return FieldSource(connection, f"{connection.topic}:{path}", path, None)
+
+
+def is_field(connection: Connection) -> bool:
+    """Return whether a topic is taken for a magnetometer's unless the options say otherwise."""
+    kind = FIELD_TYPES.get(connection.msgtype)
+    return kind is not None and (not kind.by_name or "mag" in connection.topic.lower())

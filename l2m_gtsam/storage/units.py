@@ -1,0 +1,162 @@
+"""Units of readings: named or as a number, and whether a field strength fits its unit.
+
+Anywhere on Earth, also near steel, a field is 10 to 200 uT strong. Drivers publish gauss,
+microtesla, raw counts or bare directions under the name of tesla; the strength reveals it.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+
+PLAUSIBLE_UT = (10.0, 200.0)
+EARTH_UT = 50.0
+# A strength that is constant to this, relative, over many readings was normalised.
+CONSTANT = 1e-6
+ENOUGH_READINGS = 20
+# Readings that differ by less, relative, are a sensor at rest, whatever its rounding.
+TURNED = 1e-3
+
+
+class Unit(StrEnum):
+    """Unit of the readings in a bag."""
+
+    AUTO = "auto"
+    TESLA = "tesla"
+    MILLITESLA = "millitesla"
+    MICROTESLA = "microtesla"
+    NANOTESLA = "nanotesla"
+    GAUSS = "gauss"
+    MILLIGAUSS = "milligauss"
+
+
+MICROTESLA_PER = {
+    Unit.AUTO: 1e6,  # what ROS prescribes; the strength is judged
+    Unit.TESLA: 1e6,
+    Unit.MILLITESLA: 1e3,
+    Unit.MICROTESLA: 1.0,
+    Unit.NANOTESLA: 1e-3,
+    Unit.GAUSS: 100.0,
+    Unit.MILLIGAUSS: 0.1,
+}
+# In order of how often drivers publish them; 1 mG is 0.1 uT, so that some strengths fit two.
+SUSPECTS = (Unit.GAUSS, Unit.MICROTESLA, Unit.NANOTESLA, Unit.MILLIGAUSS, Unit.MILLITESLA)
+
+Units = Unit | float
+"""A named unit, or microtesla per count."""
+
+
+def microtesla_per(units: Units, own: Unit | None) -> float:
+    """Return the factor that makes microtesla of readings as they are written.
+
+    Parameters
+    ----------
+    units
+        What the options say.
+    own
+        Unit that the type of the message prescribes, if it does.
+    """
+    if not isinstance(units, Unit):
+        return float(units)
+    return MICROTESLA_PER[own or units] if units is Unit.AUTO else MICROTESLA_PER[units]
+
+
+@dataclass(frozen=True)
+class Strength:
+    """Smallest, median and largest |B| of a sensor in uT as read; NaN without a finite reading."""
+
+    low: float
+    median: float
+    high: float
+    readings: int
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether all readings are equally strong."""
+        return self.high - self.low <= CONSTANT * self.median
+
+
+def strength(field: FloatArray) -> Strength:
+    """Summarise |B| of readings in uT, shape (N, 3); readings with a NaN axis do not count."""
+    norm = np.linalg.norm(field[np.isfinite(field).all(axis=1)], axis=1)
+    if not len(norm):
+        return Strength(float("nan"), float("nan"), float("nan"), 0)
+    return Strength(float(norm.min()), float(np.median(norm)), float(norm.max()), len(norm))
+
+
+def is_turning(field: FloatArray) -> bool:
+    """Return whether readings, shape (N, 3), turn: a stuck sensor is not a direction."""
+    finite = field[np.isfinite(field).all(axis=1)]
+    if not len(finite):
+        return False
+    return bool(np.ptp(finite, axis=0).max() > TURNED * np.abs(finite).max())
+
+
+def are_counts(written: FloatArray) -> bool:
+    """Return whether readings as they are written, shape (N, 3), are whole numbers."""
+    finite = written[np.isfinite(written).all(axis=1)]
+    return len(finite) >= ENOUGH_READINGS and bool((finite == np.round(finite)).all())
+
+
+def field_fault(written: FloatArray, units: Units, own: Unit | None) -> str | None:
+    """Return what is wrong with readings as they are written, as half a sentence, or None.
+
+    Parameters
+    ----------
+    written
+        Readings as they are in the messages, shape (N, 3).
+    units, own
+        As in ``microtesla_per``; only `AUTO` is judged by strength.
+    """
+    found, turning = strength(written), is_turning(written)
+    if not found.readings or (found.is_constant and not turning):
+        return None  # dead or stuck, not in a wrong unit: the calibration says so of it alone
+    if found.is_constant and found.readings >= ENOUGH_READINGS:
+        return (
+            f"every reading is {found.median:.4g} long, as written: directions without a "
+            "strength (no unit at all), which cannot be calibrated; record the raw field"
+        )
+    low, high = PLAUSIBLE_UT
+    if units is not Unit.AUTO:
+        return None
+    if own is not None and low <= found.median * MICROTESLA_PER[own] <= high:
+        return None
+    if are_counts(written):
+        return (
+            f"every reading is a whole number, a typical |B| {found.median:.4g}: raw counts; find "
+            "the microtesla per count in the sensor's data sheet and set them as a number, "
+            "`units: 0.15  # uT per count`, or name the unit if it was rounded"
+        )
+    if own is None:
+        return (
+            f"a typical |B| of {found.median:.4g} is in a unit that the log does not state; "
+            f"{_suspicion(found.median)}"
+        )
+    return (
+        f"a typical |B| of {found.median * MICROTESLA_PER[own]:.4g} uT, as read in {own.value}, is "
+        f"not the {low:g} to {high:g} uT found on Earth; {_suspicion(found.median)}"
+    )
+
+
+def suspected_unit(as_written: float) -> Unit | None:
+    """Return the unit in which a strength as written is most like the Earth's, if any fits."""
+    low, high = PLAUSIBLE_UT
+    fitting = [u for u in (*SUSPECTS, Unit.TESLA) if low <= as_written * MICROTESLA_PER[u] <= high]
+    return min(fitting, key=lambda u: _distance(as_written * MICROTESLA_PER[u]), default=None)
+
+
+def _suspicion(as_written: float) -> str:
+    """Return the likely unit of a strength as written in the message."""
+    likely = suspected_unit(as_written)
+    if likely is None:
+        return (
+            f"{as_written:.4g} fits no unit of field; name it with the option `units:`, or give "
+            "the microtesla per unit as a number"
+        )
+    return f"it is likely {likely.value}: set the option `units: {likely.value}`"
+
+
+def _distance(field_ut: float) -> float:
+    return float(abs(np.log(field_ut / EARTH_UT)))
