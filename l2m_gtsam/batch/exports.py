@@ -317,7 +317,10 @@ def _calibrated_topics(
         if found[key].topic in taken:
             raise BagError(f"{bag.path}: has a topic {found[key].topic} already")
         check_units(bag, key, found[key], options)
-    return {key: CalibratedTopic(found[key].topic, corrections[found[key].sensor]) for key in keys}
+    names = {key: found[key].sensor for key in keys}
+    return {
+        key: CalibratedTopic(names[key], found[key].topic, corrections[names[key]]) for key in keys
+    }
 
 
 def _unmatched(result: CalibrationResult, found: Mapping[Key, SensorTopic]) -> tuple[str, ...]:

@@ -156,8 +156,8 @@ class QaOptions(Options):
     """How far the angle between two sensor axes may be from a right angle, degrees."""
     nominal: dict[str, Nominal] = Field(default_factory=dict)
     """How sensors were meant to be mounted, by name; where nothing is given, the places of
-    `calibration.start` and of `calibration.priors.position`, and the rotations of
-    `calibration.priors.rotation`."""
+    `calibration.priors.position` and the rotations of `calibration.priors.rotation`. Those of
+    `calibration.start` are rough: they only show that two sensors are swapped."""
     nominal_m: Limit = Limit(warn=0.05, fail=0.3)
     """Distance between found and nominal place, metres."""
     nominal_deg: Limit = Limit(warn=10.0, fail=45.0)

@@ -130,6 +130,15 @@ class AxisOrder(Record):
         """Whether the sensor's axes lie along the lidar's own."""
         return self.along == ("+x", "+y", "+z")
 
+    @property
+    def in_order(self) -> str:
+        """What `bag.axes` has to say so that they do: axes of the sensor for x, y and z."""
+        found = {
+            where[1]: where[0].strip("+") + own
+            for own, where in zip("xyz", self.along, strict=True)
+        }
+        return f"[{', '.join(found[axis] for axis in 'xyz')}]"
+
 
 @dataclass(frozen=True)
 class Mounting(Record):

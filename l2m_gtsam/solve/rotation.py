@@ -47,7 +47,7 @@ def polar_rotation(C: FloatArray, covariance: FloatArray) -> PolarRotation:
     if not np.linalg.det(C) > 0:
         msg = (
             f"det C = {np.linalg.det(C):.3g}: the sensor's {flipped_axis(C)} axis looks flipped; "
-            "reverse it in the driver, a rotation cannot"
+            "reverse it in the driver or with `bag.axes`, a rotation cannot"
         )
         raise CalibrationError(msg)
     U, s, Vt = np.linalg.svd(C)

@@ -338,5 +338,5 @@ def _series(path: Path, name: str, buffer: FieldBuffer, options: BagOptions) -> 
     check_stamps(path, f"topic {buffer.topic}", stamps)
     if wrong := field_fault(written, options.units, buffer.unit):
         raise UnitsError(f"{path}: topic {buffer.topic}: {wrong}")
-    values = written * microtesla_per(options.units, buffer.unit)
+    values = options.in_order(name, written * microtesla_per(options.units, buffer.unit))
     return FieldSeries(name, buffer.topic, buffer.frame, stamps, values)

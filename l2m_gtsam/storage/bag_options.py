@@ -1,14 +1,15 @@
 """What is read from a recording, and how."""
 
 from enum import StrEnum
+from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator, model_validator
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import RigidTransform
+from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.options import Options
 from l2m_gtsam.storage.units import Unit, Units
@@ -145,6 +146,17 @@ class PoseFileOptions(Options):
         return self.paths.get(str(log), self.path)
 
 
+Axis = Literal["x", "-x", "y", "-y", "z", "-z"]
+Axes = tuple[Axis, Axis, Axis]
+
+
+def _each_once(axes: Axes) -> Axes:
+    """Refuse an axis that is there twice."""
+    if sorted(axis[-1] for axis in axes) != list("xyz"):
+        raise ValueError("each of x, y and z must be there once, with or without a minus")
+    return axes
+
+
 class BagOptions(Options):
     """What is read from a recording, and how."""
 
@@ -174,9 +186,22 @@ class BagOptions(Options):
     refuses a strength that does not fit; or `tesla`, `millitesla`, `microtesla`, `nanotesla`,
     `gauss`, `milligauss`; or a number, microtesla per count of the sensor."""
 
+    axes: dict[str, Annotated[Axes, AfterValidator(_each_once)]] = Field(default_factory=dict)
+    """For drivers that mix axes: which axes of the readings are x, y and z of a sensor, by its name
+    (`*` stands for anything), as `{mag_0: [y, -x, z]}`."""
+
     regressors: dict[RegressorName, RegressorTopic] = Field(default_factory=dict)
     """Numbers that `l2m calibrate` reads beside the readings, by names of your choice: motor
     currents, speeds, duty cycles. What follows them is separated from the map's field."""
+
+    def in_order(self, sensor: str, field: FloatArray) -> FloatArray:
+        """Return a sensor's readings, shape (N, 3), along its axes as `axes` has them."""
+        fitting = [axes for name, axes in self.axes.items() if fnmatchcase(sensor, name)]
+        if not fitting:
+            return field
+        columns = ["xyz".index(axis[-1]) for axis in fitting[0]]
+        signs = np.array([-1.0 if axis.startswith("-") else 1.0 for axis in fitting[0]])
+        return np.asarray(field[:, columns] * signs)
 
     @model_validator(mode="after")
     def _one_source_of_poses(self) -> "BagOptions":

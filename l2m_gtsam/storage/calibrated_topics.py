@@ -98,12 +98,15 @@ class CalibratedTopic:
 
     Attributes
     ----------
+    sensor
+        Its name.
     topic
         Their name.
     correct
         What makes them.
     """
 
+    sensor: str
     topic: str
     correct: Correct
 
@@ -182,6 +185,7 @@ class Calibrator:
         for key, new in self.topics.items():
             stamps = [self._stamp(block[row], contents[row]) for row in rows[key]]
             field_ut = unit * _readings([contents[row] for row in rows[key]])
+            field_ut = self.options.in_order(new.sensor, field_ut)
             result = new.correct(field_ut, np.array(stamps, dtype=np.int64))
             for row, b, spread in zip(rows[key], result.field, result.covariance, strict=True):
                 message = self._message(contents[row], b, spread)

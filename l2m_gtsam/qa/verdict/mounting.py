@@ -27,15 +27,18 @@ def mounting(case: Case) -> list[Reason]:
 
 def _place(case: Case) -> list[Reason]:
     sensor, options = case.sensor, case.options
-    meant = nominal_place(sensor.sensor, case.result, options)
-    if meant is None or not np.isfinite(sensor.t_sigma).all():
+    if not np.isfinite(sensor.t_sigma).all():
         return []
-    if other := _swapped_with(case, meant):
+    roughly = rough_place(sensor.sensor, case.result, options)
+    if roughly is not None and (other := _swapped_with(case, roughly)):
         text = (
             f"It is where {other} should be, and {other} is where it should be: the two are "
             "swapped. Exchange their topics or their cables."
         )
         return [Reason(Level.FAIL, text)]
+    meant = nominal_place(sensor.sensor, case.result, options)
+    if meant is None:
+        return []
     off = sensor.t_lidar_mag - meant
     if np.linalg.norm(off) < 3 * sensor.t_sigma.max():
         return []
@@ -51,7 +54,7 @@ def _swapped_with(case: Case, meant: FloatArray) -> str | None:
     for other in case.result.sensors:
         if other is case.sensor or other.status in NOT_SOLVED:
             continue
-        there = nominal_place(other.sensor, case.result, case.options)
+        there = rough_place(other.sensor, case.result, case.options)
         if there is None:
             continue
         # Each is nearer by far to the other's place than to its own.
@@ -83,16 +86,16 @@ def _turn(case: Case) -> list[Reason]:
         return options.nominal_deg.reasons(off, text)
     if found.axes.usual or found.axes.off_deg > options.axes_deg or found.axes.mirrored:
         return []
-    return [_unexpected(found.axes, along)]
+    return [_unexpected(case.sensor.sensor, found.axes, along)]
 
 
-def _unexpected(order: AxisOrder, along: str) -> Reason:
+def _unexpected(sensor: str, order: AxisOrder, along: str) -> Reason:
     swapped = "exchanged" if any(a[1] != n for a, n in zip(order.along, "xyz", strict=True)) else ""
     what = f"Its axes are {swapped}" if swapped else "Two of its axes are reversed"
     return Reason(
         Level.WARN,
-        f"{what}: {along}. Its driver mixes axes, or it is mounted like this: then state it in "
-        "`qa.nominal`.",
+        f"{what}: {along}. Its driver mixes axes: `bag.axes: {{{sensor}: {order.in_order}}}` puts "
+        "them in order. Or it is mounted like this: then state it in `qa.nominal`.",
     )
 
 
@@ -141,13 +144,22 @@ def nominal_place(sensor: str, result: CalibrationResult, options: QaOptions) ->
     given = options.nominal.get(sensor)
     if given is not None and given.t_lidar_mag is not None:
         return np.array(given.t_lidar_mag)
-    saved = _calibration(result)
-    if (start := _part(saved, "start").get(sensor)) is not None:
-        return np.array(start, dtype=float)
-    measured = _of_sensor(_part(_part(saved, "priors"), "position"), sensor)
+    measured = _of_sensor(_part(_part(_calibration(result), "priors"), "position"), sensor)
     if measured is None or set(measured) != {"x", "y", "z"}:
         return None
     return np.array([measured[axis][0] for axis in "xyz"], dtype=float)
+
+
+def rough_place(sensor: str, result: CalibrationResult, options: QaOptions) -> FloatArray | None:
+    """Return about where a sensor was meant to be in metres, shape (3,), if that is known.
+
+    Where a solve starts is known to decimetres: enough to see that two sensors are swapped, not
+    to judge a place by.
+    """
+    if (meant := nominal_place(sensor, result, options)) is not None:
+        return meant
+    start = _part(_calibration(result), "start").get(sensor)
+    return None if start is None else np.array(start, dtype=float)
 
 
 def nominal_rotation(

@@ -108,7 +108,7 @@ def _swapped_axes(case: Case) -> Reason | None:
         Level.FAIL,
         f"Axes {one} and {two} are swapped: {one} reads along the lidar's {found.along[moved[0]]}, "
         f"{two} along its {found.along[moved[1]]}, which no mounting does; exchange them in the "
-        "driver.",
+        f"driver, or with `bag.axes: {{{case.sensor.sensor}: {found.in_order}}}`.",
     )
 
 

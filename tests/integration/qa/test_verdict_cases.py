@@ -1,10 +1,11 @@
 """Twelve drives: each gets the verdict and the reason that a specialist would give."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrated
@@ -97,13 +98,15 @@ CASES = {
         swapped_axes,
         FAIL,
         (PASS, FAIL, PASS),
-        own=((("mag_1",), ("Axes x and y are swapped", "in the driver")),),
+        own=((("mag_1",), ("Axes x and y are swapped", "in the driver", "{mag_1: [y, x, z]}")),),
     ),
     "turned axes": Expected(
         turned_axes,
         WARN,
         (PASS, WARN, PASS),
-        own=((("mag_1",), ("axes are exchanged", "+y, -x, +z", "qa.nominal")),),
+        own=(
+            (("mag_1",), ("axes are exchanged", "+y, -x, +z", "{mag_1: [-y, x, z]}", "qa.nominal")),
+        ),
     ),
     "magnet on the vehicle": Expected(
         magnet,
@@ -170,6 +173,19 @@ def test_a_loose_sensor_is_not_blamed_on_the_map() -> None:
 
 def loosened_late() -> Drive:
     return loose(0.7)
+
+
+def test_where_a_solve_starts_is_no_nominal_place() -> None:
+    """It is known roughly: 7 cm from it nothing is wrong, from a nominal place there is."""
+    whole = drive()
+    roughly = {
+        each.sensor: tuple(each.t_lidar_mag + np.array([0.04, -0.04, 0.04])) for each in SENSORS
+    }
+    options = whole.options.model_copy(update={"start": roughly})
+    started = replace(whole, options=options)
+    assert all(not each.reasons for each in judged(lambda: started, QaOptions()).sensors)
+    meant = QaOptions(nominal={"mag_1": Nominal(t_lidar_mag=roughly["mag_1"])})
+    assert "from its nominal place" in judged(lambda: started, meant)["mag_1"].reasons[0].text
 
 
 def test_a_turned_sensor_passes_once_it_is_meant_so() -> None:

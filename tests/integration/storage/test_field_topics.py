@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from rosbags.typesys import get_types_from_msg
 
 from l2m_gtsam.errors import BagError, UnitsError
@@ -152,6 +153,26 @@ def written_with(make: Any, path: Path, content: list[Entry]) -> Path:
             data = make.store.serialize_cdr(each.message, msgtype)
             writer.write(connection, each.record_ns, data)
     return path
+
+
+def test_axes_that_a_driver_mixes_are_put_in_order(tmp_path: Path) -> None:
+    bag = write(tmp_path, "mcap", vectors("/imu/mag", 1.0))
+    options = BagOptions(units=Unit.MICROTESLA, axes={"imu/*": ("y", "-x", "z")})
+    (found,) = read_fields(bag, options)
+    expected = np.array([field_ut(k) for k in range(COUNT)])[:, [1, 0, 2]] * [1, -1, 1]
+    np.testing.assert_allclose(found.field, expected, rtol=1e-12)
+    with pytest.raises(ValidationError, match="each of x, y and z must be there once"):
+        BagOptions(axes={"mag": ("x", "x", "z")})
+
+
+def test_a_single_name_is_a_list_of_one(tmp_path: Path) -> None:
+    """And a number, or a unit, comes back from a file as it was."""
+    options = BagOptions.model_validate({"fields": "/mag_00", "units": 0.0578})
+    assert options.fields == ("/mag_00",)
+    assert BagOptions.model_validate(options.model_dump(mode="json")) == options
+    for wrong in ("furlong", -1, 0, True, float("nan"), None):
+        with pytest.raises(ValidationError, match=r"accepted: auto, tesla.*microtesla per count"):
+            BagOptions.model_validate({"units": wrong})
 
 
 def test_inspect_names_a_constant_and_an_impossible_field(tmp_path: Path) -> None:
