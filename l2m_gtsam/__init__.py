@@ -1,1 +1,53 @@
-"""Calibrate magnetometers against a LiDAR from one drive through a mapped magnetic field."""
+"""Calibrate magnetometers against a LiDAR from one drive through a mapped magnetic field.
+
+The names below are loaded when they are first used, so that importing the package takes no time.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from l2m_gtsam.api.arrays import drive, known_sensor
+    from l2m_gtsam.api.calls import build_map, calibrate, localise
+    from l2m_gtsam.api.files import load_map, read_bag, read_calibration, read_suite, save_map
+
+    __version__: str
+
+__all__ = [
+    "__version__",
+    "build_map",
+    "calibrate",
+    "drive",
+    "known_sensor",
+    "load_map",
+    "localise",
+    "read_bag",
+    "read_calibration",
+    "read_suite",
+    "save_map",
+]
+
+_WHERE = {
+    "drive": "arrays",
+    "known_sensor": "arrays",
+    "build_map": "calls",
+    "calibrate": "calls",
+    "localise": "calls",
+    "load_map": "files",
+    "read_bag": "files",
+    "read_calibration": "files",
+    "read_suite": "files",
+    "save_map": "files",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version("l2m-gtsam")
+    if name not in _WHERE:
+        raise AttributeError(f"module 'l2m_gtsam' has no attribute {name!r}")
+    return getattr(import_module(f"l2m_gtsam.api.{_WHERE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -17,6 +17,10 @@ class UnitsError(L2MError):
     """A field strength that does not fit the unit it is said to be in."""
 
 
+class InputError(L2MError):
+    """An array or an argument that is not what it should be."""
+
+
 class SyncError(L2MError):
     """Readings and poses that cannot be brought together in time."""
 

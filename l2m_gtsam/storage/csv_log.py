@@ -16,7 +16,7 @@ from l2m_gtsam.storage.bag_options import ColumnOptions, TimeUnit
 from l2m_gtsam.storage.csv_columns import Roles, column_roles
 from l2m_gtsam.storage.field_types import CSV_FIELD_TYPE
 from l2m_gtsam.storage.files import open_text
-from l2m_gtsam.storage.log import Channel, TableLog
+from l2m_gtsam.storage.log import TableLog, TableTopic
 from l2m_gtsam.storage.messages import CSV_POSE_TYPE, Orientation, Position
 
 NS_PER = {
@@ -50,7 +50,7 @@ class CsvPose:
 
 
 @dataclass(frozen=True)
-class Table:
+class NamedColumns:
     """What was read of a table.
 
     Attributes
@@ -90,7 +90,7 @@ def read_csv_log(path: Path, options: ColumnOptions) -> TableLog:
     table = read_table(path, options)
     channels = [_readings(table, name) for name in table.roles.fields]
     if table.roles.position is not None and table.roles.orientation is not None:
-        channels.append(Channel(POSE_TOPIC, CSV_POSE_TYPE, *_poses(table)))
+        channels.append(TableTopic(POSE_TOPIC, CSV_POSE_TYPE, *_poses(table)))
     if not channels:
         raise BagError(
             f"{path}: no columns of a magnetometer (as mag_x, mag_y, mag_z) or of poses (x, y, z, "
@@ -99,7 +99,7 @@ def read_csv_log(path: Path, options: ColumnOptions) -> TableLog:
     return TableLog(path, channels)
 
 
-def read_table(path: Path, options: ColumnOptions) -> Table:
+def read_table(path: Path, options: ColumnOptions) -> NamedColumns:
     """Return the columns of a table that have a meaning; errors as of ``read_csv_log``."""
     with open_text(path, BagError) as file:
         lines = (line for line in file if line.strip())
@@ -135,7 +135,7 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _read(path: Path, roles: Roles, rows: Iterator[list[str]]) -> Table:
+def _read(path: Path, roles: Roles, rows: Iterator[list[str]]) -> NamedColumns:
     fields = [each.columns for each in roles.fields.values()]
     wanted = sorted({*chain(*fields), *(roles.position or ()), *(roles.orientation or ())})
     values = {column: array("d") for column in wanted}
@@ -160,7 +160,9 @@ def _read(path: Path, roles: Roles, rows: Iterator[list[str]]) -> Table:
     if not stamps:
         raise BagError(f"{path}: no rows below the names of the columns")
     stamp_ns = _nanoseconds(path, stamps, roles.time_unit)
-    return Table(roles, stamp_ns, {c: np.array(v, dtype=np.float64) for c, v in values.items()})
+    return NamedColumns(
+        roles, stamp_ns, {c: np.array(v, dtype=np.float64) for c, v in values.items()}
+    )
 
 
 def _nanoseconds(path: Path, stamps: list[tuple[str, ...]], unit: TimeUnit) -> IntArray:
@@ -199,7 +201,7 @@ def _likely_unit(stamps: list[tuple[str, ...]]) -> TimeUnit:
     return next((unit for most, unit in STEPS if typical < most), TimeUnit.NANOSECONDS)
 
 
-def _readings(table: Table, name: str) -> Channel:
+def _readings(table: NamedColumns, name: str) -> TableTopic:
     """Return the readings of a magnetometer; rows without any of its numbers are left out."""
     columns = table.roles.fields[name]
     values = table.rows(columns.columns)
@@ -209,10 +211,10 @@ def _readings(table: Table, name: str) -> Channel:
     def contents() -> Iterator[CsvReading]:
         return (CsvReading(Position(*row)) for row in rows.tolist())
 
-    return Channel(f"/{name}", CSV_FIELD_TYPE, table.stamp_ns[kept], contents, columns.unit)
+    return TableTopic(f"/{name}", CSV_FIELD_TYPE, table.stamp_ns[kept], contents, columns.unit)
 
 
-def _poses(table: Table) -> tuple[IntArray, "PoseMaker"]:
+def _poses(table: NamedColumns) -> tuple[IntArray, "PoseMaker"]:
     """Return times and poses of the rows that have one."""
     values = table.rows([*(table.roles.position or ()), *(table.roles.orientation or ())])
     kept = ~np.isnan(values).any(axis=1)

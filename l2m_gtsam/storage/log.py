@@ -60,7 +60,7 @@ class TableExt:
 
 
 @dataclass(frozen=True)
-class Channel:
+class TableTopic:
     """A topic of a log that is a table.
 
     Attributes
@@ -85,7 +85,7 @@ class Channel:
 class TableLog:
     """A log whose topics are tables in memory."""
 
-    def __init__(self, path: Path, channels: Sequence[Channel]) -> None:
+    def __init__(self, path: Path, channels: Sequence[TableTopic]) -> None:
         self._path = path
         self._channels = tuple(channels)
         text = MessageDefinition(MessageDefinitionFormat.NONE, "")

@@ -17,7 +17,6 @@ from l2m_gtsam.storage.files import open_text
 
 NANOSECONDS = 1_000_000_000
 COLUMNS, KITTI_COLUMNS = 8, 12
-EXPECTED = "stamp x y z qx qy qz qw"
 LATEST_S = 9_000_000_000  # nanoseconds after it do not fit into 64 bits
 ROUNDED = 1e-2  # of a rotation matrix: KITTI's have seven digits, those of others often four
 
@@ -133,7 +132,7 @@ def is_kitti(path: Path) -> bool:
     """Return whether the first line of a file has the numbers of KITTI; a BagError if none has."""
     for _, words in _lines(path):
         return len(words) == KITTI_COLUMNS
-    raise BagError(f"{path}: holds no poses; expected: {EXPECTED}")
+    raise BagError(f"{path}: holds no poses; expected: stamp x y z qx qy qz qw")
 
 
 def poses_of(
@@ -184,7 +183,7 @@ def _seconds(word: str) -> int:
 def _pose(words: list[str]) -> list[float]:
     """Return position and rotation of a line; ValueError if they are none."""
     if len(words) != COLUMNS:
-        raise ValueError(f"{len(words)} columns; expected: {EXPECTED}")
+        raise ValueError(f"{len(words)} columns; expected: stamp x y z qx qy qz qw")
     values = [float(word) for word in words[1:]]
     if not np.isfinite(values).all():
         raise ValueError("a number is not finite")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.field_types import PX4_TYPE
-from l2m_gtsam.storage.log import Channel, TableLog
+from l2m_gtsam.storage.log import TableLog, TableTopic
 from l2m_gtsam.storage.messages import PX4_POSE_TYPE
 
 MAX_BYTES = 2_000_000_000
@@ -76,7 +76,7 @@ def _topic_name(name: str, index: int, count: int) -> str:
     return f"/{name}" if count == 1 else f"/{name}_{index}"
 
 
-def _channel(topic: _Topic) -> Channel:
+def _channel(topic: _Topic) -> TableTopic:
     names, groups = list[str](), defaultdict[str, dict[int, str]](dict)
     for column in topic.columns:
         element = INDEXED.match(column)
@@ -91,7 +91,7 @@ def _channel(topic: _Topic) -> Channel:
     def contents() -> Iterator[Any]:
         return (message(*row) for row in zip(*columns, strict=True))
 
-    return Channel(topic.topic, _type_of(topic), topic.stamp_ns, contents)
+    return TableTopic(topic.topic, _type_of(topic), topic.stamp_ns, contents)
 
 
 def _values(topic: _Topic, group: dict[int, str]) -> Sequence[Any]:
@@ -119,7 +119,7 @@ class _LocalPose:
     q: list[float]
 
 
-def _local_pose(topics: Sequence[_Topic]) -> Iterator[Channel]:
+def _local_pose(topics: Sequence[_Topic]) -> Iterator[TableTopic]:
     """Yield local positions with the attitudes between them, if both are there."""
     by_name = {each.name: each.columns for each in reversed(topics)}
     place, attitude = by_name.get("vehicle_local_position"), by_name.get("vehicle_attitude")
@@ -149,7 +149,7 @@ def _sampled(columns: dict[str, np.ndarray[Any, Any]]) -> IntArray:
     return np.asarray(taken.astype(np.int64))
 
 
-def _pose_channel(stamp_us: IntArray, p: FloatArray, wxyz: FloatArray) -> Channel:
+def _pose_channel(stamp_us: IntArray, p: FloatArray, wxyz: FloatArray) -> TableTopic:
     rows = zip(stamp_us.tolist(), p.tolist(), wxyz.tolist(), strict=True)
     poses = [_LocalPose(*row) for row in rows]
-    return Channel(LOCAL_POSE, PX4_POSE_TYPE, 1000 * stamp_us, lambda: iter(poses))
+    return TableTopic(LOCAL_POSE, PX4_POSE_TYPE, 1000 * stamp_us, lambda: iter(poses))

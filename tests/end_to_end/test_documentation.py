@@ -1,14 +1,17 @@
 """The documentation: every block of every page runs, every message is a real one."""
 
 import ast
+import json
 import re
 import shutil
 from pathlib import Path
 
 import pytest
 
+from l2m_gtsam.api.results import JudgedCalibration
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import load_options
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 from tests.support.pages import blocks, run_page, words
@@ -77,6 +80,26 @@ def test_every_block_of_a_page(page: Path, workplace: Path) -> None:
     if page.name == "README.md" and page.parent == REPOSITORY:
         more_readings(workplace)
     run_page(page, workplace)
+
+
+def test_the_notebook(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cells run one after the other, and what they show can be shown."""
+    monkeypatch.chdir(workplace)
+    names: dict[str, object] = {}
+    notebook = json.loads((DOCS / "python.ipynb").read_text(encoding="utf-8"))
+    cells = ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]
+    for number, cell in enumerate(cells):
+        *body, last = ast.parse(cell).body
+        shown = isinstance(last, ast.Expr)
+        rest = ast.Module(body if shown else [*body, last], [])
+        exec(compile(rest, f"cell {number}", "exec"), names)  # noqa: S102 - our own
+        if isinstance(last, ast.Expr):
+            value = eval(compile(ast.Expression(last.value), "", "eval"), names)  # noqa: S307
+            assert getattr(value, "_repr_html_", value.__repr__)()
+    found = names["found"]
+    assert isinstance(found, JudgedCalibration)
+    assert found.verdict.level is Level.PASS
+    assert all(not cell["outputs"] for cell in notebook["cells"] if cell["cell_type"] == "code")
 
 
 def more_readings(folder: Path) -> None:

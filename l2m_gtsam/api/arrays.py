@@ -1,0 +1,205 @@
+"""Drives and sensors made of arrays, with their shapes and units checked."""
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import (
+    Distortion,
+    FieldSeries,
+    FloatArray,
+    IntArray,
+    KnownSensor,
+    Recording,
+    SourceFile,
+    Trajectory,
+)
+from l2m_gtsam.errors import InputError, UnitsError
+from l2m_gtsam.storage.units import Unit, Units, field_fault, microtesla_per
+
+LATEST_S = 9e9
+ARRAYS = "(arrays)"
+
+
+def drive(
+    stamps: npt.ArrayLike,
+    positions: npt.ArrayLike,
+    orientations: npt.ArrayLike,
+    fields: Mapping[str, tuple[npt.ArrayLike, npt.ArrayLike]],
+    *,
+    units: str | float = "microtesla",
+    frame: str = "map",
+    pose_covariance: npt.ArrayLike | None = None,
+) -> Recording:
+    """Return a drive, or a survey, made of arrays.
+
+    Parameters
+    ----------
+    stamps
+        Times of the poses: seconds as floating-point numbers, or nanoseconds as integers, shape
+        (N,), increasing.
+    positions
+        Of the LiDAR in the map in metres, shape (N, 3).
+    orientations
+        Of the LiDAR in the map: quaternions x, y, z, w, shape (N, 4), or rotation matrices, shape
+        (N, 3, 3).
+    fields
+        Of each magnetometer by name its times as those of the poses, shape (M,), and its readings
+        in its own axes, shape (M, 3); NaN marks a missing one.
+    units
+        Unit of the readings: `tesla`, `millitesla`, `microtesla`, `nanotesla`, `gauss`,
+        `milligauss`, or a number, microtesla per count.
+    frame
+        Name of the frame of the poses, the same for survey and drive.
+    pose_covariance
+        Of the errors of the poses, shape (6, 6) or (N, 6, 6): a rotation in radians, then a
+        translation in metres, along the axes of the LiDAR. Poses count as exact without.
+
+    Raises
+    ------
+    InputError
+        An array has another shape, or values that cannot be; the line names it.
+    UnitsError
+        A strength does not fit its unit.
+    """
+    times = _stamps("stamps", stamps)
+    p = _numbers("positions", positions, (len(times), 3))
+    R = _rotations(orientations, len(times))
+    if len(times) < 2 or (np.diff(times) <= 0).any():
+        raise InputError("stamps: two or more, each later than the one before, are needed")
+    if not fields:
+        raise InputError("fields: no magnetometer is given; accepted: {name: (stamps, readings)}")
+    named = _units(units)
+    series = tuple(_series(name, *fields[name], named) for name in sorted(fields))
+    digest = hashlib.sha256()
+    for array in (times, p, R, *(a for each in series for a in (each.stamp_ns, each.field))):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    source = SourceFile(ARRAYS, digest.hexdigest())
+    covariance = None if pose_covariance is None else _covariance(pose_covariance, len(times))
+    return Recording(Trajectory(times, R, p, frame, "lidar", covariance), series, source)
+
+
+def known_sensor(
+    name: str,
+    t: npt.ArrayLike = (0.0, 0.0, 0.0),
+    C: npt.ArrayLike | None = None,
+    H: npt.ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    time_offset: float = 0.0,
+) -> KnownSensor:
+    """Return a magnetometer whose calibration is known: ``B_meas = C @ B_lidar + H``.
+
+    Parameters
+    ----------
+    name
+        As in the drive.
+    t
+        Position in the LiDAR's frame in metres, shape (3,).
+    C
+        Distortion matrix, shape (3, 3); that of an ideal sensor if absent.
+    H
+        Offset in microtesla, shape (3,).
+    time_offset
+        Of its clock in seconds.
+
+    Raises
+    ------
+    InputError
+        An array has another shape, is not finite, or C cannot be inverted.
+    """
+    matrix = _finite("C", np.eye(3) if C is None else C, (3, 3))
+    if np.linalg.cond(matrix) > 1e6:
+        raise InputError("C: cannot be inverted, so that readings say nothing of the field")
+    distortion = Distortion(matrix, _finite("H", H, (3,)))
+    return KnownSensor(name, _finite("t", t, (3,)), distortion, time_offset)
+
+
+def _series(name: str, stamps: npt.ArrayLike, readings: npt.ArrayLike, units: Units) -> FieldSeries:
+    times = _stamps(f"fields[{name!r}]: stamps", stamps)
+    field = _numbers(f"fields[{name!r}]: readings", readings, (len(times), 3), finite=False)
+    if wrong := _strength_fault(field, units):
+        raise UnitsError(f"fields[{name!r}]: {wrong}")
+    order = np.argsort(times, kind="stable")
+    in_ut = field[order] * microtesla_per(units, None)
+    return FieldSeries(name, name, name, times[order], in_ut)
+
+
+def _strength_fault(field: FloatArray, units: Units) -> str | None:
+    """Return what is wrong with readings; a named unit is judged as a type's would be."""
+    if isinstance(units, Unit):
+        return field_fault(field, Unit.AUTO, units)
+    return field_fault(field, units, None)
+
+
+def _units(units: str | float) -> Units:
+    accepted = [unit.value for unit in Unit if unit is not Unit.AUTO]
+    if isinstance(units, str) and units in accepted:
+        return Unit(units)
+    if isinstance(units, int | float) and not isinstance(units, bool) and 0 < units < np.inf:
+        return float(units)
+    raise InputError(
+        f"units: {units!r} is not known; accepted: {', '.join(accepted)}, or a positive number, "
+        "microtesla per count"
+    )
+
+
+def _stamps(name: str, values: npt.ArrayLike) -> IntArray:
+    """Return times in nanoseconds."""
+    array = np.asarray(values)
+    if array.ndim != 1 or array.dtype.kind not in "iuf":
+        raise InputError(
+            f"{name}: {array.dtype} of shape {array.shape}; needed are numbers of shape (N,)"
+        )
+    if array.dtype.kind != "f":
+        return array.astype(np.int64)
+    if not np.isfinite(array).all() or np.abs(array).max(initial=0.0) > LATEST_S:
+        raise InputError(f"{name}: floating-point times must be seconds; give nanoseconds as int64")
+    return np.asarray(np.round(array.astype(np.float64) * 1e9).astype(np.int64))
+
+
+def _numbers(
+    name: str, values: npt.ArrayLike, shape: tuple[int, ...], *, finite: bool = True
+) -> FloatArray:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not an array of numbers") from error
+    if array.shape != shape:
+        raise InputError(f"{name}: of shape {array.shape}; needed is {shape}")
+    if finite and not np.isfinite(array).all():
+        raise InputError(f"{name}: a number is not finite")
+    return array
+
+
+def _covariance(values: npt.ArrayLike, count: int) -> FloatArray:
+    array = np.asarray(values, dtype=np.float64)
+    each = np.broadcast_to(array, (count, 6, 6)) if array.shape == (6, 6) else array
+    found = _numbers("pose_covariance", each, (count, 6, 6))
+    largest = np.abs(found).max(axis=(1, 2), keepdims=True)
+    symmetric = np.abs(found - found.swapaxes(1, 2)) <= 1e-9 * largest
+    if not symmetric.all() or np.linalg.eigvalsh(found / largest).min() < -1e-9:
+        raise InputError("pose_covariance: must be symmetric, without negative eigenvalues")
+    return found.copy()
+
+
+def _finite(name: str, values: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    return _numbers(name, values, shape)
+
+
+def _rotations(values: npt.ArrayLike, count: int) -> FloatArray:
+    """Return rotation matrices of quaternions, or as they are, shape (N, 3, 3)."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 2:
+        q = _numbers("orientations", array, (count, 4))
+        lengths = np.linalg.norm(q, axis=1)
+        if np.abs(lengths - 1).max(initial=0.0) > 1e-2:
+            raise InputError("orientations: quaternions x, y, z, w must have length 1")
+        return np.asarray(Rotation.from_quat(q).as_matrix().reshape(-1, 3, 3))
+    R = _numbers("orientations", array, (count, 3, 3))
+    error = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(initial=0.0)
+    if error > 1e-6 or (np.linalg.det(R) < 0).any():
+        raise InputError("orientations: matrices must be rotations")
+    return R

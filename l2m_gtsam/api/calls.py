@@ -1,0 +1,162 @@
+"""What the commands compute, from records in memory."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from l2m_gtsam.api.options import options_of
+from l2m_gtsam.api.results import JudgedCalibration, LocalisedDrive
+from l2m_gtsam.calibration.calibrate import calibrated
+from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.config import Config
+from l2m_gtsam.data import FloatArray, KnownSensor, Recording
+from l2m_gtsam.errors import InputError
+from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.maps.build import refuse_structure
+from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.progress import Progress, silent
+from l2m_gtsam.qa.evaluate import evaluate
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.slam.exploration import explore
+from l2m_gtsam.slam.localisation import localise as localise_recording
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
+from l2m_gtsam.storage.known_sensors import read_known_sensors
+
+Values = Mapping[str, Any]
+Structure = npt.ArrayLike | str | Path | None
+
+
+def build_map(
+    surveys: Recording | Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | Sequence[KnownSensor] | str | Path | None = None,
+    *,
+    structure: Structure = None,
+    options: MappingOptions | Values | None = None,
+) -> FieldMap:
+    """Build a map of the magnetic field from one or several surveys.
+
+    Parameters
+    ----------
+    surveys
+        Drives with poses in one map frame.
+    suite
+        Calibrations of all their sensors, or a file of them; ideal sensors at the LiDAR's origin if
+        absent.
+    structure
+        What the LiDAR saw of steel: points in the map frame in metres, shape (M, 3), or a file.
+    options
+        As under `mapping` in a configuration.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    chosen = options_of(MappingOptions, options, "mapping")
+    drives = [surveys] if isinstance(surveys, Recording) else list(surveys)
+    if structure is not None:
+        refuse_structure(chosen.model.kind)
+    return map_recordings(drives, _sensors(suite), chosen, _cloud(structure, chosen))
+
+
+def _sensors(
+    suite: Mapping[str, KnownSensor] | Sequence[KnownSensor] | str | Path | None,
+) -> Mapping[str, KnownSensor] | None:
+    if isinstance(suite, str | Path):
+        return read_known_sensors(Path(suite))
+    if suite is None or isinstance(suite, Mapping):
+        return suite
+    return {each.sensor: each for each in suite}
+
+
+def _cloud(
+    structure: npt.ArrayLike | str | Path | None, options: MappingOptions
+) -> FloatArray | None:
+    if structure is None:
+        return None
+    if isinstance(structure, str | Path):
+        return read_cloud(Path(structure), options.structure.edge)
+    points = np.asarray(structure, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise InputError(f"structure: of shape {points.shape}; needed are finite points (M, 3)")
+    return thinned_cloud(points, options.structure.edge)
+
+
+def calibrate(
+    recording: Recording,
+    field_map: QueryableMap,
+    *,
+    options: CalibrationOptions | Values | None = None,
+    qa: QaOptions | Values | None = None,
+    progress: Progress = silent,
+) -> JudgedCalibration:
+    """Calibrate every magnetometer of a drive, and judge the result.
+
+    Parameters
+    ----------
+    recording
+        A drive through the mapped place.
+    field_map
+        The map, in the frame of the drive's poses.
+    options
+        As under `calibration` in a configuration.
+    qa
+        Thresholds of the verdict, as under `qa`.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    chosen = options_of(CalibrationOptions, options, "calibration")
+    limits = options_of(QaOptions, qa, "qa")
+    found = calibrated(recording, field_map, chosen, None, progress)
+    metrics = evaluate(recording, found, chosen, limits, progress)
+    config = Config(calibration=chosen, qa=limits)
+    result = replace(found.result, options=config.model_dump(mode="json"))
+    return JudgedCalibration(result, judge(result, metrics, limits))
+
+
+def localise(
+    recording: Recording,
+    calibration: JudgedCalibration | CalibrationResult,
+    field_map: QueryableMap | None = None,
+    *,
+    options: SlamOptions | Values | None = None,
+    progress: Progress = silent,
+) -> LocalisedDrive:
+    """Estimate where a drive went: in a map, or in the field that it meets on its way.
+
+    Parameters
+    ----------
+    recording
+        A drive; its poses are odometry.
+    calibration
+        Of its sensors.
+    field_map
+        The map; without one the field is found with the poses.
+    options
+        As under `slam` in a configuration.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    chosen = options_of(SlamOptions, options, "slam")
+    known = calibration.result if isinstance(calibration, JudgedCalibration) else calibration
+    if field_map is None:
+        return LocalisedDrive(explore(recording, known, chosen, progress).result)
+    return LocalisedDrive(localise_recording(recording, field_map, known, chosen, progress).result)

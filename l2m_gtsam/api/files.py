@@ -1,0 +1,95 @@
+"""Files in and out, as the commands read and write them."""
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from l2m_gtsam.api.options import options_of
+from l2m_gtsam.batch.files import SavedMap, read_drive_and_numbers
+from l2m_gtsam.batch.maps import write_map
+from l2m_gtsam.config import Config, with_poses
+from l2m_gtsam.data import KnownSensor, Recording
+from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.progress import silent
+from l2m_gtsam.recording.joining import joined
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.calibration_file import read_calibration as read_calibration_file
+from l2m_gtsam.storage.known_sensors import read_known_sensors
+
+Paths = str | Path | Sequence[str | Path]
+
+
+def read_bag(
+    logs: Paths,
+    *,
+    poses: Paths = (),
+    pose_times: str | Path | None = None,
+    options: BagOptions | Mapping[str, Any] | None = None,
+) -> Recording:
+    """Return a drive, or several of one vehicle as one.
+
+    Parameters
+    ----------
+    logs
+        ROS1 .bag, ROS2 folder, .db3, .mcap, .csv or .ulg; one or several.
+    poses
+        File with the poses of each log, where they are not in it: TUM, KITTI or .csv.
+    pose_times
+        Times of KITTI's poses.
+    options
+        What is read, as under `bag` in a configuration.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with a file, in one line.
+    """
+    drives = _paths(logs)
+    config = Config(bag=options_of(BagOptions, options, "bag"))
+    times = None if pose_times is None else Path(pose_times)
+    config = with_poses(config, drives, _paths(poses), times)
+    return joined([read_drive_and_numbers(log, config, silent) for log in drives])
+
+
+def read_calibration(path: str | Path) -> CalibrationResult:
+    """Return the calibration in a `calibration.yaml`; a CalibrationError if it is none."""
+    return read_calibration_file(Path(path))
+
+
+def read_suite(path: str | Path) -> dict[str, KnownSensor]:
+    """Return the sensors of a `suite.yaml` by name; a CalibrationError if it is none."""
+    return read_known_sensors(Path(path))
+
+
+def load_map(path: str | Path) -> FieldMap:
+    """Return the map in a file; a MapError if it is none."""
+    return SavedMap.read(Path(path)).open(silent)
+
+
+def save_map(path: str | Path, field_map: FieldMap, *, frame: str = "map") -> None:
+    """Write a map to a file (`.npz`) that the commands read.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    field_map
+        The map.
+    frame
+        Name of the frame that it is in.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    provenance = {"frame": frame, "version": version("l2m-gtsam")}
+    write_map(Path(path), field_map, provenance, None)
+
+
+def _paths(paths: Paths) -> list[Path]:
+    if isinstance(paths, str | Path):
+        return [Path(paths)]
+    return [Path(each) for each in paths]

@@ -1,0 +1,100 @@
+"""Arrays become drives, or one line says what is wrong with them."""
+
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import l2m_gtsam as l2m
+from l2m_gtsam.errors import InputError, L2MError, UnitsError
+
+COUNT = 40
+SECONDS = 1000.0 + 0.1 * np.arange(COUNT)
+P = np.column_stack([0.1 * np.arange(COUNT), np.zeros(COUNT), np.ones(COUNT)])
+Q = Rotation.from_rotvec(np.outer(np.arange(COUNT), [0, 0, 0.02])).as_quat()
+FIELD = np.array([20.0, 5.0, -40.0]) + np.sin(np.arange(COUNT))[:, None]
+
+
+def given(**changed: Any) -> dict[str, Any]:
+    usual = {
+        "stamps": SECONDS,
+        "positions": P,
+        "orientations": Q,
+        "fields": {"mag": (SECONDS, FIELD)},
+    }
+    return {**usual, **changed}
+
+
+def test_seconds_and_nanoseconds_quaternions_and_matrices_are_one() -> None:
+    one = l2m.drive(**given())
+    stamps = np.round(SECONDS * 1e9).astype(np.int64)
+    R = Rotation.from_quat(Q).as_matrix()
+    field = {"mag": (stamps, FIELD / 100)}
+    other = l2m.drive(stamps, P.tolist(), R, field, units="gauss")
+    np.testing.assert_array_equal(one.trajectory.stamp_ns, other.trajectory.stamp_ns)
+    np.testing.assert_allclose(one.trajectory.R, other.trajectory.R, atol=1e-12)
+    np.testing.assert_allclose(one.series[0].field, other.series[0].field, rtol=1e-12)
+    counts = l2m.drive(**given(fields={"mag": (SECONDS, FIELD / 0.0578)}, units=0.0578))
+    np.testing.assert_allclose(counts.series[0].field, FIELD, rtol=1e-12)
+    stronger = l2m.drive(**given(fields={"mag": (SECONDS, 1.1 * FIELD)}))
+    assert one.source.sha256 != stronger.source.sha256
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"positions": P[:, :2]}, r"positions: of shape \(40, 2\); needed is \(40, 3\)"),
+        ({"positions": P[1:]}, r"positions: of shape \(39, 3\)"),
+        ({"positions": np.full_like(P, np.nan)}, "positions: a number is not finite"),
+        ({"positions": "here"}, "positions: not an array of numbers"),
+        ({"orientations": Q * 2}, "quaternions x, y, z, w must have length 1"),
+        ({"orientations": -np.tile(np.eye(3), (COUNT, 1, 1))}, "matrices must be rotations"),
+        ({"stamps": SECONDS[::-1]}, "each later than the one before"),
+        ({"stamps": SECONDS * 1e9}, "floating-point times must be seconds"),
+        ({"stamps": [str(s) for s in SECONDS]}, "stamps: .*needed are numbers"),
+        ({"fields": {}}, "no magnetometer is given"),
+        ({"fields": {"m": (SECONDS[1:], FIELD)}}, r"fields\['m'\]: readings: of shape"),
+        ({"units": "furlong"}, "'furlong' is not known; accepted: tesla, .* microtesla per count"),
+        ({"units": -1.0}, "accepted: tesla"),
+        ({"pose_covariance": -np.eye(6)}, "pose_covariance: must be symmetric"),
+        ({"pose_covariance": np.eye(3)}, r"pose_covariance: of shape \(3, 3\)"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(changed: dict[str, Any], told: str) -> None:
+    with pytest.raises(InputError, match=told) as error:
+        l2m.drive(**given(**changed))
+    assert "\n" not in str(error.value)
+
+
+def test_units_are_checked() -> None:
+    with pytest.raises(UnitsError, match=r"0.4.* uT, as read in microtesla.*`units: gauss`"):
+        l2m.drive(**given(fields={"mag": (SECONDS, FIELD / 100)}))
+
+
+def test_known_sensors() -> None:
+    sensor = l2m.known_sensor("mag", [0.1, 0, 0], np.diag([1.0, 1.1, 0.9]), [1, 2, 3])
+    np.testing.assert_array_equal(sensor.distortion.H, [1, 2, 3])
+    for wrong in (np.zeros((3, 3)), np.eye(2)):
+        with pytest.raises(InputError, match="C: "):
+            l2m.known_sensor("mag", C=wrong)
+
+
+def test_names_are_there_and_no_others() -> None:
+    assert l2m.__version__
+    assert set(l2m.__all__) <= set(dir(l2m))
+    assert all(hasattr(l2m, name) for name in l2m.__all__)
+    with pytest.raises(AttributeError, match="has no attribute 'calibrat'"):
+        _ = l2m.calibrat
+    assert issubclass(InputError, L2MError)
+
+
+def test_importing_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, l2m_gtsam; l2m_gtsam.__version__; "
+        "print(sorted({'numpy', 'scipy', 'gtsam', 'pydantic', 'rosbags'} & set(sys.modules)))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
