@@ -5,7 +5,7 @@ export MPLBACKEND := Agg
 # Blocks of a few hundred readings are too small for BLAS threads.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: demo test study benchmark docs docs-serve magyc lock clean
+.PHONY: demo test study benchmark docs reference docs-serve magyc lock clean
 
 demo: .venv/runtime.stamp
 	$(BIN)/l2m demo --out demo_out
@@ -27,6 +27,10 @@ benchmark: .venv/dev.stamp
 # The site, to be opened as site/index.html; `make docs-serve` shows it while pages are written.
 docs: .venv/dev.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# The pages of all options, which are part of the repository.
+reference: .venv/runtime.stamp
+	$(BIN)/python scripts/write_reference.py
 
 docs-serve: .venv/dev.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve

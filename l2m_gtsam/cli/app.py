@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from l2m_gtsam.cli.calibration import batch, calibrate, inspect, plan
+from l2m_gtsam.cli.calibration import batch, calibrate, config, inspect, plan
 from l2m_gtsam.cli.maps import map_app
 from l2m_gtsam.cli.results import apply, export, report, validate
 from l2m_gtsam.cli.simulation import demo, simulate, study
@@ -35,6 +35,7 @@ for _command in (
     validate,
     slam,
     inspect,
+    config,
     simulate,
     calibrate,
     plan,

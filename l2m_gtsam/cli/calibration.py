@@ -48,6 +48,33 @@ def inspect(
         raise typer.Exit(1)
 
 
+def config(
+    key: Annotated[
+        str | None, typer.Argument(metavar="[KEY]", help="Only this part: bag, calibration.solve.")
+    ] = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option("--for", metavar="BAG", help="A configuration to start from, for this log."),
+    ] = None,
+) -> None:
+    """Print every option with its default and meaning, or a configuration for a log, as YAML."""
+    from l2m_gtsam.errors import ConfigError
+
+    if bag is None:
+        from l2m_gtsam.batch.options_text import options_text
+
+        typer.echo(options_text(key), nl=False)
+        return
+    if key is not None:
+        raise ConfigError("--for: makes a whole configuration; leave out KEY")
+    with shown_progress() as progress:
+        from l2m_gtsam.batch.starting_config import starting_config
+        from l2m_gtsam.progress import counter
+
+        text = starting_config(bag, counter(f"reading {bag.name}", progress))
+    typer.echo(text, nl=False)
+
+
 def plan(
     bag: BagArgument,
     map_path: MapOption,

@@ -1,7 +1,7 @@
 """Say what is in a bag, and what would be used of it and why."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,10 @@ from l2m_gtsam.storage.units import (
     PLAUSIBLE_UT,
     Strength,
     Unit,
+    Units,
     field_fault,
     is_turning,
+    likely_units,
     microtesla_per,
     strength,
 )
@@ -76,6 +78,12 @@ class TopicReport:
         |B| in uT, for magnetic fields in a unit that is known.
     use
         What would be used of it, and why, or why not.
+    role
+        `field`, `poses` or empty: what it would be used as.
+    likely_units
+        What its readings are likely in, where they are not in the unit of their type.
+    links
+        Parents and children of its transforms.
     """
 
     topic: str
@@ -89,6 +97,9 @@ class TopicReport:
     nan_share: float
     strength: Strength | None
     use: str
+    role: str = ""
+    likely_units: Units | None = None
+    links: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -107,6 +118,7 @@ class _TopicBuffers:
     frames: set[str] = field(default_factory=set)
     readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
     covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
+    links: set[tuple[str, str]] = field(default_factory=set)
     fault: str = ""
 
     @property
@@ -151,6 +163,9 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
             _report(topic, connections, collected.get(topic), uses.get(topic), duration, options)
             for topic, connections in topics.items()
         ]
+        roles = {c.topic: "poses" for c in poses}
+        roles |= {each.connection.topic: "field" for each in fields}
+        reports = [replace(each, role=roles.get(each.topic, "")) for each in reports]
     if no_poses and any(report.msgtype == CLOUD_TYPE for report in reports):
         notes.append(f"{no_poses}; {BY_CLOUDS}")
         no_poses = ""
@@ -253,6 +268,8 @@ def _collect(
     for stamped in _stamped(content, msgtype):
         into.stamps.add(stamp_of(stamped, record_ns), record_ns)
         into.frames.add(frame_of(stamped))
+    if msgtype in TF_TYPES:
+        into.links.update((t.header.frame_id, t.child_frame_id) for t in content.transforms)
     if source is not None and not into.fault:
         into.readings.unit = source.unit
         try:
@@ -302,6 +319,8 @@ def _report(
         else float("nan"),
         strength=_strength(found, options),
         use=_use(use, connections[0], found, options),
+        likely_units=likely_units(written, options.units, found.readings.unit),
+        links=tuple(sorted(found.links)),
     )
 
 

@@ -140,6 +140,20 @@ def field_fault(written: FloatArray, units: Units, own: Unit | None) -> str | No
     )
 
 
+def likely_units(written: FloatArray, units: Units, own: Unit | None) -> Units | None:
+    """Return what readings as they are written are likely in, where that is not what they say.
+
+    Of raw counts a number of one digit's worth: it makes the field of the Earth of a typical one.
+    """
+    found = strength(written)
+    if found.is_constant or field_fault(written, units, own) is None:
+        return None
+    typical = found.median
+    if are_counts(written) and typical > 0:
+        return EARTH_UT / typical
+    return suspected_unit(typical)
+
+
 def suspected_unit(as_written: float) -> Unit | None:
     """Return the unit in which a strength as written is most like the Earth's, if any fits."""
     low, high = PLAUSIBLE_UT
