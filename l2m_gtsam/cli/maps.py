@@ -29,7 +29,8 @@ StructureOption = Annotated[
     typer.Option(
         "--structure",
         metavar="CLOUD",
-        help="What the LiDAR saw: .pcd, .ply or .npz in the map frame, or a PointCloud2 topic.",
+        help="What the LiDAR saw: .pcd, .ply, .las, .laz, .e57 or .npz in the map frame, or a "
+        "PointCloud2 topic.",
     ),
 ]
 TilesOption = Annotated[

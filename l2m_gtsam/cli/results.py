@@ -102,7 +102,9 @@ def export(
     ],
     format_name: Annotated[
         str,
-        typer.Option("--format", help="ros2-launch, urdf, kalibr, json or bias-scale."),
+        typer.Option(
+            "--format", help="ros2-launch, urdf, kalibr, json, bias-scale, px4 or ardupilot."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", help="File to write.")],
     lidar_frame: LidarFrameOption = "lidar",
@@ -118,7 +120,7 @@ def export(
         typer.Option(help="URDF of a robot that the sensors are put into; --out gets the copy."),
     ] = None,
 ) -> None:
-    """Write a calibration for another program: tf, URDF, Kalibr, JSON, offsets and scales."""
+    """Write a calibration for another program: tf, URDF, Kalibr, JSON, autopilots, scales."""
     from l2m_gtsam.batch.exports import Names, export_calibration
 
     names = Names(lidar_frame, dict(_named(text) for text in frame or []))

@@ -1,4 +1,4 @@
-"""Point clouds: read from files (PCD, PLY, NPZ), averaged over voxels, written."""
+"""Point clouds: read from files (PCD, PLY, LAS, E57, NPZ), averaged over voxels, written."""
 
 import struct
 import zipfile
@@ -21,6 +21,7 @@ from l2m_gtsam.storage.point_table import (
     require_bytes,
     write_ply,
 )
+from l2m_gtsam.storage.survey_clouds import e57_pieces, las_pieces
 
 # Points that wait before they are merged, at least.
 BATCH_POINTS = 1 << 18
@@ -105,7 +106,7 @@ class VoxelMeans:
 
 
 NPZ_MEMBER = "points.npy"
-ACCEPTED = "a .pcd, .ply or .npz file (of the array `points`, shape (N, 3))"
+ACCEPTED = "a .pcd, .ply, .las, .laz, .e57 or .npz file (of the array `points`, shape (N, 3))"
 # Further from the map's origin than any site: geographic or broken coordinates.
 MAX_COORDINATE_M = 1e6
 
@@ -144,7 +145,7 @@ def read_cloud(path: Path, edge: float = 0.0) -> FloatArray:
     ----------
     path
         A ``.pcd`` (ascii, binary, binary_compressed), ``.ply`` (ascii, binary of either byte
-        order) or ``.npz`` (array ``points``, shape (N, 3)) in metres.
+        order), ``.las``, ``.laz``, ``.e57`` or ``.npz`` (array ``points``, shape (N, 3)) in metres.
     edge
         Thin the cloud while reading, as `thinned_cloud` does, in metres; 0 keeps every point.
 
@@ -274,5 +275,8 @@ READERS: dict[str, Callable[[Path], Iterator[FloatArray]]] = {
     ".pcd": pcd_pieces,
     ".ply": ply_pieces,
     ".npz": _npz_pieces,
+    ".las": las_pieces,
+    ".laz": las_pieces,
+    ".e57": e57_pieces,
 }
 WRITERS: dict[str, Callable[[Path, FloatArray], None]] = {".ply": write_ply, ".npz": _write_npz}

@@ -15,6 +15,13 @@ from l2m_gtsam.storage.calibration_file import (
     sensor_entry,
     source_entries,
 )
+from l2m_gtsam.storage.exports.autopilots import (
+    ardupilot_fault,
+    ardupilot_text,
+    autopilot_notes,
+    px4_fault,
+    px4_text,
+)
 from l2m_gtsam.storage.exports.bias_scale import bias_scale_notes, bias_scale_text, not_reducible
 from l2m_gtsam.storage.exports.export import Export, ExportedSensor, Fault, not_mounted
 from l2m_gtsam.storage.exports.urdf import urdf_text
@@ -167,4 +174,6 @@ FORMATS = {
     "kalibr": Format(kalibr_text),
     "json": Format(json_text),
     "bias-scale": Format(bias_scale_text, not_reducible, bias_scale_notes),
+    "px4": Format(px4_text, px4_fault, autopilot_notes),
+    "ardupilot": Format(ardupilot_text, ardupilot_fault, autopilot_notes),
 }

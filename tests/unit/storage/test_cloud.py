@@ -208,7 +208,7 @@ def test_missing_foreign_and_unknown_files(tmp_path: Path) -> None:
     assert "no such point cloud" in complaint(tmp_path / "none.ply")
     (tmp_path / "folder.ply").mkdir()
     assert "cannot be read" in complaint(tmp_path / "folder.ply")
-    assert ".pcd, .ply or .npz" in complaint(written(tmp_path / "a.las", "LASF"))
+    assert ".pcd, .ply, .las" in complaint(written(tmp_path / "a.xyz", "1 2 3"))
     with pytest.raises(OutputError, match=r"written as \.ply or \.npz"):
         write_cloud(tmp_path / "a.pcd", POINTS)
     for suffix in ("pcd", "ply", "npz"):
