@@ -22,6 +22,7 @@ from l2m_gtsam.qa.evaluate import FIGURES, evaluate
 from l2m_gtsam.qa.report.figures.vehicle import calibration_figure
 from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.qa.scene import scene_of
+from l2m_gtsam.qa.verdict.calibration import judgement_of
 from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.metrics import Metrics
@@ -122,7 +123,8 @@ def calibrate_drive(
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
     metrics = evaluate(recording, found, config.calibration, config.qa, progress)
-    result = replace(found.result, options=config.model_dump(mode="json"))
+    unjudged = replace(found.result, options=config.model_dump(mode="json"))
+    result = replace(unjudged, judgement=judgement_of(unjudged, metrics, config.qa))
     drives = [each.trajectory for each in recording.parts]
     figure = calibration_figure(metrics.map, drives, result, truth)
     ensure_folder(out)

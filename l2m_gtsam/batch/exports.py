@@ -9,10 +9,11 @@ import numpy as np
 from l2m_gtsam.batch.files import check_outputs, ensure_folder, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.data import CorrectedField, FloatArray, IntArray, ScalarSeries
-from l2m_gtsam.errors import BagError, ConfigError, OutputError
+from l2m_gtsam.errors import BagError, CalibrationError, ConfigError, OutputError
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.recording.regressors import ResampleOptions, resampled
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
+from l2m_gtsam.records.verdict import NOT_JUDGED, Level, Verdict
 from l2m_gtsam.solve.correction import corrected, moving_variance, without_moving
 from l2m_gtsam.storage.bag_copy import bag_copy, check_copy
 from l2m_gtsam.storage.bag_options import BagOptions
@@ -25,7 +26,7 @@ from l2m_gtsam.storage.calibrated_topics import (
     check_units,
     sensor_topics,
 )
-from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.calibration_file import read_calibration, verdict_text
 from l2m_gtsam.storage.exports.export import (
     Export,
     check_lidar_frame,
@@ -36,7 +37,7 @@ from l2m_gtsam.storage.exports.export import (
 )
 from l2m_gtsam.storage.exports.formats import FORMATS
 from l2m_gtsam.storage.exports.urdf import edited_urdf
-from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.files import atomic_path, source_file
 from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.regressors import read_scalars
 from l2m_gtsam.storage.yaml_file import MAX_BYTES
@@ -58,8 +59,53 @@ class Names:
     sensors: Mapping[str, str] = field(default_factory=dict)
 
 
+def verdict_notes(path: Path, result: CalibrationResult, despite_verdict: bool) -> tuple[str, ...]:
+    """Return what is worth a warning of the verdict on a calibration, a sentence each.
+
+    Parameters
+    ----------
+    path, result
+        The calibration and its file.
+    despite_verdict
+        Whether a FAIL is to be used all the same.
+
+    Raises
+    ------
+    CalibrationError
+        It was judged FAIL, and nobody asked for it all the same.
+    """
+    if result.judgement is None:
+        return (f"{path}: {NOT_JUDGED}; it holds no verdict",)
+    verdict = result.judgement.verdict
+    if verdict.level is Level.PASS:
+        return tuple(f"{path}: {each}" for each in result.judgement.disagreeing)
+    told = f"{path}: its verdict is {verdict.level.upper()}: {_worst_reason(verdict)}"
+    if verdict.level is Level.FAIL and not despite_verdict:
+        raise CalibrationError(f"{told}; to use it all the same, say --despite-verdict")
+    return (told,)
+
+
+def _worst_reason(verdict: Verdict) -> str:
+    """Return the first of the reasons that make a verdict what it is, and how many more."""
+    whole = [each.text for each in verdict.reasons if each.level is verdict.level]
+    whole += [
+        f"{sensor.sensor}: {each.text}"
+        for sensor in verdict.sensors
+        for each in sensor.reasons
+        if each.level is verdict.level
+    ]
+    more = f" (and {len(whole) - 1} more)" if len(whole) > 1 else ""
+    return f"{whole[0].rstrip('.')}{more}" if whole else "it gives no reason"
+
+
 def export_calibration(
-    calibration: Path, format_name: str, out: Path, names: Names, into: Path | None = None
+    calibration: Path,
+    format_name: str,
+    out: Path,
+    names: Names,
+    into: Path | None = None,
+    *,
+    despite_verdict: bool = False,
 ) -> tuple[str, ...]:
     """Write a calibration for another program.
 
@@ -75,6 +121,8 @@ def export_calibration(
         Of frames.
     into
         A URDF that the sensors are put into; it stays as it is, the copy is written.
+    despite_verdict
+        Whether a calibration that was judged FAIL is written all the same.
 
     Returns
     -------
@@ -92,12 +140,13 @@ def export_calibration(
         raise ConfigError("--into: goes with --format urdf alone")
     _check_sources(out, calibration, into)
     chosen, result = FORMATS[format_name], read_calibration(calibration)
+    judged = verdict_notes(calibration, result, despite_verdict)
     export = export_of(result, chosen.fault, names.lidar, names.sensors)
     content = chosen.text(export).encode() if into is None else _edited(export, into)
     ensure_folder(out.parent)
     with atomic_path(out) as temporary:
         temporary.write_bytes(content)
-    return (*left_out_notes(export.left_out), *chosen.notes(export))
+    return (*judged, *left_out_notes(export.left_out), *chosen.notes(export))
 
 
 def _check_sources(out: Path, *sources: Path | None) -> None:
@@ -234,6 +283,8 @@ class Application:
         Name of the frame that the corrected readings are in.
     replace
         Whether the topics that are corrected are left out.
+    despite_verdict
+        Whether a calibration that was judged FAIL is applied all the same.
     """
 
     bag: Path
@@ -242,6 +293,7 @@ class Application:
     config: Path | None = None
     lidar_frame: str = "lidar"
     replace: bool = False
+    despite_verdict: bool = False
 
 
 @dataclass(frozen=True)
@@ -276,6 +328,7 @@ def apply_calibration(wanted: Application, progress: Progress) -> Applied:
         Whatever is wrong with the input, in one line; nothing is written then.
     """
     result = read_calibration(wanted.calibration)
+    judged = verdict_notes(wanted.calibration, result, wanted.despite_verdict)
     if wanted.config is None:
         reading = Reading.of(result, wanted.calibration)
     else:
@@ -291,11 +344,18 @@ def apply_calibration(wanted: Application, progress: Progress) -> Applied:
         corrections = corrections_of(wanted.bag, here, reading, progress)
         topics = _calibrated_topics(bag, found, corrections, reading.bag)
         left_out = frozenset(topic for topic, _ in topics) if wanted.replace else frozenset()
-        calibrator = Calibrator(bag, topics, reading.bag, wanted.lidar_frame, left_out)
+        calibrator = Calibrator(
+            bag=bag,
+            topics=topics,
+            options=reading.bag,
+            frame=wanted.lidar_frame,
+            left_out=left_out,
+            verdict=verdict_text(result, source_file(wanted.calibration)),
+        )
         with bag_copy(bag, wanted.out) as copy:
             calibrator.copy(copy, counter(f"copying {name}", progress))
     added = {found[key].sensor: new.topic for key, new in topics.items()}
-    return Applied(added, (*usable.notes, *_unmatched(result, found)))
+    return Applied(added, (*judged, *usable.notes, *_unmatched(result, found)))
 
 
 def _calibrated_topics(

@@ -30,6 +30,7 @@ from l2m_gtsam.qa.fleet import with_outliers
 from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.fleet_page import fleet_page
 from l2m_gtsam.records.fleet import DriveOutcome, FleetRow
+from l2m_gtsam.records.verdict import Level, worst
 from l2m_gtsam.storage.files import atomic_path, printable, source_file
 from l2m_gtsam.storage.fleet_table import write_csv, write_parquet
 from l2m_gtsam.storage.record_files import read_outcome
@@ -58,6 +59,12 @@ class Fleet:
     drives: int
     computed: int
     notes: tuple[str, ...]
+
+    @property
+    def level(self) -> Level:
+        """The worst verdict of all sensors; FAIL if a drive was not calibrated."""
+        sensors = [row.sensor for row in self.rows]
+        return worst(Level.FAIL if each is None else Level(each.verdict) for each in sensors)
 
 
 def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) -> Fleet:

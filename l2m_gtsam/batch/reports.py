@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -17,29 +18,29 @@ from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
 from l2m_gtsam.qa.report.localisation_page import localisation_page
-from l2m_gtsam.qa.verdict.calibration import judge
-from l2m_gtsam.qa.verdict.localisation import judge_localisation
+from l2m_gtsam.qa.verdict.calibration import judge, judgement_of
+from l2m_gtsam.qa.verdict.localisation import judgement_of_localisation
 from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
-from l2m_gtsam.records.verdict import Verdict
-from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.records.verdict import Judgement, Verdict
+from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.files import atomic_path
-from l2m_gtsam.storage.record_files import read_metrics, read_slam
+from l2m_gtsam.storage.record_files import read_metrics, read_slam, write_slam
 
 SLAM_FILE = "slam.json"
 
 
-def report_localisation(folder: Path, config: Path | None, page: Path) -> Verdict:
-    """Write the report on the localisation in a folder.
+def report_localisation(folder: Path, config: Path | None, page: Path) -> Judgement:
+    """Write the report on the localisation in a folder, and its verdict if that is another.
 
     Parameters
     ----------
     folder
         Where it was written to.
     config
-        Configuration with thresholds; those of the localisation if there is none.
+        Configuration with thresholds; those that it was judged by if there is none.
     page
         File of the report.
 
@@ -49,20 +50,26 @@ def report_localisation(folder: Path, config: Path | None, page: Path) -> Verdic
         The record is missing or damaged; one line.
     """
     source = folder / SLAM_FILE
-    record = read_slam(source)
-    if config is None:
-        options = saved_options(source, record.options, QaOptions, "qa")
-    else:
+    found = read_slam(source)
+    if config is not None:
         options = load_config(config).qa
-    return write_slam_report(page, record, options)
+    elif found.judgement is not None:
+        options = saved_options(source, found.judgement.thresholds, QaOptions)
+    else:
+        options = saved_options(source, found.options, QaOptions, "qa")
+    judgement = judgement_of_localisation(found, options)
+    record = replace(found, judgement=judgement)
+    write_slam_report(page, record, options)
+    if judgement != found.judgement:
+        write_slam(source, record)
+    return judgement
 
 
-def write_slam_report(page: Path, record: LocalisationRecord, options: QaOptions) -> Verdict:
-    """Write the report on a localisation and return its verdict."""
+def write_slam_report(page: Path, record: LocalisationRecord, options: QaOptions) -> None:
+    """Write the report on a localisation."""
     text = localisation_page(record, options)
     with atomic_path(page) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="replace")
-    return judge_localisation(record, options)
 
 
 BROWSERS = (
@@ -126,8 +133,8 @@ PDF_FILE = "report.pdf"
 
 def report_folder(
     folder: Path, config: Path | None, progress: Progress = silent, *, pdf: bool = False
-) -> Verdict:
-    """Write `report.html` from what is in a folder.
+) -> Judgement:
+    """Write `report.html` from what is in a folder, and into the result what it was judged.
 
     Parameters
     ----------
@@ -135,7 +142,7 @@ def report_folder(
         Where a calibration (`calibration.yaml` and `metrics.json`) or a localisation (`slam.json`)
         was written to.
     config
-        Configuration with thresholds; those that it was computed with if there is none.
+        Configuration with thresholds; those that it was judged by if there is none.
     progress
         Called with a stage and the fraction of it that is done.
     pdf
@@ -149,13 +156,13 @@ def report_folder(
     progress(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE, folder / PDF_FILE)
     if holds_localisation(folder):
-        verdict = report_localisation(folder, config, folder / REPORT_FILE)
+        judgement = report_localisation(folder, config, folder / REPORT_FILE)
     else:
-        verdict = _report_calibration(folder, config, progress)
+        judgement = _report_calibration(folder, config, progress)
     if pdf:
         print_page(folder / REPORT_FILE, folder / PDF_FILE)
     progress(STAGE, 1.0)
-    return verdict
+    return judgement
 
 
 def report_calibration(
@@ -206,11 +213,18 @@ def holds_localisation(folder: Path) -> bool:
     return True
 
 
-def _report_calibration(folder: Path, config: Path | None, progress: Progress) -> Verdict:
-    result = read_calibration(folder / CALIBRATION_FILE)
+def _report_calibration(folder: Path, config: Path | None, progress: Progress) -> Judgement:
+    source = folder / CALIBRATION_FILE
+    found = read_calibration(source)
     metrics = read_metrics(folder / METRICS_FILE)
-    options = _saved(result) if config is None else load_config(config).qa
-    return write_report(folder, result, metrics, options, progress)
+    options = _saved(found) if config is None else load_config(config).qa
+    check_names([each.sensor for each in found.sensors], options)
+    judgement = judgement_of(found, metrics, options)
+    result = replace(found, judgement=judgement)
+    write_report(folder, result, metrics, options, progress)
+    if judgement != found.judgement:
+        write_calibration(source, result)
+    return judgement
 
 
 def write_report(
@@ -237,9 +251,10 @@ def write_report(
 
 
 def _saved(result: CalibrationResult) -> QaOptions:
-    """Return the thresholds that a calibration was made with."""
+    """Return the thresholds that a calibration was judged by, else those that it was made with."""
+    judged, made = result.judgement, result.options.get("qa", {})
     try:
-        return QaOptions.model_validate(result.options.get("qa", {}))
+        return QaOptions.model_validate(made if judged is None else judged.thresholds)
     except ValidationError as error:
         fault = first_fault(error, "qa")
         raise ConfigError(

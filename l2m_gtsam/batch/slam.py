@@ -22,13 +22,14 @@ from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.metrics.pose_errors import check_truth
+from l2m_gtsam.qa.verdict.localisation import judgement_of_localisation
 from l2m_gtsam.recording.odometry_jumps import without_jumps
 from l2m_gtsam.recording.sync import twists
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.records.verdict import Verdict
+from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import NO_SCANS, localise, start_pose
 from l2m_gtsam.slam.odometry import scan_odometry
@@ -140,6 +141,9 @@ GRAPH_FILE = "graph.g2o"
 REFINED_FILE = "refined.yaml"
 MAP_FILE = "map.npz"
 FILES = (TRAJECTORY_FILE, BAG_FILE, GRAPH_FILE, SLAM_FILE, REFINED_FILE, MAP_FILE, REPORT_FILE)
+REFINED = (
+    "refined by `l2m slam`: the verdict is that of the calibration before, not of what it became"
+)
 NOWHERE = (LocalisationStatus.OUTSIDE_MAP, LocalisationStatus.NOT_HERE)
 
 
@@ -233,19 +237,30 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
         found = _explored(recording, calibration, scanned.evidence, config, progress)
     else:
         found = _localised(recording, calibration, saved, scanned.evidence, config, progress)
-    notes = (*scanned.notes, *found.result.notes)
+    judged = calibration_notes(given.calibration, calibration)
+    notes = (*scanned.notes, *judged, *found.result.notes)
     result = replace(found.result, map=map_source, calibration_source=calibration_source)
     found = replace(found, result=replace(result, notes=notes))
     options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})
     truth_source = None if given.truth is None else source_file(given.truth)
     context = RecordContext(calibration, found.field_map, options, gap, truth, truth_source)
-    record = localisation_record(found.result, found.solution, context)
+    unjudged = localisation_record(found.result, found.solution, context)
+    judgement = judgement_of_localisation(unjudged, config.qa)
+    record = replace(unjudged, judgement=judgement)
     ensure_folder(out)
     _write(found, record, config, out)
     if saved is None:
         _write_map(found, config, out)
-    verdict = write_slam_report(out / REPORT_FILE, record, config.qa)
-    return SlamOutcome(found.result, record, verdict)
+    write_slam_report(out / REPORT_FILE, record, config.qa)
+    return SlamOutcome(found.result, record, judgement.verdict)
+
+
+def calibration_notes(path: Path, calibration: CalibrationResult) -> tuple[str, ...]:
+    """Return that a calibration was judged FAIL, a sentence; none where it was not."""
+    judged = calibration.judgement
+    if judged is None or judged.level is not Level.FAIL:
+        return ()
+    return (f"{path}: the verdict on the calibration that is used here is FAIL",)
 
 
 def _localised(
@@ -301,7 +316,12 @@ def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path)
     (out / REFINED_FILE).unlink(missing_ok=True)  # of an earlier run, which these files replace
     if result.calibration is not None:
         refined = replace(
-            result.calibration, bag=result.bag, bags=(), map=result.map, options=record.options
+            result.calibration,
+            bag=result.bag,
+            bags=(),
+            map=result.map,
+            options=record.options,
+            notes=(*result.calibration.notes, REFINED),
         )
         write_calibration(out / REFINED_FILE, refined)
     write_slam(out / SLAM_FILE, record)

@@ -13,8 +13,11 @@ from l2m_gtsam.cli.terminal import (
     PosesOption,
     PoseTimesOption,
     SchedulerOption,
+    StrictOption,
     WorkersOption,
+    end_with,
     print_table,
+    print_verdict,
     shown_progress,
     warn,
 )
@@ -172,6 +175,7 @@ def calibrate(
             help="Write map, drive, sensors and misfits for Rerun's 3-D viewer, too.",
         ),
     ] = None,
+    strict: StrictOption = False,
 ) -> None:
     """Calibrate every magnetometer of one drive or several; write a picture and a report, too."""
     with shown_progress() as progress:
@@ -185,9 +189,10 @@ def calibrate(
         found = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
         verdict = report_calibration(out, found, chosen.qa, progress)
     _print_calibration(found.result, models)
-    typer.echo("\n".join(verdict.lines()))
+    print_verdict(verdict)
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
     typer.echo(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
+    end_with(verdict.level, strict)
 
 
 def _print_calibration(result: "CalibrationResult", models: bool) -> None:
@@ -236,11 +241,17 @@ def batch(
     ] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
+    strict: Annotated[
+        bool,
+        typer.Option(
+            "--strict", help="End with exit code 3 if a sensor's verdict is FAIL, or a bag fails."
+        ),
+    ] = False,
 ) -> None:
     """Calibrate a folder or a manifest of bags; write index.html, fleet.csv and fleet.parquet.
 
-    A bag that fails is a row with its reason, and the exit code stays 0. Started again with the
-    same --out it computes only what is missing or has changed.
+    A bag that fails is a row with its reason; only --strict changes the exit code. Started again
+    with the same --out it computes only what is missing or has changed.
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.fleet import run_fleet
@@ -259,6 +270,7 @@ def batch(
     warn(fleet.notes)
     written = [PAGE_FILE, CSV_FILE, *([] if fleet.notes else [PARQUET_FILE])]
     typer.echo(f"written: {', '.join(str(out / name) for name in written)}")
+    end_with(fleet.level, strict)
 
 
 def _summary(fleet: "Fleet") -> str:

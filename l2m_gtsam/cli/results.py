@@ -9,7 +9,10 @@ from l2m_gtsam.cli.terminal import (
     CalibrationOption,
     PosesOption,
     PoseTimesOption,
+    StrictOption,
+    end_with,
     print_table,
+    print_verdict,
     shown_progress,
     warn,
 )
@@ -17,6 +20,14 @@ from l2m_gtsam.errors import ConfigError
 
 LidarFrameOption = Annotated[
     str, typer.Option("--lidar-frame", help="Name of the LiDAR's frame (or link) there.")
+]
+
+DespiteOption = Annotated[
+    bool,
+    typer.Option(
+        "--despite-verdict",
+        help="Use a calibration that was judged FAIL all the same; the verdict is written, too.",
+    ),
 ]
 
 
@@ -39,8 +50,9 @@ def report(
     with shown_progress() as progress:
         from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
 
-        verdict = report_folder(folder, config, progress, pdf=pdf)
-    typer.echo("\n".join(verdict.lines()))
+        judged = report_folder(folder, config, progress, pdf=pdf)
+    print_verdict(judged.verdict)
+    warn([f"the verdict was {each}" for each in judged.disagreeing])
     written = [folder / REPORT_FILE, *([folder / PDF_FILE] if pdf else [])]
     typer.echo(f"written: {', '.join(map(str, written))}")
 
@@ -68,6 +80,7 @@ def validate(
     ] = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
+    strict: StrictOption = False,
 ) -> None:
     """Say whether a calibration still holds: on another drive and map, or beside an older one.
 
@@ -91,9 +104,10 @@ def validate(
         print_table(validation_table(found.drive, found.verdict))
     if found.comparison is not None:
         print_table(change_table(found.comparison))
-    typer.echo("\n".join(found.verdict.lines(Level.PASS)))
+    print_verdict(found.verdict, Level.PASS)
     if out is not None:
         typer.echo(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")
+    end_with(found.verdict.level, strict)
 
 
 def export(
@@ -119,12 +133,16 @@ def export(
         Path | None,
         typer.Option(help="URDF of a robot that the sensors are put into; --out gets the copy."),
     ] = None,
+    despite_verdict: DespiteOption = False,
 ) -> None:
     """Write a calibration for another program: tf, URDF, Kalibr, JSON, autopilots, scales."""
     from l2m_gtsam.batch.exports import Names, export_calibration
 
     names = Names(lidar_frame, dict(_named(text) for text in frame or []))
-    warn(export_calibration(calibration, format_name, out, names, into))
+    notes = export_calibration(
+        calibration, format_name, out, names, into, despite_verdict=despite_verdict
+    )
+    warn(notes)
     typer.echo(f"written: {out}")
 
 
@@ -142,12 +160,13 @@ def apply(
     replace: Annotated[
         bool, typer.Option("--replace", help="Leave the topics that are corrected out.")
     ] = False,
+    despite_verdict: DespiteOption = False,
 ) -> None:
     """Copy a bag and add the corrected readings, in the axes of the LiDAR, as TOPIC/calibrated."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.exports import Application, apply_calibration
 
-        wanted = Application(bag, calibration, out, config, lidar_frame, replace)
+        wanted = Application(bag, calibration, out, config, lidar_frame, replace, despite_verdict)
         applied = apply_calibration(wanted, progress)
     warn(applied.notes)
     for sensor, topic in applied.topics.items():

@@ -10,7 +10,10 @@ from l2m_gtsam.cli.terminal import (
     OutOption,
     PosesOption,
     PoseTimesOption,
+    StrictOption,
+    end_with,
     print_table,
+    print_verdict,
     shown_progress,
 )
 
@@ -35,6 +38,7 @@ def slam(
     ] = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
+    strict: StrictOption = False,
 ) -> None:
     """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
     with shown_progress() as progress:
@@ -57,7 +61,8 @@ def slam(
         *drift_lines(done.result),
         *scan_lines(done.result.scans),
         *truth_lines(done.record.truth),
-        *done.verdict.lines(),
     )
     typer.echo("\n".join(lines))
+    print_verdict(done.verdict)
     typer.echo(f"written: {out}")
+    end_with(done.verdict.level, strict)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from l2m_gtsam.progress import Progress
+    from l2m_gtsam.records.verdict import Level, Verdict
 
 STARTING = "starting"
 ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
@@ -46,6 +47,41 @@ SchedulerOption = Annotated[
 CalibrationOption = Annotated[
     Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
 ]
+
+
+StrictOption = Annotated[
+    bool, typer.Option("--strict", help="End with exit code 3 if the verdict is FAIL.")
+]
+FAILED = 3  # exit code of a verdict; 2 is that of an error
+COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
+
+
+def coloured(level: str) -> str:
+    """Return a verdict's level as rich prints it."""
+    return f"[bold {COLOURS[level]}]{level.upper()}[/]"
+
+
+def print_verdict(verdict: "Verdict", least: "Level | None" = None) -> None:
+    """Print a verdict with its reasons of at least a level, WARN if none is given."""
+    from rich.console import Console
+    from rich.markup import escape
+
+    from l2m_gtsam.records.verdict import Level
+
+    console = Console(highlight=False)
+    for line in verdict.lines(least or Level.WARN):
+        text = escape(line)
+        for level in Level:
+            # The first word in capitals that is a level: reasons may hold it, too.
+            if line.lstrip().removeprefix("verdict: ").startswith(level.upper()):
+                text = text.replace(level.upper(), coloured(level), 1)
+        console.print(text, soft_wrap=True)
+
+
+def end_with(level: "Level", strict: bool) -> None:
+    """End with exit code 3 if a verdict is FAIL and that is asked for."""
+    if strict and level == "fail":
+        raise typer.Exit(FAILED)
 
 
 def warn(doubts: Sequence[str]) -> None:

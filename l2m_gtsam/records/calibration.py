@@ -23,6 +23,7 @@ from l2m_gtsam.data import (
     Vector,
 )
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
+from l2m_gtsam.records.verdict import Judgement
 
 Row15 = Annotated[list[float], Field(min_length=15, max_length=15)]
 
@@ -359,6 +360,8 @@ class CalibrationResult:
         The drives that were calibrated together, in order of time; empty for a single one.
     notes
         What is worth knowing of the drives, a sentence each.
+    judgement
+        The verdict with its thresholds; absent where nobody judged it.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
@@ -372,6 +375,7 @@ class CalibrationResult:
     versions: dict[str, str]
     bags: tuple[SourceFile, ...] = ()
     notes: tuple[str, ...] = ()
+    judgement: Judgement | None = None
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

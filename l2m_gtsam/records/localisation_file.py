@@ -18,6 +18,7 @@ from l2m_gtsam.records.localisation import (
 )
 from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Record, Row, Rows, Series
 from l2m_gtsam.records.validation import ChiSquare, NamedSource
+from l2m_gtsam.records.verdict import Judgement
 
 POSE_FREEDOM = 6
 
@@ -267,6 +268,8 @@ class LocalisationRecord(Record):
         Of the packages that computed it.
     options
         That it was computed with.
+    judgement
+        The verdict with its thresholds; files of older versions have none.
     """
 
     status: LocalisationStatus
@@ -288,3 +291,4 @@ class LocalisationRecord(Record):
     sources: tuple[NamedSource, ...]
     versions: dict[str, str]
     options: dict[str, Any]
+    judgement: Judgement | None = None

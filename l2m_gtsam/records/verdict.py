@@ -1,9 +1,10 @@
 """A verdict with its reasons: on a calibration, a localisation or a validation."""
 
+import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field
 
@@ -100,6 +101,15 @@ class Verdict(Record):
         level = worst([counted, *(each.level for each in ordered)])
         return cls(level, ordered, tuple(sensors))
 
+    @property
+    def follows(self) -> bool:
+        """Whether the levels are those of all reasons, as of a calibration's verdict."""
+        own = worst(each.level for each in self.reasons)
+        each_follows = (
+            each.level is worst(reason.level for reason in each.reasons) for each in self.sensors
+        )
+        return self.level is worst([own, *(s.level for s in self.sensors)]) and all(each_follows)
+
     def __getitem__(self, sensor: str) -> SensorVerdict:
         return next(each for each in self.sensors if each.sensor == sensor)
 
@@ -117,6 +127,105 @@ class Verdict(Record):
                 head = f"  {sensor.level.upper()} {sensor.sensor}"
                 lines.append(": ".join([head, *([" ".join(texts)] if texts else [])]))
         return lines
+
+
+@dataclass(frozen=True)
+class EarlierVerdict(Record):
+    """What the same numbers were judged before.
+
+    Attributes
+    ----------
+    level
+        The verdict then.
+    changed
+        Thresholds that were changed after it, "name: old -> new"; empty if none was.
+    """
+
+    level: Level
+    changed: tuple[str, ...]
+
+    def __str__(self) -> str:
+        if not self.changed:
+            return f"{self.level.upper()} before, by the same thresholds"
+        return f"{self.level.upper()} before, by other thresholds ({', '.join(self.changed)})"
+
+
+@dataclass(frozen=True)
+class Judgement(Record):
+    """A verdict and the thresholds that it was reached by, which travel together.
+
+    Attributes
+    ----------
+    verdict
+        The verdict.
+    thresholds
+        The options `qa` that it was judged by, plain values.
+    earlier
+        What the same numbers were judged before, the oldest first.
+    """
+
+    verdict: Verdict
+    thresholds: dict[str, Any]
+    earlier: tuple[EarlierVerdict, ...] = ()
+
+    @classmethod
+    def of(
+        cls, verdict: Verdict, thresholds: dict[str, Any], before: "Judgement | None"
+    ) -> "Judgement":
+        """Return a judgement, the first on its numbers or one after another."""
+        return cls(verdict, thresholds) if before is None else before.again(verdict, thresholds)
+
+    def again(self, verdict: Verdict, thresholds: dict[str, Any]) -> "Judgement":
+        """Return the judgement on the same numbers by thresholds that may be others."""
+        changed = _changed(self.thresholds, thresholds)
+        if not changed and verdict.level is self.verdict.level:
+            return Judgement(verdict, thresholds, self.earlier)
+        before = EarlierVerdict(self.verdict.level, changed)
+        return Judgement(verdict, thresholds, (*self.earlier, before))
+
+    @property
+    def level(self) -> Level:
+        """Of the verdict."""
+        return self.verdict.level
+
+    @property
+    def disagreeing(self) -> tuple[EarlierVerdict, ...]:
+        """Earlier verdicts that were others."""
+        return tuple(each for each in self.earlier if each.level is not self.verdict.level)
+
+    def lines(self) -> list[str]:
+        """Return verdict, reasons from WARN on, earlier verdicts and thresholds, a line each."""
+        thresholds = json.dumps(self.thresholds, ensure_ascii=False)
+        earlier = [f"  {each}" for each in self.disagreeing]
+        return [*self.verdict.lines(), *earlier, f"judged by qa: {thresholds}"]
+
+
+NOT_JUDGED = "not judged"
+
+
+def judged_lines(judgement: Judgement | None) -> list[str]:
+    """Return a judgement as lines; one where there is none."""
+    return [f"verdict: {NOT_JUDGED}"] if judgement is None else judgement.lines()
+
+
+def _changed(old: dict[str, Any], new: dict[str, Any]) -> tuple[str, ...]:
+    before, after = _flat(old), _flat(new)
+    return tuple(
+        f"{name}: {before.get(name, 'none')} -> {after.get(name, 'none')}"
+        for name in {**before, **after}
+        if before.get(name) != after.get(name)
+    )
+
+
+def _flat(options: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested options with dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in options.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,22 @@
 
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag1
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag1,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag1.reader import decompressors
@@ -20,8 +29,23 @@ from rosbags.rosbag2.storage_mcap import McapReader
 
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.storage.open_bag import Bag, typestore
+from l2m_gtsam.storage.ros_messages import ros1, ros2
 
 SUFFIX = {StoragePlugin.MCAP: ".mcap", StoragePlugin.SQLITE3: ".db3"}
+TEXT = "std_msgs/msg/String"
+FOREVER = QosTime(2147483647, 4294967295)
+# Transient local: who subscribes late gets the last message.
+KEPT = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    FOREVER,
+    FOREVER,
+    QosLiveliness.AUTOMATIC,
+    FOREVER,
+    False,
+)
 # ROS 2's own word for a type without a hash: version 1, all zero.
 NO_HASH = "RIHS01_" + 64 * "0"
 
@@ -63,6 +87,20 @@ class BagCopy:
     def write(self, connection: Connection, record_ns: int, data: bytes) -> None:
         """Append a message to a connection of the new bag."""
         self.writer.write(connection, record_ns, data)
+
+    def add_text(self, topic: str) -> tuple[Connection, Callable[[str], bytes]]:
+        """Return a new connection of texts that late subscribers get, too, and what encodes one."""
+        is_ros1 = isinstance(self.source.reader, Ros1Reader)
+        dialect = ros1() if is_ros1 else ros2()
+        kept: dict[str, Any] = {"latching": 1} if is_ros1 else {"offered_qos_profiles": [KEPT]}
+        connection: Connection = self.writer.add_connection(
+            topic, TEXT, typestore=dialect.store, **kept
+        )
+
+        def encode(text: str) -> bytes:
+            return bytes(dialect.serialize(dialect.make(TEXT, data=text), TEXT))
+
+        return connection, encode
 
     def _add(self, connection: Connection, topic: str) -> Connection:
         added: Connection

@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ Key = tuple[str, str]
 """Topic and frame of a sensor."""
 
 ENDING = "calibrated"
+VERDICT_TOPIC = "/l2m/verdict"
 TESLA_PER_MICROTESLA = 1e-6
 # Enough to judge a unit by; more are not kept.
 MOST_JUDGED = 20_000
@@ -127,6 +129,8 @@ class Calibrator:
         Of the corrected readings: the lidar's.
     left_out
         Topics that are not copied.
+    verdict
+        That the calibration was judged by, as text; the first message of the copy.
     """
 
     bag: Bag
@@ -134,6 +138,7 @@ class Calibrator:
     options: BagOptions
     frame: str
     left_out: frozenset[str]
+    verdict: str
     _codecs: dict[int, Codec] = field(default_factory=dict)
 
     def copy(self, into: BagCopy, progress: Count | None) -> None:
@@ -151,7 +156,12 @@ class Calibrator:
         self._codecs = {c.id: self.bag.codec(c) for c in sources}
         kept = {c.id: into.add(c) for c in self.bag.connections if c.topic not in self.left_out}
         added = self._connections(into, sources)
+        stated, encode = into.add_text(free_topic(self.bag, VERDICT_TOPIC))
+        first = True
         for block in _blocks(self.bag.raw_messages(self.bag.connections, progress)):
+            if first:
+                into.write(stated, block[0].record_ns, encode(self.verdict))
+                first = False
             extra = self._corrections(block)
             for row, message in enumerate(block):
                 if message.connection.id in kept:
@@ -207,6 +217,13 @@ class Calibrator:
             magnetic_field=replace(content.magnetic_field, x=x, y=y, z=z),
             magnetic_field_covariance=spread,
         )
+
+
+def free_topic(bag: Bag, name: str) -> str:
+    """Return a name that no topic of a bag has: it, or with a number behind it."""
+    taken = {connection.topic for connection in bag.connections}
+    names = (name if k == 1 else f"{name}_{k}" for k in count(1))
+    return next(each for each in names if each not in taken)
 
 
 def _topic(key: Key, frames: Mapping[str, Sequence[str]]) -> str:

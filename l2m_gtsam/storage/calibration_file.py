@@ -1,5 +1,6 @@
 """``calibration.yaml``: everything about each sensor, with formulas and units inside."""
 
+import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -8,13 +9,15 @@ import numpy as np
 from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import FloatArray, RigidTransform
+from l2m_gtsam.data import FloatArray, RigidTransform, SourceFile
+from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import (
     EXPLAINED,
     CalibrationResult,
     SensorCalibration,
     Uncertainty,
 )
+from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
 FORMAT = "l2m-calibration"
@@ -71,6 +74,10 @@ MODEL = {
         "how many times larger variances are than noise, map and poses explain, from the scatter "
         "of parts of the drive; covariance and sigmas hold it; absent where nothing is"
     ),
+    "verdict": (
+        "what the report concludes, with its reasons; thresholds: the options `qa` it was judged "
+        "by; earlier: what the same numbers were judged before, by other thresholds"
+    ),
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
 SENSOR_KEYS = (
@@ -97,15 +104,18 @@ class _CalibrationFile(CalibrationResult, _Head):
 _FILE = TypeAdapter(_CalibrationFile)
 _RESULT = TypeAdapter(CalibrationResult)
 _SENSOR = TypeAdapter(SensorCalibration)
+_JUDGEMENT = TypeAdapter(Judgement)
 
 
 def write_calibration(path: Path, result: CalibrationResult) -> None:
     """Write a calibration; `read_calibration` gives it back equal."""
     plain = _RESULT.dump_python(result, exclude={"sensors"})
+    judged = {} if result.judgement is None else {"verdict": verdict_entry(result.judgement)}
     disagreements = [_without_empty(each, "bag") for each in plain["disagreements"]]
     content = {
         "format": FORMAT,
         "version": VERSION,
+        **judged,
         "model": {"uncertainty": UNCERTAINTY[result.uncertainty], **MODEL},
         "uncertainty": plain["uncertainty"],
         "doubts": plain["doubts"],
@@ -128,21 +138,53 @@ def read_calibration(path: Path) -> CalibrationResult:
     CalibrationError
         The file is missing, damaged or something else.
     """
-    found = read_checked(path, _FILE, _with_distortions, added=("distortion",))
+    found = read_checked(path, _FILE, _as_record, added=("distortion", "judgement"))
+    if found.judgement is not None and not found.judgement.verdict.follows:
+        raise CalibrationError(
+            f"{path}: verdict.level: {found.judgement.verdict.level.upper()} does not follow from "
+            "its reasons; it was edited: calibrate again"
+        )
     return CalibrationResult(
         **{each.name: getattr(found, each.name) for each in fields(CalibrationResult)}
     )
 
 
-def _with_distortions(content: dict[str, Any]) -> dict[str, Any]:
-    """Return a file as its record has it: C and H of a sensor together as its distortion."""
+def _as_record(content: dict[str, Any]) -> dict[str, Any]:
+    """Return a file as its record has it: C and H as a distortion, a verdict as a judgement."""
     sensors = content.get("sensors")
     if isinstance(sensors, dict):
         sensors = {
             name: {**entry, "distortion": entry} if isinstance(entry, dict) else entry
             for name, entry in sensors.items()
         }
-    return {**FIRST_VERSION, **content, "sensors": sensors}
+    record = {**FIRST_VERSION, **content, "sensors": sensors}
+    if "verdict" in content:
+        verdict = content["verdict"]
+        beside = verdict if isinstance(verdict, dict) else {}
+        names = ("thresholds", "earlier")
+        kept = {name: beside[name] for name in names if name in beside}
+        record["judgement"] = {"verdict": verdict, **kept}
+    return record
+
+
+def verdict_entry(judgement: Judgement) -> dict[str, Any]:
+    """Return a judgement as plain values: the verdict, and what it rests on beside it."""
+    plain = _JUDGEMENT.dump_python(judgement)
+    earlier = {"earlier": plain["earlier"]} if plain["earlier"] else {}
+    return {**plain["verdict"], **earlier, "thresholds": plain["thresholds"]}
+
+
+def verdict_text(result: CalibrationResult, source: SourceFile) -> str:
+    """Return the verdict on a calibration, and which it is, as JSON for other files."""
+    judged = result.judgement
+    verdict = {"level": NOT_JUDGED} if judged is None else verdict_entry(judged)
+    content = {
+        "format": "l2m-verdict",
+        "version": 1,
+        "calibration": {"path": Path(source.path).name, "sha256": source.sha256},
+        "verdict": verdict,
+    }
+    return json.dumps(content, ensure_ascii=False)
 
 
 def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:

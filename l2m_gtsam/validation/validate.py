@@ -19,6 +19,7 @@ from l2m_gtsam.qa.metrics.coverage import drive_metrics
 from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
 from l2m_gtsam.records.validation import DriveValidation, NotValidated, ValidatedSensor
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration, knows_its_errors
@@ -31,6 +32,8 @@ SAME_MAP = (
     "This is the map that it was calibrated with: errors of the map that the calibration took over "
     "do not show. A map of another survey would show them."
 )
+UNJUDGED = "The calibration was not judged: its file holds no verdict."
+FAILED = "The calibration itself was judged FAIL when it was computed: calibration.yaml says why."
 NOT_CORRELATED = (
     "This kind of map does not know how its errors are correlated; they count as each reading's "
     "own, and chance may be reported as a change."
@@ -300,6 +303,11 @@ def doubts_and_notes(
         doubts.append(SAME_BAG)
     elif same_content(calibration.map, map_source):
         notes.append(SAME_MAP)
+    judged = calibration.judgement
+    if judged is None:
+        notes.append(UNJUDGED)
+    elif judged.level is Level.FAIL:
+        doubts.append(FAILED)
     if not knows_its_errors(field_map):
         notes.append(NOT_CORRELATED)
     if calibration.uncertainty is Uncertainty.INDEPENDENT:

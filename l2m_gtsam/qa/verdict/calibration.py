@@ -10,7 +10,7 @@ from l2m_gtsam.qa.verdict.repeatability import repeat
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, misfit, precision
 from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
 from l2m_gtsam.records.metrics import Metrics
-from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Verdict
+from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
 
 HEADS = {
     Return.NEVER: "The environment has changed, or something passed by",
@@ -43,6 +43,18 @@ def judge(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Ve
         for sensor in result.sensors
     )
     return Verdict.of(_shared_reasons(cases, result), [_on_sensor(case) for case in cases])
+
+
+def judgement_of(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Judgement:
+    """Return the verdict with its thresholds, and what was judged before by other thresholds.
+
+    Parameters
+    ----------
+    result, metrics, options
+        As of `judge`.
+    """
+    used = options.model_dump(mode="json", exclude={"validation", "slam"})
+    return Judgement.of(judge(result, metrics, options), used, result.judgement)
 
 
 def _on_sensor(case: Case) -> SensorVerdict:

@@ -16,7 +16,7 @@ from l2m_gtsam.records.localisation_file import (
     SensorRecord,
     TruthRecord,
 )
-from l2m_gtsam.records.verdict import Level, Reason, SensorVerdict, Threshold, Verdict
+from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Threshold, Verdict
 from l2m_gtsam.solve.chi_square import chance_beyond
 
 SHARED_LIMITS = ("rejected", "outside_map", "chi_square")
@@ -50,6 +50,18 @@ def judge_localisation(record: LocalisationRecord, options: QaOptions) -> Verdic
     return Verdict.of(
         _shared_reasons(record, options.slam), sensors, Level.WARN if served else Level.FAIL
     )
+
+
+def judgement_of_localisation(record: LocalisationRecord, options: QaOptions) -> Judgement:
+    """Return the verdict with its thresholds, and what was judged before by other thresholds.
+
+    Parameters
+    ----------
+    record, options
+        As of `judge_localisation`.
+    """
+    used = options.model_dump(mode="json", exclude={"validation"})
+    return Judgement.of(judge_localisation(record, options), used, record.judgement)
 
 
 def localisation_thresholds(options: QaOptions) -> tuple[Threshold, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, SensorStatus
+from l2m_gtsam.records.verdict import judged_lines
 
 Fault = Callable[[SensorCalibration], str | None]
 """Why a sensor cannot be part of a file, as half a sentence; None where it can."""
@@ -58,7 +59,7 @@ class Export:
 
     @property
     def origin(self) -> tuple[str, ...]:
-        """Where the file comes from and what is not in it, a printable line each."""
+        """Where the file comes from, what is not in it and the verdict, a printable line each."""
         made_by = self.result.versions.get("l2m-gtsam", "")
         lines = [f"Magnetometers calibrated against a LiDAR by l2m_gtsam {made_by}".rstrip()]
         sources = [("drive", each) for each in self.result.drives]
@@ -66,6 +67,7 @@ class Export:
         for name, source in sources:
             lines.append(f"{name}: {Path(source.path).name}, sha256 {source.sha256}")
         lines += [f"left out: {name}: {reason}" for name, reason in self.left_out.items()]
+        lines += judged_lines(self.result.judgement)
         return tuple(_printable(line) for line in lines)
 
 

@@ -12,6 +12,10 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.storage.exports.export import Export, ExportedSensor
 
+COMMENT = "l2m_gtsam:"
+OWN_COMMENTS = re.compile(rb"[ \t]*<!-- l2m_gtsam:(?:(?!-->).)*-->[ \t]*\r?\n?")
+"""Lines that an earlier export put into a robot's URDF."""
+
 
 def urdf_text(export: Export) -> str:
     """Return a URDF of the lidar and its sensors alone."""
@@ -218,7 +222,8 @@ def edited_urdf(export: Export, name: str, data: bytes) -> bytes:
     """Return a URDF with the sensors in it.
 
     The joint above a sensor's link is replaced where there is one and keeps its name; missing links
-    and joints are added before the end. All other bytes stay, comments too.
+    and joints, origin and verdict are added before the end. All other bytes stay, comments too, but
+    for those of an earlier calibration.
 
     Parameters
     ----------
@@ -234,7 +239,7 @@ def edited_urdf(export: Export, name: str, data: bytes) -> bytes:
     ConfigError
         The file is no URDF, has no link for the lidar, or hangs the lidar below a sensor.
     """
-    urdf = UrdfFile.parse(name, data)
+    urdf = UrdfFile.parse(name, OWN_COMMENTS.sub(b"", data))
     _check(urdf, export)
     added: list[str] = []
     spans: list[tuple[UrdfJoint, bytes]] = []
@@ -247,7 +252,7 @@ def edited_urdf(export: Export, name: str, data: bytes) -> bytes:
             added.append(joint_text(free, sensor, export.lidar_frame, "  "))
         else:
             spans.append((joint, _replacement(urdf, joint, sensor, export.lidar_frame)))
-    notes = [f"<!-- {comment_text(line)} -->" for line in export.origin] if added else []
+    notes = [f"<!-- {COMMENT} {comment_text(line)} -->" for line in export.origin]
     return _spliced(urdf, spans, [*notes, *added])
 
 

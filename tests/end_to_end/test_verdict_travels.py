@@ -1,0 +1,214 @@
+"""No path through the commands turns a FAIL into a file without a verdict."""
+
+import json
+import shutil
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from ruamel.yaml import YAML
+
+from l2m_gtsam.batch import reports
+from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.storage.calibrated_topics import VERDICT_TOPIC
+from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.open_bag import open_bag
+from tests.drives.yard import CalibratedYard, calibrated_yard, written
+from tests.support.command_line import Finished, ended, l2m, one_line
+
+FORMATS = ("ros2-launch", "urdf", "kalibr", "json", "bias-scale")
+ROBOT = '<robot name="r">\n  <link name="lidar"/>\n</robot>\n'
+LOOSE, TIGHT, NEVER = ({"warn": limit, "fail": limit} for limit in (1e6, 1e-9, 1e-9))
+LIMITS = (
+    *("position_sigma_m", "rotation_sigma_deg", "hard_iron_sigma_ut", "unexplained", "rejected"),
+    *("outside_map", "halves_sigmas", "chi_square", "time_offset_s", "scale", "skew_deg"),
+)
+LAX = dict.fromkeys(LIMITS, LOOSE)
+THRESHOLDS: dict[str, dict[str, Any]] = {
+    "fail": {**LAX, "position_sigma_m": TIGHT},
+    "warn": {**LAX, "position_sigma_m": {"warn": 1e-9, "fail": 1e6}},
+    "other warn": {**LAX, "hard_iron_sigma_ut": {"warn": 1e-9, "fail": 1e6}},
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:
+    return calibrated_yard(tmp_path_factory)
+
+
+def config(folder: Path, name: str) -> Path:
+    """Write a configuration with thresholds that lead to a verdict."""
+    path = folder / f"{name.replace(' ', '_')}.yaml"
+    path.write_text(json.dumps({"qa": THRESHOLDS[name]}))
+    return path
+
+
+def stated(bag: Path) -> dict[str, Any]:
+    """Return the last verdict that a corrected bag states."""
+    with open_bag(bag) as opened:
+        topics = [c for c in opened.connections if c.topic.startswith(VERDICT_TOPIC)]
+        messages = [each.content.data for each in opened.messages(topics)]
+    found = json.loads(messages[-1])
+    assert isinstance(found, dict)
+    return found
+
+
+class Commands(RuleBasedStateMachine):
+    """Commands in any order on one calibration, whose verdicts are known beforehand."""
+
+    place: CalibratedYard
+    folder: Path
+    bags: dict[str, Path]
+    runs = count()
+
+    @initialize(first=st.sampled_from(sorted(THRESHOLDS)))
+    def start(self, first: str) -> None:
+        self.here = self.folder / f"run_{next(self.runs)}"
+        self.here.mkdir()
+        for name in ("calibration.yaml", "metrics.json"):
+            shutil.copy(self.place.calibration.parent / name, self.here)
+        self.seen: list[tuple[Level, str]] = []
+        self.report(first)
+
+    @property
+    def level(self) -> Level:
+        return self.seen[-1][0]
+
+    @rule(name=st.sampled_from(sorted(THRESHOLDS)))
+    def report(self, name: str) -> None:
+        run = l2m("report", self.here, "--config", config(self.folder, name))
+        level = Level(name.split()[-1])
+        assert f"verdict: {level.upper()}" in run.out
+        if not self.seen or self.seen[-1][1] != name:
+            self.seen.append((level, name))
+        others = {each.upper() for each, _ in self.seen if each is not level}
+        assert all(f"the verdict was {each} before" in run.err for each in others)
+
+    @rule()
+    def report_again(self) -> None:
+        """Without thresholds a report is rendered with those it was judged by."""
+        assert f"verdict: {self.level.upper()}" in l2m("report", self.here).out
+
+    @rule(name=st.sampled_from(FORMATS), despite=st.booleans(), into=st.booleans())
+    def export(self, name: str, despite: bool, into: bool) -> None:
+        out = self.here / f"export_{next(self.runs)}"
+        arguments: list[str | Path] = ["--format", name, "--out", out]
+        if into and name == "urdf":
+            robot = self.folder / "robot.urdf"
+            robot.write_text(ROBOT)
+            arguments += ["--into", robot]
+        arguments += ["--despite-verdict"] if despite else []
+        run = ended("export", self.here / "calibration.yaml", *arguments)
+        if self.refused(run, out, despite):
+            return
+        text = out.read_text()
+        if name == "json":
+            found = json.loads(text)["verdict"]
+            assert found["level"] == self.level
+            self.check_thresholds(found["thresholds"])
+        else:
+            assert f"verdict: {self.level.upper()}" in text
+            assert "judged by qa: " in text
+        for level in {each for each, _ in self.seen}:
+            assert level.upper() in text or f'"{level}"' in text
+
+    @rule(kind=st.sampled_from(("ros1", "sqlite3", "mcap")), despite=st.booleans())
+    def apply(self, kind: str, despite: bool) -> None:
+        out = self.here / f"bag_{next(self.runs)}{'.bag' if kind == 'ros1' else ''}"
+        arguments = ["--despite-verdict"] if despite else []
+        calibration = self.here / "calibration.yaml"
+        common = ("apply", self.bags[kind], "--calibration", calibration, "--out", out)
+        if not self.refused(ended(*common, *arguments), out, despite):
+            found = stated(out)["verdict"]
+            assert found["level"] == self.level
+            self.check_thresholds(found["thresholds"])
+
+    @precondition(lambda self: any(each is Level.FAIL for each, _ in self.seen))
+    @invariant()
+    def a_fail_is_remembered(self) -> None:
+        judged = read_calibration(self.here / "calibration.yaml").judgement
+        assert judged is not None
+        assert Level.FAIL in (judged.level, *(each.level for each in judged.earlier))
+
+    def refused(self, run: Finished, out: Path, despite: bool) -> bool:
+        """Check that a FAIL is refused, but where it was asked for, and return whether it was."""
+        if self.level is Level.FAIL and not despite:
+            assert "say --despite-verdict" in one_line(run)
+            assert not out.exists()
+            return True
+        assert run.code == 0
+        assert f"its verdict is {self.level.upper()}" in run.err
+        return False
+
+    def check_thresholds(self, found: dict[str, Any]) -> None:
+        """Check that thresholds are those of the last judgement."""
+        wanted = THRESHOLDS[self.seen[-1][1]]
+        assert {name: found[name] for name in wanted} == wanted
+
+
+def test_a_fail_leaves_no_file_without_a_verdict(
+    place: CalibratedYard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twelve walks of eight commands; pages, which take long, are drawn elsewhere."""
+    monkeypatch.setattr(reports, "calibration_page", lambda *_, **__: "")
+    Commands.place, Commands.folder = place, tmp_path
+    kinds = {"ros1": "ros1", "sqlite3": "sqlite3", "mcap": "mcap"}
+    Commands.bags = {kind: written(tmp_path, kind, f"drive_{kind}") for kind in kinds}
+    machine: Any = Commands.TestCase
+    machine.settings = settings(
+        max_examples=12,
+        stateful_step_count=8,
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+    )
+    machine().runTest()
+
+
+def test_an_old_calibration_counts_as_not_judged(place: CalibratedYard, tmp_path: Path) -> None:
+    """It is read, used and said to be not judged, in one line; a report judges it."""
+    yaml: Any = YAML(typ="safe", pure=True)
+    content = yaml.load(place.calibration.read_text())
+    del content["verdict"]
+    old, out = tmp_path / "calibration.yaml", tmp_path / "mag.json"
+    with old.open("w") as file:
+        yaml.dump(content, file)
+    run = l2m("export", old, "--format", "json", "--out", out)
+    (line,) = run.err.splitlines()
+    assert line == f"l2m: warning: {old}: not judged; it holds no verdict"
+    assert json.loads(out.read_text())["verdict"] == {"level": "not judged"}
+    shutil.copy(place.calibration.parent / "metrics.json", tmp_path)
+    l2m("report", tmp_path)
+    assert read_calibration(old).judgement == read_calibration(place.calibration).judgement
+
+
+def test_an_edited_verdict_is_refused(place: CalibratedYard, tmp_path: Path) -> None:
+    """A level that does not follow from the reasons beside it."""
+    shutil.copy(place.calibration.parent / "metrics.json", tmp_path)
+    edited = tmp_path / "calibration.yaml"
+    shutil.copy(place.calibration, edited)
+    l2m("report", tmp_path, "--config", config(tmp_path, "fail"))
+    edited.write_text(edited.read_text().replace("level: fail", "level: pass", 1))
+    run = ended("export", edited, "--format", "json", "--out", tmp_path / "x")
+    assert "verdict.level: PASS does not follow from its reasons" in one_line(run)
+
+
+def test_strict_ends_with_three(place: CalibratedYard, tmp_path: Path) -> None:
+    """What is written is the same; only the exit code differs."""
+    yard_config = json.loads((place.calibration.parent / "c.yaml").read_text())
+    failing = tmp_path / "failing.yaml"
+    failing.write_text(json.dumps({**yard_config, "qa": THRESHOLDS["fail"]}))
+    common = ("calibrate", place.drive, "--map", place.map, "--config", failing, "--out")
+    assert ended(*common, tmp_path / "one").code == 0
+    run = ended(*common, tmp_path / "two", "--strict")
+    assert run.code == 3
+    assert "verdict: FAIL" in run.out
+    names = ("calibration.yaml", "metrics.json", "report.html")
+    assert all((tmp_path / "two" / name).is_file() for name in names)
+    judged = read_calibration(tmp_path / "two" / "calibration.yaml").judgement
+    assert judged is not None
+    assert judged.level is Level.FAIL
