@@ -22,7 +22,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.qa.verdict.calibration import judgement_of
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise as localise_recording
@@ -123,8 +123,9 @@ def calibrate(
     found = calibrated(recording, field_map, chosen, None, progress)
     metrics = evaluate(recording, found, chosen, limits, progress)
     config = Config(calibration=chosen, qa=limits)
-    result = replace(found.result, options=config.model_dump(mode="json"))
-    return JudgedCalibration(result, judge(result, metrics, limits))
+    unjudged = replace(found.result, options=config.model_dump(mode="json"))
+    judgement = judgement_of(unjudged, metrics, limits)
+    return JudgedCalibration(replace(unjudged, judgement=judgement), judgement.verdict)
 
 
 def localise(

@@ -1,5 +1,6 @@
 """Files of sensors whose place and distortion are known: truths, mapping suites, calibrations."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
 
 from l2m_gtsam.data import Distortion, KnownSensor, Matrix, Vector
+from l2m_gtsam.errors import Notice
 from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
 
@@ -33,8 +36,13 @@ class _Known(_Finite):
         return C
 
 
+class _Judged(_Finite):
+    level: Level
+
+
 class _KnownFile(_Finite):
     sensors: dict[str, _Known] = Field(min_length=1)
+    verdict: _Judged | None = None
 
     @field_validator("sensors", mode="before")
     @classmethod
@@ -85,7 +93,8 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     """Return the sensors of a truth, of a mapping suite or of a calibration, by name.
 
     Without C and H an entry is free of distortion: C = I, H = 0; without a time offset its clock is
-    that of the poses. Sensors that a calibration could not solve are left out.
+    that of the poses. Sensors that a calibration could not solve are left out. A `Notice` says that
+    a calibration was judged FAIL.
 
     Raises
     ------
@@ -93,6 +102,8 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
         The file is missing or is not of this form.
     """
     found = read_checked(path, _FILE)
+    if found.verdict is not None and found.verdict.level is Level.FAIL:
+        warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
     return {name: _known(name, entry) for name, entry in found.sensors.items()}
 
 

@@ -13,14 +13,16 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from ruamel.yaml import YAML
 
 from l2m_gtsam.batch import reports
+from l2m_gtsam.errors import Notice
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibrated_topics import VERDICT_TOPIC
 from l2m_gtsam.storage.calibration_file import read_calibration
+from l2m_gtsam.storage.known_sensors import read_known_sensors
 from l2m_gtsam.storage.open_bag import open_bag
 from tests.drives.yard import CalibratedYard, calibrated_yard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
 
-FORMATS = ("ros2-launch", "urdf", "kalibr", "json", "bias-scale")
+FORMATS = ("ros2-launch", "urdf", "kalibr", "json", "bias-scale", "px4", "ardupilot")
 ROBOT = '<robot name="r">\n  <link name="lidar"/>\n</robot>\n'
 LOOSE, TIGHT, NEVER = ({"warn": limit, "fail": limit} for limit in (1e6, 1e-9, 1e-9))
 LIMITS = (
@@ -153,15 +155,15 @@ class Commands(RuleBasedStateMachine):
 def test_a_fail_leaves_no_file_without_a_verdict(
     place: CalibratedYard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Twelve walks of eight commands; pages, which take long, are drawn elsewhere."""
+    """Six walks of six commands; pages, which take long, are drawn elsewhere."""
     monkeypatch.setattr(reports, "calibration_page", lambda *_, **__: "")
     Commands.place, Commands.folder = place, tmp_path
     kinds = {"ros1": "ros1", "sqlite3": "sqlite3", "mcap": "mcap"}
     Commands.bags = {kind: written(tmp_path, kind, f"drive_{kind}") for kind in kinds}
     machine: Any = Commands.TestCase
     machine.settings = settings(
-        max_examples=12,
-        stateful_step_count=8,
+        max_examples=6,
+        stateful_step_count=6,
         deadline=None,
         derandomize=True,
         suppress_health_check=list(HealthCheck),
@@ -195,6 +197,15 @@ def test_an_edited_verdict_is_refused(place: CalibratedYard, tmp_path: Path) -> 
     edited.write_text(edited.read_text().replace("level: fail", "level: pass", 1))
     run = ended("export", edited, "--format", "json", "--out", tmp_path / "x")
     assert "verdict.level: PASS does not follow from its reasons" in one_line(run)
+
+
+def test_a_suite_that_failed_is_named(place: CalibratedYard, tmp_path: Path) -> None:
+    """Maps are built from calibrations, too."""
+    for name in ("metrics.json", "calibration.yaml"):
+        shutil.copy(place.calibration.parent / name, tmp_path)
+    l2m("report", tmp_path, "--config", config(tmp_path, "fail"))
+    with pytest.warns(Notice, match="its verdict is FAIL"):
+        read_known_sensors(tmp_path / "calibration.yaml")
 
 
 def test_strict_ends_with_three(place: CalibratedYard, tmp_path: Path) -> None:

@@ -253,7 +253,7 @@ def edited_urdf(export: Export, name: str, data: bytes) -> bytes:
         else:
             spans.append((joint, _replacement(urdf, joint, sensor, export.lidar_frame)))
     notes = [f"<!-- {COMMENT} {comment_text(line)} -->" for line in export.origin]
-    return _spliced(urdf, spans, [*notes, *added])
+    return _spliced(urdf, spans, [*added, *notes])
 
 
 def _check(urdf: UrdfFile, export: Export) -> None:
