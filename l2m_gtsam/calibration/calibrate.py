@@ -27,6 +27,7 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
+from l2m_gtsam.recording.drive_trace import trace_of
 from l2m_gtsam.recording.joining import drive_at, own_ns
 from l2m_gtsam.recording.sync import stuck_readings
 from l2m_gtsam.records.calibration import (
@@ -149,6 +150,7 @@ def calibrated(
         versions={name: version(name) for name in VERSIONED},
         bags=tuple(drive.source for drive in recording.drives),
         notes=tuple(note for drive in recording.parts for note in drive.notes),
+        traces=tuple(trace_of(drive.trajectory) for drive in recording.parts),
     )
     return Calibrated(result, solution, field_map, solver_map)
 

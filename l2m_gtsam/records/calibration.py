@@ -22,6 +22,7 @@ from l2m_gtsam.data import (
     SyncCounts,
     Vector,
 )
+from l2m_gtsam.records.drive_trace import DriveTrace
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
 
@@ -362,6 +363,8 @@ class CalibrationResult:
         What is worth knowing of the drives, a sentence each.
     judgement
         The verdict with its thresholds; absent where nobody judged it.
+    traces
+        What its drives are recognised by, whatever file they are in.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
@@ -376,6 +379,7 @@ class CalibrationResult:
     bags: tuple[SourceFile, ...] = ()
     notes: tuple[str, ...] = ()
     judgement: Judgement | None = None
+    traces: tuple[DriveTrace, ...] = ()
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

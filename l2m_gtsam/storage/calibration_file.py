@@ -78,6 +78,7 @@ MODEL = {
         "what the report concludes, with its reasons; thresholds: the options `qa` it was judged "
         "by; earlier: what the same numbers were judged before, by other thresholds"
     ),
+    "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
 SENSOR_KEYS = (
@@ -122,12 +123,14 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "notes": plain["notes"],
         "disagreements": disagreements,
         **source_entries(result),
+        "traces": plain["traces"],
         "versions": plain["versions"],
         "iterations": plain["iterations"],
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }
-    write_yaml(path, _without_empty(content, "notes"), HEADER)
+    written = _without_empty(_without_empty(content, "notes"), "traces")
+    write_yaml(path, written, HEADER)
 
 
 def read_calibration(path: Path) -> CalibrationResult:

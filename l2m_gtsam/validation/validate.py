@@ -16,6 +16,7 @@ from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
 from l2m_gtsam.qa.metrics.changes import is_calibrated
 from l2m_gtsam.qa.metrics.coverage import drive_metrics
+from l2m_gtsam.recording.drive_trace import is_of
 from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
 from l2m_gtsam.records.validation import DriveValidation, NotValidated, ValidatedSensor
@@ -25,9 +26,6 @@ from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration, knows_its_errors
 from l2m_gtsam.validation.recheck import SensorDrive, recheck
 
-SAME_BAG = (
-    "This is the drive that the calibration was computed from: it agrees with itself. Take another."
-)
 SAME_MAP = (
     "This is the map that it was calibrated with: errors of the map that the calibration took over "
     "do not show. A map of another survey would show them."
@@ -76,12 +74,17 @@ def validate(
     Raises
     ------
     CalibrationError
-        Calibration and recording have no sensor in common.
+        Calibration and recording have no sensor in common, or it was computed from this drive.
     ConfigError
         Readings follow a number that was not recorded.
     SyncError
         Readings and poses do not overlap.
     """
+    if is_own_drive(recording, calibration):
+        raise CalibrationError(
+            f"{recording.source.path}: is the drive that the calibration was computed from, or a "
+            "copy or a part of it: it agrees with itself; take another drive"
+        )
     missing = missing_sensors(recording, calibration)
     here = {each.sensor for each in recording.series}
     known = [each for each in calibration.sensors if each.sensor in here and is_sound(each)]
@@ -94,7 +97,7 @@ def validate(
         found.append(_tested(test, sensor))
     progress("validating", 1.0)
     places = np.concatenate([_places(test.readings, each) for each in known])
-    doubts, notes = doubts_and_notes(recording, field_map, calibration, map_source)
+    doubts, notes = doubts_and_notes(field_map, calibration, map_source)
     return DriveValidation(
         sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
         missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
@@ -290,8 +293,15 @@ def nothing_shared(
     )
 
 
+def is_own_drive(recording: Recording, calibration: CalibrationResult) -> bool:
+    """Return whether a calibration was computed from a drive, whatever file that is in."""
+    poses = recording.trajectory
+    return any(same_content(drive, recording.source) for drive in calibration.drives) or any(
+        is_of(trace, poses.stamp_ns, poses.p) for trace in calibration.traces
+    )
+
+
 def doubts_and_notes(
-    recording: Recording,
     field_map: QueryableMap,
     calibration: CalibrationResult,
     map_source: SourceFile | None,
@@ -299,9 +309,7 @@ def doubts_and_notes(
     """Return what speaks against the outcome, and what is worth knowing."""
     of_map = field_map.summary.doubts if isinstance(field_map, Summarised) else ()
     doubts, notes = [f"Of the map: {each}." for each in of_map], list[str]()
-    if any(same_content(drive, recording.source) for drive in calibration.drives):
-        doubts.append(SAME_BAG)
-    elif same_content(calibration.map, map_source):
+    if same_content(calibration.map, map_source):
         notes.append(SAME_MAP)
     judged = calibration.judgement
     if judged is None:

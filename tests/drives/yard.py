@@ -19,6 +19,7 @@ TURN = Rotation.from_euler("xyz", [0.2, -0.1, 1.3])
 P = np.array([[1.03, 0.01, 0], [0.01, 0.97, -0.012], [0, -0.012, 1.01]])
 C = TURN.as_matrix() @ P
 H = np.array([4.0, -7.0, 2.0])
+FIRST, DAY_NS = 5, 86_400_000_000_000
 
 
 @dataclass(frozen=True)
@@ -57,9 +58,12 @@ def _make(folder: Path) -> None:
 
 
 def written(
-    folder: Path, kind: str, name: str = "drive", seed: int = 5, offset: FloatArray = H
+    folder: Path, kind: str, name: str = "drive", seed: int = FIRST, offset: FloatArray = H
 ) -> Path:
-    """Write a drive through the west with turns and tilts, and one distorted sensor."""
+    """Write a drive through the west with turns and tilts, and one distorted sensor.
+
+    Each seed is another day: drives of one time and one way would be one drive.
+    """
     make, entries = ros(kind), []
     p, rng = route(-2.8, 0.2), np.random.default_rng(seed)
     k = np.arange(len(p))
@@ -67,8 +71,9 @@ def written(
     R = Rotation.from_euler("ZYX", angles)
     field, _ = world().field_and_gradient(p + R.apply(T_LIDAR_MAG))
     readings = R.inv().apply(field) @ C.T + offset + rng.normal(0, NOISE, field.shape)
+    start = START + (seed - FIRST) * DAY_NS
     for n, q in enumerate(R.as_quat()):
-        stamp = START + n * STEP
+        stamp = start + n * STEP
         pose = make.pose_stamped(stamp, p[n], q)
         entries.append(Entry("/pose", "geometry_msgs/PoseStamped", stamp, pose))
         magnetic = make.magnetic(stamp, readings[n] * 1e-6)

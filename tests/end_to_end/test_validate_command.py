@@ -92,6 +92,20 @@ def test_a_magnet_on_the_vehicle_is_named(
     assert {each.role for each in found.sources} == {"calibration", "drive", "map"}
 
 
+def test_its_own_drive_is_refused_in_any_container(
+    place: CalibratedYard, calibration: Path, field_map: Path, tmp_path: Path
+) -> None:
+    """Copied by `l2m apply`, or written as another kind of bag."""
+    copy = tmp_path / "copy"
+    l2m("apply", place.drive, "--calibration", calibration, "--out", copy, "--despite-verdict")
+    drives = [place.drive, copy, *(written(tmp_path, kind, kind) for kind in ("ros1", "sqlite3"))]
+    for bag in drives:
+        asked = ("--calibration", calibration, "--map", field_map, "--out", tmp_path / "out")
+        said = complaint_here("validate", bag, *asked)
+        assert f"{bag}: is the drive that the calibration was computed from" in said
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_change_since_an_older_calibration(calibration: Path, tmp_path: Path) -> None:
     sensor = read_calibration(calibration)["mag"]
     shifted = (sensor.t_lidar_mag + np.array([0.3, 0.0, 0.0])).tolist()

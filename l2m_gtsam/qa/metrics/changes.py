@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import BoolArray, FloatArray, same_content
 from l2m_gtsam.qa.metrics.mounting import PAIRS, gains, sensor_axes, skews_deg
 from l2m_gtsam.qa.metrics.plain import row
+from l2m_gtsam.recording.drive_trace import same_drive
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
@@ -105,6 +106,7 @@ def compare_calibrations(
         if each.sensor not in names
     ]
     same_bag = any(same_content(one, other) for one, other in product(new.drives, old.drives))
+    same_bag |= any(same_drive(one, other) for one, other in product(new.traces, old.traces))
     assumption = INDEPENDENT + (SHARED_BAG if same_bag else "")
     if same_content(new.map, old.map) and not same_bag:
         assumption += SHARED_MAP

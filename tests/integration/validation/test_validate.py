@@ -23,6 +23,7 @@ from l2m_gtsam.qa.fleet import rotations_apart
 from l2m_gtsam.qa.metrics.changes import compare_calibrations
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
+from l2m_gtsam.recording.drive_trace import trace_of
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
 from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.records.validation import (
@@ -287,14 +288,16 @@ def test_a_stuck_sensor_is_told() -> None:
     assert "it is stuck" in text_of(verdict, "mag_1")
 
 
-def test_its_own_drive_and_its_own_map_prove_little() -> None:
+def test_its_own_drive_is_refused_and_its_own_map_is_named() -> None:
     calibration = replace(calibrated(), map=MAP)
     notes = judged(on_drive(other_drive(), calibration)).reasons
     assert any("map that it was calibrated with" in each.text for each in notes)
     own = replace(calibration, bag=SourceFile("other.bag", "ef56"))
-    verdict = judged(on_drive(other_drive(), own))
-    assert verdict.level == "warn"
-    assert "drive that the calibration was computed from" in verdict.reasons[0].text
+    with pytest.raises(CalibrationError, match="drive that the calibration was computed from"):
+        on_drive(other_drive(), own)
+    copied = replace(calibration, bag=None, traces=(trace_of(other_drive().trajectory),))
+    with pytest.raises(CalibrationError, match="drive that the calibration was computed from"):
+        on_drive(other_drive(), copied)
 
 
 def test_a_motor_s_field_is_taken_off() -> None:
