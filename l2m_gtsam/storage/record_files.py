@@ -125,7 +125,9 @@ def write_slam(path: Path, record: LocalisationRecord) -> None:
     OutputError
         The file cannot be written.
     """
-    _write(path, _SLAM.dump_json(_SlamFile("l2m-slam", 4, LEGEND, **_parts(record))))
+    unjudged = {"judgement"} if record.judgement is None else None
+    file = _SlamFile("l2m-slam", 4, LEGEND, **_parts(record))
+    _write(path, _SLAM.dump_json(file, exclude=unjudged))
 
 
 def read_slam(path: Path) -> LocalisationRecord:

@@ -29,6 +29,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import BagError, CalibrationError, ConfigError, L2MError, OutputError
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.records.sensor_models import MovingField
+from l2m_gtsam.records.verdict import Judgement, Verdict
 from l2m_gtsam.storage import calibrated_topics
 from l2m_gtsam.storage.bag import read_fields
 from l2m_gtsam.storage.bag_options import BagOptions
@@ -50,6 +51,10 @@ LATCHED = Qos(
     QosTime(5, 6),
     avoid_ros_namespace_conventions=False,
 )
+
+
+GOOD = Judgement(Verdict.of([], []), {})
+VERDICT = "/l2m/verdict"
 
 
 def silent(_stage: str, _share: float) -> None:
@@ -83,9 +88,9 @@ def entries(kind: str, field_ut: FloatArray, per_tesla: float = 1e-6) -> list[En
 def applied(
     folder: Path, bag: Path, result: CalibrationResult | None = None, **changes: Any
 ) -> Applied:
-    """Apply a calibration to a bag, which gives `folder / out`."""
-    path = folder / "calibration.yaml"
-    write_calibration(path, made() if result is None else result)
+    """Apply a calibration, one without doubts if it was not judged, which gives `folder / out`."""
+    path, given = folder / "calibration.yaml", made() if result is None else result
+    write_calibration(path, replace(given, judgement=given.judgement or GOOD))
     out = folder / ("out.bag" if bag.suffix == ".bag" else "out")
     return apply_calibration(replace(Application(bag, path, out), **changes), silent)
 
@@ -123,6 +128,8 @@ def test_readings_are_corrected_beside_their_own(kind: str, tmp_path: Path) -> N
     out = tmp_path / ("out.bag" if kind == "ros1" else "out")
     before, after = content(bag), content(out)
     added = after.pop("/imu/mag/calibrated")
+    ((first, _),) = after.pop(VERDICT)
+    assert first == min(stamp for stamp, _ in before["/imu/mag"])
     assert after == before
     assert [stamp for stamp, _ in added] == [stamp for stamp, _ in before["/imu/mag"]]
     series = calibrated(out)
@@ -141,6 +148,13 @@ def test_what_is_said_of_topics_is_kept(kind: str, tmp_path: Path) -> None:
     before = connections(bag)
     after = connections(tmp_path / ("out.bag" if kind == "ros1" else "out"))
     assert after.pop("/imu/mag/calibrated") == before["/imu/mag"]
+    text, *_, extra = after.pop(VERDICT)
+    assert text == "std_msgs/msg/String"
+    if kind == "ros1":
+        assert extra.latching == 1
+    else:
+        (kept,) = extra.offered_qos_profiles
+        assert kept.durability is QosDurability.TRANSIENT_LOCAL
     assert after == before
 
 
@@ -175,7 +189,7 @@ def test_a_missing_axis_is_not_known_and_its_covariance_neither(tmp_path: Path) 
 def test_the_originals_can_be_left_out(tmp_path: Path) -> None:
     bag = write(tmp_path, "mcap", entries("mcap", readings()))
     applied(tmp_path, bag, replace=True)
-    assert set(content(tmp_path / "out")) == {"/imu/mag/calibrated", "/pose", "/note"}
+    assert set(content(tmp_path / "out")) == {"/imu/mag/calibrated", "/pose", "/note", VERDICT}
 
 
 def test_units_are_those_of_the_calibration_or_of_a_configuration(tmp_path: Path) -> None:
@@ -287,6 +301,7 @@ def test_ros1_compression_and_callers_are_kept(compression: Any, tmp_path: Path)
     with Ros1Reader(tmp_path / "out.bag") as reader:
         found = {(c.topic, *c.ext) for c in reader.connections}
         used = {chunk.decompressor for chunk in reader.chunks.values()}
+    found.remove((VERDICT, None, 1))
     assert found == {
         (topic, who, 1)
         for topic in ("/imu/mag", "/imu/mag/calibrated")
