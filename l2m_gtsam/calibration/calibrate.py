@@ -148,7 +148,7 @@ def calibrated(
         options=options.model_dump(mode="json"),
         versions={name: version(name) for name in VERSIONED},
         bags=tuple(drive.source for drive in recording.drives),
-        notes=tuple(note for drive in recording.parts for note in drive.notes),
+        notes=tuple(n for drive in recording.parts for n in (*drive.notes, *drive.origins)),
     )
     return Calibrated(result, solution, field_map, solver_map)
 
