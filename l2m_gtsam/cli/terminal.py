@@ -46,6 +46,13 @@ SchedulerOption = Annotated[
 CalibrationOption = Annotated[
     Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
 ]
+SensorsOption = Annotated[
+    Path,
+    typer.Option(
+        "--calibration",
+        help="calibration.yaml of `l2m calibrate`, or a list of sensors with t, C and H.",
+    ),
+]
 
 
 def warn(doubts: Sequence[str]) -> None:
