@@ -198,6 +198,8 @@ class Recording:
     notes
         What is worth a warning, a sentence each: where its poses come from if the bag has none, or
         a clock that was set.
+    origins
+        What else it was made from, a sentence each with the hash of the file.
     """
 
     trajectory: Trajectory
@@ -207,6 +209,7 @@ class Recording:
     drives: tuple["Recording", ...] = ()
     moved_ns: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
+    origins: tuple[str, ...] = ()
 
     @property
     def parts(self) -> tuple["Recording", ...]:

@@ -15,8 +15,8 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.joining import joined
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.storage.bag_options import BagOptions
-from l2m_gtsam.storage.calibration_file import read_calibration as read_calibration_file
 from l2m_gtsam.storage.known_sensors import read_known_sensors
+from l2m_gtsam.storage.listed_sensors import read_sensors
 
 Paths = str | Path | Sequence[str | Path]
 
@@ -54,8 +54,14 @@ def read_bag(
 
 
 def read_calibration(path: str | Path) -> CalibrationResult:
-    """Return the calibration in a `calibration.yaml`; a CalibrationError if it is none."""
-    return read_calibration_file(Path(path))
+    """Return the calibration in a `calibration.yaml`, or of sensors that are listed.
+
+    Raises
+    ------
+    CalibrationError
+        The file is neither of both.
+    """
+    return read_sensors(Path(path))
 
 
 def read_suite(path: str | Path) -> dict[str, KnownSensor]:

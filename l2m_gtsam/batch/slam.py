@@ -37,8 +37,9 @@ from l2m_gtsam.slam.options import Usage
 from l2m_gtsam.slam.pose_graph import write_g2o
 from l2m_gtsam.slam.record import RecordContext, localisation_record
 from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
+from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.point_cloud2 import has_clouds
 from l2m_gtsam.storage.pose_files import read_tum
 from l2m_gtsam.storage.record_files import write_slam
@@ -222,7 +223,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     """
     _check_folder(out)
     saved = None if given.map is None else SavedMap.read(given.map)
-    calibration = read_calibration(given.calibration)
+    calibration = read_sensors(given.calibration)
     if (out / REFINED_FILE).exists() and given.calibration.samefile(out / REFINED_FILE):
         raise OutputError(f"{given.calibration}: is what is read; choose another --out")
     truth = None if given.truth is None else read_tum(given.truth)
@@ -238,7 +239,9 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     else:
         found = _localised(recording, calibration, saved, scanned.evidence, config, progress)
     judged = calibration_notes(given.calibration, calibration)
-    notes = (*scanned.notes, *judged, *found.result.notes)
+    # Those of a calibration are its own; those of a list say what is assumed here.
+    assumed = () if calibration.versions else calibration.notes
+    notes = (*assumed, *scanned.notes, *judged, *found.result.notes)
     result = replace(found.result, map=map_source, calibration_source=calibration_source)
     found = replace(found, result=replace(result, notes=notes))
     options = config.model_dump(mode="json", include={"bag", "lidar", "slam", "qa"})

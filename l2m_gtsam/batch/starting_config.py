@@ -3,27 +3,30 @@
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from ruamel.yaml import YAML
 
 from l2m_gtsam.config import Config
 from l2m_gtsam.progress import Count
-from l2m_gtsam.storage.bag_options import BagOptions
-from l2m_gtsam.storage.inspect import BagReport, TopicReport, inspect_bag
+from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
+from l2m_gtsam.storage.inspect import POSE_FILE, BagReport, TopicReport, inspect_bag
 from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
 from l2m_gtsam.storage.units import EARTH_UT, Unit
 
 TRACKED = ("base_link", "lidar", "velodyne", "os_sensor", "base_footprint", "imu_link", "body")
 
 
-def starting_config(path: Path, progress: Count | None = None) -> str:
+def starting_config(path: Path, given: BagOptions, progress: Count | None = None) -> str:
     """Return a configuration for a log in YAML, and in comments why and what else there is.
 
     Parameters
     ----------
     path
         Log of any kind.
+    given
+        What is known already: poses in a file.
     progress
         Called with the messages read and their number.
 
@@ -32,9 +35,10 @@ def starting_config(path: Path, progress: Count | None = None) -> str:
     BagError
         The log cannot be read.
     """
-    report = inspect_bag(path, BagOptions(), progress)
+    report = inspect_bag(path, given, progress)
     lines = [f"# For {path}. `l2m config` has all options.", "bag:"]
-    lines += [*_fields(report), *_poses(report), *_stamps(report)]
+    lines += [*_fields(report), *_pose_file(given.pose_file, path), *_poses(report)]
+    lines += [*_stamps(report)]
     if lines[-1] == "bag:":
         lines[-1] = "bag: {}"
     chosen = _read("\n".join(lines))
@@ -68,13 +72,13 @@ def _fields(report: BagReport) -> Iterator[str]:
         yield f"  # {each.topic}: {each.msgtype}, {each.rate_hz:.3g} Hz{_strength(each)}"
     if any(len(each.frames) > 1 for each in fields):
         yield "  split_by_frame: true  # a topic has readings in several frames"
-    suggested = {each.likely_units for each in fields} - {None}
-    if len(suggested) == 1:
-        (units,) = suggested
-        if isinstance(units, Unit):
-            yield f"  units: {units.value}  # likely, by the strength of the readings"
-        else:
-            yield f"  units: {units:.3g}  # uT per count: makes {EARTH_UT:g} uT; see the data sheet"
+    suggested = [each.likely_units for each in fields if each.likely_units is not None]
+    named = {each for each in suggested if isinstance(each, Unit)}
+    if len(named) == 1:
+        yield f"  units: {named.pop().value}  # likely, by the strength of the readings"
+    elif suggested and not named:
+        units = median(float(each) for each in suggested)
+        yield f"  units: {units:.3g}  # uT per count: makes {EARTH_UT:g} uT; see the data sheet"
 
 
 def _strength(topic: TopicReport) -> str:
@@ -84,9 +88,18 @@ def _strength(topic: TopicReport) -> str:
     return f", |B| {found.low:.3g} - {found.median:.3g} - {found.high:.3g} uT"
 
 
+def _pose_file(given: PoseFileOptions, path: Path) -> Iterator[str]:
+    """Yield the file with the poses, if one is known."""
+    if (poses := given.of(path)) is not None:
+        yield "  pose_file:"
+        yield f"    path: {json.dumps(str(poses))}"
+        if given.times is not None:
+            yield f"    times: {json.dumps(str(given.times))}"
+
+
 def _poses(report: BagReport) -> Iterator[str]:
     """Yield where poses come from, and what else has some."""
-    if _used(report, "poses"):
+    if _used(report, "poses") or any(each.msgtype == POSE_FILE for each in report.topics):
         return
     named = [each for each in report.topics if each.msgtype in ALL_POSE_TYPES and each.count]
     for first in named[:1]:

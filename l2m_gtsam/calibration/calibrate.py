@@ -149,7 +149,7 @@ def calibrated(
         options=options.model_dump(mode="json"),
         versions={name: version(name) for name in VERSIONED},
         bags=tuple(drive.source for drive in recording.drives),
-        notes=tuple(note for drive in recording.parts for note in drive.notes),
+        notes=tuple(n for drive in recording.parts for n in (*drive.notes, *drive.origins)),
         traces=tuple(trace_of(drive.trajectory) for drive in recording.parts),
     )
     return Calibrated(result, solution, field_map, solver_map)

@@ -59,6 +59,8 @@ def config(
         Path | None,
         typer.Option("--for", metavar="BAG", help="A configuration to start from, for this log."),
     ] = None,
+    poses: PosesOption = None,
+    times: PoseTimesOption = None,
 ) -> None:
     """Print every option with its default and meaning, or a configuration for a log, as YAML."""
     from l2m_gtsam.errors import ConfigError
@@ -72,9 +74,11 @@ def config(
         raise ConfigError("--for: makes a whole configuration; leave out KEY")
     with shown_progress() as progress:
         from l2m_gtsam.batch.starting_config import starting_config
+        from l2m_gtsam.config import Config, with_poses
         from l2m_gtsam.progress import counter
 
-        text = starting_config(bag, counter(f"reading {bag.name}", progress))
+        given = with_poses(Config(), [bag], poses or (), times).bag
+        text = starting_config(bag, given, counter(f"reading {bag.name}", progress))
     typer.echo(text, nl=False)
 
 

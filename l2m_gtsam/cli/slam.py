@@ -6,10 +6,10 @@ from typing import Annotated
 import typer
 
 from l2m_gtsam.cli.terminal import (
-    CalibrationOption,
     OutOption,
     PosesOption,
     PoseTimesOption,
+    SensorsOption,
     StrictOption,
     end_with,
     print_table,
@@ -23,7 +23,7 @@ def slam(
         Path,
         typer.Argument(metavar="BAG", help="Drive with odometry: ROS1 .bag, ROS2 folder, .mcap."),
     ],
-    calibration: CalibrationOption,
+    calibration: SensorsOption,
     out: OutOption,
     map_path: Annotated[
         Path | None,

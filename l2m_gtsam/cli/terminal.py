@@ -47,6 +47,13 @@ SchedulerOption = Annotated[
 CalibrationOption = Annotated[
     Path, typer.Option("--calibration", help="calibration.yaml of `l2m calibrate`.")
 ]
+SensorsOption = Annotated[
+    Path,
+    typer.Option(
+        "--calibration",
+        help="calibration.yaml of `l2m calibrate`, or a list of sensors with t, C and H.",
+    ),
+]
 
 
 StrictOption = Annotated[

@@ -126,7 +126,7 @@ def _result(
         options=options.model_dump(mode="json"),
         versions={"l2m-gtsam": version("l2m-gtsam")},
         bags=tuple(each.source for each in recording.drives),
-        notes=tuple(note for part in recording.parts for note in part.notes),
+        notes=tuple(n for part in recording.parts for n in (*part.notes, *part.origins)),
     )
 
 

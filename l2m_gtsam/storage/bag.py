@@ -85,11 +85,11 @@ def read_recording(path: Path, options: BagOptions, progress: Count | None = Non
     series = _all_series(path, buffers, fields, options)
     trajectory = _trajectory(path, buffers, options, paths)
     check_clocks(path, trajectory, series)
-    notes = _clocks(path, buffers, options)
+    notes, origins = _clocks(path, buffers, options), tuple[str, ...]()
     if apart is not None:
-        found = source_file(apart)
-        notes = (*notes, f"{path}: poses are those of {apart} (sha256 {found.sha256})")
-    return Recording(trajectory, series, source_file(path), notes=notes)
+        digest = source_file(apart).sha256
+        origins = (f"{path}: poses are those of {apart} (sha256 {digest})",)
+    return Recording(trajectory, series, source_file(path), notes=notes, origins=origins)
 
 
 def read_fields(path: Path, options: BagOptions) -> tuple[FieldSeries, ...]:

@@ -31,7 +31,9 @@ from l2m_gtsam.storage.messages import (
     frame_of,
     stamp_of,
 )
+from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import open_log
+from l2m_gtsam.storage.path_topic import path_trajectory
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
 from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
@@ -156,6 +158,8 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         sources |= {each.connection.id: each for each in fields}
         usable = [c for c in bag.connections if _is_usable(c) or c.id in sources]
         collected = _collected(bag, usable, sources, progress)
+        if (fault := _collect_paths(bag, poses, collected)) and not no_poses:
+            no_poses = fault
         uses = {each.connection.topic: "magnetic readings" for each in fields}
         uses |= {c.topic: f"poses ({_why_poses(options)})" for c in poses}
         topics, duration = _by_topic(bag), max(bag.duration_s, 1e-9)
@@ -196,6 +200,22 @@ def _collected(
         source = sources.get(message.connection.id)
         _collect(into, message.content, message.connection.msgtype, message.record_ns, source)
     return collected
+
+
+def _collect_paths(bag: Log, poses: list[Connection], collected: dict[str, "_TopicBuffers"]) -> str:
+    """Add the stamps of poses that come from paths; return what is wrong with them, if anything."""
+    paths = [c for c in poses if c.msgtype == PATH_TYPE]
+    if not paths or not isinstance(bag, Bag):
+        return ""
+    try:
+        found = path_trajectory(bag, paths, None)
+    except (L2MError, ValueError) as error:
+        return str(error)
+    into = collected.setdefault(paths[0].topic, _TopicBuffers())
+    into.frames.add(found.frame)
+    for stamp in found.stamp_ns.tolist():
+        into.stamps.add(stamp, stamp)
+    return ""
 
 
 def _pose_file(path: Path, options: BagOptions) -> TopicReport:
@@ -246,7 +266,7 @@ def _selected(select: Any, bag: Log, options: BagOptions) -> tuple[list[Any], st
 
 
 def _is_usable(connection: Connection) -> bool:
-    return connection.msgtype in (*FIELD_TYPES, *ALL_POSE_TYPES, *TF_TYPES)
+    return connection.msgtype in (*FIELD_TYPES, *POSE_TYPES, *TF_TYPES)
 
 
 def _why_poses(options: BagOptions) -> str:
@@ -281,12 +301,8 @@ def _collect(
 
 
 def _stamped(content: Any, msgtype: str) -> Sequence[Any]:
-    """Return what has stamps in a message: of a path the poses, which are all there is of one."""
-    if msgtype in TF_TYPES:
-        return tuple(content.transforms)
-    if msgtype == PATH_TYPE:
-        return tuple(content.poses[-1:])
-    return (content,)
+    """Return what has stamps in a message."""
+    return tuple(content.transforms) if msgtype in TF_TYPES else (content,)
 
 
 def _report(

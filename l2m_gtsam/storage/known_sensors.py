@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
 
 from l2m_gtsam.data import Distortion, KnownSensor, Matrix, Vector
 from l2m_gtsam.errors import Notice
-from l2m_gtsam.records.calibration import SensorStatus
+from l2m_gtsam.records.calibration import SensorStatus, TimeOffset
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
@@ -40,6 +40,34 @@ class _Judged(_Finite):
     level: Level
 
 
+class ListedSensor(_Known):
+    """A sensor as it is listed by hand, with how well it is known."""
+
+    t_sigma: float = Field(default=0.005, gt=0)
+    """Standard deviation of each coordinate of its place, metres."""
+    C_sigma: float = Field(default=0.01, gt=0)
+    """Of each entry of C."""
+    H_sigma: float = Field(default=0.5, gt=0)
+    """Of each component of H, microtesla."""
+    noise: float = Field(default=0.3, gt=0)
+    """Of a reading, microtesla."""
+
+    @property
+    def has_sigmas(self) -> bool:
+        """Whether the list says how well it is known."""
+        return {"t_sigma", "C_sigma", "H_sigma"} <= self.model_fields_set
+
+    def known(self, name: str) -> KnownSensor:
+        """Return it as a sensor with a name."""
+        return _known(name, self)
+
+    def offset(self) -> TimeOffset | None:
+        """Return the offset of its clock, which counts as exact; None where there is none."""
+        if self.time_offset is None:
+            return None
+        return TimeOffset(self.time_offset.seconds, float("inf"), np.zeros(15), "it is listed")
+
+
 class _KnownFile(_Finite):
     sensors: dict[str, _Known] = Field(min_length=1)
     verdict: _Judged | None = None
@@ -58,7 +86,12 @@ class _KnownFile(_Finite):
         }
 
 
+class _ListedFile(_Finite):
+    sensors: dict[str, ListedSensor] = Field(min_length=1)
+
+
 _FILE = TypeAdapter(_KnownFile)
+_LIST = TypeAdapter(_ListedFile)
 
 
 def write_known_sensors(
@@ -105,6 +138,17 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     if found.verdict is not None and found.verdict.level is Level.FAIL:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
     return {name: _known(name, entry) for name, entry in found.sensors.items()}
+
+
+def read_listed_sensors(path: Path) -> dict[str, ListedSensor]:
+    """Return the sensors of a list by name, with how well they are known.
+
+    Raises
+    ------
+    CalibrationError
+        The file is missing or is not of this form.
+    """
+    return dict(read_checked(path, _LIST).sensors)
 
 
 def _known(name: str, entry: _Known) -> KnownSensor:

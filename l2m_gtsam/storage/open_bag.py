@@ -24,6 +24,8 @@ from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
 
 ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3, .mcap, .csv or .ulg file"
+TABLES = (".csv", ".ulg")
+"""How the names of logs end that are no bags."""
 # mcap counts nanoseconds unsigned, everything else in 63 bits.
 LATEST_NS = (1 << 63) - 1
 PROGRESS_EVERY = 2000
@@ -178,6 +180,11 @@ def open_bag(path: Path) -> Iterator[Bag]:
     """
     if not path.exists():
         raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
+    if path.suffix.lower() in TABLES:
+        raise BagError(
+            f"{path}: a bag is needed here, this is a table; for readings in one, `l2m export "
+            "--format json` has C and H"
+        )
     try:
         reader = Ros1Reader(path) if path.suffix == ".bag" else Ros2Reader(path)
         reader.open()

@@ -8,16 +8,13 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import ColumnOptions
 from l2m_gtsam.storage.csv_log import read_csv_log
 from l2m_gtsam.storage.log import Log
-from l2m_gtsam.storage.open_bag import ACCEPTED, open_bag
+from l2m_gtsam.storage.open_bag import ACCEPTED, TABLES, open_bag
 from l2m_gtsam.storage.ulog import read_ulog
-
-CSV, ULOG = ".csv", ".ulg"
-"""How the names of logs end that are no bags."""
 
 
 def is_table(path: Path) -> bool:
     """Return whether a log is no bag, by its name: it has no point clouds and cannot be copied."""
-    return path.suffix.lower() in (CSV, ULOG)
+    return path.suffix.lower() in TABLES
 
 
 @contextmanager
@@ -42,5 +39,5 @@ def open_log(path: Path, columns: ColumnOptions | None = None) -> Iterator[Log]:
         return
     if not path.is_file():
         raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
-    is_ulog = path.suffix.lower() == ULOG
+    is_ulog = path.suffix.lower() == ".ulg"
     yield read_ulog(path) if is_ulog else read_csv_log(path, columns or ColumnOptions())

@@ -45,7 +45,7 @@ def path_trajectory(bag: Bag, paths: Sequence[Connection], progress: Count | Non
         latest.update(zip(stamps, content.poses, strict=True))
     if len(frames) > 1:
         raise BagError(f"{bag.path}: paths in several frames: {', '.join(sorted(frames)[:10])}")
-    if not latest:
+    if not latest or not frames:
         raise BagError(f"{bag.path}: the topic of the poses has no poses")
     buffer = PoseBuffer(frames.pop(), "lidar")
     for stamp_ns, stamped in sorted(latest.items()):

@@ -87,8 +87,8 @@ def select_poses(bag: Log, options: BagOptions) -> list[Connection]:
             )
     raise BagError(
         f"{bag.path}: no poses in it; needed is a topic of one of the types "
-        f"{', '.join(ROS_POSE_TYPES)}, a /tf chain named by `bag.tf`, or a file with `--poses`; "
-        f"there are: {listed(bag.connections)}"
+        f"{', '.join(each.rpartition('/')[2] for each in ROS_POSE_TYPES)}, a /tf chain named by "
+        f"`bag.tf`, or a file with `--poses`; there are: {listed(bag.connections)}"
     )
 
 
