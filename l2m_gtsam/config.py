@@ -14,6 +14,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.shown import shown_value
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
@@ -126,7 +127,7 @@ def _explain(path: Path, error: ValidationError, model: type[BaseModel]) -> str:
     if fault["type"] == "extra_forbidden":
         accepted = ", ".join(_accepted(model, fault["loc"][:-1]))
         return f"{path}: unknown key {key!r}; accepted here: {accepted}"
-    return f"{path}: {key}: {fault['msg']}, got {fault['input']!r}"
+    return f"{path}: {key}: {fault['msg']}, got {shown_value(fault['input'])}"
 
 
 def _accepted(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

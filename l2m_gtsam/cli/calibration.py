@@ -15,6 +15,7 @@ from l2m_gtsam.cli.terminal import (
     SchedulerOption,
     WorkersOption,
     print_table,
+    say,
     shown_progress,
     warn,
 )
@@ -40,10 +41,10 @@ def inspect(
         report = inspect_file(bag, chosen, progress)
     print_table(bag_table(report))
     for note in report.notes:
-        typer.echo(note)
+        say(note)
     for obstacle in report.obstacles:
-        typer.echo(f"cannot be calibrated as it is: {obstacle}")
-    typer.echo("clock: record time less header stamp, median; |B|: lowest - median - highest")
+        say(f"cannot be calibrated as it is: {obstacle}")
+    say("clock: record time less header stamp, median; |B|: lowest - median - highest")
     if report.obstacles:
         raise typer.Exit(1)
 
@@ -115,10 +116,10 @@ def plan(
         found = plan_bag(bag, map_path, chosen, places, progress)
     print_table(plan_table(found))
     if held := held_plan_note(found):
-        typer.echo(held)
+        say(held)
     print_table(motion_table(found))
-    typer.echo(advice(found))
-    typer.echo(UNCERTAINTY[found.uncertainty])
+    say(advice(found))
+    say(UNCERTAINTY[found.uncertainty])
     warn(found.doubts)
 
 
@@ -189,9 +190,9 @@ def calibrate(
         found = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
         verdict = report_calibration(out, found, chosen.qa, progress)
     _print_calibration(found.result, models)
-    typer.echo("\n".join(verdict.lines()))
+    say(*verdict.lines())
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
-    typer.echo(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
+    say(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
 
 
 def _print_calibration(result: "CalibrationResult", models: bool) -> None:
@@ -208,17 +209,17 @@ def _print_calibration(result: "CalibrationResult", models: bool) -> None:
 
     print_table(calibration_table(result))
     for note in result.notes:
-        typer.echo(note)
-    typer.echo(UNCERTAINTY[result.uncertainty])
+        say(note)
+    say(UNCERTAINTY[result.uncertainty])
     warn(result.doubts)
     warn(missing_note(result))
     warn([disagreement_note(each) for each in result.disagreements])
     if held := held_clocks_note(result):
-        typer.echo(held)
+        say(held)
     for table in model_tables(result) if models else ():
         print_table(table)
     for note in filter(None, map(model_note, result.sensors)):
-        typer.echo(note)
+        say(note)
 
 
 def batch(
@@ -256,13 +257,13 @@ def batch(
             scheduler=scheduler, **({} if workers is None else {"workers": workers})
         )
         fleet = run_fleet(order, cluster, progress)
-    typer.echo(_summary(fleet))
+    say(_summary(fleet))
     for row in fleet.rows:
         if row.error:
-            typer.echo(f"not calibrated: {row.vehicle}, {row.bag}: {row.error}")
+            say(f"not calibrated: {row.vehicle}, {row.bag}: {row.error}")
     warn(fleet.notes)
     written = [PAGE_FILE, CSV_FILE, *([] if fleet.notes else [PARQUET_FILE])]
-    typer.echo(f"written: {', '.join(str(out / name) for name in written)}")
+    say(f"written: {', '.join(str(out / name) for name in written)}")
 
 
 def _summary(fleet: "Fleet") -> str:

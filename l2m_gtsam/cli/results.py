@@ -10,6 +10,7 @@ from l2m_gtsam.cli.terminal import (
     PosesOption,
     PoseTimesOption,
     print_table,
+    say,
     shown_progress,
     warn,
 )
@@ -40,9 +41,9 @@ def report(
         from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
 
         verdict = report_folder(folder, config, progress, pdf=pdf)
-    typer.echo("\n".join(verdict.lines()))
+    say(*verdict.lines())
     written = [folder / REPORT_FILE, *([folder / PDF_FILE] if pdf else [])]
-    typer.echo(f"written: {', '.join(map(str, written))}")
+    say(f"written: {', '.join(map(str, written))}")
 
 
 def validate(
@@ -91,9 +92,9 @@ def validate(
         print_table(validation_table(found.drive, found.verdict))
     if found.comparison is not None:
         print_table(change_table(found.comparison))
-    typer.echo("\n".join(found.verdict.lines(Level.PASS)))
+    say(*found.verdict.lines(Level.PASS))
     if out is not None:
-        typer.echo(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")
+        say(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")
 
 
 def export(
@@ -125,7 +126,7 @@ def export(
 
     names = Names(lidar_frame, dict(_named(text) for text in frame or []))
     warn(export_calibration(calibration, format_name, out, names, into))
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")
 
 
 def apply(
@@ -151,8 +152,8 @@ def apply(
         applied = apply_calibration(wanted, progress)
     warn(applied.notes)
     for sensor, topic in applied.topics.items():
-        typer.echo(f"{sensor}: {topic}")
-    typer.echo(f"written: {out}")
+        say(f"{sensor}: {topic}")
+    say(f"written: {out}")
 
 
 def _named(text: str) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from l2m_gtsam.cli.terminal import (
     PoseTimesOption,
     SensorsOption,
     print_table,
+    say,
     shown_progress,
 )
 
@@ -59,5 +60,5 @@ def slam(
         *truth_lines(done.record.truth),
         *done.verdict.lines(),
     )
-    typer.echo("\n".join(lines))
-    typer.echo(f"written: {out}")
+    say(*lines)
+    say(f"written: {out}")

@@ -248,6 +248,38 @@ class FieldBuffer:
         return np.array(self.values, dtype=np.float64).reshape(-1, 3)
 
 
+# Drivers round quaternions, in single precision or to a few digits; none is off by more than this.
+QUATERNION_LENGTH = (0.5, 2.0)
+# Further than any place of the Earth from another one: the unit is wrong, or the number is.
+MOST_METRES = 1e8
+
+
+def odd_orientation(quaternion: FloatArray) -> str:
+    """Return what is wrong with quaternions, shape (N, 4); nothing if all are rotations."""
+    if np.any(~quaternion.any(axis=1)):
+        return "an orientation is all zero, it must be a unit quaternion"
+    # Of large numbers the squares are infinite: the largest component bounds the length, too.
+    largest = np.abs(quaternion).max(axis=1)
+    sound = (largest > QUATERNION_LENGTH[0] / 2) & (largest <= QUATERNION_LENGTH[1])
+    length = np.linalg.norm(quaternion[sound], axis=1)
+    inside = (length >= QUATERNION_LENGTH[0]) & (length <= QUATERNION_LENGTH[1])
+    if sound.all() and inside.all():
+        return ""
+    worst = quaternion[~sound][0] if not sound.all() else quaternion[sound][~inside][0]
+    return (
+        f"an orientation is ({', '.join(f'{each:.3g}' for each in worst)}), it must be a unit "
+        "quaternion"
+    )
+
+
+def odd_position(p: FloatArray) -> str:
+    """Return what is wrong with positions in metres, shape (N, 3); nothing if all can be."""
+    furthest = float(np.abs(p).max(initial=0.0))
+    if furthest <= MOST_METRES:
+        return ""
+    return f"a position has a coordinate of {furthest:.3g} m, at most {MOST_METRES:g} m can be"
+
+
 @dataclass
 class PoseBuffer:
     """Poses of one body as they come."""
@@ -285,13 +317,12 @@ class PoseBuffer:
         Raises
         ------
         ValueError
-            An orientation has no direction (all zero), or no pose is finite.
+            An orientation is no rotation, a position is out of range, or no pose is finite.
         """
         used = self._used()
         stamps, rows = np.array(self.stamp_ns, dtype=np.int64)[used], self._rows()[used]
-        length = np.linalg.norm(rows[:, 3:], axis=1)
-        if np.any(length < 1e-6):
-            raise ValueError("an orientation is all zero, it must be a unit quaternion")
+        if (wrong := odd_orientation(rows[:, 3:])) or (wrong := odd_position(rows[:, :3])):
+            raise ValueError(wrong)
         R = Rotation.from_quat(rows[:, 3:]).as_matrix().reshape(-1, 3, 3)
         if self.static:  # the last one published holds, whenever
             return Link(self.frame, self.child_frame, stamps[:0], R[-1:], rows[-1:, :3])
