@@ -11,11 +11,11 @@ from typing import Annotated
 import typer
 
 from l2m_gtsam.cli.calibration import batch, calibrate, config, inspect, plan
+from l2m_gtsam.cli.endings import Stopped, flush_output, last_line, stopped_by_signals
 from l2m_gtsam.cli.maps import map_app
 from l2m_gtsam.cli.results import apply, export, report, validate
 from l2m_gtsam.cli.simulation import demo, simulate, study
 from l2m_gtsam.cli.slam import slam
-from l2m_gtsam.cli.endings import Stopped, flush_output, last_line, stopped_by_signals
 from l2m_gtsam.cli.terminal import shown_notices
 
 app = typer.Typer(

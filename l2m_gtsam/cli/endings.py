@@ -1,5 +1,6 @@
 """How a command ends when it does not end well: one last line, and an exit code."""
 
+import errno
 import os
 import signal
 import sys
@@ -14,6 +15,9 @@ from l2m_gtsam.errors import L2MError
 from l2m_gtsam.shown import shown
 
 USER, FAULT, SIGNAL = 2, 70, 128  # exit codes: 70 is that of sysexits.h for internal errors
+LOST = "standard output: cannot be written: "
+# Files of results name themselves when they cannot be written.
+UNWRITTEN = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -25,7 +29,7 @@ class Stopped(BaseException):
         self.number = number
 
 
-class OutputLost(L2MError):
+class OutputLostError(L2MError):
     """What a command printed did not arrive."""
 
 
@@ -54,7 +58,7 @@ def flush_output() -> None:
 
     Raises
     ------
-    OutputLost
+    OutputLostError
         It cannot: the disk that it goes to is full.
     """
     try:
@@ -64,7 +68,7 @@ def flush_output() -> None:
     except (OSError, ValueError) as error:
         _forget_output()
         reason = getattr(error, "strerror", None) or error
-        raise OutputLost(f"standard output: cannot be written: {reason}") from error
+        raise OutputLostError(f"{LOST}{reason}") from error
 
 
 def last_line(error: BaseException) -> int:
@@ -88,7 +92,8 @@ def _told(error: BaseException) -> tuple[str, int]:
         return "not enough memory; give a shorter drive or a smaller map", USER
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        return f"{where}{error.strerror or error}", USER
+        what = LOST if not where and error.errno in UNWRITTEN else ""
+        return f"{where}{what}{error.strerror or error}", USER
     what = f"{type(error).__name__}: {error}"
     return f"a fault of this program, please report it with what --debug shows: {what}", FAULT
 

@@ -152,9 +152,7 @@ def _show_control_characters(table: "Table") -> None:
         if isinstance(text := getattr(table, name), str):
             setattr(table, name, shown(text))
     for column in table.columns:
-        column._cells = [  # noqa: SLF001 - rich has no other way to change a cell
-            shown(cell) if isinstance(cell, str) else cell for cell in column.cells
-        ]
+        column._cells = [shown(cell) if isinstance(cell, str) else cell for cell in column.cells]
 
 
 def _needed(console: "Console", table: "Table") -> int:

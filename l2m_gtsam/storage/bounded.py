@@ -4,10 +4,12 @@ All readers open files here, or have them checked here where a library opens the
 device would be waited for, or be read until the memory is full.
 """
 
+import errno
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
 
@@ -38,22 +40,36 @@ def opened(
         read.
     """
     try:
-        # Without waiting: a pipe would be waited for until somebody writes to it.
-        handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        file = open_regular(path)
     except (OSError, ValueError) as reason:
         raise error(f"{path}: {_why(reason, missing)}") from reason
-    mode = os.fstat(handle).st_mode
-    if not stat.S_ISREG(mode):
-        os.close(handle)
-        raise error(f"{path}: {_kind(mode)}; a regular file is expected")
-    with os.fdopen(handle, "rb") as file:
+    with file:
         try:
             yield file
         except OSError as reason:
             raise error(f"{path}: {_why(reason, missing)}") from reason
 
 
-def content(
+def open_regular(path: Path) -> BufferedReader:
+    """Return a regular file, opened for reading bytes.
+
+    Raises
+    ------
+    OSError
+        It is missing, is a folder, a pipe or a device, or cannot be opened.
+    ValueError
+        There can be no such name.
+    """
+    # Without waiting: a pipe would be waited for until somebody writes to it.
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    mode = os.fstat(handle).st_mode
+    if stat.S_ISREG(mode):
+        return os.fdopen(handle, "rb")
+    os.close(handle)
+    raise OSError(errno.EINVAL, f"{_kind(mode)}; a regular file is expected", str(path))
+
+
+def read_content(
     path: Path, most_bytes: int, error: type[L2MError] = L2MError, missing: str = "no such file"
 ) -> bytes:
     """Return the bytes of a regular file.
@@ -73,9 +89,7 @@ def content(
     with opened(path, error, missing) as file:
         found = file.read(most_bytes + 1)  # files of the system have no size beforehand
     if len(found) > most_bytes:
-        raise error(
-            f"{path}: larger than {most_bytes / MEGABYTE:g} MB, not a file of this program"
-        )
+        raise error(f"{path}: larger than {most_bytes / MEGABYTE:g} MB, not a file of this program")
     return found
 
 

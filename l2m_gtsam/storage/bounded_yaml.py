@@ -1,5 +1,6 @@
 """YAML that is read within bounds: counted while it is parsed, before anything is made of it."""
 
+from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -14,13 +15,15 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.parser import Parser
 
+from l2m_gtsam.storage.bounded import read_content
+
 MAX_BYTES = 2_000_000  # a calibration of a hundred sensors is half of it; ten seconds
 MAX_DEPTH = 40  # ours are nested in ten levels
 # With aliases in full: they are shared in memory, but not by what walks over the content.
 MAX_NODES = 400_000
 
 
-class TooMuchYAML(YAMLError):  # type: ignore[misc]
+class TooMuchYAMLError(YAMLError):
     """A document that is nested too deep, or that has too many nodes with its aliases in full."""
 
 
@@ -34,7 +37,7 @@ class _BoundedParser(Parser):
         self._nodes = 0
 
     def get_event(self) -> Any:
-        """Return the next event; a TooMuchYAML beyond the bounds."""
+        """Return the next event; a TooMuchYAMLError beyond the bounds."""
         event = super().get_event()
         if event is not None:
             self._count(event)
@@ -49,7 +52,7 @@ class _BoundedParser(Parser):
                 self._sizes[anchor] = self._nodes - before
         elif isinstance(event, AliasEvent):
             if event.anchor in (anchor for anchor, _ in self._open):
-                raise TooMuchYAML(f"&{event.anchor} holds itself")
+                raise TooMuchYAMLError(f"&{event.anchor} holds itself")
             self._nodes += self._sizes.get(event.anchor, 1)
         elif isinstance(event, NodeEvent):
             if isinstance(event, CollectionStartEvent):
@@ -58,9 +61,9 @@ class _BoundedParser(Parser):
                 self._sizes[event.anchor] = 1
             self._nodes += 1
         if len(self._open) > MAX_DEPTH:
-            raise TooMuchYAML(f"nested more than {MAX_DEPTH} levels deep")
+            raise TooMuchYAMLError(f"nested more than {MAX_DEPTH} levels deep")
         if self._nodes > MAX_NODES:
-            raise TooMuchYAML(f"more than {MAX_NODES:,} values, aliases counted in full")
+            raise TooMuchYAMLError(f"more than {MAX_NODES:,} values, aliases counted in full")
 
 
 class BoundedYAML(YAML):
@@ -70,21 +73,26 @@ class BoundedYAML(YAML):
         super().__init__(typ="safe", pure=True)
         self.Parser = _BoundedParser
 
-    def load(self, stream: str | bytes) -> Any:
-        """Return the content of a text.
+    def load(self, stream: Any) -> Any:
+        """Return the content of a text, or of a file.
 
         Raises
         ------
         YAMLError
             It is not YAML, or there is too much of it.
         """
+        if isinstance(stream, Path):
+            stream = read_content(stream, MAX_BYTES)
+        elif not isinstance(stream, str | bytes):
+            stream = stream.read(MAX_BYTES + 1)
         if len(stream) > MAX_BYTES:
-            raise TooMuchYAML(f"larger than {MAX_BYTES / 1e6:g} MB")
+            raise TooMuchYAMLError(f"larger than {MAX_BYTES / 1e6:g} MB")
         try:
             return super().load(stream)
         except OverflowError as reason:  # moved to UTC, year 1 or 9999 may be left
-            raise YAMLError("has a date that no calendar holds; accepted: years 2 to 9998") from reason
+            why = "has a date that no calendar holds; accepted: years 2 to 9998"
+            raise YAMLError(why) from reason
         except (ValueError, TypeError, AttributeError, KeyError, IndexError) as reason:
             raise YAMLError(" ".join(str(reason).split())[:100]) from reason
         except RecursionError as reason:
-            raise TooMuchYAML("nested too deep") from reason
+            raise TooMuchYAMLError("nested too deep") from reason

@@ -60,7 +60,8 @@ class VoxelMeans:
         Raises
         ------
         ValueError
-            A point is more than a million cells away from the first one, or too many cells have any.
+            A point is more than a million cells away from the first one, or there are too many
+            cells.
         """
         self._waiting.append(points)
         self._number_waiting += len(points)

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Trajectory
 from l2m_gtsam.geometry import from_ros
+from l2m_gtsam.storage.number_ranges import odd_poses, readable
 from l2m_gtsam.storage.tf import Link
 from l2m_gtsam.storage.units import Unit
 
@@ -244,40 +245,8 @@ class FieldBuffer:
         return np.array(self.stamp_ns, dtype=np.int64)
 
     def field(self) -> FloatArray:
-        """Return the readings as they were written, shape (N, 3)."""
-        return np.array(self.values, dtype=np.float64).reshape(-1, 3)
-
-
-# Drivers round quaternions, in single precision or to a few digits; none is off by more than this.
-QUATERNION_LENGTH = (0.5, 2.0)
-# Further than any place of the Earth from another one: the unit is wrong, or the number is.
-MOST_METRES = 1e8
-
-
-def odd_orientation(quaternion: FloatArray) -> str:
-    """Return what is wrong with quaternions, shape (N, 4); nothing if all are rotations."""
-    if np.any(~quaternion.any(axis=1)):
-        return "an orientation is all zero, it must be a unit quaternion"
-    # Of large numbers the squares are infinite: the largest component bounds the length, too.
-    largest = np.abs(quaternion).max(axis=1)
-    sound = (largest > QUATERNION_LENGTH[0] / 2) & (largest <= QUATERNION_LENGTH[1])
-    length = np.linalg.norm(quaternion[sound], axis=1)
-    inside = (length >= QUATERNION_LENGTH[0]) & (length <= QUATERNION_LENGTH[1])
-    if sound.all() and inside.all():
-        return ""
-    worst = quaternion[~sound][0] if not sound.all() else quaternion[sound][~inside][0]
-    return (
-        f"an orientation is ({', '.join(f'{each:.3g}' for each in worst)}), it must be a unit "
-        "quaternion"
-    )
-
-
-def odd_position(p: FloatArray) -> str:
-    """Return what is wrong with positions in metres, shape (N, 3); nothing if all can be."""
-    furthest = float(np.abs(p).max(initial=0.0))
-    if furthest <= MOST_METRES:
-        return ""
-    return f"a position has a coordinate of {furthest:.3g} m, at most {MOST_METRES:g} m can be"
+        """Return the readings as they were written, NaN for what no sensor reads, shape (N, 3)."""
+        return readable(np.array(self.values, dtype=np.float64).reshape(-1, 3))
 
 
 @dataclass
@@ -321,7 +290,7 @@ class PoseBuffer:
         """
         used = self._used()
         stamps, rows = np.array(self.stamp_ns, dtype=np.int64)[used], self._rows()[used]
-        if (wrong := odd_orientation(rows[:, 3:])) or (wrong := odd_position(rows[:, :3])):
+        if wrong := odd_poses(rows[:, :3], rows[:, 3:]):
             raise ValueError(wrong)
         R = Rotation.from_quat(rows[:, 3:]).as_matrix().reshape(-1, 3, 3)
         if self.static:  # the last one published holds, whenever

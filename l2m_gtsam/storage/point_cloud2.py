@@ -127,13 +127,13 @@ def _column(scan: Any, offset: int, kind: str) -> npt.NDArray[Any]:
     """Return a field of all points, shape (N,)."""
     height, width, step = int(scan.height), int(scan.width), int(scan.point_step)
     row = int(scan.row_step) if height > 1 else width * step
-    if height * width > MOST_POINTS:
-        raise ValueError(f"a scan has {height * width:,} points, at most {MOST_POINTS:,}")
     if row < width * step or (height - 1) * row + width * step > len(scan.data):
         raise ValueError(
             f"a scan declares {height} x {width} points of {step} bytes in rows of {row} bytes, "
             f"which its {len(scan.data)} bytes are not"
         )
+    if height * width > MOST_POINTS:
+        raise ValueError(f"a scan has {height * width:,} points, at most {MOST_POINTS:,}")
     order = ">" if scan.is_bigendian else "<"
     return np.ndarray((height, width), order + kind, scan.data, offset, (row, step)).ravel()
 

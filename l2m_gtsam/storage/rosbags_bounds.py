@@ -37,7 +37,7 @@ MOST_SEQUENCE = MOST_CHUNK  # of bytes, that is
 MOST_REPEATED = 1000  # of a message type in another one
 PIECE = 1 << 16
 SQLITE_LIMIT_LENGTH = 0  # its number in SQLite's interface
-ZSTD: Any = ros2.zstd  # before it is replaced below
+ZSTD: Any = vars(ros2)["zstd"]  # before it is replaced below
 WINDOW = {ZSTD.DecompressionParameter.window_log_max: 27}  # 128 MiB; the default of its program
 
 
@@ -103,7 +103,7 @@ class _BoundedZstd:
 
     @staticmethod
     @contextmanager
-    def open(file: BinaryIO, mode: str) -> Iterator[BinaryIO]:
+    def open(file: BinaryIO, mode: str) -> Iterator[io.RawIOBase]:
         """Give what a compressed file holds, as far as ``MOST_UNPACKED``."""
         with ZSTD.open(file, mode) as inner:
             yield _Counted(inner)

@@ -13,8 +13,8 @@ from ruamel.yaml.representer import SafeRepresenter
 
 from l2m_gtsam.errors import CalibrationError, L2MError
 from l2m_gtsam.options import first_fault
-from l2m_gtsam.storage.bounded import content
-from l2m_gtsam.storage.bounded_yaml import MAX_BYTES, BoundedYAML, TooMuchYAML
+from l2m_gtsam.storage.bounded import read_content
+from l2m_gtsam.storage.bounded_yaml import MAX_BYTES, BoundedYAML, TooMuchYAMLError
 from l2m_gtsam.storage.files import atomic_path
 
 Content = TypeVar("Content")
@@ -37,14 +37,14 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
     error
         What to raise, with one line that names the file, if it cannot be read.
     """
-    raw = content(path, MAX_BYTES, error)
+    raw = read_content(path, MAX_BYTES, error)
     try:
         text = raw.decode("utf-8")
     except UnicodeDecodeError as reason:
         raise error(f"{path}: cannot be read as text") from reason
     try:
         return BoundedYAML().load(text)
-    except TooMuchYAML as reason:
+    except TooMuchYAMLError as reason:
         raise error(f"{path}: {reason}; not a file of this program") from reason
     except YAMLError as reason:
         mark = getattr(reason, "problem_mark", None)
