@@ -1,6 +1,7 @@
 """Poses and readings with numbers that no pose and no sensor has."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def drive(
     return write(folder, kind, entries)
 
 
-ODD = {
+ODD: dict[str, tuple[dict[str, Any], str]] = {
     "huge": ({"q": (1e200, 0.0, 0.0, 1.0)}, r"an orientation is \(1e\+200, 0, 0, 1\)"),
     "largest": ({"q": (1.7e308,) * 4}, "an orientation is"),
     "tiny": ({"q": (0.0, 0.0, 0.0, 1e-200)}, "an orientation is"),
