@@ -14,11 +14,14 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.shown import shown, shown_value
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
 
 Model = TypeVar("Model", bound=BaseModel)
+
+LONGEST_KEY, LONGEST_REASON = 120, 400  # letters
 
 
 class Config(Options):
@@ -122,11 +125,12 @@ def with_poses(
 def _explain(path: Path, error: ValidationError, model: type[BaseModel]) -> str:
     """Return one line about the first fault."""
     fault = error.errors()[0]
-    key = ".".join(str(part) for part in fault["loc"]) or "the file"
+    key = shown(".".join(str(part) for part in fault["loc"]), LONGEST_KEY) or "the file"
     if fault["type"] == "extra_forbidden":
         accepted = ", ".join(_accepted(model, fault["loc"][:-1]))
         return f"{path}: unknown key {key!r}; accepted here: {accepted}"
-    return f"{path}: {key}: {fault['msg']}, got {fault['input']!r}"
+    why = shown(fault["msg"], LONGEST_REASON)
+    return f"{path}: {key}: {why}, got {shown_value(fault['input'])}"
 
 
 def _accepted(model: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:

@@ -17,6 +17,7 @@ from l2m_gtsam.records.verdict import NOT_JUDGED, Level, Verdict
 from l2m_gtsam.solve.correction import corrected, moving_variance, without_moving
 from l2m_gtsam.storage.bag_copy import bag_copy, check_copy
 from l2m_gtsam.storage.bag_options import BagOptions
+from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.calibrated_topics import (
     CalibratedTopic,
     Calibrator,
@@ -40,7 +41,8 @@ from l2m_gtsam.storage.exports.urdf import edited_urdf
 from l2m_gtsam.storage.files import atomic_path, source_file
 from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.regressors import read_scalars
-from l2m_gtsam.storage.yaml_file import MAX_BYTES
+
+MAX_URDF_BYTES = 20_000_000  # those of vehicles are under one
 
 
 @dataclass(frozen=True)
@@ -157,12 +159,7 @@ def _check_sources(out: Path, *sources: Path | None) -> None:
 
 
 def _edited(export: Export, urdf: Path) -> bytes:
-    try:
-        if urdf.stat().st_size > MAX_BYTES:
-            raise ConfigError(f"{urdf}: larger than {MAX_BYTES // 1_000_000} MB, no URDF")
-        return edited_urdf(export, str(urdf), urdf.read_bytes())
-    except OSError as error:
-        raise ConfigError(f"{urdf}: cannot be read: {error.strerror or error}") from error
+    return edited_urdf(export, str(urdf), read_content(urdf, MAX_URDF_BYTES, ConfigError))
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from typing import Annotated
 import typer
 
 from l2m_gtsam.cli.calibration import batch, calibrate, config, inspect, plan
+from l2m_gtsam.cli.endings import Stopped, flush_output, last_line, stopped_by_signals
 from l2m_gtsam.cli.maps import map_app
 from l2m_gtsam.cli.results import apply, export, report, validate
 from l2m_gtsam.cli.simulation import demo, simulate, study
 from l2m_gtsam.cli.slam import slam
 from l2m_gtsam.cli.terminal import shown_notices
-from l2m_gtsam.errors import L2MError
 
 app = typer.Typer(
     name="l2m",
@@ -44,20 +44,33 @@ for _command in (
     app.command()(_command)
 
 
+DEBUG = "--debug"
+
+
 def main() -> None:
-    """Run the command line; an error that a user can mend is one line and exit code 2."""
+    """Run the command line; whatever ends it is one last line and an exit code.
+
+    2 is what a user can mend, 70 a fault of this program, 128 and the number of a signal a stop.
+    """
     # Blocks of a few hundred readings are too small for threads, which then only wait for each
     # other; has to be set before numpy is imported.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
+    arguments = [argument for argument in sys.argv[1:] if argument != DEBUG]
     try:
-        with shown_notices():
-            app(arguments)
-    except L2MError as error:
-        if "--debug" in sys.argv[1:]:
+        with stopped_by_signals(), shown_notices():
+            _run(arguments)
+    except (Stopped, Exception) as error:
+        if DEBUG in sys.argv[1:]:
             raise
-        typer.echo(f"l2m: {error}", err=True)
-        sys.exit(2)
+        sys.exit(last_line(error))
+
+
+def _run(arguments: list[str]) -> None:
+    """Run a command; what it printed has arrived when it returns or ends."""
+    try:
+        app(arguments)
+    finally:
+        flush_output()
 
 
 def _version(wanted: bool) -> None:

@@ -18,6 +18,7 @@ from l2m_gtsam.cli.terminal import (
     end_with,
     print_table,
     print_verdict,
+    say,
     shown_progress,
     warn,
 )
@@ -43,10 +44,10 @@ def inspect(
         report = inspect_file(bag, chosen, progress)
     print_table(bag_table(report))
     for note in report.notes:
-        typer.echo(note)
+        say(note)
     for obstacle in report.obstacles:
-        typer.echo(f"cannot be calibrated as it is: {obstacle}")
-    typer.echo("clock: record time less header stamp, median; |B|: lowest - median - highest")
+        say(f"cannot be calibrated as it is: {obstacle}")
+    say("clock: record time less header stamp, median; |B|: lowest - median - highest")
     if report.obstacles:
         raise typer.Exit(1)
 
@@ -118,10 +119,10 @@ def plan(
         found = plan_bag(bag, map_path, chosen, places, progress)
     print_table(plan_table(found))
     if held := held_plan_note(found):
-        typer.echo(held)
+        say(held)
     print_table(motion_table(found))
-    typer.echo(advice(found))
-    typer.echo(UNCERTAINTY[found.uncertainty])
+    say(advice(found))
+    say(UNCERTAINTY[found.uncertainty])
     warn(found.doubts)
 
 
@@ -195,7 +196,7 @@ def calibrate(
     _print_calibration(found.result, models)
     print_verdict(verdict)
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
-    typer.echo(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
+    say(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
     end_with(verdict.level, strict)
 
 
@@ -213,17 +214,17 @@ def _print_calibration(result: "CalibrationResult", models: bool) -> None:
 
     print_table(calibration_table(result))
     for note in result.notes:
-        typer.echo(note)
-    typer.echo(UNCERTAINTY[result.uncertainty])
+        say(note)
+    say(UNCERTAINTY[result.uncertainty])
     warn(result.doubts)
     warn(missing_note(result))
     warn([disagreement_note(each) for each in result.disagreements])
     if held := held_clocks_note(result):
-        typer.echo(held)
+        say(held)
     for table in model_tables(result) if models else ():
         print_table(table)
     for note in filter(None, map(model_note, result.sensors)):
-        typer.echo(note)
+        say(note)
 
 
 def batch(
@@ -267,13 +268,13 @@ def batch(
             scheduler=scheduler, **({} if workers is None else {"workers": workers})
         )
         fleet = run_fleet(order, cluster, progress)
-    typer.echo(_summary(fleet))
+    say(_summary(fleet))
     for row in fleet.rows:
         if row.error:
-            typer.echo(f"not calibrated: {row.vehicle}, {row.bag}: {row.error}")
+            say(f"not calibrated: {row.vehicle}, {row.bag}: {row.error}")
     warn(fleet.notes)
     written = [PAGE_FILE, CSV_FILE, *([] if fleet.notes else [PARQUET_FILE])]
-    typer.echo(f"written: {', '.join(str(out / name) for name in written)}")
+    say(f"written: {', '.join(str(out / name) for name in written)}")
     end_with(fleet.level, strict)
 
 

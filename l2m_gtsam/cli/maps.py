@@ -10,6 +10,7 @@ from l2m_gtsam.cli.terminal import (
     PosesOption,
     PoseTimesOption,
     print_table,
+    say,
     shown_progress,
     warn,
 )
@@ -78,7 +79,7 @@ def suite(
         found = calibrate_suite_file(bags, out, chosen, known, progress)
     print_table(calibration_table(found))
     warn(found.doubts)
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")
 
 
 @map_app.command("build")
@@ -113,7 +114,7 @@ def map_build(
             make_tiles(built.field_map, out, progress)
     print_table(map_table(built.description))
     warn(built.description.summary.doubts)
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")
 
 
 @map_app.command("update")
@@ -143,7 +144,7 @@ def map_update(
             make_tiles(updated.field_map, out, progress)
     print_table(map_table(updated.description))
     warn(updated.description.summary.doubts)
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")
 
 
 @map_app.command("compare")
@@ -191,4 +192,4 @@ def map_plot(
         from l2m_gtsam.batch.maps import plot_map_file
 
         plot_map_file(map_path, out, height, progress)
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")

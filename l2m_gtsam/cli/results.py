@@ -13,6 +13,7 @@ from l2m_gtsam.cli.terminal import (
     end_with,
     print_table,
     print_verdict,
+    say,
     shown_progress,
     warn,
 )
@@ -54,7 +55,7 @@ def report(
     print_verdict(judged.verdict)
     warn([f"the verdict was {each}" for each in judged.disagreeing])
     written = [folder / REPORT_FILE, *([folder / PDF_FILE] if pdf else [])]
-    typer.echo(f"written: {', '.join(map(str, written))}")
+    say(f"written: {', '.join(map(str, written))}")
 
 
 def validate(
@@ -106,7 +107,7 @@ def validate(
         print_table(change_table(found.comparison))
     print_verdict(found.verdict, Level.PASS)
     if out is not None:
-        typer.echo(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")
+        say(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")
     end_with(found.verdict.level, strict)
 
 
@@ -143,7 +144,7 @@ def export(
         calibration, format_name, out, names, into, despite_verdict=despite_verdict
     )
     warn(notes)
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")
 
 
 def apply(
@@ -170,8 +171,8 @@ def apply(
         applied = apply_calibration(wanted, progress)
     warn(applied.notes)
     for sensor, topic in applied.topics.items():
-        typer.echo(f"{sensor}: {topic}")
-    typer.echo(f"written: {out}")
+        say(f"{sensor}: {topic}")
+    say(f"written: {out}")
 
 
 def _named(text: str) -> tuple[str, str]:

@@ -11,6 +11,7 @@ from l2m_gtsam.cli.terminal import (
     SchedulerOption,
     WorkersOption,
     print_table,
+    say,
     shown_progress,
 )
 
@@ -46,7 +47,7 @@ def simulate(
             raise ConfigError(msg)
         wanted = _scenario(options, seed)
         simulate_bags(out, wanted, [BagKind(k) for k in kind or known], progress)
-    typer.echo(f"bags, suite.yaml, structure.ply and truth.yaml are in {out}")
+    say(f"bags, suite.yaml, structure.ply and truth.yaml are in {out}")
 
 
 def demo(
@@ -72,9 +73,9 @@ def demo(
         result = calibrate_bag(drive, map_path, chosen, out, progress, truth)
         report_folder(out, None, progress)
     print_table(truth_table(result, truth))
-    typer.echo(consistency_note(result, truth))
+    say(consistency_note(result, truth))
     picture, page = out / OVERVIEW_FILE, out / REPORT_FILE
-    typer.echo(f"picture: {picture}; report: {page}; everything else is in {out}")
+    say(f"picture: {picture}; report: {page}; everything else is in {out}")
 
 
 def _scenario(options: Path | None, seed: int | None) -> "ScenarioOptions":
@@ -122,5 +123,5 @@ def study(
             ["l2m", "study", name, *(["--options", str(options)] if options else [])]
         )
         made = run_study(chosen, wanted, out, cluster, progress, f"{command} --seed {wanted.seed}")
-    typer.echo(chosen.page(made.summary))
-    typer.echo(f"written: {out / f'{name}.md'}")
+    say(*chosen.page(made.summary).splitlines())
+    say(f"written: {out / f'{name}.md'}")

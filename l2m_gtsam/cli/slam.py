@@ -14,6 +14,7 @@ from l2m_gtsam.cli.terminal import (
     end_with,
     print_table,
     print_verdict,
+    say,
     shown_progress,
 )
 
@@ -62,7 +63,7 @@ def slam(
         *scan_lines(done.result.scans),
         *truth_lines(done.record.truth),
     )
-    typer.echo("\n".join(lines))
+    say("\n".join(lines))
     print_verdict(done.verdict)
-    typer.echo(f"written: {out}")
+    say(f"written: {out}")
     end_with(done.verdict.level, strict)

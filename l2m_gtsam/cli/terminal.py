@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
+from l2m_gtsam.shown import shown
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from l2m_gtsam.records.verdict import Level, Verdict
 
 STARTING = "starting"
+LONGEST_STAGE = 60  # letters
 ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
 
 BagArgument = Annotated[
@@ -76,7 +79,7 @@ def print_verdict(verdict: "Verdict", least: "Level | None" = None) -> None:
     from l2m_gtsam.records.verdict import Level
 
     console = Console(highlight=False)
-    for line in verdict.lines(least or Level.WARN):
+    for line in map(shown, verdict.lines(least or Level.WARN)):
         text = escape(line)
         for level in Level:
             # The first word in capitals that is a level: reasons may hold it, too.
@@ -94,7 +97,13 @@ def end_with(level: "Level", strict: bool) -> None:
 def warn(doubts: Sequence[str]) -> None:
     """Print doubts about a result that was written all the same on the error stream."""
     for doubt in doubts:
-        typer.echo(f"l2m: warning: {doubt}", err=True)
+        typer.echo(f"l2m: warning: {shown(doubt)}", err=True)
+
+
+def say(*lines: str) -> None:
+    """Print lines; names that others chose are in them."""
+    for line in lines:
+        typer.echo(shown(line))
 
 
 @contextmanager
@@ -129,6 +138,7 @@ def print_table(table: "Table") -> None:
     """Print a table as wide as its numbers need: a narrow terminal wraps, it cuts no digits."""
     from rich.console import Console
 
+    _show_control_characters(table)
     console = Console()
     wide = console.width if console.is_terminal else 200
     Console(width=max(_needed(console, table), wide)).print(table)
@@ -146,7 +156,7 @@ def shown_progress() -> "Iterator[Progress]":
     from rich.progress import TimeRemainingColumn as TimeLeftColumn
 
     columns = (
-        TextColumn("{task.description:<28}"),
+        TextColumn("{task.description:<28}", markup=False),
         BarColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
@@ -160,7 +170,7 @@ def shown_progress() -> "Iterator[Progress]":
 
         def tell(stage: str, fraction: float) -> None:
             if stage not in stages:
-                stages[stage] = bars.add_task(stage, total=1.0)
+                stages[stage] = bars.add_task(shown(stage, LONGEST_STAGE), total=1.0)
             bars.update(stages[stage], completed=fraction)
             while starting:
                 bars.remove_task(starting.pop())
@@ -170,6 +180,15 @@ def shown_progress() -> "Iterator[Progress]":
         finally:
             while starting:
                 bars.remove_task(starting.pop())
+
+
+def _show_control_characters(table: "Table") -> None:
+    """Put text in the place of control characters, in headings and cells."""
+    for name in ("title", "caption"):
+        if isinstance(text := getattr(table, name), str):
+            setattr(table, name, shown(text))
+    for column in table.columns:
+        column._cells = [shown(cell) if isinstance(cell, str) else cell for cell in column.cells]
 
 
 def _needed(console: "Console", table: "Table") -> int:

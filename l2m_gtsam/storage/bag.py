@@ -38,7 +38,7 @@ from l2m_gtsam.storage.selection import (
     sensor_names,
     several_frames,
 )
-from l2m_gtsam.storage.tf import Link, ancestors, compose
+from l2m_gtsam.storage.tf import Link, chain_frames, compose
 from l2m_gtsam.storage.units import field_fault, microtesla_per
 
 
@@ -230,7 +230,7 @@ def _clocks(path: Path, buffers: Buffers, options: BagOptions) -> tuple[str, ...
     """Return what is worth a warning of the clocks behind header stamps, where these count."""
     if options.stamps is Stamps.RECORD:
         return ()
-    chain = () if options.tf is None else _needed(buffers, options.tf)
+    chain = () if options.tf is None else chain_frames(buffers.links, options.tf.ends)
     links = [key for key, link in buffers.links.items() if key[1] in chain and not link.static]
     poses = [buffers.pose_times[each] for each in links or buffers.poses]
     return clock_notes(path, poses, buffers.field_times)
@@ -278,7 +278,7 @@ def _single(path: Path, buffers: Buffers) -> Trajectory:
 
 def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:
     """Return the poses of a chain; a fault in a link beside it does not matter."""
-    needed = _needed(buffers, chain)
+    needed = chain_frames(buffers.links, chain.ends)
     links: dict[str, Link] = {}
     for (parent, child), buffer in buffers.links.items():
         if child in needed and child in links:
@@ -290,18 +290,7 @@ def _composed(path: Path, buffers: Buffers, chain: TfChain) -> Trajectory:
         except ValueError:
             if child in needed:
                 raise
-    return compose(links, *_ends(chain), chain.max_gap_s, str(path))
-
-
-def _ends(chain: TfChain) -> tuple[str, str]:
-    return chain.frame.lstrip("/"), chain.child_frame.lstrip("/")
-
-
-def _needed(buffers: Buffers, chain: TfChain) -> set[str]:
-    """Return the frames from both ends of a chain up to where their trees begin."""
-    parents = {child: parent for parent, child in buffers.links}
-    frame, child_frame = _ends(chain)
-    return ancestors(parents, frame) | ancestors(parents, child_frame)
+    return compose(links, *chain.ends, chain.max_gap_s, str(path))
 
 
 def _all_series(

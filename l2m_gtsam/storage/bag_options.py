@@ -57,6 +57,11 @@ class TfChain(Options):
     max_gap_s: float = Field(default=1.0, gt=0)
     """No pose is made where two transforms of a link in the chain are further apart."""
 
+    @property
+    def ends(self) -> tuple[str, str]:
+        """Both frames, as tf2 writes them."""
+        return self.frame.lstrip("/"), self.child_frame.lstrip("/")
+
 
 class FixedTransform(Options):
     """A rigid transform as numbers."""

@@ -2,16 +2,16 @@
 
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import Literal
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError, OutputError
+from l2m_gtsam.storage.bounded_zip import ArrayMember, open_archive, opened_array
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.point_table import (
     PIECE_POINTS,
@@ -60,7 +60,8 @@ class VoxelMeans:
         Raises
         ------
         ValueError
-            A point is more than a million cells away from the first one.
+            A point is more than a million cells away from the first one, or there are too many
+            cells.
         """
         self._waiting.append(points)
         self._number_waiting += len(points)
@@ -88,6 +89,10 @@ class VoxelMeans:
         keys = np.concatenate([self._keys, self._keys_of(points)])
         self._keys, cell = np.unique(keys, return_inverse=True)
         self._sums = np.column_stack([np.bincount(cell, column) for column in sums.T])
+        if len(self) > MAX_CELLS:
+            raise ValueError(
+                f"it fills more than {MAX_CELLS:,} cells of {self._edge:g} m; choose a larger edge"
+            )
 
     def _keys_of(self, points: FloatArray) -> IntArray:
         """Return one number per point that identifies its cell, shape (N,)."""
@@ -106,7 +111,12 @@ class VoxelMeans:
 
 
 NPZ_MEMBER = "points.npy"
+COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 ACCEPTED = "a .pcd, .ply, .las, .laz, .e57 or .npz file (of the array `points`, shape (N, 3))"
+MISSING = f"no such point cloud; accepted: {ACCEPTED}"
+# Held at once: 120 MB, and a few times as much while they are merged.
+MAX_CELLS = 5_000_000
+MAX_KEPT_POINTS = 20_000_000  # of a cloud that is not thinned: 480 MB, twice for a moment
 # Further from the map's origin than any site: geographic or broken coordinates.
 MAX_COORDINATE_M = 1e6
 
@@ -210,36 +220,48 @@ def located(points: FloatArray, where: str) -> FloatArray:
 
 def _collected(pieces: Iterable[FloatArray], edge: float) -> FloatArray:
     if not edge > 0:
-        return np.concatenate([np.zeros((0, 3)), *pieces])
+        return np.concatenate([np.zeros((0, 3)), *_few(pieces)])
     means = VoxelMeans(edge)
     for piece in pieces:
         means.add(piece)
     return means.points()
 
 
+def _few(pieces: Iterable[FloatArray]) -> Iterator[FloatArray]:
+    """Yield pieces as they are, as long as all of them can be held at once."""
+    count = 0
+    for piece in pieces:
+        count += len(piece)
+        if count > MAX_KEPT_POINTS:
+            raise ValueError(f"it has more than {MAX_KEPT_POINTS:,} points; thin it while reading")
+        yield piece
+
+
 def _npz_pieces(path: Path) -> Iterator[FloatArray]:
-    with zipfile.ZipFile(path) as archive:
+    with open_archive(path, MapError, MISSING, COMPRESSIONS) as archive:
         if NPZ_MEMBER not in archive.namelist():
             raise ValueError("it has no array `points`")
-        with archive.open(NPZ_MEMBER) as member:
-            size = archive.getinfo(NPZ_MEMBER).file_size
-            refuse_many(path, _npz_count(member, size))
-        with archive.open(NPZ_MEMBER) as member:
-            points = np.lib.format.read_array(member, allow_pickle=False)
-    for low in range(0, len(points), PIECE_POINTS):
-        yield points[low : low + PIECE_POINTS].astype(np.float64)
+        with opened_array(archive, NPZ_MEMBER) as member:
+            yield from _array_pieces(path, member)
 
 
-def _npz_count(member: IO[bytes], size: int) -> int:
-    """Return the points that an array's header declares and its size in bytes confirms."""
-    version = np.lib.format.read_magic(member)
-    if version != (1, 0):
-        raise ValueError("its array `points` is of an unknown version")
-    shape, _, kind = np.lib.format.read_array_header_1_0(member)
+def _array_pieces(path: Path, member: ArrayMember) -> Iterator[FloatArray]:
+    shape, kind = member.shape, member.dtype
     if len(shape) != 2 or shape[1] != 3 or kind.kind not in "iuf":
         raise ValueError(f"its array `points` is {kind} of shape {shape}, not numbers (N, 3)")
-    require_bytes(size - member.tell(), shape[0], 3 * kind.itemsize)
-    return shape[0]
+    row = 3 * kind.itemsize
+    require_bytes(member.size, shape[0], row)
+    refuse_many(path, shape[0])
+    # Column after column it is read at once.
+    step = shape[0] if member.fortran else PIECE_POINTS
+    if member.fortran and shape[0] > MAX_KEPT_POINTS:
+        raise ValueError(f"more than {MAX_KEPT_POINTS:,} points must be in C order")
+    for low in range(0, shape[0], max(step, 1)):
+        count = min(step, shape[0] - low)
+        data = member.file.read(count * row)
+        require_bytes(len(data), count, row)
+        order: Literal["C", "F"] = "F" if member.fortran else "C"
+        yield np.frombuffer(data, dtype=kind).reshape((-1, 3), order=order).astype(np.float64)
 
 
 def _write_npz(path: Path, points: FloatArray) -> None:
@@ -254,15 +276,11 @@ def _translated(path: Path) -> Iterator[None]:
     """Turn what opening and understanding a bad file raises into one line."""
     try:
         yield
-    except FileNotFoundError as error:
-        raise MapError(f"{path}: no such point cloud; accepted: {ACCEPTED}") from error
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
     except KeyError as error:
         raise MapError(_damaged(path, f"{error} is missing or unknown")) from error
     except (IndexError, EOFError, struct.error) as error:
         raise MapError(_damaged(path, "it ends too early")) from error
-    except (*ZIP_ERRORS, ValueError, OverflowError) as error:
+    except (ValueError, OverflowError) as error:
         raise MapError(_damaged(path, str(error))) from error
 
 
@@ -270,7 +288,6 @@ def _damaged(path: Path, reason: str) -> str:
     return f"{path}: not a usable point cloud: {' '.join(reason.split())[:200]}"
 
 
-ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError)
 READERS: dict[str, Callable[[Path], Iterator[FloatArray]]] = {
     ".pcd": pcd_pieces,
     ".ply": ply_pieces,

@@ -7,11 +7,13 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Protocol, TextIO
 
 from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import L2MError, OutputError
+from l2m_gtsam.storage.bounded import open_regular, opened
 
 MAX_TEXT_BYTES = 500_000_000  # a day of poses at 50 Hz
 
@@ -29,18 +31,13 @@ def open_text(path: Path, error: type[L2MError], most: int = MAX_TEXT_BYTES) -> 
     most
         Bytes that are accepted.
     """
-    try:
-        if not path.is_file():
-            kind = "not a regular file" if path.exists() else "no such file"
-            raise error(f"{path}: {kind}")
-        if path.stat().st_size > most:
+    with opened(path, error) as file:
+        if os.fstat(file.fileno()).st_size > most:
             raise error(f"{path}: larger than {most // 1_000_000} MB; give a shorter one")
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            yield file
-    except UnicodeDecodeError as reason:
-        raise error(f"{path}: cannot be read: it is no text") from reason
-    except OSError as reason:
-        raise error(f"{path}: cannot be read: {reason.strerror or reason}") from reason
+        try:
+            yield TextIOWrapper(file, encoding="utf-8-sig", newline="")
+        except UnicodeDecodeError as reason:
+            raise error(f"{path}: cannot be read: it is no text") from reason
 
 
 @contextmanager
@@ -128,8 +125,9 @@ def source_file(path: Path) -> SourceFile:
             _take_folder(digest, path)
         else:
             _take_file(digest, path)
-    except OSError as error:
-        raise L2MError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise L2MError(f"{path}: cannot be read: {reason}") from error
     return SourceFile(str(path), digest.hexdigest())
 
 
@@ -142,7 +140,7 @@ def _take_folder(digest: Hasher, folder: Path) -> None:
 
 
 def _take_file(digest: Hasher, path: Path) -> None:
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         while chunk := file.read(CHUNK_BYTES):
             digest.update(chunk)
 

@@ -35,6 +35,7 @@ from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.path_topic import path_trajectory
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
+from l2m_gtsam.storage.pose_check import PoseCheck, needed_frames
 from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
 from l2m_gtsam.storage.units import (
@@ -120,7 +121,7 @@ class _TopicBuffers:
     frames: set[str] = field(default_factory=set)
     readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
     covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
-    links: set[tuple[str, str]] = field(default_factory=set)
+    poses: PoseCheck = field(default_factory=PoseCheck)
     fault: str = ""
 
     @property
@@ -170,6 +171,7 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         roles = {c.topic: "poses" for c in poses}
         roles |= {each.connection.topic: "field" for each in fields}
         reports = [replace(each, role=roles.get(each.topic, "")) for each in reports]
+        reports = _judged_poses(reports, poses, collected, options)
     if no_poses and any(report.msgtype == CLOUD_TYPE for report in reports):
         notes.append(f"{no_poses}; {BY_CLOUDS}")
         no_poses = ""
@@ -216,6 +218,22 @@ def _collect_paths(bag: Log, poses: list[Connection], collected: dict[str, "_Top
     for stamp in found.stamp_ns.tolist():
         into.stamps.add(stamp, stamp)
     return ""
+
+
+def _judged_poses(
+    reports: list[TopicReport],
+    poses: list[Connection],
+    collected: dict[str, "_TopicBuffers"],
+    options: BagOptions,
+) -> list[TopicReport]:
+    """Return the same; topics whose poses would be used and cannot be are refused."""
+    checks = {c.topic: collected[c.topic].poses for c in poses if c.topic in collected}
+    needed = needed_frames(checks.values(), options.tf)
+    faults = {topic: check.fault(needed) for topic, check in checks.items()}
+    return [
+        replace(each, use=f"refused: {faults[each.topic]}") if faults.get(each.topic) else each
+        for each in reports
+    ]
 
 
 def _pose_file(path: Path, options: BagOptions) -> TopicReport:
@@ -288,8 +306,7 @@ def _collect(
     for stamped in _stamped(content, msgtype):
         into.stamps.add(stamp_of(stamped, record_ns), record_ns)
         into.frames.add(frame_of(stamped))
-    if msgtype in TF_TYPES:
-        into.links.update((t.header.frame_id, t.child_frame_id) for t in content.transforms)
+    into.poses.add(content, msgtype, record_ns)
     if source is not None and not into.fault:
         into.readings.unit = source.unit
         try:
@@ -336,7 +353,7 @@ def _report(
         strength=_strength(found, options),
         use=_use(use, connections[0], found, options),
         likely_units=likely_units(written, options.units, found.readings.unit),
-        links=tuple(sorted(found.links)),
+        links=tuple(sorted(found.poses.bodies)) if msgtype in TF_TYPES else (),
     )
 
 

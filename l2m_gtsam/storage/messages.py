@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Trajectory
 from l2m_gtsam.geometry import from_ros
+from l2m_gtsam.storage.number_ranges import odd_poses, readable
 from l2m_gtsam.storage.tf import Link
 from l2m_gtsam.storage.units import Unit
 
@@ -244,8 +245,8 @@ class FieldBuffer:
         return np.array(self.stamp_ns, dtype=np.int64)
 
     def field(self) -> FloatArray:
-        """Return the readings as they were written, shape (N, 3)."""
-        return np.array(self.values, dtype=np.float64).reshape(-1, 3)
+        """Return the readings as they were written, NaN for what no sensor reads, shape (N, 3)."""
+        return readable(np.array(self.values, dtype=np.float64).reshape(-1, 3))
 
 
 @dataclass
@@ -285,13 +286,12 @@ class PoseBuffer:
         Raises
         ------
         ValueError
-            An orientation has no direction (all zero), or no pose is finite.
+            An orientation is no rotation, a position is out of range, or no pose is finite.
         """
         used = self._used()
         stamps, rows = np.array(self.stamp_ns, dtype=np.int64)[used], self._rows()[used]
-        length = np.linalg.norm(rows[:, 3:], axis=1)
-        if np.any(length < 1e-6):
-            raise ValueError("an orientation is all zero, it must be a unit quaternion")
+        if wrong := odd_poses(rows[:, :3], rows[:, 3:]):
+            raise ValueError(wrong)
         R = Rotation.from_quat(rows[:, 3:]).as_matrix().reshape(-1, 3, 3)
         if self.static:  # the last one published holds, whenever
             return Link(self.frame, self.child_frame, stamps[:0], R[-1:], rows[-1:, :3])

@@ -20,14 +20,26 @@ from rosbags.typesys.store import Typestore
 
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
+from l2m_gtsam.shown import shown
+from l2m_gtsam.storage.bounded import is_there, require_regular
 from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
+from l2m_gtsam.storage.rosbags_bounds import (
+    MOST_DEFINITION,
+    MOST_SEQUENCE,
+    bound_rosbags,
+    check_definition,
+    check_sizes,
+)
+
+bound_rosbags()
 
 ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3, .mcap, .csv or .ulg file"
 TABLES = (".csv", ".ulg")
 """How the names of logs end that are no bags."""
 # mcap counts nanoseconds unsigned, everything else in 63 bits.
 LATEST_NS = (1 << 63) - 1
+STORED = (".yaml", ".db3", ".mcap", ".zstd")  # what a folder's bag is read from
 PROGRESS_EVERY = 2000
 
 
@@ -178,8 +190,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     BagError
         No such file, not a bag, damaged, or without messages.
     """
-    if not path.exists():
-        raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
+    _check_files(path)
     if path.suffix.lower() in TABLES:
         raise BagError(
             f"{path}: a bag is needed here, this is a table; for readings in one, `l2m export "
@@ -191,6 +202,7 @@ def open_bag(path: Path) -> Iterator[Bag]:
     except Exception as error:
         raise BagError(_damaged(path, error)) from error
     try:
+        _check_content(path, reader)
         if not reader.message_count:
             raise BagError(f"{path}: the bag has no messages")
         yield Bag(path, reader)
@@ -198,8 +210,32 @@ def open_bag(path: Path) -> Iterator[Bag]:
         reader.close()
 
 
+def _check_files(path: Path) -> None:
+    """Refuse what is no bag, and what would be waited for: pipes and devices."""
+    if not is_there(path, BagError):
+        raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
+    if not path.is_dir():
+        require_regular(path, BagError)
+        return
+    try:
+        inside = [each for each in path.iterdir() if not each.is_dir()]
+    except OSError as error:
+        raise BagError(f"{path}: cannot be read: {error.strerror or error}") from error
+    for file in inside:
+        if file.suffix in STORED:
+            require_regular(file, BagError)
+
+
+def _check_content(path: Path, reader: Ros1Reader | Ros2Reader) -> None:
+    """Refuse an open bag that declares what cannot be held in memory."""
+    try:
+        check_sizes(reader)
+    except Exception as error:
+        raise BagError(_damaged(path, error)) from error
+
+
 def _damaged(path: Path, error: Exception) -> str:
-    reason = " ".join(str(error).split())[:200] or type(error).__name__
+    reason = shown(" ".join(str(error).split())[:200]) or type(error).__name__
     return f"{path}: not a readable bag ({reason}); it may be truncated; accepted: {ACCEPTED}"
 
 
@@ -222,7 +258,12 @@ def typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typ
         if msgtype not in store.types:
             raise ValueError("the bag holds none and ROS knows none; an mcap file would carry it")
         return store
+    if len(definition.data) > MOST_DEFINITION:
+        raise ValueError(f"it has {len(definition.data):,} letters")
+    types = get_types_from_msg(definition.data, msgtype)
+    check_definition(types)
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(definition.data, msgtype))
+    store.max_sequence_length = MOST_SEQUENCE
+    store.register(types)
     store.get_msgdef(msgtype)
     return store

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import ColumnOptions
+from l2m_gtsam.storage.bounded import require_regular
 from l2m_gtsam.storage.csv_log import read_csv_log
 from l2m_gtsam.storage.log import Log
 from l2m_gtsam.storage.open_bag import ACCEPTED, TABLES, open_bag
@@ -37,7 +38,6 @@ def open_log(path: Path, columns: ColumnOptions | None = None) -> Iterator[Log]:
         with open_bag(path) as bag:
             yield bag
         return
-    if not path.is_file():
-        raise BagError(f"{path}: no such file; accepted: {ACCEPTED}")
+    require_regular(path, BagError, f"no such file; accepted: {ACCEPTED}")
     is_ulog = path.suffix.lower() == ".ulg"
     yield read_ulog(path) if is_ulog else read_csv_log(path, columns or ColumnOptions())

@@ -27,6 +27,7 @@ INTEGERS = {5: "i4", 6: "u4"}  # PointField.INT32 and UINT32
 TIME_FIELDS = ("time", "t", "timestamp", "time_stamp", "offset_time")
 # Numbers above these are times since 1970, in seconds and in nanoseconds.
 EPOCH_S, EPOCH_NS = 1e8, 1e17
+MOST_POINTS = 10_000_000  # of one scan
 # A turn of a lidar is shorter: times further from the stamp are something else.
 LONGEST_S = 1.0
 
@@ -131,6 +132,8 @@ def _column(scan: Any, offset: int, kind: str) -> npt.NDArray[Any]:
             f"a scan declares {height} x {width} points of {step} bytes in rows of {row} bytes, "
             f"which its {len(scan.data)} bytes are not"
         )
+    if height * width > MOST_POINTS:
+        raise ValueError(f"a scan has {height * width:,} points, at most {MOST_POINTS:,}")
     order = ">" if scan.is_bigendian else "<"
     return np.ndarray((height, width), order + kind, scan.data, offset, (row, step)).ravel()
 

@@ -20,8 +20,10 @@ import numpy.typing as npt
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.storage.bounded import opened
 
 MAX_POINTS = 50_000_000
+MISSING = "no such point cloud; accepted: a .pcd, .ply or .npz file"
 MAX_HEADER_BYTES = 1 << 16
 MAX_LINE_BYTES = 1 << 13
 PIECE_POINTS = 1 << 18
@@ -194,7 +196,7 @@ def ply_pieces(path: Path) -> Iterator[FloatArray]:
         It is damaged or another kind of file. So are KeyError (a type of number or order of
         bytes that is not known), IndexError (what ends too early) and OverflowError.
     """
-    with path.open("rb") as file:
+    with opened(path, MapError, MISSING) as file:
         words = _ply_header(file)
         if words[0] != ["ply"] or words[1][0] != "format":
             raise ValueError("its first lines are not those of a PLY file")
@@ -256,7 +258,7 @@ def write_ply(path: Path, points: FloatArray) -> None:
 PCD_TYPES = {"F4": "<f4", "F8": "<f8"} | {
     f"{sign}{size}": f"<{sign.lower()}{size}" for sign in "IU" for size in (1, 2, 4, 8)
 }
-MAX_UNPACKED_BYTES = 2 << 30
+MAX_UNPACKED_BYTES = 512 << 20
 
 
 def pcd_pieces(path: Path) -> Iterator[FloatArray]:
@@ -270,7 +272,7 @@ def pcd_pieces(path: Path) -> Iterator[FloatArray]:
         It is damaged or another kind of file. So are KeyError (what the header lacks),
         IndexError and struct.error (what ends too early).
     """
-    with path.open("rb") as file:
+    with opened(path, MapError, MISSING) as file:
         header = _pcd_header(file)
         table = _pcd_table(header)
         refuse_many(path, table.count)

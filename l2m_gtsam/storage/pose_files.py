@@ -14,6 +14,7 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import ColumnOptions, PoseFileOptions
 from l2m_gtsam.storage.csv_log import read_table
 from l2m_gtsam.storage.files import open_text
+from l2m_gtsam.storage.number_ranges import odd_poses
 
 NANOSECONDS = 1_000_000_000
 COLUMNS, KITTI_COLUMNS = 8, 12
@@ -68,8 +69,6 @@ def read_csv_poses(path: Path, options: ColumnOptions) -> Trajectory:
         )
     p, q = table.rows(position), table.rows(orientation)
     kept = np.isfinite(p).all(axis=1) & np.isfinite(q).all(axis=1)
-    if (np.linalg.norm(q[kept], axis=1) < 1e-6).any():
-        raise BagError(f"{path}: a quaternion is all zero, it must be a rotation")
     return poses_of(path, table.stamp_ns[kept], p[kept], q[kept])
 
 
@@ -143,11 +142,13 @@ def poses_of(
     Raises
     ------
     BagError
-        There are fewer than two.
+        There are fewer than two, or one of them is out of range.
     """
     if len(stamp_ns) < 2:
         raise BagError(f"{path}: holds {len(stamp_ns)} poses; two or more are needed")
     stamps, first = np.unique(stamp_ns, return_index=True)
+    if wrong := odd_poses(p[first], quaternion_xyzw[first]):
+        raise BagError(f"{path}: {wrong}")
     R = Rotation.from_quat(quaternion_xyzw[first]).as_matrix()
     return Trajectory(stamps, R, p[first], "map", "lidar")
 
@@ -187,8 +188,9 @@ def _pose(words: list[str]) -> list[float]:
     values = [float(word) for word in words[1:]]
     if not np.isfinite(values).all():
         raise ValueError("a number is not finite")
-    if np.linalg.norm(values[3:]) < 1e-6:
-        raise ValueError("the quaternion is all zero, it must be a rotation")
+    pose = np.array(values)
+    if wrong := odd_poses(pose[None, :3], pose[None, 3:]):
+        raise ValueError(wrong)
     return values
 
 

@@ -17,6 +17,7 @@ from l2m_gtsam.records.fleet import DATE, VERDICTS, DriveOutcome, SensorRow
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics, Record
 from l2m_gtsam.records.validation import Validation
+from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
 
 MAX_BYTES = 100_000_000  # figures of a hundred sensors are some megabytes
@@ -157,10 +158,9 @@ def read_outcome(path: Path) -> DriveOutcome | None:
     a table of what was never found.
     """
     try:
-        if path.stat().st_size > MAX_OUTCOME_BYTES:
-            return None
-        found = _OUTCOME.validate_json(path.read_bytes()).outcome
-    except (OSError, ValidationError):
+        raw = read_content(path, MAX_OUTCOME_BYTES, CalibrationError)
+        found = _OUTCOME.validate_json(raw).outcome
+    except (CalibrationError, ValidationError):
         return None
     return found if _sound(found) else None
 
@@ -190,9 +190,9 @@ def _is_date(text: str) -> bool:
         return False
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write(path: Path, plain: bytes) -> None:
     with atomic_path(path) as temporary:
-        temporary.write_bytes(content + b"\n")
+        temporary.write_bytes(plain + b"\n")
 
 
 def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> Content:
@@ -214,16 +214,9 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
     CalibrationError
         The file is missing, damaged or something else.
     """
+    raw = read_content(path, MAX_BYTES, CalibrationError, f"no such file; {writer}")
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise CalibrationError(
-                f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
-            )
-        return adapter.validate_json(path.read_bytes())
-    except FileNotFoundError as error:
-        raise CalibrationError(f"{path}: no such file; {writer}") from error
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot be read: {error.strerror}") from error
+        return adapter.validate_json(raw)
     except ValidationError as error:
         fault = first_fault(error)
         raise CalibrationError(f"{path}: not a {kind} file of this program: {fault}") from error

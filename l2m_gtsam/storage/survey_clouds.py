@@ -7,6 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.storage.bounded import opened, require_regular
 from l2m_gtsam.storage.point_table import PIECE_POINTS, refuse_many
 
 MISSING = "reading it needs {}: install l2m-gtsam with its extra `clouds`"
@@ -28,7 +29,7 @@ def las_pieces(path: Path) -> Iterator[FloatArray]:
     except ImportError as error:
         raise MapError(f"{path}: {MISSING.format('laspy')}") from error
     try:
-        with laspy.open(path) as reader:
+        with opened(path, MapError) as file, laspy.open(file, closefd=False) as reader:
             refuse_many(path, int(reader.header.point_count))
             for piece in reader.chunk_iterator(PIECE_POINTS):
                 yield np.column_stack([np.asarray(each) for each in (piece.x, piece.y, piece.z)])
@@ -56,6 +57,7 @@ def e57_pieces(path: Path) -> Iterator[FloatArray]:
         from pye57 import libe57
     except ImportError as error:
         raise MapError(f"{path}: {MISSING.format('pye57')}") from error
+    require_regular(path, MapError)
     try:
         file = pye57.E57(str(path))
         with file:

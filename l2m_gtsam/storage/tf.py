@@ -1,5 +1,6 @@
 """Chains of transforms from ``/tf`` and ``/tf_static``."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,7 +111,21 @@ def _bracket_ns(link_ns: IntArray, stamps: IntArray) -> IntArray:
     return np.asarray(link_ns[after] - link_ns[before])
 
 
-def ancestors(parents: dict[str, str], frame: str) -> set[str]:
+def chain_frames(links: Iterable[tuple[str, str]], ends: tuple[str, str]) -> set[str]:
+    """Return the frames from both ends of a chain up to where their trees begin.
+
+    Parameters
+    ----------
+    links
+        Parent and child of each transform.
+    ends
+        Of the chain.
+    """
+    parents = {child: parent for parent, child in links}
+    return _ancestors(parents, ends[0]) | _ancestors(parents, ends[1])
+
+
+def _ancestors(parents: dict[str, str], frame: str) -> set[str]:
     """Return a frame and all above it that have a parent; stops where a chain bites its tail."""
     found: set[str] = set()
     while frame in parents and frame not in found:

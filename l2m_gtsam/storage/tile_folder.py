@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from l2m_gtsam.errors import ConfigError, MapError, Notice, OutputError
 from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, Entry, Made, TileStore
+from l2m_gtsam.storage.bounded import open_regular
 from l2m_gtsam.storage.files import renamed_path
 
 MAGIC = b"l2m-tile"
@@ -70,7 +71,7 @@ def read_tile(path: Path, entry: Entry) -> Arrays:
     OSError
         It cannot be read.
     """
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         left = os.fstat(file.fileno()).st_size
         checksum, header = _read_start(file, left)
         facts = _facts(header)
@@ -91,7 +92,7 @@ def read_tile(path: Path, entry: Entry) -> Arrays:
 def fingerprint_of(path: Path) -> str | None:
     """Return the fingerprint that a file claims to have; None if it has none."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             _, header = _read_start(file, os.fstat(file.fileno()).st_size)
             return str(_facts(header)["fingerprint"])
     except (MapError, OSError):

@@ -1,5 +1,6 @@
 """ULogs of PX4 as logs: each topic with the messages that PX4's bridge to ROS 2 would have."""
 
+import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
@@ -12,11 +13,13 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import BagError
+from l2m_gtsam.storage.bounded import opened
 from l2m_gtsam.storage.field_types import PX4_TYPE
 from l2m_gtsam.storage.log import TableLog, TableTopic
 from l2m_gtsam.storage.messages import PX4_POSE_TYPE
 
 MAX_BYTES = 2_000_000_000
+TOO_LARGE = f"{{}}: larger than {MAX_BYTES // 1_000_000} MB; give a shorter log"
 MISSING = "ULogs need pyulog: install l2m-gtsam with its extra `px4`"
 INDEXED = re.compile(r"^(.*)\[(\d+)\]$")
 LOCAL_POSE = "/vehicle_local_pose"
@@ -50,11 +53,13 @@ def read_ulog(path: Path) -> TableLog:
         from pyulog import ULog
     except ImportError as error:
         raise BagError(f"{path}: {MISSING}") from error
-    if path.stat().st_size > MAX_BYTES:
-        raise BagError(f"{path}: larger than {MAX_BYTES // 1_000_000} MB; give a shorter log")
     try:
-        with path.open("rb") as file:
+        with opened(path, BagError) as file:
+            if os.fstat(file.fileno()).st_size > MAX_BYTES:
+                raise BagError(TOO_LARGE.format(path))
             parsed = ULog(file).data_list
+    except BagError:
+        raise
     except Exception as error:  # of a damaged file it raises whatever comes first
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise BagError(f"{path}: not a readable ULog ({reason})") from error

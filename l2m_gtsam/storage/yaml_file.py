@@ -8,15 +8,14 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.representer import SafeRepresenter
 
 from l2m_gtsam.errors import CalibrationError, L2MError
 from l2m_gtsam.options import first_fault
+from l2m_gtsam.storage.bounded import read_content
+from l2m_gtsam.storage.bounded_yaml import MAX_BYTES, BoundedYAML, TooMuchYAMLError
 from l2m_gtsam.storage.files import atomic_path
-
-# A calibration of a hundred sensors is under 1 MB; more than this is not ours.
-MAX_BYTES = 50_000_000
 
 Content = TypeVar("Content")
 
@@ -38,31 +37,26 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
     error
         What to raise, with one line that names the file, if it cannot be read.
     """
+    raw = read_content(path, MAX_BYTES, error)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise error(
-                f"{path}: larger than {MAX_BYTES // 1_000_000} MB, not a file of this program"
-            )
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as reason:
-        why = "no such file" if isinstance(reason, FileNotFoundError) else "cannot be read as text"
-        raise error(f"{path}: {why}") from reason
+        text = raw.decode("utf-8")
+    except UnicodeDecodeError as reason:
+        raise error(f"{path}: cannot be read as text") from reason
     try:
-        return YAML(typ="safe", pure=True).load(text)
-    except OverflowError as reason:  # moved to UTC, year 1 or 9999 may be left
-        raise error(
-            f"{path}: has a date that no calendar holds; accepted: years 2 to 9998"
-        ) from reason
-    except (YAMLError, ValueError, RecursionError) as reason:
-        line = getattr(getattr(reason, "problem_mark", None), "line", None)
-        where = "" if line is None else f", line {line + 1}"
-        raise error(f"{path}: not valid YAML{where}") from reason
+        return BoundedYAML().load(text)
+    except TooMuchYAMLError as reason:
+        raise error(f"{path}: {reason}; not a file of this program") from reason
+    except YAMLError as reason:
+        mark = getattr(reason, "problem_mark", None)
+        where = "" if mark is None else f", line {mark.line + 1}"
+        why = f": {reason}" if mark is None and not isinstance(reason, MarkedYAMLError) else ""
+        raise error(f"{path}: not valid YAML{where}{why}") from reason
 
 
-def write_yaml(path: Path, content: dict[str, Any], header: str) -> None:
+def write_yaml(path: Path, plain: dict[str, Any], header: str) -> None:
     """Write plain content with a comment on top; short lists of numbers stay on one line."""
     with atomic_path(path) as temporary:
-        temporary.write_text(yaml_text(content, header), encoding="utf-8")
+        temporary.write_text(yaml_text(plain, header), encoding="utf-8")
 
 
 def yaml_text(content: dict[str, Any], header: str) -> str:
@@ -102,9 +96,9 @@ def read_checked(
     CalibrationError
         The file is missing, is not YAML or is not of this form; the line names the first fault.
     """
-    content = read_yaml(path, CalibrationError)
+    plain = read_yaml(path, CalibrationError)
     try:
-        return adapter.validate_python(prepare(content) if isinstance(content, dict) else content)
+        return adapter.validate_python(prepare(plain) if isinstance(plain, dict) else plain)
     except ValidationError as error:
         fault = first_fault(error, hidden=added)
         msg = f"{path}: not a calibration file of this program: {fault}"

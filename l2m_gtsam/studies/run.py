@@ -20,6 +20,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.report.svg import save_figure
+from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.studies.study import Study
 
@@ -30,6 +31,7 @@ Summary = TypeVar("Summary")
 STUDY_FILE, CELLS, CONDITIONS = "study.json", "cells", "conditions.json"
 FORMAT = "l2m-study-1"
 GIB = 2**30
+MAX_BYTES = 200_000_000  # of a study and of each of its cells
 
 
 @dataclass(frozen=True)
@@ -162,7 +164,7 @@ def render(study: Study[Opts, Any, Summary], folder: Path) -> StudyFile[Opts, Su
 
 def read_study(study: Study[Opts, Any, Summary], path: Path) -> StudyFile[Opts, Summary]:
     """Return the content of a ``study.json``."""
-    return file_type(study).validate_json(path.read_bytes())
+    return file_type(study).validate_json(read_content(path, MAX_BYTES, ConfigError))
 
 
 def file_type(study: Study[Opts, Any, Summary]) -> TypeAdapter[StudyFile[Opts, Summary]]:
@@ -245,8 +247,8 @@ def read_json(path: Path) -> Any:
         It is not JSON.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return json.loads(read_content(path, MAX_BYTES, ConfigError))
+    except (RecursionError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read as JSON; remove it") from error
 
 

@@ -254,7 +254,7 @@ FLOATS = np.ones((5, 3), "<f4").tobytes()
         (
             pcd_header("binary_compressed", 5),
             struct.pack("<II", 2, 0xFFFFFFF0) + b"\x20\x05",
-            "at most 2147483648",
+            "at most 536870912",
         ),
     ],
 )

@@ -59,7 +59,7 @@ def test_order_comments_and_repeated_stamps(folder: Path) -> None:
         (f"{LINE}\nnan 1 2 3 0 0 0 1", "line 2: 'nan' is no time"),
         (f"{LINE}\n1 1 2 inf 0 0 0 1", "line 2: a number is not finite"),
         (f"{LINE}\n1 1 2 x 0 0 0 1", "line 2: could not convert"),
-        (f"{LINE}\n1 1 2 3 0 0 0 0", "line 2: the quaternion is all zero"),
+        (f"{LINE}\n1 1 2 3 0 0 0 0", "line 2: an orientation is all zero"),
     ],
 )
 def test_what_is_no_trajectory_is_told(tmp_path: Path, text: str, told: str) -> None:
