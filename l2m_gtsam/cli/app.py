@@ -6,9 +6,10 @@ first bar, so that it is seen while they load.
 
 import os
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from l2m_gtsam.cli.calibration import batch, calibrate, config, inspect, plan
 from l2m_gtsam.cli.endings import Stopped, flush_output, last_line, stopped_by_signals
@@ -18,7 +19,24 @@ from l2m_gtsam.cli.simulation import demo, simulate, study
 from l2m_gtsam.cli.slam import slam
 from l2m_gtsam.cli.terminal import shown_notices
 
+ORDER = (
+    *("inspect", "config", "map", "plan", "calibrate", "report", "validate", "export", "apply"),
+    *("batch", "slam", "demo", "simulate", "study"),
+)
+"""Of use."""
+
+
+class InOrder(TyperGroup):
+    """The commands in the order of use."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return their names."""
+        names = super().list_commands(ctx)
+        return sorted(names, key=ORDER.index)
+
+
 app = typer.Typer(
+    cls=InOrder,
     name="l2m",
     help="Calibrate magnetometers against a LiDAR from one drive through a mapped field.",
     no_args_is_help=True,

@@ -14,6 +14,7 @@ from l2m_gtsam.cli.terminal import (
     PoseTimesOption,
     SchedulerOption,
     StrictOption,
+    WideOption,
     WorkersOption,
     end_with,
     print_table,
@@ -33,6 +34,7 @@ def inspect(
     config: ConfigOption = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
+    wide: WideOption = False,
 ) -> None:
     """Say what is in a log and what would be used of it, and why; exit code 1 if nothing can be."""
     with shown_progress() as progress:
@@ -42,7 +44,7 @@ def inspect(
 
         chosen = with_poses(load_config(config), [bag], poses or (), times)
         report = inspect_file(bag, chosen, progress)
-    print_table(bag_table(report))
+    print_table(bag_table(report), wide)
     for note in report.notes:
         say(note)
     for obstacle in report.obstacles:
@@ -97,6 +99,7 @@ def plan(
     ] = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
+    wide: WideOption = False,
 ) -> None:
     """Say what a drive will determine, how well, and which extra motion would help most.
 
@@ -117,10 +120,10 @@ def plan(
         chosen = with_poses(load_config(config), [bag], poses or (), times)
         places = [_place(text) for text in at or []]
         found = plan_bag(bag, map_path, chosen, places, progress)
-    print_table(plan_table(found))
+    print_table(plan_table(found), wide)
     if held := held_plan_note(found):
         say(held)
-    print_table(motion_table(found))
+    print_table(motion_table(found), wide)
     say(advice(found))
     say(UNCERTAINTY[found.uncertainty])
     warn(found.doubts)
@@ -181,6 +184,7 @@ def calibrate(
         ),
     ] = None,
     strict: StrictOption = False,
+    wide: WideOption = False,
 ) -> None:
     """Calibrate every magnetometer of one drive or several; write a picture and a report, too."""
     with shown_progress() as progress:
@@ -193,14 +197,14 @@ def calibrate(
         chosen = with_uncertainty(chosen, uncertainty)
         found = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
         verdict = report_calibration(out, found, chosen.qa, progress)
-    _print_calibration(found.result, models)
+    _print_calibration(found.result, models, wide)
     print_verdict(verdict)
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]
     say(f"written: {', '.join(map(str, [*written, *([view] if view else [])]))}")
     end_with(verdict.level, strict)
 
 
-def _print_calibration(result: "CalibrationResult", models: bool) -> None:
+def _print_calibration(result: "CalibrationResult", models: bool, wide: bool) -> None:
     """Print what came out, and what its reader should know."""
     from l2m_gtsam.cli.tables.calibration import (
         calibration_table,
@@ -209,10 +213,12 @@ def _print_calibration(result: "CalibrationResult", models: bool) -> None:
         missing_note,
         model_note,
         model_tables,
+        status_lines,
     )
     from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 
-    print_table(calibration_table(result))
+    print_table(calibration_table(result), wide)
+    say(*status_lines(result))
     for note in result.notes:
         say(note)
     say(UNCERTAINTY[result.uncertainty])
@@ -222,7 +228,7 @@ def _print_calibration(result: "CalibrationResult", models: bool) -> None:
     if held := held_clocks_note(result):
         say(held)
     for table in model_tables(result) if models else ():
-        print_table(table)
+        print_table(table, wide)
     for note in filter(None, map(model_note, result.sensors)):
         say(note)
 

@@ -9,6 +9,7 @@ from l2m_gtsam.cli.terminal import (
     ConfigOption,
     PosesOption,
     PoseTimesOption,
+    WideOption,
     print_table,
     say,
     shown_progress,
@@ -64,6 +65,7 @@ def suite(
     ] = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
+    wide: WideOption = False,
 ) -> None:
     """Calibrate a mapping suite from its own drive, before there is any map.
 
@@ -72,12 +74,13 @@ def suite(
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.survey import calibrate_suite_file
-        from l2m_gtsam.cli.tables.calibration import calibration_table
+        from l2m_gtsam.cli.tables.calibration import calibration_table, status_lines
         from l2m_gtsam.config import load_config, with_poses
 
         chosen = with_poses(load_config(config), bags, poses or (), times)
         found = calibrate_suite_file(bags, out, chosen, known, progress)
-    print_table(calibration_table(found))
+    print_table(calibration_table(found), wide)
+    say(*status_lines(found))
     warn(found.doubts)
     say(f"written: {out}")
 
@@ -155,6 +158,7 @@ def map_compare(
     structure: StructureOption = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
+    wide: WideOption = False,
 ) -> None:
     """Say which kind of map predicts places best that it has not seen."""
     with shown_progress() as progress:
@@ -164,7 +168,7 @@ def map_compare(
 
         chosen = with_poses(load_config(config), bags, poses or (), times)
         comparison = compare_map_kinds(bags, chosen, suite, structure, progress)
-    print_table(comparison_table(comparison))
+    print_table(comparison_table(comparison), wide)
 
 
 @map_app.command("info")

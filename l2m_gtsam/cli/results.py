@@ -10,6 +10,7 @@ from l2m_gtsam.cli.terminal import (
     PosesOption,
     PoseTimesOption,
     StrictOption,
+    WideOption,
     end_with,
     print_table,
     print_verdict,
@@ -82,6 +83,7 @@ def validate(
     poses: PosesOption = None,
     times: PoseTimesOption = None,
     strict: StrictOption = False,
+    wide: WideOption = False,
 ) -> None:
     """Say whether a calibration still holds: on another drive and map, or beside an older one.
 
@@ -102,9 +104,9 @@ def validate(
         )
         found = validate_calibration(asked, progress)
     if found.drive is not None:
-        print_table(validation_table(found.drive, found.verdict))
+        print_table(validation_table(found.drive, found.verdict), wide)
     if found.comparison is not None:
-        print_table(change_table(found.comparison))
+        print_table(change_table(found.comparison), wide)
     print_verdict(found.verdict, Level.PASS)
     if out is not None:
         say(f"written: {out / VALIDATION_FILE}, {out / PAGE_FILE}")

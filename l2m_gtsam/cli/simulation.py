@@ -9,6 +9,7 @@ import typer
 from l2m_gtsam.cli.terminal import (
     OutOption,
     SchedulerOption,
+    WideOption,
     WorkersOption,
     print_table,
     say,
@@ -54,6 +55,7 @@ def demo(
     out: OutOption = Path("demo_out"),
     options: ScenarioOption = None,
     seed: SeedOption = None,
+    wide: WideOption = False,
 ) -> None:
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     with shown_progress() as progress:
@@ -72,7 +74,7 @@ def demo(
         build_map_file([mapping], map_path, chosen, out / SUITE_FILE, progress, cloud)
         result = calibrate_bag(drive, map_path, chosen, out, progress, truth)
         report_folder(out, None, progress)
-    print_table(truth_table(result, truth))
+    print_table(truth_table(result, truth), wide)
     say(consistency_note(result, truth))
     picture, page = out / OVERVIEW_FILE, out / REPORT_FILE
     say(f"picture: {picture}; report: {page}; everything else is in {out}")

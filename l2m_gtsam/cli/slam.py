@@ -11,6 +11,7 @@ from l2m_gtsam.cli.terminal import (
     PoseTimesOption,
     SensorsOption,
     StrictOption,
+    WideOption,
     end_with,
     print_table,
     print_verdict,
@@ -40,6 +41,7 @@ def slam(
     poses: PosesOption = None,
     times: PoseTimesOption = None,
     strict: StrictOption = False,
+    wide: WideOption = False,
 ) -> None:
     """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
     with shown_progress() as progress:
@@ -56,7 +58,7 @@ def slam(
         chosen = with_poses(load_config(config), [bag], poses or (), times)
         given = SlamInput(bag, map_path, calibration, truth)
         done = slam_bag(given, chosen, out, progress)
-    print_table(slam_table(done.result))
+    print_table(slam_table(done.result), wide)
     lines = (
         *start_lines(done.result.start),
         *drift_lines(done.result),

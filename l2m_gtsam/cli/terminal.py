@@ -1,5 +1,6 @@
 """What commands have in common: arguments, tables, warnings and progress at a terminal."""
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 STARTING = "starting"
 LONGEST_STAGE = 60  # letters
+USUAL_WIDTH = 120  # of a file, or of whatever else is no terminal
+SPACE = 2  # between columns
+FEWEST_COLUMNS = 3  # of a table, on a terminal of any width
 ESTIMATE_S = 3600.0  # the time left follows from the pace over so many seconds
 
 BagArgument = Annotated[
@@ -62,13 +66,10 @@ SensorsOption = Annotated[
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="End with exit code 3 if the verdict is FAIL.")
 ]
+WideOption = Annotated[
+    bool, typer.Option("--wide", help="Print all columns of tables, however wide.")
+]
 FAILED = 3  # exit code of a verdict; 2 is that of an error
-COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
-
-
-def coloured(level: str) -> str:
-    """Return a verdict's level as rich prints it."""
-    return f"[bold {COLOURS[level]}]{level.upper()}[/]"
 
 
 def print_verdict(verdict: "Verdict", least: "Level | None" = None) -> None:
@@ -76,6 +77,7 @@ def print_verdict(verdict: "Verdict", least: "Level | None" = None) -> None:
     from rich.console import Console
     from rich.markup import escape
 
+    from l2m_gtsam.cli.tables import coloured
     from l2m_gtsam.records.verdict import Level
 
     console = Console(highlight=False)
@@ -134,14 +136,29 @@ def shown_notices() -> Iterator[None]:
         yield
 
 
-def print_table(table: "Table") -> None:
-    """Print a table as wide as its numbers need: a narrow terminal wraps, it cuts no digits."""
+def print_table(table: "Table", wide: bool = False) -> None:
+    """Print as many columns of a table as fit, and the names of those that do not.
+
+    Parameters
+    ----------
+    table
+        With its columns in the order of their importance.
+    wide
+        Whether all columns are printed, on a terminal of any width.
+    """
     from rich.console import Console
 
-    _show_control_characters(table)
     console = Console()
-    wide = console.width if console.is_terminal else 200
-    Console(width=max(_needed(console, table), wide)).print(table)
+    known = console.is_terminal or "COLUMNS" in os.environ
+    width = console.width if known else USUAL_WIDTH
+    if wide:
+        width = max(_needed(console, table), width)
+    left_out: list[str] = []
+    while len(table.columns) > FEWEST_COLUMNS and _needed(console, table) > width:
+        left_out.insert(0, str(table.columns.pop().header))
+    Console(width=width).print(table)
+    if left_out:
+        Console(width=width, highlight=False).print(f"--wide shows also: {', '.join(left_out)}")
 
 
 @contextmanager
@@ -192,12 +209,15 @@ def _show_control_characters(table: "Table") -> None:
 
 
 def _needed(console: "Console", table: "Table") -> int:
-    """Return the width of a table whose words, and lines that do not wrap, are whole."""
+    """Return the width of a table whose words, and lines that do not wrap, are whole.
+
+    Text that is broken where it must has a least width of its own.
+    """
     from rich.measure import Measurement
 
     options, widths = console.options.update(width=1000), []
     for column in table.columns:
         cells = (Measurement.get(console, options, cell) for cell in (column.header, *column.cells))
-        widths.append(max(cell.maximum if column.no_wrap else cell.minimum for cell in cells))
-    borders = 3 * len(widths) + 1
-    return sum(widths) + borders
+        width = max(cell.maximum if column.no_wrap else cell.minimum for cell in cells)
+        widths.append(width if column.min_width is None else column.min_width)
+    return sum(widths) + SPACE * (len(widths) - 1)

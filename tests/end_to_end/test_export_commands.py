@@ -103,7 +103,7 @@ def test_bad_input(place: CalibratedYard, calibration: Path, tmp_path: Path) -> 
     assert "no sensor 'm'; there" in export(calibration, "--format", "urdf", "--frame", "m=x")
     assert "goes with --format urdf" in export(calibration, "--format", "json", "--into", drive)
     assert "no such file" in export(tmp_path / "no.yaml", "--format", "json")
-    assert "cannot be read" in export(calibration, "--format", "urdf", "--into", tmp_path / "no")
+    assert "no such file" in export(calibration, "--format", "urdf", "--into", tmp_path / "no")
     apply = ("apply", drive, "--calibration")
     assert "no such file" in complaint_here(*apply, tmp_path / "no.yaml", "--out", out)
     assert "exists already" in complaint_here(*apply, calibration, "--out", drive)

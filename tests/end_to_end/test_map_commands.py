@@ -157,7 +157,7 @@ def test_an_updated_harmonic_map_knows_the_new_place(
 def test_kinds_are_compared(yard: Yard, structure: tuple[str, ...], best: str) -> None:
     """A post in the middle of the survey is beyond floor and ceiling modes without sources."""
     out = l2m("map", "compare", yard.west, "--config", yard.config, *structure).out
-    rows = {kind: out.count(f"│ {kind} ") for kind in ("harmonic", "sliding_gp", "bilinear")}
+    rows = {kind: out.count(f"\n{kind} ") for kind in ("harmonic", "sliding_gp", "bilinear")}
     assert rows == {"harmonic": 1, "sliding_gp": 1, "bilinear": 1}
     assert f"recommended: {best}; the log-likelihood of {best} is" in out
     assert "failed" not in out
@@ -189,7 +189,7 @@ def test_bad_structures_are_one_line(yard: Yard, tmp_path: Path) -> None:
         return complaint_here("map", "build", yard.west, *given, "--out", out)
 
     assert "nowhere.pcd: no such point cloud" in build(tmp_path / "nowhere.pcd")
-    assert "cloud.las: not a kind of point cloud that is read" in build("cloud.las")
+    assert "cloud.obj: not a kind of point cloud that is read" in build("cloud.obj")
     assert "cut.ply: not a usable point cloud" in build(truncated)
     assert "no topic '/lidar'; with clouds there are: /points" in build("/lidar")
     assert "topic /mag is of type sensor_msgs/msg/MagneticField" in build("/mag")

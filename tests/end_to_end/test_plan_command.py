@@ -35,7 +35,8 @@ def poses_only(folder: Path, places: FloatArray) -> Path:
 def test_the_sensors_of_a_bag(yard: Yard, field_map: Path) -> None:
     run = l2m("plan", yard.west, "--map", field_map, "--config", yard.config)
     out = " ".join(run.out.split())
-    assert "│ mag │ 0.000 0.000 0.000 │" in out
+    (row,) = [line for line in run.out.splitlines() if line.startswith("mag ")]
+    assert "  0.000 0.000 0.000  " in row
     for motion in ("heave", "roll", "pitch", "turn round", "other way round", "a loop of 0.5 m"):
         assert motion in out
     assert "helps mag most: " in out
@@ -57,7 +58,7 @@ def test_a_parked_vehicle(yard: Yard, field_map: Path, tmp_path: Path) -> None:
     out = l2m("plan", bag, "--map", field_map, "--config", yard.config).out
     assert "at 0,0,0" in out
     assert "everything: the vehicle did not move (0.00 m, 0.0 deg)" in " ".join(out.split())
-    assert "- - - │ - - - │ - - - │ - - - " in " ".join(out.split())
+    assert "- - - - - - - - - " in " ".join(out.split())  # of t, H and rotation
     assert "(15 parameters not determined; with it " in out
 
 

@@ -2,13 +2,49 @@
 
 from collections.abc import Sequence
 
+from rich import box
 from rich.table import Table
+
+TEXT_WIDTH = 18  # the least of a column of text that breaks where it must
+COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
 
 
 def new_table(title: str, first: str, numbers: Sequence[str], caption: str | None = None) -> Table:
-    """Return an empty table: a column of names, then columns of numbers."""
-    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    """Return an empty table: a column of names, then columns of numbers.
+
+    The most important ones come first: a narrow terminal shows those that fit.
+    """
+    table = plain_table(title, caption)
     table.add_column(first, no_wrap=True)
-    for heading in numbers:
-        table.add_column(heading, justify="right", no_wrap=True)
+    add_numbers(table, numbers)
     return table
+
+
+def plain_table(title: str, caption: str | None = None) -> Table:
+    """Return a table without columns; lines are only below the headings."""
+    return Table(
+        title=title,
+        title_justify="left",
+        caption=caption,
+        caption_justify="left",
+        box=box.SIMPLE_HEAD,
+        show_edge=False,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+
+
+def add_numbers(table: Table, headings: Sequence[str]) -> None:
+    """Add columns of numbers, which do not wrap."""
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+
+
+def add_text(table: Table, heading: str, width: int = TEXT_WIDTH) -> None:
+    """Add a column of text, of this width at least."""
+    table.add_column(heading, overflow="fold", min_width=width)
+
+
+def coloured(level: str) -> str:
+    """Return a verdict's level as rich prints it."""
+    return f"[bold {COLOURS[level]}]{level.upper()}[/]"

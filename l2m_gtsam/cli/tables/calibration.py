@@ -4,7 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import new_table
+from l2m_gtsam.cli.tables import add_numbers, new_table, plain_table
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -20,54 +20,75 @@ HEADINGS = (
     "t_lidar_mag (m)",
     "± (mm)",
     "H (uT)",
-    "|C - R| max",
-    "rotation (deg)",
+    "± (uT)",
+    "turned (deg)",
+    "± (deg)",
     "clock (ms)",
-    "|residual| rms (uT)",
-    "readings used",
-    "outside map",
-    "rejected",
-)
-MODEL_HEADINGS = (
-    "parameters",
     "rms (uT)",
-    "held out (uT)",
+    "used",
+    "rejected",
+    "outside map",
+    "|C - R| max",
+)
+PLACES = {1: 4, 2: 6, 3: 6}
+"""Of a number with so many digits behind the point: millimetres, microtesla, metres."""
+MODEL_HEADINGS = (
     "score",
     "behind the best",
+    "rms (uT)",
+    "held out (uT)",
+    "parameters",
     "BIC above the least",
 )
 
 
 def calibration_table(result: CalibrationResult) -> Table:
-    """Return one row per sensor: position, sigma, offset, scale, rotation, residual, status."""
-    table = new_table("Calibration: B_meas = C @ B_lidar + H", "sensor", HEADINGS)
-    table.add_column("status")
+    """Return one row per sensor: position, H and rotation with their sigmas, clock, readings."""
+    title = "Calibration: B_meas = C @ B_lidar + H; rms: of the residuals; ±: one sigma"
+    table = plain_table(title)
+    table.add_column("sensor", no_wrap=True)
+    table.add_column("status", no_wrap=True)
+    add_numbers(table, HEADINGS)
     for sensor in result.sensors:
         table.add_row(*_calibration_row(sensor))
     return table
 
 
 def _calibration_row(sensor: SensorCalibration) -> tuple[str, ...]:
-    status = _status(sensor)
+    name, status = escape(sensor.sensor), _status(sensor)
     if sensor.residuals is None:
-        counts = (f"{sensor.outside_map:,}", f"{sensor.rejected:,}")
-        return (escape(sensor.sensor), *("-",) * 8, *counts, status)
+        counts = (f"{sensor.rejected:,}", f"{sensor.outside_map:,}")
+        return (name, status, *("-",) * 9, *counts, "-")
     distortion, R = sensor.distortion, sensor.R_lidar_mag.T
     angle = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+    turned = np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))
     return (
-        escape(sensor.sensor),
+        name,
+        status,
         _vector(sensor.t_lidar_mag, 3),
         _vector(1e3 * sensor.t_sigma, 1),
         _vector(distortion.H, 2),
-        f"{np.abs(distortion.C - R).max():.3f}",
+        " ".join(f"{each:.2f}" for each in sensor.H_sigma),
         f"{angle:.2f}",
+        " ".join(f"{each:.2f}" for each in turned),
         _clock(sensor.time_offset),
         f"{sensor.residuals.rms:.3f}",
         f"{sensor.residuals.readings:,}",
-        f"{sensor.outside_map:,}",
         f"{sensor.rejected:,}",
-        status,
+        f"{sensor.outside_map:,}",
+        f"{np.abs(distortion.C - R).max():.3f}",
     )
+
+
+def status_lines(result: CalibrationResult) -> list[str]:
+    """Return what is to be said of sensors that are not solved, or rest on priors, a line each."""
+    lines = []
+    for sensor in result.sensors:
+        if sensor.status is not SensorStatus.SOLVED:
+            lines.append(f"{sensor.sensor}: {sensor.status.value}: {sensor.message}")
+        elif sensor.from_priors:
+            lines.append(f"{sensor.sensor}: from priors: {', '.join(sensor.from_priors)}")
+    return lines
 
 
 def _clock(offset: TimeOffset | None) -> str:
@@ -78,15 +99,12 @@ def _clock(offset: TimeOffset | None) -> str:
 
 
 def _vector(values: FloatArray, digits: int) -> str:
-    return " ".join(f"{value:{digits + 5}.{digits}f}" for value in values)
+    return " ".join(f"{value:{PLACES[digits]}.{digits}f}" for value in values)
 
 
 def _status(sensor: SensorCalibration) -> str:
     colour = "green" if sensor.status is SensorStatus.SOLVED else "yellow"
-    if sensor.status is SensorStatus.SOLVED:
-        known = f"; from priors: {', '.join(sensor.from_priors)}" if sensor.from_priors else ""
-        return f"[{colour}]{sensor.status.value}[/]{escape(known)}"
-    return f"[{colour}]{sensor.status.value}[/]: {escape(sensor.message)}"
+    return f"[{colour}]{sensor.status.value}[/]"
 
 
 def disagreement_note(stretch: Disagreement) -> str:
@@ -133,29 +151,30 @@ def held_clocks_note(result: CalibrationResult) -> str:
 
 def truth_table(result: CalibrationResult, truth: tuple[KnownSensor, ...]) -> Table:
     """Return truth, estimate, error and sigma of every sensor's position, and errors of C and H."""
-    place = ("true t (m)", "estimated t (m)", "error (mm)", "sigma (mm)")
-    others = ("|C error|", "sigma", "|H error| (uT)", "sigma")
-    table = new_table("Truth and estimate", "sensor", [*place, *others])
+    errors = ("t error (mm)", "sigma (mm)", "|H error| (uT)", "sigma (uT)")
+    others = ("|C error|", "sigma of C", "true t (m)", "estimated t (m)")
+    table = new_table("Truth and estimate", "sensor", [*errors, *others])
     for known in truth:
         table.add_row(*_truth_row(known, result[known.sensor]))
     return table
 
 
 def _truth_row(known: KnownSensor, sensor: SensorCalibration) -> tuple[str, ...]:
+    name, true = escape(known.sensor), _vector(known.t_lidar_mag, 3)
     if sensor.residuals is None:
-        return (escape(known.sensor), _vector(known.t_lidar_mag, 3), *("-",) * 6, _status(sensor))
+        return (name, _status(sensor), *("-",) * 5, true, "-")
     C_error = np.linalg.norm(sensor.distortion.C - known.distortion.C)
     H_error = np.linalg.norm(sensor.distortion.H - known.distortion.H)
     return (
-        escape(known.sensor),
-        _vector(known.t_lidar_mag, 3),
-        _vector(sensor.t_lidar_mag, 3),
+        name,
         _vector(1e3 * (sensor.t_lidar_mag - known.t_lidar_mag), 1),
         _vector(1e3 * sensor.t_sigma, 1),
-        f"{C_error:.4f}",
-        f"{np.linalg.norm(sensor.C_sigma):.4f}",
         f"{H_error:.3f}",
         f"{np.linalg.norm(sensor.H_sigma):.3f}",
+        f"{C_error:.4f}",
+        f"{np.linalg.norm(sensor.C_sigma):.4f}",
+        true,
+        _vector(sensor.t_lidar_mag, 3),
     )
 
 
@@ -185,16 +204,13 @@ def model_table(sensor: str, comparison: ModelComparison) -> Table:
     how much it is less than the best that the BIC admits.
     """
     numbers = f", {', '.join(comparison.regressors)}" if comparison.regressors else ""
-    table = Table(
-        title=f"Models of {escape(sensor)}{escape(numbers)}: {comparison.readings:,} readings that "
+    table = new_table(
+        f"Models of {escape(sensor)}{escape(numbers)}: {comparison.readings:,} readings that "
         f"count as {comparison.independent:,.0f}, {comparison.segments} segments held out in turn",
-        title_justify="left",
-        caption=f"recommended: {comparison.recommended}; {comparison.reason}",
-        caption_justify="left",
+        "model",
+        MODEL_HEADINGS,
+        f"recommended: {comparison.recommended}; {comparison.reason}",
     )
-    table.add_column("model", no_wrap=True)
-    for heading in MODEL_HEADINGS:
-        table.add_column(heading, justify="right")
     for fit in comparison.fits:
         style = "green" if fit.model is comparison.recommended else None
         table.add_row(*_model_row(fit), style=style)
@@ -204,11 +220,11 @@ def model_table(sensor: str, comparison: ModelComparison) -> Table:
 def _model_row(fit: ModelFigures) -> tuple[str, ...]:
     return (
         fit.model.value,
-        str(fit.parameters),
-        f"{fit.rms:.3f}",
-        f"{fit.held_out_rms:.3f}",
         f"{fit.held_out_score:.3f} ± {fit.score_error:.3f}",
         f"{fit.behind:.3f} ± {fit.behind_error:.3f}",
+        f"{fit.rms:.3f}",
+        f"{fit.held_out_rms:.3f}",
+        str(fit.parameters),
         f"{fit.bic_above:.1f}",
     )
 

@@ -4,21 +4,13 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import new_table
+from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.plan import DrivePlan, SensorPlan, Worst
 from l2m_gtsam.storage.inspect import BagReport, TopicReport
 
-HEADINGS = (
-    "assumed t (m)",
-    "± t (mm)",
-    "± C by column",
-    "± H (uT)",
-    "± rotation (deg)",
-    "± clock (ms)",
-    "readings",
-    "outside map",
-)
+HEADINGS = ("± t (mm)", "± H (uT)", "± rotation (deg)", "± clock (ms)")
+OTHERS = ("± C by column", "assumed t (m)", "readings", "outside map")
 OPEN = "-"  # for a sigma that nothing bounds
 UNITS = {"t": (1e3, "mm"), "C": (1.0, ""), "H": (1.0, "uT")}
 
@@ -27,8 +19,9 @@ def plan_table(plan: DrivePlan) -> Table:
     """Return one row per sensor: sigmas of position, C, H and rotation, and what stays open."""
     title = f"What this drive will determine, with a noise of {plan.noise:.3g} uT"
     caption = "sigmas; of C the largest of each column; - is not determined"
-    table = new_table(title, "sensor", HEADINGS, caption)
-    table.add_column("not determined", overflow="fold")
+    table = new_table(title, "sensor", HEADINGS[:3], caption)
+    add_text(table, "not determined", 14)
+    add_numbers(table, (*HEADINGS[3:], *OTHERS))
     for sensor in plan.sensors:
         table.add_row(*_sensor_row(sensor))
     return table
@@ -47,9 +40,10 @@ def held_plan_note(plan: DrivePlan) -> str:
 def motion_table(plan: DrivePlan) -> Table:
     """Return one row per extra motion for the sensor that is known least, the best first."""
     title = f"What an extra motion would add for {escape(plan.worst.sensor)}, by itself"
-    table = Table(title=title, title_justify="left")
-    for heading in ("motion", "parameters not determined", "known least", "its sigma"):
-        table.add_column(heading, overflow="fold")
+    table = plain_table(title)
+    add_text(table, "motion")
+    for heading in ("parameters not determined", "known least", "its sigma"):
+        table.add_column(heading)
     table.add_row("(the drive as it is)", *_worst_cells(plan.worst))
     for each in plan.motions:
         table.add_row(escape(each.motion), *_worst_cells(each.worst))
@@ -86,15 +80,15 @@ def _sensor_row(sensor: SensorPlan) -> tuple[str, ...]:
     place = " ".join(f"{value:.3f}" for value in sensor.t_lidar_mag)
     return (
         escape(sensor.sensor),
-        place,
         _sigmas(1e3 * sigma[:3]),
-        _sigmas(sigma[3:12].reshape(3, 3).max(axis=0)),
         _sigmas(sigma[12:]),
         _sigmas(np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))),
+        escape(". ".join([*sensor.undetermined, *priors])),
         _sigmas(np.array([1e3 * sensor.offset_sigma])),
+        _sigmas(sigma[3:12].reshape(3, 3).max(axis=0)),
+        place,
         f"{sensor.readings:,}",
         f"{sensor.outside_map:,}",
-        escape(". ".join([*sensor.undetermined, *priors])),
     )
 
 
@@ -103,13 +97,14 @@ def _sigmas(values: FloatArray) -> str:
 
 
 def bag_table(report: BagReport) -> Table:
-    """Return one row per topic: type, frame, count, rate, gaps, NaN, strength, use."""
-    table = Table(title=escape(str(report.path)), title_justify="left")
-    for heading in ("topic", "type", "frame"):
-        table.add_column(heading, overflow="fold")
-    for heading in ("count", "Hz", "gap (s)", "clock (s)", "NaN", "|B| (uT)"):
-        table.add_column(heading, justify="right")
-    table.add_column("use", overflow="fold")
+    """Return one row per topic: use, count, rate, strength, type, frame, gaps, NaN."""
+    table = plain_table(escape(str(report.path)))
+    add_text(table, "topic", 14)
+    add_text(table, "use", 20)
+    add_numbers(table, ("count", "Hz", "|B| (uT)"))
+    add_text(table, "type", 14)
+    add_text(table, "frame", 10)
+    add_numbers(table, ("gap (s)", "clock (s)", "NaN"))
     for topic in report.topics:
         table.add_row(*_topic_row(topic))
     return table
@@ -120,15 +115,15 @@ def _topic_row(topic: TopicReport) -> tuple[str, ...]:
     field = "" if found is None else f"{found.low:.4g} - {found.median:.4g} - {found.high:.4g}"
     return (
         escape(topic.topic),
-        escape(topic.msgtype.replace("/msg/", "/")),
-        escape(", ".join(topic.frames)),
+        escape(topic.use),
         f"{topic.count:,}",
         _number(topic.rate_hz, ".4g"),
+        field,
+        escape(topic.msgtype.replace("/msg/", "/")),
+        escape(", ".join(topic.frames)),
         _number(topic.longest_gap_s, ".3g"),
         _number(topic.clock_offset_s, ".3g"),
         _number(topic.nan_share, ".1%"),
-        field,
-        escape(topic.use),
     )
 
 

@@ -6,18 +6,19 @@ from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.batch.maps import MapDescription
+from l2m_gtsam.cli.tables import add_numbers, add_text, plain_table
 from l2m_gtsam.maps.compare import KindFigures, KindResult, MapComparison
 
 HEADINGS = (
     "log-likelihood",
     "rmse (uT)",
-    "x y z (uT)",
-    "shared rmse (uT)",
     "z-score std",
     "in 95 %",
     "inside",
-    "noise (uT)",
     "build (s)",
+    "noise (uT)",
+    "shared rmse (uT)",
+    "x y z (uT)",
 )
 
 
@@ -27,23 +28,20 @@ def comparison_table(comparison: MapComparison) -> Table:
     Figures are of the readings inside each map, "shared" of those inside all maps; only the
     log-likelihood is of all readings.
     """
-    table = Table(
-        title=f"Maps compared on {comparison.readings:,} readings in {comparison.patches:,} "
+    table = plain_table(
+        f"Maps compared on {comparison.readings:,} readings in {comparison.patches:,} "
         f"patches of {comparison.fold:.3g} m, held out in {comparison.folds} folds",
-        title_justify="left",
-        caption=escape(recommendation(comparison)),
-        caption_justify="left",
+        escape(recommendation(comparison)),
     )
-    table.add_column("kind")
-    for heading in HEADINGS:
-        table.add_column(heading, justify="right")
+    table.add_column("kind", no_wrap=True)
     failed = any(result.figures is None for result in comparison.kinds)
     if failed:
-        table.add_column("failed", overflow="fold")
+        add_text(table, "failed")
+    add_numbers(table, HEADINGS)
     for result in comparison.kinds:
         row = _row(result)
         style = "green" if result.kind == comparison.recommended else None
-        table.add_row(*(row if failed else row[:-1]), style=style)
+        table.add_row(*(row if failed else (row[0], *row[2:])), style=style)
     return table
 
 
@@ -57,27 +55,29 @@ def recommendation(comparison: MapComparison) -> str:
 def _row(result: KindResult) -> tuple[str, ...]:
     figures = result.figures
     cells = ("-",) * len(HEADINGS) if figures is None else _cells(figures)
-    return (escape(result.kind), *cells, escape(result.reason))
+    return (escape(result.kind), escape(result.reason), *cells)
 
 
 def _cells(figures: KindFigures) -> tuple[str, ...]:
     return (
         f"{figures.log_likelihood:.3f}",
         f"{figures.rmse:.3f}",
-        " ".join(f"{value:.3f}" for value in figures.rmse_axes),
-        f"{figures.rmse_shared:.3f}",
         f"{figures.z_std:.2f}",
         f"{figures.coverage:.3f}",
         f"{figures.inside:.1%}",
-        f"{figures.noise:.3f}",
         f"{figures.seconds:.1f}",
+        f"{figures.noise:.3f}",
+        f"{figures.rmse_shared:.3f}",
+        " ".join(f"{value:.3f}" for value in figures.rmse_axes),
     )
 
 
 def map_table(description: MapDescription) -> Table:
     """Return what a map is made of, what it covers and where it came from."""
     summary = description.summary
-    table = Table("fact", "value", title="Magnetic map", title_justify="left")
+    table = plain_table("Magnetic map")
+    for heading in ("fact", "value"):
+        table.add_column(heading)
     table.add_row("kind", summary.kind)
     table.add_row("readings given, rows kept", f"{summary.readings:,}, {summary.rows:,}")
     for axis, low, high in zip("xyz", summary.lower, summary.upper, strict=True):

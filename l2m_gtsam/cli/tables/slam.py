@@ -11,16 +11,16 @@ from l2m_gtsam.records.localisation_file import TruthRecord
 
 def slam_table(result: LocalisationResult) -> Table:
     """Return one row per sensor: what its readings were worth."""
-    counts = ("on key poses", "outside map", "rejected")
-    table = new_table("Readings", "sensor", [*counts, "residual rms (uT)", "chi2 per dof"])
+    counts = ("on key poses", "rejected", "outside map")
+    table = new_table("Readings", "sensor", ["rms (uT)", "chi2 per dof", *counts])
     for each in result.sensors:
         table.add_row(
             escape(each.sensor),
-            str(each.readings),
-            str(each.outside_map),
-            str(each.rejected),
             f"{each.rms:.3g}",
             f"{each.chi2_per_dof:.2f}",
+            str(each.readings),
+            str(each.rejected),
+            str(each.outside_map),
         )
     return table
 

@@ -4,7 +4,7 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
-from l2m_gtsam.cli.tables import new_table
+from l2m_gtsam.cli.tables import add_numbers, coloured, new_table, plain_table
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
     ComparedSensor,
@@ -14,41 +14,39 @@ from l2m_gtsam.records.validation import (
 )
 from l2m_gtsam.records.verdict import Verdict
 
-COLOURS = {"pass": "green", "warn": "yellow", "fail": "red"}
-
 
 def validation_table(drive: DriveValidation, verdict: Verdict) -> Table:
     """Return one row per sensor: field errors before and after, NIS, and the verdict."""
-    errors = ("e_B before", "e_B after", "distance", "x", "y", "z", "NIS")
-    table = new_table(
+    table = plain_table(
         "Readings beside pose, map and calibration",
-        "sensor",
-        [*errors, "readings", "outside", "rejected"],
         "e_B: mean squared distance to the map's field (uT^2); distance and axes (of the lidar): "
         "mean ± std after the calibration (uT); NIS per degree of freedom, in brackets where 95 % "
         "of all lie",
     )
-    table.add_column("verdict")
+    for heading in ("sensor", "verdict"):
+        table.add_column(heading, no_wrap=True)
+    add_numbers(table, ("e_B before", "e_B after", "NIS", "readings", "rejected", "outside"))
+    add_numbers(table, ("distance", "x", "y", "z"))
     levels = {each.sensor: each.level for each in verdict.sensors}
     for sensor in drive.sensors:
-        table.add_row(*_row(sensor), _level(levels[sensor.sensor]))
+        name = escape(sensor.sensor)
+        table.add_row(name, coloured(levels[sensor.sensor]), *_figures(sensor))
     for each in drive.missing:
-        table.add_row(escape(each.sensor), *("-",) * 10, _level(levels[each.sensor]))
+        table.add_row(escape(each.sensor), coloured(levels[each.sensor]), *("-",) * 10)
     return table
 
 
-def _row(sensor: ValidatedSensor) -> tuple[str, ...]:
+def _figures(sensor: ValidatedSensor) -> tuple[str, ...]:
     nis = sensor.nis
     return (
-        escape(sensor.sensor),
         f"{sensor.before.squared:.3g}",
         f"{sensor.after.squared:.3g}",
-        f"{sensor.after.mean:.3f} ± {sensor.after.std:.3f}",
-        *_axes(sensor.after),
         f"{nis.ratio:.2f} ({nis.low / nis.freedom:.2f} - {nis.high / nis.freedom:.2f})",
         f"{sensor.readings:,}",
-        f"{sensor.outside:,}",
         f"{sensor.rejected:,}",
+        f"{sensor.outside:,}",
+        f"{sensor.after.mean:.3f} ± {sensor.after.std:.3f}",
+        *_axes(sensor.after),
     )
 
 
@@ -57,16 +55,12 @@ def _axes(error: FieldError) -> list[str]:
     return [f"{mean:.3f} ± {std:.3f}" for mean, std in pairs]
 
 
-def _level(level: str) -> str:
-    return f"[{COLOURS[level]}]{level.upper()}[/]"
-
-
 def change_table(comparison: CalibrationComparison) -> Table:
     """Return one row per sensor: differences with their sigmas, and the chi-square tests."""
     table = new_table(
         "New less old calibration",
         "sensor",
-        ("t (mm)", "H (uT)", "place", "rotation", "gains", "angles", "C", "H", "all"),
+        ("all", "place", "rotation", "H", "gains", "angles", "C", "less t (mm)", "less H (uT)"),
         "chi-square / degrees of freedom over each part and all; ! where chance makes as much less "
         "than once in 1,000 times",
     )
@@ -79,12 +73,12 @@ def change_table(comparison: CalibrationComparison) -> Table:
 
 def _comparison_row(sensor: ComparedSensor) -> tuple[str, ...]:
     d, sigma = np.array(sensor.difference), np.array(sensor.sigma)
-    names = ("place", "rotation", "gains", "angles", "C", "offset", "all")
+    names = ("all", "place", "rotation", "offset", "gains", "angles", "C")
     return (
         escape(sensor.sensor),
+        *(_test(sensor, name) for name in names),
         _with_sigmas(1e3 * d[:3], 1e3 * sigma[:3], 1),
         _with_sigmas(d[12:], sigma[12:], 2),
-        *(_test(sensor, name) for name in names),
     )
 
 

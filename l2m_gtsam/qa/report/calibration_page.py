@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.progress import Progress, counter, silent
 from l2m_gtsam.qa.options import QaOptions, thresholds
 from l2m_gtsam.qa.report.drawing import Drawing
@@ -19,9 +20,10 @@ from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.qa.verdict.measured import Measured, measured
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
-from l2m_gtsam.records.verdict import SensorVerdict
+from l2m_gtsam.records.verdict import Level, SensorVerdict, Verdict
 from l2m_gtsam.solve.rank import PARAMETERS
 from l2m_gtsam.storage.calibration_file import MODEL, UNCERTAINTY
 
@@ -40,6 +42,8 @@ class SensorSection:
         What it is drawn from; no metrics where it was not solved.
     pictures
         By their keys; empty where it was not solved.
+    measured
+        Its figures beside their limits; none where it was not solved.
     """
 
     anchor: str
@@ -47,12 +51,18 @@ class SensorSection:
     metrics: SensorMetrics | None
     verdict: SensorVerdict
     pictures: dict[str, Picture]
+    measured: tuple[Measured, ...]
 
     @property
     def roll_pitch_yaw(self) -> tuple[float, float, float] | None:
         """Of R_lidar_mag in degrees; None where that is not known."""
         R = self.sensor.R_lidar_mag
         return roll_pitch_yaw(Rotation.from_matrix(R)) if np.isfinite(R).all() else None
+
+    @property
+    def turn_sigma_deg(self) -> FloatArray:
+        """Standard deviations of the rotation about the sensor's axes in degrees, shape (3,)."""
+        return np.asarray(np.rad2deg(np.sqrt(np.diag(self.sensor.rotation_covariance))))
 
 
 def calibration_page(
@@ -92,7 +102,9 @@ def calibration_page(
             anchor, found = f"sensor-{k}", metrics.get(each.sensor)
             drawn = {} if found is None else _figures(each, found)
             own = verdict[each.sensor]
-            sections.append(SensorSection(anchor, each, found, own, pictures(drawn, anchor)))
+            beside = () if found is None else measured(each, found, options)
+            section = SensorSection(anchor, each, found, own, pictures(drawn, anchor), beside)
+            sections.append(section)
         tell(steps - 1, steps)
         return render(
             "report.html.j2",
@@ -109,13 +121,15 @@ def calibration_page(
             uncertainty=UNCERTAINTY[result.uncertainty],
             model=MODEL,
             options=json.dumps(result.options, indent=2, ensure_ascii=False),
-            fingerprint=_fingerprint(result),
+            earlier=() if result.judgement is None else result.judgement.earlier,
+            fingerprint=_fingerprint(result, verdict, options),
         )
 
 
-def _fingerprint(result: CalibrationResult) -> str:
-    """Return ten digits of a digest of a calibration's numbers."""
-    digest = hashlib.sha256()
+def _fingerprint(result: CalibrationResult, verdict: Verdict, options: QaOptions) -> str:
+    """Return ten digits of a digest of a calibration's numbers, its verdict and the thresholds."""
+    judged = [*verdict.lines(Level.PASS), options.model_dump_json()]
+    digest = hashlib.sha256("\n".join(judged).encode(errors="surrogatepass"))
     for sensor in result.sensors:
         digest.update(sensor.sensor.encode(errors="surrogatepass"))
         for part in (sensor.t_lidar_mag, sensor.distortion.vector(), sensor.covariance):

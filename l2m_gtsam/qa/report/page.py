@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
@@ -61,6 +61,15 @@ def vector(values: FloatArray, digits: int) -> str:
     return "(" + ", ".join(f"{value:.{digits}f}" for value in rounded) + ")"
 
 
+def code(text: str) -> Markup:
+    """Return a sentence in which what stands in backticks is code; all of it is text."""
+    parts = str(escape(text)).split("`")
+    if len(parts) % 2 == 0:  # a name has one of its own
+        return escape(text)
+    marked = (f"<code>{part}</code>" if k % 2 else part for k, part in enumerate(parts))
+    return Markup("".join(marked))  # noqa: S704 - escaped above
+
+
 def roll_pitch_yaw(turn: Rotation) -> tuple[float, float, float]:
     """Return the angles of a rotation in degrees, as ROS names them (REP 103)."""
     yaw, pitch, roll = turn.as_euler("ZYX", degrees=True)  # intrinsic z, y, x
@@ -94,6 +103,7 @@ def _environment() -> Environment:
     )
     environment.tests["finite"] = math.isfinite
     environment.filters |= {
+        "code": code,
         "number": number,
         "fixed": fixed,
         "vector": vector,

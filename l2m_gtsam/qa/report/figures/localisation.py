@@ -38,6 +38,7 @@ ELLIPSES = 12
 LARGEST = 0.05  # of the picture's longer side: half an axis of the largest ellipse, at most
 SCALES = (1, 2, 5, 10, 20, 50, 100, 200, 500)
 BAND_95 = 12.59  # chi-square of six
+NAMES_APART = 0.15  # of the picture: nearer names cover each other
 ROW = 0.42  # inches of a sensor
 DECADE = 10.0
 SHORTEST = 1e-4  # m and degrees: less is nothing on an axis of decades
@@ -65,10 +66,20 @@ def path_figure(path: LocalisedTrajectory, picture: MapPicture, truth: Rows | No
         shape = ellipse(path.p[k, :2], path.covariance[k, :2, :2], scale)
         shape.set(facecolor="#ffffff66", edgecolor="black")
         axes.add_patch(shape)
-    mark(axes, path.p[0, :2], "start")
-    mark(axes, path.p[-1, :2], "end")
+    _mark_ends(axes, path.p[0, :2], path.p[-1, :2], picture)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
+
+
+def _mark_ends(axes: Axes, start: FloatArray, end: FloatArray, picture: MapPicture) -> None:
+    """Mark where a path starts and ends: with one name where two would cover each other."""
+    left, right, bottom, top = picture.extent
+    if np.linalg.norm(end - start) < NAMES_APART * max(right - left, top - bottom):
+        axes.plot(*end, "o", color="white", markeredgecolor="black", markersize=6)
+        mark(axes, start, "start, end")
+        return
+    mark(axes, start, "start")
+    mark(axes, end, "end")
 
 
 def drift_figure(path: LocalisedTrajectory) -> Figure:

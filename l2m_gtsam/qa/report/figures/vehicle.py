@@ -30,7 +30,7 @@ ESTIMATE, TRUTH = "#d55e00", "black"  # vermilion and black differ for all kinds
 COLOURS = {Level.PASS: GOOD, Level.WARN: FAIR, Level.FAIL: BAD}
 SHAPES = {Level.PASS: "o", Level.WARN: "^", Level.FAIL: "X"}
 # An ellipse that is less than this share of the picture is a dot: all are drawn larger then.
-SEEN = 0.06
+SEEN = 0.1
 BEHIND = 0.08  # of the picture: names closer than this would cover each other
 FAR = 0.75  # of the picture: names beyond this are written on the left of their dot
 ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200)
@@ -105,7 +105,7 @@ def _name(axes: Axes, found: list[SensorCalibration], view: Viewpoint) -> None:
         label = axes.annotate(
             text,
             tuple(at),
-            xytext=(-7 if right else 7, 4),
+            xytext=(-10 if right else 10, 6),
             textcoords="offset points",
             ha="right" if right else "left",
             fontsize=SMALL,
@@ -126,9 +126,11 @@ def _draw(
     if shape is None:
         _draw_open(axes, sensor, view)
     else:
-        shape.set(facecolor=COLOURS[level], edgecolor=COLOURS[level], alpha=0.35)
+        colour = COLOURS[level]
+        # The line lies above the marker: an ellipse that is smaller is seen on it.
+        shape.set(facecolor="none", edgecolor=colour, linewidth=1.4, zorder=3)
         axes.add_patch(shape)
-    axes.plot(*at, SHAPES[level], color=COLOURS[level], markersize=5)
+    axes.plot(*at, SHAPES[level], color=COLOURS[level], markersize=3.5, zorder=2)
 
 
 def _draw_open(axes: Axes, sensor: SensorCalibration, view: Viewpoint) -> None:
@@ -180,8 +182,8 @@ def calibration_figure(
         label = "_" if k else "drive of the lidar"  # one entry in the legend
         place.plot(*drive.p[:, :2].T, color="white", linewidth=2.2)
         place.plot(*drive.p[:, :2].T, color=ESTIMATE, linewidth=1.0, label=label)
-    place.set_title(f"map at z = {picture.height:.2f} m and drive")
-    place.legend(loc="upper right")
+    place.set_title(f"map at z = {picture.height:.2f} m", loc="right")
+    place.legend(loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     solved = [s for s in result.sensors if s.residuals is not None]
     _draw_vehicle(above, solved, truth, (0, 1))
     _draw_vehicle(side, solved, truth, (0, 2))
