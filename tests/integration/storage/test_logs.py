@@ -250,11 +250,11 @@ def test_a_ulog_of_strangers_is_no_danger(
 ) -> None:
     """Times that do not fit, names that are none, and what the parser prints of damage."""
     mag = {"magnetometer_ga": 3}
-    late = 9.1e15 + 20_000.0 * np.arange(COUNT)
+    late = np.asarray(9.1e15 + 20_000.0 * np.arange(COUNT), dtype=np.float64)
     path = write_ulog(tmp_path / "late.ulg", [("vehicle_magnetometer", 0, mag, late, readings())])
     with pytest.raises(BagError, match="damaged: times on /vehicle_magnetometer are those of no"):
         read_fields(path, BagOptions())
-    stamps = 20_000.0 * np.arange(1, COUNT + 1)
+    stamps = np.asarray(20_000.0 * np.arange(1, COUNT + 1), dtype=np.float64)
     odd = ("class", 0, {"a b": 1, "class": 1, "1st": 1}, stamps, readings())
     good = ("vehicle_magnetometer", 0, mag, stamps, readings(0.01))
     path = write_ulog(tmp_path / "odd.ulg", [good, odd])
