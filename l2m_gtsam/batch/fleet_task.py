@@ -8,12 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 
-from l2m_gtsam.batch.drives import (
-    CALIBRATION_FILE,
-    METRICS_FILE,
-    OVERVIEW_FILE,
-    calibrate_drive,
-)
+from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, calibrate_drive
 from l2m_gtsam.batch.files import OpenMap, SavedMap, check_outputs, ensure_folder
 from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_calibration
 from l2m_gtsam.batch.scan_poses import read_drive_on

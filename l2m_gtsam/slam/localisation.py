@@ -6,13 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.data import (
-    FloatArray,
-    Readings,
-    Recording,
-    RigidTransform,
-    Trajectory,
-)
+from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.parallel.threads import one_blas_thread

@@ -7,10 +7,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.evidence import normal_of
-from l2m_gtsam.maps.harmonic.explanation import (
-    explanation_of,
-    patchwork,
-)
+from l2m_gtsam.maps.harmonic.explanation import explanation_of, patchwork
 from l2m_gtsam.maps.harmonic.furnish import COARSE
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out

@@ -18,15 +18,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from l2m_factors import (
-    D,
-    MapBatch,
-    StepError,
-    T,
-    Whitening,
-    X,
-    key_pose_factor,
-)
+from l2m_factors import D, MapBatch, StepError, T, Whitening, X, key_pose_factor
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.progress import Progress
