@@ -29,4 +29,3 @@ class DifferentiableMap(Protocol):
         gradient
             ``gradient[n, i, j]`` = dB_i/dx_j in microtesla per metre, shape (N, 3, 3).
         """
-        ...

@@ -35,13 +35,11 @@ class TileField(Protocol):
 
     def features(self, points: FloatArray, /) -> FloatArray:
         """Return the field of each weight at points (N, 3) in metres, uT, shape (N, 3, m)."""
-        ...
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray, /
     ) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, of weights of shape (m,)."""
-        ...
 
 
 class WeightedField:

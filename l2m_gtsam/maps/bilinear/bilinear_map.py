@@ -13,6 +13,7 @@ how far the data are, and too little where a cell holds a single reading.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -32,8 +33,6 @@ from l2m_gtsam.maps.training import (
     training_set,
 )
 
-KIND = "bilinear"
-
 
 @dataclass(frozen=True)
 class BilinearMap:
@@ -51,6 +50,7 @@ class BilinearMap:
         Mean square of the readings about the interpolant per axis in square microtesla.
     """
 
+    kind: ClassVar[str] = "bilinear"
     cells: Cells
     options: BilinearOptions
     lattice: Lattice
@@ -99,11 +99,6 @@ class BilinearMap:
         return cls(cells, options, lattice_over(cells, options), float(spread[0]))
 
     @property
-    def kind(self) -> str:
-        """Name of the map kind."""
-        return KIND
-
-    @property
     def readings(self) -> TrainingSet:
         """Readings in the map frame, averaged over cells."""
         return TrainingSet(self.cells.points, self.cells.field, self.cells.count)
@@ -113,7 +108,7 @@ class BilinearMap:
         """Figures of the map."""
         heights, points = self.cells.heights, self.cells.points
         return MapSummary(
-            kind=KIND,
+            kind=self.kind,
             readings=int(self.cells.count.sum()),
             rows=len(points),
             lower=points.min(axis=0),
@@ -162,7 +157,7 @@ class BilinearMap:
     def to_state(self) -> MapState:
         """Return the map as its averages: the nodes are filled again from them."""
         arrays = {**vars(self.cells), "spread": np.array([self.spread])}
-        return MapState(KIND, arrays, self.options.model_dump(mode="json"), {})
+        return MapState(self.kind, arrays, self.options.model_dump(mode="json"), {})
 
 
 def squares_about(lattice: Lattice, readings: TrainingSet) -> float:

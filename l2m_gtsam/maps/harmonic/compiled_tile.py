@@ -40,7 +40,6 @@ class Smooth(Protocol):
         self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
     ) -> FloatArray:
         """Return the potential in uT m at the nodes of these axes, shape (nx, ny, nz)."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -30,15 +30,12 @@ class Family(Protocol):
 
     def __len__(self) -> int:
         """Return the number m of weights."""
-        ...
 
     def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
         """Return the prior of the weights."""
-        ...
 
     def features(self, points: FloatArray) -> FloatArray:
         """Return the field of each weight at points, in uT per unit weight, shape (N, 3, m)."""
-        ...
 
     def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
         """Write the field that so many units of each weight make at points.
@@ -52,17 +49,14 @@ class Family(Protocol):
         rows
             For the field in uT, one weight after the other, shape (m, 3, N), in C order.
         """
-        ...
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the field (N, 3) in uT and its gradient (N, 3, 3) in uT/m for given weights."""
-        ...
 
     def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
         """Return the potential phi with ``B = grad phi`` in uT m, shape (N,)."""
-        ...
 
 
 def features_of(family: Family, points: FloatArray) -> FloatArray:
