@@ -8,17 +8,15 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
-from l2m_gtsam.maps.harmonic.blend import Blend
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
-from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
-from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
+from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.harmonic.visits import Visit
+from l2m_gtsam.maps.harmonic.visits import Blend, Visit
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
 from l2m_gtsam.parallel.threads import in_threads
