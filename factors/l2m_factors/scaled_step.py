@@ -10,7 +10,7 @@ With the step (R, p) as it was measured and the share s the true one is taken to
 import gtsam
 import numpy as np
 
-from l2m_factors.field_map import FloatArray
+from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.keys import G, X
 
 
@@ -32,9 +32,7 @@ def scaled_step_factor(
     R, p = step.rotation(), step.translation()
     by_share = np.append(np.zeros(3), R.matrix().T @ p)  # as a right perturbation of Z
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         before, after = values.atPose3(X(key_pose)), values.atPose3(X(key_pose + 1))
         way = before.between(after)
         off = gtsam.Pose3(R, (1 + values.atDouble(G())) * p).between(way)

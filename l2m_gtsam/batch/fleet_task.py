@@ -114,13 +114,7 @@ def _in_folder(order: FleetOrder) -> list[FleetDrive]:
     if order.map_path is None:
         raise ConfigError(f"{order.source}: a folder of bags needs a map; give it with --map")
     return [
-        FleetDrive(
-            bag,
-            order.map_path,
-            order.config,
-            _vehicle(bag),
-            _seen_from(order.source, bag),
-        )
+        FleetDrive(bag, order.map_path, order.config, _vehicle(bag), _seen_from(order.source, bag))
         for bag in bags
     ]
 

@@ -186,11 +186,7 @@ def _spaced(p: FloatArray) -> IntArray:
 
 
 def calibrate_suite_file(
-    bags: Sequence[Path],
-    out: Path,
-    config: Config,
-    known: Path | None,
-    progress: Progress,
+    bags: Sequence[Path], out: Path, config: Config, known: Path | None, progress: Progress
 ) -> CalibrationResult:
     """Calibrate the sensors of mapping bags and write the calibration.
 

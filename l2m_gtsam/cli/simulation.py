@@ -51,9 +51,7 @@ def simulate(
 
 
 def demo(
-    out: OutOption = Path("demo_out"),
-    options: ScenarioOption = None,
-    seed: SeedOption = None,
+    out: OutOption = Path("demo_out"), options: ScenarioOption = None, seed: SeedOption = None
 ) -> None:
     """Simulate, map and calibrate a warehouse, and compare with the truth."""
     with shown_progress() as progress:

@@ -105,12 +105,7 @@ def localise(
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, decoys)
-    result = replace(
-        result,
-        notes=(*notes, *result.notes),
-        bag=recording.source,
-        start=search,
-    )
+    result = replace(result, notes=(*notes, *result.notes), bag=recording.source, start=search)
     return Localisation(result, solution)
 
 

@@ -170,12 +170,7 @@ def middle(field: FloatArray) -> FloatArray:
 
 @njit(cache=True, nogil=True)
 def write_trimmed(
-    b: FloatArray,
-    inside: FloatArray,
-    z: FloatArray,
-    has: FloatArray,
-    good: float,
-    rms: FloatArray,
+    b: FloatArray, inside: FloatArray, z: FloatArray, has: FloatArray, good: float, rms: FloatArray
 ) -> None:
     """Write what regressions on (1, b) leave of the readings that they explain best.
 

@@ -77,10 +77,7 @@ class Modes:
         log_variance = 2 * np.log(scale) + 3 * np.log(2 * h) - 2 * k * h - np.log(k)
         return WeightPrior(
             log_variance + self._log_share,
-            {
-                f"{self.side}_scale": np.full(len(k), 2.0),
-                f"{self.side}_depth": 3.0 - 2.0 * k * h,
-            },
+            {f"{self.side}_scale": np.full(len(k), 2.0), f"{self.side}_depth": 3.0 - 2.0 * k * h},
         )
 
     @cached_property

@@ -44,10 +44,7 @@ class Tiles:
     """
 
     def __init__(
-        self,
-        learnt: Learnt,
-        kept: Mapping[int, Tile] | None = None,
-        store: TileStore = NO_STORE,
+        self, learnt: Learnt, kept: Mapping[int, Tile] | None = None, store: TileStore = NO_STORE
     ) -> None:
         self.store = store
         self._learnt = learnt

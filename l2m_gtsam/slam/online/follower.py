@@ -224,12 +224,7 @@ class Follower:
         fixed = None if self._free else self._drive.sensors.fixed()
         batch = MapBatch(self._map, readings, fixed)
         for each in pending.accepted:
-            yield key_pose_factor(
-                batch,
-                each.step.key_pose,
-                each.whitening,
-                step=each.step,
-            )
+            yield key_pose_factor(batch, each.step.key_pose, each.whitening, step=each.step)
 
     def _hand_over(self, last: int) -> None:
         """Begin a new section at the last key pose of this one."""
