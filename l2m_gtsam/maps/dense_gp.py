@@ -63,6 +63,8 @@ class DenseGP(GPMap[DenseGPOptions]):
             factor = cholesky(K, lower=True)
         except LinAlgError:
             raise MapError(not_definite(trained.hyperparameters)) from None
+        # The mean is k^T alpha with alpha = (K + noise)^-1 (y - mean) (Rasmussen and Williams 2006,
+        # 2.25).
         alpha = cho_solve((factor, True), readings.field - readings.mean)
         return cls(trained, options, readings.mean, factor, alpha)
 
@@ -95,6 +97,7 @@ class DenseGP(GPMap[DenseGPOptions]):
         prior = self.trained.hyperparameters.signal**2
         variances = [np.empty(0)]
         for batch in batches(checked_points(points)):
+            # As L^-1 k: the explained variance is a sum of squares, and no inverse is formed.
             V = solve_triangular(self.factor, covariance(self.trained, batch).T, lower=True)
             variances.append(np.maximum(prior - np.sum(V**2, axis=0), 0.0))
         return np.repeat(np.concatenate(variances)[:, None], 3, axis=1)

@@ -99,6 +99,8 @@ def models_for(samples: Samples) -> list[Model]:
 def trial_of(samples: Samples, model: Model, fit: Fit, spread: Spread, held_out: HeldOut) -> Trial:
     """Return a model with its rms and its BIC."""
     values = samples.z.size
+    # Schwarz 1978, with the effective number of parameters in place of their count, as residuals
+    # are correlated.
     bic = values * np.log(fit.squares / values) + spread.freedom * np.log(values)
     rms = _rms(fit.coefficients.residual(samples))
     return Trial(model, fit, spread, rms, held_out, float(bic))
@@ -144,8 +146,11 @@ def correlation_of(residual: FloatArray, drives: Sequence[slice] = ONE_DRIVE) ->
     for rows in drives:
         own = residual[rows]
         n = len(own)
+        # Wiener and Khinchin: the autocovariance is the transform of the power. Twice the length,
+        # so that the end does not meet the beginning.
         power = np.abs(np.fft.rfft(own, 2 * n, axis=0)) ** 2
         covariance[:n] += np.fft.irfft(power, 2 * n, axis=0)[:n].sum(axis=1)
+    # Beyond the first zero an estimated correlation is chance.
     covariance[np.cumsum(covariance <= 0) > 0] = 0.0
     covariance[0] = max(covariance[0], np.finfo(float).tiny)
     return np.asarray(covariance / covariance[0])

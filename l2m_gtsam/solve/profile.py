@@ -94,6 +94,7 @@ def interpolated(own: Readings, at: Readings) -> FloatArray:
     # At the very time of a reading the other one does not matter.
     near = (close(a, at) | (share == 1)) & (close(b, at) | (share == 0))
     near &= (share >= 0) & (share <= 1)
+    # A value between two drives was never read.
     near &= (a.of_drive == at.of_drive) & (b.of_drive == at.of_drive)
     field[near] = (a.field + share[:, None] * (b.field - a.field))[near]
     return field

@@ -13,12 +13,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
-from l2m_gtsam.storage.bag_options import (
-    BagOptions,
-    ColumnOptions,
-    PoseFileOptions,
-    RegressorTopic,
-)
+from l2m_gtsam.storage.bag_options import BagOptions, ColumnOptions, PoseFileOptions, RegressorTopic
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.regressors import read_scalars
 from l2m_gtsam.storage.units import Unit
