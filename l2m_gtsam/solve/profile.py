@@ -29,7 +29,7 @@ CONCENTRATIONS = 4  # fits, each on the readings that the one before explains be
 # Sums in any order and fused products: loops over readings run in vector registers.
 FAST = {"reassoc", "contract", "nsz"}
 
-Prediction = Callable[[FloatArray], tuple[FloatArray, BoolArray]]
+FieldPredictor = Callable[[FloatArray], tuple[FloatArray, BoolArray]]
 """Field in uT at points (N, 3) in metres, shape (N, 3), and whether it is known, shape (N,)."""
 
 
@@ -125,7 +125,9 @@ class Misfits:
     known: FloatArray
 
 
-def misfits(snapshots: Snapshots, predict: Prediction, t: FloatArray, good: float = 1.0) -> Misfits:
+def misfits(
+    snapshots: Snapshots, predict: FieldPredictor, t: FloatArray, good: float = 1.0
+) -> Misfits:
     """Return how well candidates in the lidar frame, shape (G, 3), explain every sensor.
 
     Least trimmed squares by concentration (P. J. Rousseeuw, K. Van Driessen, "Computing LTS
