@@ -17,8 +17,7 @@ from benchmarks.map_queries import Survey, survey, warehouse
 from benchmarks.timing import seconds
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.harmonic.compiled import CompiledMap
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.maps.sliding_gp import SlidingGP
 from l2m_gtsam.simulate import hall_drives
 from l2m_gtsam.simulate.steel_hall import STRONG, CloudVariant, hall_cloud, steel_hall

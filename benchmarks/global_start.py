@@ -13,8 +13,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.calibration.start.global_start import StartOptions, find_starts
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.maps.harmonic.compiled import CompiledMap
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.records.calibration import FoundStart
 from tests.worlds.exact import DipoleWorld, drive, random_sensors
 

@@ -70,8 +70,8 @@ def row(place: Place) -> list[str]:
     learn = seconds(
         lambda: made.append(HarmonicMap.fit(place.points, place.field, cloud=place.cloud)), 1
     )
-    solve = seconds(made[0].tiles.solve_all, 1)
-    tiles, fast = made[0].tiles, CompiledTiles.of(made[0])
+    solve = seconds(lambda: in_threads(made[0].tiles.__getitem__, range(len(made[0].tiles))), 1)
+    tiles, fast = made[0].tiles, CompiledTiles.of(made[0].learnt, made[0].options, made[0].tiles)
     indices = range(len(tiles))
     compiling = seconds(lambda: in_threads(lambda i: fast.compiled(i, tiles[i]), indices), 1)
     with TemporaryDirectory() as folder:

@@ -22,8 +22,7 @@ from l2m_gtsam.calibration.optimise import LinearSolver
 from l2m_gtsam.calibration.uncertain import UncertainDrive, UncertainProblem, starting_values
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
-from l2m_gtsam.maps.harmonic.compiled import CompiledMap
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from tests.reference.elimination import Eliminated, eliminate
 from tests.worlds.exact import DipoleWorld, random_sensors

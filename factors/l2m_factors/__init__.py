@@ -12,15 +12,9 @@ from l2m_factors.key_pose_readings import (
 from l2m_factors.keys import D, G, M, P, Q, S, T, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import MapBatch, key_pose_factor
-from l2m_factors.priors import (
-    distance_prior,
-    distortion_prior,
-    held_directions,
-    rotation_prior,
-)
+from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
 from l2m_factors.reading import BatchedReadings, block_factor, reading_factor
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, field_rate, reading_residuals
-from l2m_factors.scaled_step import scaled_step_factor
 from l2m_factors.shared_errors import (
     SharedError,
     UncertainReadings,
@@ -32,7 +26,7 @@ from l2m_factors.shared_errors import (
     uncertain_block_factor,
     uncertain_reading_factor,
 )
-from l2m_factors.step import StepError
+from l2m_factors.step import StepError, scaled_step_factor
 from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor
 from l2m_factors.whitening import Whitening
 

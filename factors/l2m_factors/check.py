@@ -7,11 +7,7 @@ from l2m_factors.field_map import FloatArray
 
 
 def assert_jacobians_match(
-    factor: gtsam.NonlinearFactor,
-    values: gtsam.Values,
-    *,
-    rtol: float = 1e-6,
-    step: float = 1e-5,
+    factor: gtsam.NonlinearFactor, values: gtsam.Values, *, rtol: float = 1e-6, step: float = 1e-5
 ) -> None:
     """Raise an AssertionError if a factor's Jacobians differ from central differences.
 

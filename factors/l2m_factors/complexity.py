@@ -27,7 +27,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.field_map import FloatArray
+from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.tile import TileBatch
 
 
@@ -81,9 +81,7 @@ def effective_parameters_factor(
     if not keys:
         return None
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         where = batch.places(values, key_pose)
         if jacobians is not None:
             for slot, block in enumerate(batch.place_jacobians(key_pose, where)):

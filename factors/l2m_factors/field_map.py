@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+Jacobians = list[FloatArray] | None  # what GTSAM hands to a factor to be filled, if it wants them
 
 
 class DifferentiableMap(Protocol):
@@ -29,4 +30,3 @@ class DifferentiableMap(Protocol):
         gradient
             ``gradient[n, i, j]`` = dB_i/dx_j in microtesla per metre, shape (N, 3, 3).
         """
-        ...

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from l2m_factors.field_map import DifferentiableMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import X
@@ -104,9 +104,7 @@ def key_pose_factor(
     of_steps = [key for each in terms for key in each.keys]
     slots = Slots([*batch.keys_of(key_pose), *of_errors, *of_steps])
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, key_pose)
         e, more = residuals.reading.residual[rows], np.zeros((len(rows), 3))
         C = batch.C(values, key_pose) if errors else np.empty(0)

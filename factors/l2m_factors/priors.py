@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 
-from l2m_factors.field_map import FloatArray
+from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.keys import D, T
 
 # What a small rotation by each axis adds to the identity, row by row, shape (9, 3).
@@ -67,9 +67,7 @@ def distance_prior(first: int, second: int, metres: float, sigma: float) -> gtsa
         The distance and its standard deviation.
     """
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         apart = values.atPoint3(T(second)) - values.atPoint3(T(first))
         length = float(np.linalg.norm(apart))
         if jacobians is not None:
@@ -86,9 +84,7 @@ def _near(sensor: int, C0: FloatArray, noise: gtsam.noiseModel.Base) -> gtsam.Cu
     expected = C0.ravel()
     derivative = np.eye(9, 12)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         if jacobians is not None:
             jacobians[0] = derivative
         return np.asarray(values.atVector(D(sensor))[:9] - expected)
@@ -113,9 +109,7 @@ def held_directions(sensor: int, directions: FloatArray, at: FloatArray) -> gtsa
     """
     start = directions @ at
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         if jacobians is not None:
             jacobians[0] = directions[:, :3]
             jacobians[1] = directions[:, 3:]

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.field_map import DifferentiableMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.keys import D, S, T
 from l2m_factors.residual import MagneticReadings, ReadingResiduals, reading_residuals
 
@@ -137,9 +137,7 @@ def reading_factor(
     """
     sensor = batch.sensor_of(reading)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, sensor)
         if jacobians is not None:
             for slot, jacobian in enumerate(batch.jacobians(residuals)):
@@ -165,9 +163,7 @@ def block_factor(batch: BatchedReadings, sensor: int, whitening: FloatArray) -> 
     rows = _span(batch.rows_of(sensor))
     W = whitening[rows]
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, sensor)
         if jacobians is not None:
             for slot, jacobian in enumerate(batch.jacobians(residuals)):

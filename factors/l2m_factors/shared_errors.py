@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from l2m_factors.field_map import FloatArray
+from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.keys import D, M, P
 from l2m_factors.reading import BatchedReadings
 
@@ -150,9 +150,7 @@ class UncertainReadings:
 def uncertain_block_factor(readings: UncertainReadings) -> gtsam.CustomFactor:
     """Return one factor for all of some readings: the same mathematics as one each, and faster."""
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         if jacobians is None:
             return readings.white_residual(values)
         found = readings.linearised(values)
@@ -179,9 +177,7 @@ def uncertain_reading_factor(readings: UncertainReadings, reading: int) -> gtsam
     """
     own = slice(3 * reading, 3 * reading + 3)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         found = readings.linearised(values)
         if jacobians is not None:
             for slot, block in enumerate(found.blocks):
@@ -218,9 +214,7 @@ def map_weights_prior(sizes: Mapping[int, int], root_information: FloatArray) ->
     ends = np.cumsum(list(sizes.values()))
     blocks = np.split(root_information, ends[:-1], axis=1)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         if jacobians is not None:
             for slot, block in enumerate(blocks):
                 jacobians[slot] = block
@@ -282,9 +276,7 @@ def _next_pose_error(knot: int, correlation: float) -> gtsam.CustomFactor:
     own = 1 / np.sqrt(1 - correlation**2)
     by_last, by_next = -correlation * own * np.eye(POSE), own * np.eye(POSE)
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         if jacobians is not None:
             jacobians[0], jacobians[1] = by_last, by_next
         last, following = values.atVector(P(knot)), values.atVector(P(knot + 1))

@@ -21,7 +21,7 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
-from l2m_factors.field_map import DifferentiableMap, FloatArray
+from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import M, X
@@ -35,13 +35,11 @@ class TileField(Protocol):
 
     def features(self, points: FloatArray, /) -> FloatArray:
         """Return the field of each weight at points (N, 3) in metres, uT, shape (N, 3, m)."""
-        ...
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray, /
     ) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, of weights of shape (m,)."""
-        ...
 
 
 class WeightedField:
@@ -195,9 +193,7 @@ def tile_factor(
     terms = [] if step is None else [step]
     slots = Slots([*batch.keys_of(key_pose), *(key for each in terms for key in each.keys)])
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, key_pose)
         e = residuals.reading.residual[rows]
         for each in terms:

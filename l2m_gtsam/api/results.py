@@ -101,8 +101,7 @@ class JudgedCalibration(Shown):
             **_axes("sigma_H_{}_ut", sensor.H_sigma),
             **_axes("rotation_{}_deg", _turn_deg(sensor.R_lidar_mag)),
             **_axes(
-                "sigma_rotation_{}_deg",
-                np.degrees(np.sqrt(np.diag(sensor.rotation_covariance))),
+                "sigma_rotation_{}_deg", np.degrees(np.sqrt(np.diag(sensor.rotation_covariance)))
             ),
             "time_offset_s": 0.0 if offset is None else offset.seconds,
             "noise_ut": sensor.noise,

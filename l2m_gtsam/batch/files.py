@@ -50,11 +50,9 @@ class Tiled(Protocol):
 
     def with_store(self, store: TileStore) -> "FieldMap":
         """Return the map that keeps its tiles in a store."""
-        ...
 
     def make_tiles(self, count: Count) -> int:
         """Have all tiles in the store, and return how many there are."""
-        ...
 
 
 def with_tiles(field_map: FieldMap, path: Path) -> FieldMap:

@@ -8,12 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 
-from l2m_gtsam.batch.drives import (
-    CALIBRATION_FILE,
-    METRICS_FILE,
-    OVERVIEW_FILE,
-    calibrate_drive,
-)
+from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, calibrate_drive
 from l2m_gtsam.batch.files import OpenMap, SavedMap, check_outputs, ensure_folder
 from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_calibration
 from l2m_gtsam.batch.scan_poses import read_drive_on
@@ -119,13 +114,7 @@ def _in_folder(order: FleetOrder) -> list[FleetDrive]:
     if order.map_path is None:
         raise ConfigError(f"{order.source}: a folder of bags needs a map; give it with --map")
     return [
-        FleetDrive(
-            bag,
-            order.map_path,
-            order.config,
-            _vehicle(bag),
-            _seen_from(order.source, bag),
-        )
+        FleetDrive(bag, order.map_path, order.config, _vehicle(bag), _seen_from(order.source, bag))
         for bag in bags
     ]
 

@@ -5,12 +5,7 @@ from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
-from l2m_gtsam.batch.files import (
-    SavedMap,
-    read_drive,
-    read_drive_and_numbers,
-    read_numbers,
-)
+from l2m_gtsam.batch.files import SavedMap, read_drive, read_drive_and_numbers, read_numbers
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import BagError, LidarError

@@ -10,14 +10,7 @@ import numpy as np
 from l2m_gtsam.batch.files import check_bags, check_outputs, ensure_folder, read_drive
 from l2m_gtsam.batch.scan_poses import read_drive_or_follow
 from l2m_gtsam.config import Config
-from l2m_gtsam.data import (
-    FloatArray,
-    IntArray,
-    KnownSensor,
-    LidarMap,
-    Recording,
-    Trajectory,
-)
+from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, LidarMap, Recording, Trajectory
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.lidar.surface import smoothed
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
@@ -193,11 +186,7 @@ def _spaced(p: FloatArray) -> IntArray:
 
 
 def calibrate_suite_file(
-    bags: Sequence[Path],
-    out: Path,
-    config: Config,
-    known: Path | None,
-    progress: Progress,
+    bags: Sequence[Path], out: Path, config: Config, known: Path | None, progress: Progress
 ) -> CalibrationResult:
     """Calibrate the sensors of mapping bags and write the calibration.
 

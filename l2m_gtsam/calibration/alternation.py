@@ -16,12 +16,7 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.solve.closed_form import (
-    ClosedFormOptions,
-    fit_distortion,
-    ridge_unit,
-    row_weights,
-)
+from l2m_gtsam.solve.closed_form import ClosedFormOptions, fit_distortion, ridge_unit, row_weights
 from l2m_gtsam.solve.noise import estimate_noise
 from l2m_gtsam.solve.rank import RankOptions
 from l2m_gtsam.solve.robust import RobustOptions

@@ -17,12 +17,7 @@ from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.data import (
-    FloatArray,
-    Readings,
-    Recording,
-    SourceFile,
-)
+from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread

@@ -86,11 +86,7 @@ class Scores:
 
 
 def unmodelled(
-    readings: Readings,
-    rows: Sequence[Rows],
-    own: IntArray,
-    covariance: FloatArray,
-    tests: int,
+    readings: Readings, rows: Sequence[Rows], own: IntArray, covariance: FloatArray, tests: int
 ) -> Unmodelled:
     """Return how far variances of one sensor exceed those that the model explains.
 

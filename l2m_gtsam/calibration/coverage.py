@@ -29,19 +29,15 @@ class MapErrors(Protocol):
     @property
     def covariance(self) -> FloatArray:
         """Covariance of all beta, tile by tile, shape (K, K)."""
-        ...
 
     def sizes(self) -> dict[int, int]:
         """Return the number of beta of each tile."""
-        ...
 
     def owner(self, points: FloatArray, /) -> IntArray:
         """Return the tile whose beta act at each point, shape (N,)."""
-        ...
 
     def features(self, points: FloatArray, tile: int, /) -> FloatArray:
         """Return A of a tile at points in uT, shape (N, 3, r)."""
-        ...
 
 
 @runtime_checkable
@@ -50,7 +46,6 @@ class UncertainMap(Protocol):
 
     def errors_over(self, points: FloatArray, /) -> MapErrors:
         """Return the map's error over places, shape (N, 3), in metres."""
-        ...
 
 
 class NothingShared:

@@ -26,10 +26,7 @@ MOSTLY = 2.0
 
 
 def determinacies(
-    jacobians: Mapping[int, FloatArray],
-    priors: Priors,
-    values: gtsam.Values,
-    options: RankOptions,
+    jacobians: Mapping[int, FloatArray], priors: Priors, values: gtsam.Values, options: RankOptions
 ) -> dict[int, Determinacy]:
     """Test the rank of every sensor.
 

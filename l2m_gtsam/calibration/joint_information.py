@@ -150,10 +150,7 @@ class JointInformation:
 
 
 def joint_information(
-    columns: Mapping[int, slice],
-    rows: Sequence[Rows],
-    weights: FloatArray,
-    at: FloatArray,
+    columns: Mapping[int, slice], rows: Sequence[Rows], weights: FloatArray, at: FloatArray
 ) -> JointInformation:
     """Solve a linear system.
 

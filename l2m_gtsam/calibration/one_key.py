@@ -159,7 +159,6 @@ class SharedFinish(Protocol):
         options: OneKeyOptions,
     ) -> UncertainSolution:
         """Return the solutions from the optimum with independent errors."""
-        ...
 
 
 @dataclass(frozen=True)

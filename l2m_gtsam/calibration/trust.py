@@ -14,14 +14,7 @@ from l2m_gtsam.calibration.view import QueryableMap, View, places_of
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.solve.disagreement import Judged
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
-from l2m_gtsam.solve.robust import (
-    WEIGHTS,
-    Loss,
-    RobustOptions,
-    consistent,
-    grown,
-    median_noise,
-)
+from l2m_gtsam.solve.robust import WEIGHTS, Loss, RobustOptions, consistent, grown, median_noise
 
 # Stages of the graduation; what is wrong by far is left out before, so that few are enough.
 GRADUATION = (1.0, 10.0, float("inf"))

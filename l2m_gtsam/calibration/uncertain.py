@@ -18,13 +18,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import (
-    D,
-    Q,
-    UncertainReadings,
-    uncertain_block_factor,
-    uncertain_reading_factor,
-)
+from l2m_factors import D, Q, UncertainReadings, uncertain_block_factor, uncertain_reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.cluster_robust import unmodelled
 from l2m_gtsam.calibration.contradictions import contradictions

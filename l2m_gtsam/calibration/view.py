@@ -14,11 +14,9 @@ class QueryableMap(Protocol):
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, smoothly extended beyond the data."""
-        ...
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
-        ...
 
 
 @runtime_checkable
@@ -27,7 +25,6 @@ class Compilable(Protocol):
 
     def compile(self) -> QueryableMap:
         """Return that form."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -108,12 +108,7 @@ def plan(
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import plan_bag
-        from l2m_gtsam.cli.tables.drives import (
-            advice,
-            held_plan_note,
-            motion_table,
-            plan_table,
-        )
+        from l2m_gtsam.cli.tables.drives import advice, held_plan_note, motion_table, plan_table
         from l2m_gtsam.config import load_config, with_poses
         from l2m_gtsam.storage.calibration_file import UNCERTAINTY
 

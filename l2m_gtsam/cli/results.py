@@ -77,8 +77,7 @@ def validate(
         typer.Option("--config", help="YAML configuration; that of the calibration if absent."),
     ] = None,
     out: Annotated[
-        Path | None,
-        typer.Option("--out", help="Folder for validation.json and validation.html."),
+        Path | None, typer.Option("--out", help="Folder for validation.json and validation.html.")
     ] = None,
     poses: PosesOption = None,
     times: PoseTimesOption = None,

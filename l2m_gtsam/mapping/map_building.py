@@ -138,9 +138,7 @@ def compare_recordings(
 
 @one_blas_thread()
 def suite_readings(
-    recordings: Sequence[Recording],
-    suite: Mapping[str, KnownSensor] | None,
-    sync: SyncOptions,
+    recordings: Sequence[Recording], suite: Mapping[str, KnownSensor] | None, sync: SyncOptions
 ) -> TrainingSet:
     """Return what a suite read, in the map frame; see ``map_recordings``."""
     frames = sorted({recording.trajectory.frame for recording in recordings})

@@ -6,14 +6,7 @@ from importlib.metadata import version
 
 import numpy as np
 
-from l2m_gtsam.data import (
-    Distortion,
-    FloatArray,
-    KnownSensor,
-    Readings,
-    Recording,
-    SyncCounts,
-)
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_solver import SuiteSolution, solve_suite

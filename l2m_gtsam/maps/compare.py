@@ -413,6 +413,8 @@ def standard_error(values: FloatArray, patch: IntArray) -> float:
     Values of one patch are taken as one: the sums over the patches are independent, not the
     values (the linearised variance of a ratio over clusters; Cochran, Sampling Techniques, 1977).
     """
+    # Readings of a patch are correlated: their sums, not they, count as independent (Liang and
+    # Zeger, Biometrika 73:13, 1986).
     sums = np.bincount(patch, values - values.mean())
     patches = len(sums)
     return float(np.sqrt(np.sum(sums**2) * patches / (patches - 1)) / len(values))

@@ -11,23 +11,13 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 
-from l2m_gtsam.data import FieldSample, FloatArray, MapState
+from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.field_map import masked
 from l2m_gtsam.maps.hyperparameters import not_definite
-from l2m_gtsam.maps.trained import (
-    GPOptions,
-    Trained,
-    extended,
-    options_from_state,
-    train,
-    trained_from_state,
-    trained_summary,
-    trained_to_state,
-)
-from l2m_gtsam.maps.training import TrainingSet, checked_points
+from l2m_gtsam.maps.trained import GPMap, GPOptions, Trained
+from l2m_gtsam.maps.training import checked_points
 
-KIND = "dense_gp"
 MOST_ROWS = 6000  # the factor of as many takes 290 MB
 BATCH = 64  # points whose differences to all readings are in memory at once
 
@@ -37,51 +27,21 @@ class DenseGPOptions(GPOptions):
 
 
 @dataclass(frozen=True)
-class DenseGP:
+class DenseGP(GPMap[DenseGPOptions]):
     """A field map of one Gaussian process.
 
     Attributes
     ----------
-    trained
-        Training readings (map frame, metres and uT) and hyperparameters.
-    options
-        Options of the process, lengths in length scales.
-    mean
-        Prior mean per axis in microtesla, shape (3,).
     factor
         Lower Cholesky factor of the readings' covariance in microtesla, shape (M, M).
     alpha
         Weights of the readings in 1/microtesla, shape (M, 3).
     """
 
-    trained: Trained
-    options: DenseGPOptions
-    mean: FloatArray
+    kind = "dense_gp"
+    model = DenseGPOptions
     factor: FloatArray
     alpha: FloatArray
-
-    @classmethod
-    def fit(
-        cls, points: FloatArray, field: FloatArray, options: DenseGPOptions | None = None
-    ) -> "DenseGP":
-        """Return the map of readings.
-
-        Parameters
-        ----------
-        points
-            Positions of the readings in the map frame in metres, shape (N, 3).
-        field
-            Readings in the map frame in microtesla, shape (N, 3).
-        options
-            Defaults where absent.
-
-        Raises
-        ------
-        MapError
-            If no map can be made of the readings.
-        """
-        options = DenseGPOptions() if options is None else options
-        return cls.condition(train(points, field, options), options)
 
     @classmethod
     def condition(cls, trained: Trained, options: DenseGPOptions) -> "DenseGP":
@@ -95,7 +55,7 @@ class DenseGP:
         readings = trained.readings
         if len(readings) > MOST_ROWS:
             raise MapError(
-                f"a map of kind {KIND} holds at most {MOST_ROWS} training readings after "
+                f"a map of kind {cls.kind} holds at most {MOST_ROWS} training readings after "
                 f"thinning, got {len(readings)}; kind sliding_gp has no such limit"
             )
         K = covariance(trained, readings.points) + np.diag(trained.noise_variance)
@@ -103,35 +63,10 @@ class DenseGP:
             factor = cholesky(K, lower=True)
         except LinAlgError:
             raise MapError(not_definite(trained.hyperparameters)) from None
+        # The mean is k^T alpha with alpha = (K + noise)^-1 (y - mean) (Rasmussen and Williams 2006,
+        # 2.25).
         alpha = cho_solve((factor, True), readings.field - readings.mean)
         return cls(trained, options, readings.mean, factor, alpha)
-
-    @classmethod
-    def from_state(cls, state: MapState) -> "DenseGP":
-        """Return the map that ``to_state`` took apart.
-
-        Raises
-        ------
-        MapError
-            If the state is damaged.
-        """
-        options = options_from_state(state, DenseGPOptions)
-        return cls.condition(trained_from_state(state), options)
-
-    @property
-    def kind(self) -> str:
-        """Name of the map kind."""
-        return KIND
-
-    @property
-    def readings(self) -> TrainingSet:
-        """Readings in the map frame, thinned."""
-        return self.trained.readings
-
-    @property
-    def summary(self) -> MapSummary:
-        """Figures of the map."""
-        return trained_summary(KIND, self.trained, {})
 
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
@@ -162,21 +97,10 @@ class DenseGP:
         prior = self.trained.hyperparameters.signal**2
         variances = [np.empty(0)]
         for batch in batches(checked_points(points)):
+            # As L^-1 k: the explained variance is a sum of squares, and no inverse is formed.
             V = solve_triangular(self.factor, covariance(self.trained, batch).T, lower=True)
             variances.append(np.maximum(prior - np.sum(V**2, axis=0), 0.0))
         return np.repeat(np.concatenate(variances)[:, None], 3, axis=1)
-
-    def updated(self, points: FloatArray, field: FloatArray, /) -> "DenseGP":
-        """Return the map with more readings and the same hyperparameters; see ``FieldMap``.
-
-        The prior mean is that of all readings, as in a map that was given them at once.
-        """
-        trained = extended(self.trained, points, field, self.options)
-        return self.condition(trained, self.options)
-
-    def to_state(self) -> MapState:
-        """Return the map as plain arrays and facts."""
-        return trained_to_state(KIND, self.trained, self.options)
 
 
 def covariance(trained: Trained, points: FloatArray) -> FloatArray:

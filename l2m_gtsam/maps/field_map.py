@@ -45,7 +45,6 @@ class Summarised(Protocol):
     @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
-        ...
 
 
 @runtime_checkable
@@ -55,7 +54,6 @@ class Surveyed(Protocol):
     @property
     def readings(self) -> TrainingSet:
         """Readings in the map frame, thinned or averaged."""
-        ...
 
 
 class FieldMap(Protocol):
@@ -64,12 +62,10 @@ class FieldMap(Protocol):
     @property
     def kind(self) -> str:
         """Name of the map kind, as in the registry of ``build``."""
-        ...
 
     @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
-        ...
 
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance at points, shape (N, 3), in metres.
@@ -81,7 +77,6 @@ class FieldMap(Protocol):
         MapError
             If a point is not finite or the shape is wrong.
         """
-        ...
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m, also outside of the map.
@@ -94,7 +89,6 @@ class FieldMap(Protocol):
         MapError
             If a point is not finite or the shape is wrong.
         """
-        ...
 
     def variance(self, points: FloatArray) -> FloatArray:
         """Return the posterior variance per axis in uT^2, shape (N, 3), also outside of the map.
@@ -104,7 +98,6 @@ class FieldMap(Protocol):
         MapError
             If a point is not finite or the shape is wrong.
         """
-        ...
 
     def updated(self, points: FloatArray, field: FloatArray, /) -> "FieldMap":
         """Return the map with more readings, shapes (N, 3) in metres and uT, and the same prior.
@@ -116,11 +109,9 @@ class FieldMap(Protocol):
         MapError
             If the readings are not fit for a map.
         """
-        ...
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""
-        ...
 
 
 def unknown(count: int) -> FieldSample:

@@ -143,6 +143,8 @@ def log_likelihood(near: Neighbourhood, hyperparameters: KernelHyperparameters) 
     alpha, _ = lapack.dpotrs(L, near.residual, lower=True)
     lower, _ = lapack.dpotri(L, lower=True)
     inverse = np.tril(lower) + np.tril(lower, -1).T
+    # dL/dp = tr((a a^T - K^-1) dK/dp) / 2 (Rasmussen and Williams 2006, equation 5.9); the three
+    # axes share K, hence their sum.
     evidence = alpha @ alpha.T - AXES * inverse
     weighted = evidence * signal
     value = -0.5 * np.sum(near.residual * alpha)
@@ -210,8 +212,12 @@ def start_from_pairs(readings: TrainingSet, seed: int) -> KernelHyperparameters:
     half_squared = 0.5 * pdist(readings.field[rows], "sqeuclidean") / AXES
     order = np.argsort(distance)
     parts = np.array_split(order, min(200, len(order)))
+    # Half the mean square of differences over distance is the variogram: it rises from the noise at
+    # no distance to the signal beyond the length scale.
     at = np.array([distance[part].mean() for part in parts])
     level = np.array([half_squared[part].mean() for part in parts])
+    # At one length scale the kernel has fallen to exp(-1/2), the variogram risen to 0.39 of the
+    # signal.
     reached = int(np.argmax(level >= min(0.39 * signal**2, level.max())))
     length_scale = max(float(at[reached]), 1e-3 * extent, SHORTEST)
     noise = float(np.clip(np.sqrt(level[0]), 1e-2 * signal, 0.5 * signal))
@@ -232,6 +238,7 @@ def maximise(
     """Return the maximum of the summed likelihood of neighbourhoods drawn at random."""
     sample = thinned(readings, start.length_scale, thinning)
     drawn = draw_neighbourhoods(sample, options)
+    # In logarithms all three are unbounded, and the search does not depend on their units.
     x0 = np.log([start.length_scale, start.signal, start.noise])
     low, high = log_bounds(sample)
 

@@ -14,25 +14,15 @@ from typing import Any, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
+from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.field_map import MapSummary, masked
+from l2m_gtsam.maps.field_map import masked
 from l2m_gtsam.maps.grid import Grid, grid_over
 from l2m_gtsam.maps.kernel_sum import KernelSums
 from l2m_gtsam.maps.posterior import Posterior, condition
-from l2m_gtsam.maps.trained import (
-    GPOptions,
-    Trained,
-    extended,
-    options_from_state,
-    train,
-    trained_from_state,
-    trained_summary,
-    trained_to_state,
-)
-from l2m_gtsam.maps.training import TrainingSet, checked_points
+from l2m_gtsam.maps.trained import GPMap, GPOptions, Trained
+from l2m_gtsam.maps.training import checked_points
 
-KIND = "sliding_gp"
 MOST_IN_BLOCK = 6000  # rows; the whitener of such a block takes 290 MB
 FACTOR_MEMORY = 1e9  # bytes of whiteners that are kept for variances
 BATCH = 256  # points whose kernel rows are in memory, and about in cache, at once
@@ -72,51 +62,21 @@ class BlockQuery:
 
 
 @dataclass(frozen=True)
-class SlidingGP:
+class SlidingGP(GPMap[SlidingGPOptions]):
     """A field map of Gaussian processes on square blocks.
 
     Attributes
     ----------
-    trained
-        Training readings (map frame, metres and uT) and hyperparameters.
-    options
-        Options of the process, lengths in length scales.
-    mean
-        Prior mean per axis in microtesla, shape (3,).
     grid
         Square blocks in x and y of the map frame, metres.
     blocks
         One posterior per block of the grid.
     """
 
-    trained: Trained
-    options: SlidingGPOptions
-    mean: FloatArray
+    kind = "sliding_gp"
+    model = SlidingGPOptions
     grid: Grid
     blocks: tuple[Posterior, ...]
-
-    @classmethod
-    def fit(
-        cls, points: FloatArray, field: FloatArray, options: SlidingGPOptions | None = None
-    ) -> "SlidingGP":
-        """Return the map of readings.
-
-        Parameters
-        ----------
-        points
-            Positions of the readings in the map frame in metres, shape (N, 3).
-        field
-            Readings in the map frame in microtesla, shape (N, 3).
-        options
-            Defaults where absent.
-
-        Raises
-        ------
-        MapError
-            If no map can be made of the readings.
-        """
-        options = SlidingGPOptions() if options is None else options
-        return cls.condition(train(points, field, options), options)
 
     @classmethod
     def condition(cls, trained: Trained, options: SlidingGPOptions) -> "SlidingGP":
@@ -135,18 +95,6 @@ class SlidingGP:
         blocks = tuple(posteriors(trained, members))
         return cls(trained, options, readings.mean, grid, blocks)
 
-    @classmethod
-    def from_state(cls, state: MapState) -> "SlidingGP":
-        """Return the map that ``to_state`` took apart.
-
-        Raises
-        ------
-        MapError
-            If the state is damaged.
-        """
-        options = options_from_state(state, SlidingGPOptions)
-        return cls.condition(trained_from_state(state), options)
-
     def __reduce__(self) -> tuple[Any, ...]:
         # Factors of all blocks are hundreds of times as large as what they follow from.
         return SlidingGP.condition, (self.trained, self.options)
@@ -157,26 +105,15 @@ class SlidingGP:
         return KernelSums.of(self.blocks)
 
     @property
-    def kind(self) -> str:
-        """Name of the map kind."""
-        return KIND
-
-    @property
-    def readings(self) -> TrainingSet:
-        """Readings in the map frame, thinned."""
-        return self.trained.readings
-
-    @property
-    def summary(self) -> MapSummary:
-        """Figures of the map."""
+    def facts(self) -> dict[str, Any]:
+        """Number and size of the blocks."""
         sizes = [len(block.y) for block in self.blocks]
-        facts = {
+        return {
             "blocks": len(sizes),
             "block (m)": self.grid.size,
             "readings in a block (median)": int(np.median(sizes)),
             "readings in a block (most)": max(sizes),
         }
-        return trained_summary(KIND, self.trained, facts)
 
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
@@ -204,18 +141,6 @@ class SlidingGP:
             block, at = self.blocks[visit.block], visit.rows
             variance[at] = block.variance(block.rows(points[at]))[:, None]
         return variance
-
-    def updated(self, points: FloatArray, field: FloatArray, /) -> "SlidingGP":
-        """Return the map with more readings and the same hyperparameters; see ``FieldMap``.
-
-        The prior mean is that of all readings, as in a map that was given them at once.
-        """
-        trained = extended(self.trained, points, field, self.options)
-        return self.condition(trained, self.options)
-
-    def to_state(self) -> MapState:
-        """Return the map as plain arrays and facts."""
-        return trained_to_state(KIND, self.trained, self.options)
 
     def _visits(self, points: FloatArray) -> Iterator[BlockQuery]:
         """Yield every point once, block by block and batch by batch."""

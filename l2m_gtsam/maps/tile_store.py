@@ -38,7 +38,6 @@ class TileStore(Protocol):
     @property
     def takes_more(self) -> bool:
         """Whether what is given to it now is kept."""
-        ...
 
     def recall(self, entry: Entry, decode: Callable[[Arrays], Made], /) -> Made | None:
         """Return what an entry decodes to, or None.
@@ -50,15 +49,12 @@ class TileStore(Protocol):
         decode
             Raises a MapError for arrays that make no sense.
         """
-        ...
 
     def keep(self, entry: Entry, arrays: Arrays, /) -> None:
         """Keep an entry in place of the one that has its name."""
-        ...
 
     def sweep(self, wanted: Collection[Entry], /) -> None:
         """Remove all entries but these."""
-        ...
 
 
 class NoStore:

@@ -1,7 +1,8 @@
 """What every Gaussian-process map is made of: training readings and hyperparameters."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,7 @@ class GPOptions(Options):
 
 
 AnyOptions = TypeVar("AnyOptions", bound=Options)
+AnyGPOptions = TypeVar("AnyGPOptions", bound=GPOptions)
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,106 @@ class Trained:
     def noise_variance(self) -> FloatArray:
         """Variance of the noise of each row in square microtesla, shape (N,)."""
         return self.hyperparameters.noise**2 / self.readings.weight
+
+
+@dataclass(frozen=True)
+class GPMap(ABC, Generic[AnyGPOptions]):
+    """What the Gaussian-process maps have in common: all but how they are conditioned and asked.
+
+    Attributes
+    ----------
+    kind
+        Name of the map kind.
+    model
+        Class of its options.
+    trained
+        Training readings in the map frame and hyperparameters.
+    options
+        Effective options.
+    mean
+        Prior mean in uT, shape (3,).
+    """
+
+    kind: ClassVar[str]
+    model: ClassVar[Any]
+    trained: Trained
+    options: AnyGPOptions
+    mean: FloatArray
+
+    @classmethod
+    def fit(
+        cls, points: FloatArray, field: FloatArray, options: AnyGPOptions | None = None
+    ) -> Self:
+        """Return the map of readings in the map frame, shapes (N, 3) in metres and (N, 3) in uT.
+
+        Raises
+        ------
+        MapError
+            If the readings are not fit for a map of this kind.
+        """
+        options = cls.model() if options is None else options
+        return cls.condition(train(points, field, options), options)
+
+    @classmethod
+    @abstractmethod
+    def condition(cls, trained: Trained, options: AnyGPOptions) -> Self:
+        """Return the map of training readings whose hyperparameters are known.
+
+        Raises
+        ------
+        MapError
+            If there are too many readings, or their covariance is not positive definite.
+        """
+
+    @classmethod
+    def from_state(cls, state: MapState) -> Self:
+        """Return the map that ``to_state`` took apart.
+
+        Raises
+        ------
+        MapError
+            If the state is damaged.
+        """
+        options = options_from_state(state, cls.model)
+        return cls.condition(trained_from_state(state), options)
+
+    @property
+    def readings(self) -> TrainingSet:
+        """Training readings in the map frame, thinned."""
+        return self.trained.readings
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What a kind adds to its summary."""
+        return {}
+
+    @property
+    def summary(self) -> MapSummary:
+        """Figures of the map."""
+        points, known = self.readings.points, self.trained.hyperparameters
+        learning = self.trained.origin.learning
+        return MapSummary(
+            kind=self.kind,
+            readings=self.trained.origin.readings,
+            rows=len(points),
+            lower=points.min(axis=0),
+            upper=points.max(axis=0),
+            facts={
+                "length scale (m)": known.length_scale,
+                "signal (uT)": known.signal,
+                "noise of a reading (uT)": known.noise,
+                "hyperparameters": "given" if learning is None else describe(learning),
+                **self.facts,
+            },
+        )
+
+    def updated(self, points: FloatArray, field: FloatArray, /) -> Self:
+        """Return the map with more readings and the same hyperparameters; see ``FieldMap``."""
+        return self.condition(extended(self.trained, points, field, self.options), self.options)
+
+    def to_state(self) -> MapState:
+        """Return the map as plain arrays and facts."""
+        return trained_to_state(self.kind, self.trained, self.options)
 
 
 def train(points: FloatArray, field: FloatArray, options: GPOptions) -> Trained:
@@ -204,25 +306,6 @@ def first_complaint(error: ValidationError) -> str:
     """Return the first complaint of pydantic as one line."""
     detail = error.errors()[0]
     return f"{'.'.join(str(part) for part in detail['loc'])}: {detail['msg']}"
-
-
-def trained_summary(kind: str, trained: Trained, facts: dict[str, Any]) -> MapSummary:
-    """Return the figures of a map, with what its kind adds."""
-    points, learning = trained.readings.points, trained.origin.learning
-    return MapSummary(
-        kind=kind,
-        readings=trained.origin.readings,
-        rows=len(points),
-        lower=points.min(axis=0),
-        upper=points.max(axis=0),
-        facts={
-            "length scale (m)": trained.hyperparameters.length_scale,
-            "signal (uT)": trained.hyperparameters.signal,
-            "noise of a reading (uT)": trained.hyperparameters.noise,
-            "hyperparameters": "given" if learning is None else describe(learning),
-            **facts,
-        },
-    )
 
 
 def describe(learning: LikelihoodFit) -> str:

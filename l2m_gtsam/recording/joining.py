@@ -172,11 +172,7 @@ def _same(one: Recording, other: Recording) -> bool:
 
 def _when(recording: Recording) -> tuple[int, str, str]:
     """Return what orders drives: their start; of clocks that start alike anything that is fixed."""
-    return (
-        int(recording.trajectory.stamp_ns[0]),
-        recording.source.sha256,
-        recording.source.path,
-    )
+    return (int(recording.trajectory.stamp_ns[0]), recording.source.sha256, recording.source.path)
 
 
 def _moved_ns(trajectories: Sequence[Trajectory]) -> tuple[int, ...]:

@@ -6,14 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import (
-    BoolArray,
-    FloatArray,
-    IntArray,
-    Readings,
-    ScalarSeries,
-    Synchronised,
-)
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings, ScalarSeries, Synchronised
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.options import Options
 

@@ -13,15 +13,7 @@ import numpy as np
 from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
-from l2m_gtsam.data import (
-    Distortion,
-    FloatArray,
-    InFile,
-    Matrix,
-    SourceFile,
-    SyncCounts,
-    Vector,
-)
+from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
 from l2m_gtsam.records.drive_trace import DriveTrace
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement

@@ -169,10 +169,7 @@ def _induced(
 
 
 def _remanent(
-    options: WarehouseOptions,
-    dimensions: FloatArray,
-    fill: FloatArray,
-    rng: np.random.Generator,
+    options: WarehouseOptions, dimensions: FloatArray, fill: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
     """Return the remanent polarisation in tesla, shape (N, 3)."""
     along = dimensions == dimensions.max(axis=1, keepdims=True)
@@ -226,9 +223,7 @@ def _hall_beams(options: WarehouseOptions, plan: FloorPlan) -> Parts:
     x = spread(0.0, plan.length, options.post_pitch)
     levels = np.array([options.hall_height + section.height / 2, -options.floor_beam_depth])
     places = grid(x, np.array([0.25, 0.75]) * plan.width)
-    centres = np.column_stack(
-        [np.tile(places, (len(levels), 1)), np.repeat(levels, len(places))],
-    )
+    centres = np.column_stack([np.tile(places, (len(levels), 1)), np.repeat(levels, len(places))])
     return alike("hall beam", section, (section.breadth, plan.width / 2, section.height), centres)
 
 

@@ -116,11 +116,7 @@ class _Carrier:
     """Transfers poses and covariances from scans to the key poses nearest in time."""
 
     def __init__(
-        self,
-        stamp_ns: IntArray,
-        trajectory: Trajectory,
-        rows: IntArray,
-        options: DriftOptions,
+        self, stamp_ns: IntArray, trajectory: Trajectory, rows: IntArray, options: DriftOptions
     ) -> None:
         stamps, self._options = np.unique(stamp_ns), options
         at, keys = interpolated(trajectory, stamps), trajectory.stamp_ns[rows]

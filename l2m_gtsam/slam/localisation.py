@@ -6,13 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.data import (
-    FloatArray,
-    Readings,
-    Recording,
-    RigidTransform,
-    Trajectory,
-)
+from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -111,12 +105,7 @@ def localise(
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, decoys)
-    result = replace(
-        result,
-        notes=(*notes, *result.notes),
-        bag=recording.source,
-        start=search,
-    )
+    result = replace(result, notes=(*notes, *result.notes), bag=recording.source, start=search)
     return Localisation(result, solution)
 
 

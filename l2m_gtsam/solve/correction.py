@@ -35,7 +35,10 @@ def corrected(
     spread = np.full((len(readings), 3, 3), np.nan)
     b[known] = distortion.undo(readings[known])
     J = _jacobian(b[known])
+    # First-order propagation of errors: z = C b + H, of calibration and sensor noise, which are
+    # independent.
     of_reading = J @ covariance @ J.transpose(0, 2, 1) + variance[known, :, None] * np.eye(3)
+    # C^-1 S C^-T by two solves: no inverse is formed.
     half = np.linalg.solve(distortion.C, of_reading)
     found = np.linalg.solve(distortion.C, half.transpose(0, 2, 1))
     spread[known] = (found + found.transpose(0, 2, 1)) / 2

@@ -96,6 +96,7 @@ def passed_again(judged: Judged, rows: IntArray) -> Return:
     """Return what the same sensors read at the same place at another time."""
     readings, stamps = judged.readings, judged.readings.stamp_ns
     low, high = stamps[rows].min() - LATER_S * 1e9, stamps[rows].max() + LATER_S * 1e9
+    # Another passage, by the same sensors: a later time, or an earlier one.
     other = np.isin(readings.sensor, readings.sensor[rows]) & ((stamps < low) | (stamps > high))
     other &= np.isfinite(judged.place).all(axis=1)
     if not other.any():

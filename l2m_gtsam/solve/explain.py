@@ -223,6 +223,8 @@ def _both(rows: FloatArray, drive: DriveFacts, options: RankOptions) -> tuple[st
 
 def _not_imitated(slope: FloatArray, b_lidar: FloatArray) -> FloatArray:
     """Return what a regression on (1, b) leaves of the slopes, shape (N, 3, 3)."""
+    # C and H can imitate whatever is linear in the field and constant: only what is orthogonal to
+    # it shows the place.
     Q, _ = np.linalg.qr(np.column_stack([np.ones(len(b_lidar)), b_lidar]))
     flat = slope.reshape(len(slope), -1)
     return np.asarray((flat - Q @ (Q.T @ flat)).reshape(slope.shape))

@@ -63,6 +63,7 @@ def triangular_information_root(covariance: FloatArray, ridge: float) -> FloatAr
 def correlation_factor(covariance: FloatArray, ridge: float) -> FloatArray:
     """Return the lower Cholesky factor of a covariance's correlations; as above."""
     sigma = np.sqrt(np.diag(covariance))
+    # Metres beside microtesla: scaled to correlations before factorising.
     correlation = covariance / np.outer(sigma, sigma) + ridge * np.eye(len(sigma))
     return np.asarray(cholesky(correlation, lower=True, check_finite=False))
 

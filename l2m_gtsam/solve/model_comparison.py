@@ -15,10 +15,11 @@ taken together.
    criteria", 2010): many times where its regressor varies as slowly as the map's errors, once where
    it is quick. Differences are divided by that factor to read as odds.
 
-``model_choice`` states how the two decide.
+``choose`` states how the two decide.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
@@ -27,11 +28,119 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.sensor_models import ONE_DRIVE, Model, ModelComparison, ModelFigures, Samples
-from l2m_gtsam.solve.model_choice import Choice, HeldOut, Trial, choose, reason_of, standard_error
 from l2m_gtsam.solve.model_fits import Fit, Spread, compress, fit_model, inflation, spread_of
 
 PER_COLUMN = 4  # readings, at the least
 PER_SEGMENT = 4
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How a model predicts segments that it was not fitted to.
+
+    Attributes
+    ----------
+    rms
+        Of the errors per axis in uT, over all of them.
+    scores
+        Mean logarithm of the density of a reading in 1/uT^3 in each of S segments, shape (S,).
+    """
+
+    rms: float
+    scores: FloatArray
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A model with all that it is judged by."""
+
+    model: Model
+    fit: Fit
+    spread: Spread
+    rms: float
+    held_out: HeldOut
+    bic: float
+
+    def lead(self, other: "Trial") -> tuple[float, float]:
+        """Return by how much another's score is behind, and the standard error of that."""
+        difference = self.held_out.scores - other.held_out.scores
+        return float(difference.mean()), standard_error(difference)
+
+    def above(self, least: "Trial") -> float:
+        """Return how much more its BIC is than the least, in units that read as odds."""
+        more = self.fit.parameters - least.fit.parameters
+        counted = (
+            (self.spread.freedom - least.spread.freedom) / more
+            if more
+            else self.spread.freedom / self.fit.parameters
+        )
+        return (self.bic - least.bic) / max(counted, 1.0)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The recommended model beside those that it is judged by.
+
+    Attributes
+    ----------
+    chosen
+        Recommended model.
+    best
+        Of those that the BIC admits, the one that predicts held-out segments best.
+    least
+        Model of least BIC.
+    """
+
+    chosen: Trial
+    best: Trial
+    least: Trial
+
+
+def choose(trials: list[Trial], strong: float) -> Choice:
+    """Return the simplest adequate model.
+
+    Parameters
+    ----------
+    trials
+        Models from few parameters to many.
+    strong
+        By how much a BIC above the least rejects a model.
+    """
+    least = min(trials, key=lambda trial: trial.bic)
+    admitted = [trial for trial in trials if trial.above(least) <= strong]
+    best = max(admitted, key=lambda trial: trial.held_out.scores.mean())
+    near = [trial for trial in admitted if _is_near(best, trial)]
+    return Choice(min(near, key=lambda trial: trial.fit.parameters), best, least)
+
+
+def _is_near(best: Trial, trial: Trial) -> bool:
+    behind, error = best.lead(trial)
+    return behind <= error
+
+
+def standard_error(values: FloatArray) -> float:
+    """Return the standard error of the mean over segments, shape (S,)."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values)))
+
+
+def reason_of(choice: Choice, trials: list[Trial]) -> str:
+    """Return why a model is recommended, as a sentence."""
+    chosen, best = choice.chosen, choice.best
+    why = f"{chosen.model} predicts held-out segments best"
+    if chosen is not best:
+        why = f"{chosen.model} predicts held-out segments as well as {best.model} does"
+        why += f" ({_deficit(best, chosen)})"
+    simpler = [t for t in trials if t.fit.parameters < chosen.fit.parameters]
+    if not simpler:
+        return why
+    next_ = max(simpler, key=lambda trial: trial.fit.parameters)
+    above = next_.above(choice.least)
+    return f"{why}; {next_.model} is {_deficit(best, next_)}, its BIC {above:.0f} above the least"
+
+
+def _deficit(best: Trial, trial: Trial) -> str:
+    behind, error = best.lead(trial)
+    return f"{behind:.2g} per reading behind, with a standard error of {error:.2g}"
 
 
 class ModelOptions(Options):
@@ -99,6 +208,8 @@ def models_for(samples: Samples) -> list[Model]:
 def trial_of(samples: Samples, model: Model, fit: Fit, spread: Spread, held_out: HeldOut) -> Trial:
     """Return a model with its rms and its BIC."""
     values = samples.z.size
+    # Schwarz 1978, with the effective number of parameters in place of their count, as residuals
+    # are correlated.
     bic = values * np.log(fit.squares / values) + spread.freedom * np.log(values)
     rms = _rms(fit.coefficients.residual(samples))
     return Trial(model, fit, spread, rms, held_out, float(bic))
@@ -144,8 +255,11 @@ def correlation_of(residual: FloatArray, drives: Sequence[slice] = ONE_DRIVE) ->
     for rows in drives:
         own = residual[rows]
         n = len(own)
+        # Wiener and Khinchin: the autocovariance is the transform of the power. Twice the length,
+        # so that the end does not meet the beginning.
         power = np.abs(np.fft.rfft(own, 2 * n, axis=0)) ** 2
         covariance[:n] += np.fft.irfft(power, 2 * n, axis=0)[:n].sum(axis=1)
+    # Beyond the first zero an estimated correlation is chance.
     covariance[np.cumsum(covariance <= 0) > 0] = 0.0
     covariance[0] = max(covariance[0], np.finfo(float).tiny)
     return np.asarray(covariance / covariance[0])

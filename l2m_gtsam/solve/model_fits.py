@@ -220,6 +220,8 @@ def _rotated(compressed: Compressed) -> Solution:
 
 def _nearest_rotation(compressed: Compressed, mirror: float) -> FloatArray:
     """Return the rotation that, times 1 or -1, explains most (W. Kabsch 1976)."""
+    # Orthogonal Procrustes problem: the rotation nearest in least squares (Schoenemann,
+    # Psychometrika 31:1, 1966), with det = 1 (Kabsch, Acta Crystallographica A32:922, 1976).
     U, _, Vt = np.linalg.svd(mirror * compressed.Y[1:4].T @ compressed.R[1:4, 1:4])
     # The direction of the least singular value costs least to flip where det would be -1.
     U[:, 2] *= np.sign(np.linalg.det(U @ Vt))

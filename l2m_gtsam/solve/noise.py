@@ -106,6 +106,7 @@ def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float)
         Degrees of freedom that the fit took: the number of its free parameters, less for those
         with a prior. At least half of the values are counted.
     """
+    # Bessel: each fitted parameter takes one degree of freedom from the residuals.
     left = max(residual.size - taken, residual.size / 2)
     e2, v = residual**2 * (residual.size / left), map_variance[:, None]
 

@@ -29,7 +29,7 @@ CONCENTRATIONS = 4  # fits, each on the readings that the one before explains be
 # Sums in any order and fused products: loops over readings run in vector registers.
 FAST = {"reassoc", "contract", "nsz"}
 
-Prediction = Callable[[FloatArray], tuple[FloatArray, BoolArray]]
+FieldPredictor = Callable[[FloatArray], tuple[FloatArray, BoolArray]]
 """Field in uT at points (N, 3) in metres, shape (N, 3), and whether it is known, shape (N,)."""
 
 
@@ -94,6 +94,7 @@ def interpolated(own: Readings, at: Readings) -> FloatArray:
     # At the very time of a reading the other one does not matter.
     near = (close(a, at) | (share == 1)) & (close(b, at) | (share == 0))
     near &= (share >= 0) & (share <= 1)
+    # A value between two drives was never read.
     near &= (a.of_drive == at.of_drive) & (b.of_drive == at.of_drive)
     field[near] = (a.field + share[:, None] * (b.field - a.field))[near]
     return field
@@ -124,7 +125,9 @@ class Misfits:
     known: FloatArray
 
 
-def misfits(snapshots: Snapshots, predict: Prediction, t: FloatArray, good: float = 1.0) -> Misfits:
+def misfits(
+    snapshots: Snapshots, predict: FieldPredictor, t: FloatArray, good: float = 1.0
+) -> Misfits:
     """Return how well candidates in the lidar frame, shape (G, 3), explain every sensor.
 
     Least trimmed squares by concentration (P. J. Rousseeuw, K. Van Driessen, "Computing LTS
@@ -170,12 +173,7 @@ def middle(field: FloatArray) -> FloatArray:
 
 @njit(cache=True, nogil=True)
 def write_trimmed(
-    b: FloatArray,
-    inside: FloatArray,
-    z: FloatArray,
-    has: FloatArray,
-    good: float,
-    rms: FloatArray,
+    b: FloatArray, inside: FloatArray, z: FloatArray, has: FloatArray, good: float, rms: FloatArray
 ) -> None:
     """Write what regressions on (1, b) leave of the readings that they explain best.
 

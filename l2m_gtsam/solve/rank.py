@@ -127,6 +127,8 @@ def determinacy(jacobian: FloatArray, options: RankOptions) -> Determinacy:
     options
         Largest useful sigmas of t (m), C, H (uT) and the offset (s).
     """
+    # In units of useful sigmas a singular value below one is a direction with a sigma above the
+    # useful one; QR instead of J^T J, which would square the condition number.
     triangular = np.asarray(np.linalg.qr(jacobian * options.scale(), mode="r"))
     square = np.zeros((15, 15))
     square[: len(triangular)] = triangular

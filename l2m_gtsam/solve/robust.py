@@ -76,6 +76,8 @@ def truncated_weights(r2: FloatArray, largest: float, mu: float) -> FloatArray:
     mu
         Small for a loss that is nearly convex; infinite for the truncated loss itself.
     """
+    # Truncated least squares by graduated non-convexity (Yang, Antonante, Tzoumas and Carlone, RA-L
+    # 5:2, 2020): mu near 0 is convex, infinity the truncated loss itself.
     if np.isinf(mu):
         return np.asarray(r2 <= largest, dtype=float)
     # Above one up to the lower threshold and negative beyond the upper one: clipping gives all

@@ -32,12 +32,7 @@ from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.path_topic import path_trajectory
 from l2m_gtsam.storage.pose_files import read_poses
-from l2m_gtsam.storage.selection import (
-    select_fields,
-    select_poses,
-    sensor_names,
-    several_frames,
-)
+from l2m_gtsam.storage.selection import select_fields, select_poses, sensor_names, several_frames
 from l2m_gtsam.storage.tf import Link, chain_frames, compose
 from l2m_gtsam.storage.units import field_fault, microtesla_per
 

@@ -256,10 +256,7 @@ def _transforms(T_lidar_mag: RigidTransform) -> dict[str, Any]:
 
 
 def _direction(transform: RigidTransform) -> dict[str, list[float]]:
-    return {
-        "translation": transform.t.tolist(),
-        "quaternion_xyzw": _quaternion(transform.R),
-    }
+    return {"translation": transform.t.tolist(), "quaternion_xyzw": _quaternion(transform.R)}
 
 
 def _quaternion(R: FloatArray) -> list[float]:

@@ -190,10 +190,7 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
 
 
 def _collected(
-    bag: Log,
-    usable: list[Connection],
-    sources: dict[int, FieldSource],
-    progress: Count | None,
+    bag: Log, usable: list[Connection], sources: dict[int, FieldSource], progress: Count | None
 ) -> dict[str, "_TopicBuffers"]:
     """Return what the messages on usable topics say."""
     collected: dict[str, _TopicBuffers] = {}

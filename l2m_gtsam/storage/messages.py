@@ -22,6 +22,7 @@ ROUNDING = 1e-6
 # map's field with poses that are worse than this, in metres and radians.
 MOST_POSITION = 100.0
 MOST_ROTATION = 1.0
+LATEST_US = 9_000_000_000_000_000  # nanoseconds after it do not fit into 64 bits
 
 
 @dataclass
@@ -196,7 +197,9 @@ def stamp_of(message: Any, record_ns: int) -> int:
     if hasattr(getattr(message, "header", None), "stamp"):
         return header_ns(message)
     taken_us = getattr(message, "timestamp_sample", 0) or getattr(message, "timestamp", 0)
-    return 1000 * int(taken_us) if isinstance(taken_us, int) and taken_us else record_ns
+    if isinstance(taken_us, int) and 0 < taken_us < LATEST_US:
+        return 1000 * taken_us
+    return record_ns
 
 
 def frame_of(message: Any) -> str:

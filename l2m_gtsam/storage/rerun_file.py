@@ -140,9 +140,6 @@ def _log_sensor(recording: "RecordingStream", view: SensorView, metres: float) -
         ("rejected", known & view.rejected, REJECTED),
     ):
         arrows = rr.Arrows3D(
-            origins=view.place[rows],
-            vectors=metres * view.misfit[rows],
-            colors=colour,
-            radii=0.005,
+            origins=view.place[rows], vectors=metres * view.misfit[rows], colors=colour, radii=0.005
         )
         recording.log(f"{entity}/{part}", arrows, static=True)

@@ -4,7 +4,10 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass, make_dataclass
+from io import StringIO
+from keyword import iskeyword
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +19,7 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bounded import opened
 from l2m_gtsam.storage.field_types import PX4_TYPE
 from l2m_gtsam.storage.log import TableLog, TableTopic
-from l2m_gtsam.storage.messages import PX4_POSE_TYPE
+from l2m_gtsam.storage.messages import LATEST_US, PX4_POSE_TYPE
 
 MAX_BYTES = 2_000_000_000
 TOO_LARGE = f"{{}}: larger than {MAX_BYTES // 1_000_000} MB; give a shorter log"
@@ -54,7 +57,8 @@ def read_ulog(path: Path) -> TableLog:
     except ImportError as error:
         raise BagError(f"{path}: {MISSING}") from error
     try:
-        with opened(path, BagError) as file:
+        # It prints what it thinks of damaged logs, names of strangers among it.
+        with opened(path, BagError) as file, redirect_stdout(StringIO()):
             if os.fstat(file.fileno()).st_size > MAX_BYTES:
                 raise BagError(TOO_LARGE.format(path))
             parsed = ULog(file).data_list
@@ -71,6 +75,8 @@ def read_ulog(path: Path) -> TableLog:
     ]
     if not topics:
         raise BagError(f"{path}: the log has no messages")
+    if late := [each.topic for each in topics if each.columns["timestamp"].max() > LATEST_US]:
+        raise BagError(f"{path}: damaged: times on {late[0]} are those of no log")
     channels = [_channel(each) for each in topics]
     if all(channel.msgtype != PX4_POSE_TYPE for channel in channels):
         channels.extend(_local_pose(topics))
@@ -85,8 +91,9 @@ def _channel(topic: _Topic) -> TableTopic:
     names, groups = list[str](), defaultdict[str, dict[int, str]](dict)
     for column in topic.columns:
         element = INDEXED.match(column)
-        name = (element[1] if element else column).replace(".", "_").replace("[", "_")
-        name = name.replace("]", "")
+        name = re.sub(r"\W+", "_", element[1] if element else column, flags=re.ASCII).strip("_")
+        if not name.isidentifier() or iskeyword(name):
+            continue
         groups[name][int(element[2]) if element else -1] = column
         if name not in names:
             names.append(name)
@@ -150,7 +157,8 @@ def _local_pose(topics: Sequence[_Topic]) -> Iterator[TableTopic]:
 def _sampled(columns: dict[str, np.ndarray[Any, Any]]) -> IntArray:
     """Return when a topic's messages were measured in microseconds, shape (N,)."""
     sampled = columns.get("timestamp_sample")
-    taken = columns["timestamp"] if sampled is None or not sampled.all() else sampled
+    unknown = sampled is None or not sampled.all() or sampled.max() > LATEST_US
+    taken = columns["timestamp"] if unknown or sampled is None else sampled
     return np.asarray(taken.astype(np.int64))
 
 

@@ -120,11 +120,7 @@ def cramer_rao(
     """
     none = np.zeros(1)
     truth = Estimate(
-        sensor.t_lidar_mag[None],
-        sensor.distortion.vector()[None],
-        np.array([noise]),
-        none,
-        none,
+        sensor.t_lidar_mag[None], sensor.distortion.vector()[None], np.array([noise]), none, none
     )
     return bound_at(readings, field_map, truth, options)[:-1, :-1]
 

@@ -11,12 +11,7 @@ from l2m_gtsam.qa.metrics.changes import change_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, refitted, series
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
-from l2m_gtsam.records.validation import (
-    Change,
-    ChiSquare,
-    MinimumDetectableChange,
-    ValidatedSensor,
-)
+from l2m_gtsam.records.validation import Change, ChiSquare, MinimumDetectableChange, ValidatedSensor
 from l2m_gtsam.validation.innovation import (
     COLUMNS,
     PARAMETERS,

@@ -302,9 +302,7 @@ def is_own_drive(recording: Recording, calibration: CalibrationResult) -> bool:
 
 
 def doubts_and_notes(
-    field_map: QueryableMap,
-    calibration: CalibrationResult,
-    map_source: SourceFile | None,
+    field_map: QueryableMap, calibration: CalibrationResult, map_source: SourceFile | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return what speaks against the outcome, and what is worth knowing."""
     of_map = field_map.summary.doubts if isinstance(field_map, Summarised) else ()

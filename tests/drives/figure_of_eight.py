@@ -3,13 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import (
-    FieldSeries,
-    KnownSensor,
-    Recording,
-    SourceFile,
-    Trajectory,
-)
+from l2m_gtsam.data import FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
 from tests.worlds.exact import DipoleWorld
 
 STEP_NS = 50_000_000

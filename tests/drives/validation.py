@@ -7,14 +7,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import (
-    Distortion,
-    FloatArray,
-    KnownSensor,
-    Recording,
-    SourceFile,
-    Trajectory,
-)
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.records.calibration import CalibrationResult
 from tests.drives.degenerate import COUNT, STRONG, World, at_height, poses
 from tests.drives.verdict import EIGHT, NOMINAL, SENSORS, drive, read

@@ -14,6 +14,7 @@ from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.sliding_gp import SlidingGP
+from tests.reference.potentials import features
 from tests.worlds.exact import DIPOLE_CONSTANT, DipoleWorld
 from tests.worlds.harmonic import OPTIONS, POST, PRIOR, WORLD, fitted_map, rms
 from tests.worlds.harmonic import readings as readings_at_a_post
@@ -145,8 +146,8 @@ def test_modes_of_a_large_box_have_the_covariance_of_the_closed_form(side: str, 
     offsets = np.column_stack([rng.uniform(-0.7, 0.7, (8, 2)), up * rng.uniform(0, 0.5, 8)])
     points = np.array([BOX / 2, BOX / 2, 0]) + offsets
     variance = np.exp(modes.prior(h).log_variance)
-    F = modes.features(points)
-    phi = modes.features(points)[:, 2] / modes.kz  # dphi/dz = kz phi
+    F = features(modes, points)
+    phi = features(modes, points)[:, 2] / modes.kz  # dphi/dz = kz phi
     strength, r = 4.0 * 0.8**3, points[:, None] - points
     r[..., 2] = 0.8 + up * (points[:, None, 2] + points[:, 2])
     d = np.linalg.norm(r, axis=-1)[..., None, None]
@@ -167,7 +168,7 @@ def test_the_prior_of_modes_at_the_lowest_reading_is_the_documented_scale() -> N
     modes = modes_up_to(FLOOR, np.full(2, BOX), 0.0, K_MAX)
     middle = np.array([[BOX / 2 + 0.3, BOX / 2 - 0.2, 0.0]])
     h = PRIOR.model_copy(update={"floor_scale": 3.0, "floor_depth": 0.4})
-    F = modes.features(middle)[0]
+    F = features(modes, middle)[0]
     sigma = np.sqrt(F**2 @ np.exp(modes.prior(h).log_variance))
     # Mirror images as above.
     np.testing.assert_allclose(sigma, [3.0, 3.0, 3.0 * np.sqrt(2)], rtol=0.005)

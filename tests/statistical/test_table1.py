@@ -19,14 +19,7 @@ from l2m_gtsam.studies.table1.cells import (
     compute,
     prepare,
 )
-from l2m_gtsam.studies.table1.methods import (
-    HARMONIC,
-    NAIVE,
-    OTHERS,
-    OURS,
-    SLIDING,
-    as_published,
-)
+from l2m_gtsam.studies.table1.methods import HARMONIC, NAIVE, OTHERS, OURS, SLIDING, as_published
 from l2m_gtsam.studies.table1.study import TABLE1
 from l2m_gtsam.studies.table1.summary import (
     BETTER,

@@ -10,7 +10,7 @@ from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.harmonic import learning
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
-from l2m_gtsam.maps.harmonic.family import Family
+from l2m_gtsam.maps.harmonic.family import Family, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.furnish import basis_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -18,7 +18,6 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.harmonic.search import SearchOptions
-from l2m_gtsam.maps.harmonic.uniform import UniformField
 from tests.worlds.exact import DipoleWorld, dipole_world
 
 GIVEN = Hyperparameters(

@@ -8,7 +8,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
-from l2m_gtsam.solve.profile import Linearisation, Prediction, Snapshots, linearised, misfits
+from l2m_gtsam.solve.profile import FieldPredictor, Linearisation, Snapshots, linearised, misfits
 from l2m_gtsam.solve.robust import RobustOptions, consistent
 
 ABREAST = 256  # descents at a time: the map is asked once for all of them, memory stays small
@@ -55,7 +55,7 @@ class StartProblem:
     """
 
     snapshots: Snapshots
-    predict: Prediction
+    predict: FieldPredictor
     field_map: QueryableMap
     longest: float
     good: float

@@ -23,7 +23,7 @@ from l2m_gtsam.maps.nearest import NearestReadings
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.records.calibration import FoundStart
-from l2m_gtsam.solve.profile import Prediction, Snapshots, misfits, snapshots_of
+from l2m_gtsam.solve.profile import FieldPredictor, Snapshots, misfits, snapshots_of
 
 BATCH = 256  # candidates at a time
 FIRST = 10  # poses that decide whether a candidate lies in the map at all
@@ -235,7 +235,7 @@ def place_group(
         found[sensor] = None if start is None else start.moved(offset)
 
 
-def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> Prediction:
+def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> FieldPredictor:
     """Return the nearest readings of a map that knows its own, and else the map."""
     if isinstance(field_map, Surveyed):
         return NearestReadings(field_map.readings, options.reach).predict
@@ -247,7 +247,7 @@ def coarse_prediction(field_map: QueryableMap, options: StartOptions) -> Predict
     return predict
 
 
-def fine_prediction(field_map: QueryableMap, coarse: Prediction) -> Prediction:
+def fine_prediction(field_map: QueryableMap, coarse: FieldPredictor) -> FieldPredictor:
     """Return the map itself where the coarse one knows something: its variance is not asked."""
 
     def predict(points: FloatArray) -> tuple[FloatArray, BoolArray]:
@@ -260,7 +260,7 @@ def fine_prediction(field_map: QueryableMap, coarse: Prediction) -> Prediction:
 
 
 def screen(
-    snapshots: Snapshots, predict: Prediction, grid: Candidates, options: StartOptions
+    snapshots: Snapshots, predict: FieldPredictor, grid: Candidates, options: StartOptions
 ) -> FloatArray:
     """Return the misfits in uT of all nodes and sensors, shape (nx, ny, nz, S).
 

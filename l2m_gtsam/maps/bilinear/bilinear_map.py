@@ -13,15 +13,15 @@ how far the data are, and too little where a cell holds a single reading.
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FieldSample, FloatArray, MapState
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.bilinear.cells import Cells, averaged, cells_from_state
+from l2m_gtsam.maps.bilinear.cells import BilinearOptions, Cells, averaged, cells_from_state
 from l2m_gtsam.maps.bilinear.lattice import Lattice, lattice_over
-from l2m_gtsam.maps.bilinear.options import BilinearOptions
 from l2m_gtsam.maps.field_map import MapSummary, masked
 from l2m_gtsam.maps.trained import options_from_state, state_array
 from l2m_gtsam.maps.training import (
@@ -31,8 +31,6 @@ from l2m_gtsam.maps.training import (
     joined,
     training_set,
 )
-
-KIND = "bilinear"
 
 
 @dataclass(frozen=True)
@@ -51,6 +49,7 @@ class BilinearMap:
         Mean square of the readings about the interpolant per axis in square microtesla.
     """
 
+    kind: ClassVar[str] = "bilinear"
     cells: Cells
     options: BilinearOptions
     lattice: Lattice
@@ -99,11 +98,6 @@ class BilinearMap:
         return cls(cells, options, lattice_over(cells, options), float(spread[0]))
 
     @property
-    def kind(self) -> str:
-        """Name of the map kind."""
-        return KIND
-
-    @property
     def readings(self) -> TrainingSet:
         """Readings in the map frame, averaged over cells."""
         return TrainingSet(self.cells.points, self.cells.field, self.cells.count)
@@ -113,7 +107,7 @@ class BilinearMap:
         """Figures of the map."""
         heights, points = self.cells.heights, self.cells.points
         return MapSummary(
-            kind=KIND,
+            kind=self.kind,
             readings=int(self.cells.count.sum()),
             rows=len(points),
             lower=points.min(axis=0),
@@ -162,7 +156,7 @@ class BilinearMap:
     def to_state(self) -> MapState:
         """Return the map as its averages: the nodes are filled again from them."""
         arrays = {**vars(self.cells), "spread": np.array([self.spread])}
-        return MapState(KIND, arrays, self.options.model_dump(mode="json"), {})
+        return MapState(self.kind, arrays, self.options.model_dump(mode="json"), {})
 
 
 def squares_about(lattice: Lattice, readings: TrainingSet) -> float:

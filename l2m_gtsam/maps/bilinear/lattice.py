@@ -8,8 +8,7 @@ from scipy.spatial import QhullError, cKDTree
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.bilinear.cells import Cells
-from l2m_gtsam.maps.bilinear.options import BilinearOptions
+from l2m_gtsam.maps.bilinear.cells import BilinearOptions, Cells
 
 MOST_NODES = 5_000_000  # their values take 120 MB
 FEWEST_IN_PLANE = 3  # averages that span a triangle

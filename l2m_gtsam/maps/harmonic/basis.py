@@ -96,17 +96,6 @@ class Basis:
             gradient[at] = R @ sum(part[1] for part in parts) @ R.T
         return field, gradient
 
-    def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
-        """Return the potential phi with ``B = grad phi`` in uT m, shape (N,)."""
-        phi = np.empty(len(points))
-        for at in batches(len(points)):
-            local = self.frame.localise(points[at])
-            phi[at] = sum(
-                family.potential(local, weights[columns])
-                for family, columns in zip(self.families, self.columns, strict=True)
-            )
-        return phi
-
     @cached_property
     def columns(self) -> tuple[slice, ...]:
         """Columns of each family."""

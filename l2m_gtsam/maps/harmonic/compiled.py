@@ -1,87 +1,32 @@
-"""The harmonic map for solvers: the same field, hundreds of times faster."""
+"""The tiles of a harmonic map for solvers: the same field, hundreds of times faster."""
 
 from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from threading import Lock
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
-from l2m_gtsam.data import FieldSample, FloatArray, IntArray, MapState
-from l2m_gtsam.maps.field_map import MapSummary
-from l2m_gtsam.maps.harmonic.blend import Blend
-from l2m_gtsam.maps.harmonic.compiled_arrays import compiled_from_arrays, compiled_to_arrays
-from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile
-from l2m_gtsam.maps.harmonic.entries import compiled_entry
-from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile, sources_of
+from l2m_gtsam.maps.harmonic.entries import compiled_entry, solved_entry
+from l2m_gtsam.maps.harmonic.kept_arrays import finite, floats, integers
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
+from l2m_gtsam.maps.harmonic.near_sources import NearSources
 from l2m_gtsam.maps.harmonic.places import Places
+from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
+from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.training import TrainingSet, checked_points
+from l2m_gtsam.maps.harmonic.visits import Blend
+from l2m_gtsam.maps.tile_store import Arrays
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.progress import Count
 
 MEMORY = 1_000_000_000  # bytes of grids that are kept
-SHARES = 4  # that points are divided into, for as many threads at most
-PIECE = 65_536  # about the most points of a share
 AT_ONCE = 4_096  # points that a tile is evaluated at: its answers stay in the processor's cache
-BLOCK = 0.5  # metres: what a map knows of a square of this size fits the processor's cache
-SERIAL = 6_000  # fewer points than this are not worth threads
-
-
-class ExactMap(Protocol):
-    """What the compiled form needs of the map itself; see ``HarmonicMap``."""
-
-    @property
-    def learnt(self) -> Learnt:
-        """Readings, prior, sources and tiling."""
-        ...
-
-    @property
-    def options(self) -> HarmonicOptions:
-        """Effective options."""
-        ...
-
-    @property
-    def tiles(self) -> Tiles:
-        """One for each cell of the tiling."""
-        ...
-
-    @property
-    def kind(self) -> str:
-        """Name of the map kind."""
-        ...
-
-    @property
-    def summary(self) -> MapSummary:
-        """Figures of the map."""
-        ...
-
-    def sample(
-        self,
-        points: FloatArray,
-        answers: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
-    ) -> FieldSample:
-        """Return what is known at points, given who answers for those near a reading."""
-        ...
-
-    def variance(self, points: FloatArray) -> FloatArray:
-        """Return the variance per axis, also outside."""
-        ...
-
-    def errors_over(self, points: FloatArray, /) -> ErrorModes:
-        """Return the map's error over places as correlated numbers."""
-        ...
-
-    def updated(self, points: FloatArray, field: FloatArray) -> "ExactMap":
-        """Return the map with more readings."""
-        ...
-
-    def to_state(self) -> MapState:
-        """Return the map as plain arrays and facts."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -90,32 +35,34 @@ class CompiledTiles:
 
     Attributes
     ----------
-    exact
-        Map whose tiles are compiled.
+    learnt, options, tiles
+        Of the map whose tiles are compiled; see ``HarmonicMap``.
     made
         Compiled tiles by index, the one used last at the end.
     locks
         One for each tile, so that no tile is made twice, and one for ``made`` at the end.
     """
 
-    exact: ExactMap
+    learnt: Learnt
+    options: HarmonicOptions
+    tiles: Tiles
     made: OrderedDict[int, CompiledTile | Tile] = field(default_factory=OrderedDict)
     locks: tuple[Lock, ...] = ()
 
     @classmethod
-    def of(cls, exact: ExactMap) -> "CompiledTiles":
+    def of(cls, learnt: Learnt, options: HarmonicOptions, tiles: Tiles) -> "CompiledTiles":
         """Return the tiles of a map, none of them made yet."""
-        return cls(exact, locks=tuple(Lock() for _ in range(len(exact.tiles) + 1)))
+        return cls(learnt, options, tiles, locks=tuple(Lock() for _ in range(len(tiles) + 1)))
 
-    def __reduce__(self) -> tuple[Callable[[ExactMap], "CompiledTiles"], tuple[ExactMap]]:
-        return CompiledTiles.of, (self.exact,)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return CompiledTiles.of, (self.learnt, self.options, self.tiles)
 
     def tile(self, index: int) -> CompiledTile | Tile:
         """Return a tile, compiled; the exact one where no grid is good enough."""
         with self.locks[index]:
             found = self.made.get(index)
             if found is None:
-                found = self.compiled(index, self.exact.tiles[index])
+                found = self.compiled(index, self.tiles[index])
                 with self.locks[-1]:
                     self.made[index] = found
                     self._forget()
@@ -126,8 +73,8 @@ class CompiledTiles:
 
     def compiled(self, index: int, tile: Tile) -> CompiledTile | Tile:
         """Return a tile as it was kept, else compiled and kept, without holding it in memory."""
-        store, places = self.exact.tiles.store, self.places(index)
-        entry = compiled_entry(self.exact.learnt, index, places)
+        store, places = self.tiles.store, self.places(index)
+        entry = compiled_entry(self.learnt, index, places)
         found = store.recall(entry, partial(compiled_from_arrays, tile))
         if found is None:
             found = compile_tile(tile, places)
@@ -136,83 +83,52 @@ class CompiledTiles:
 
     def places(self, index: int) -> Places:
         """Return where a tile is evaluated."""
-        tiling = self.exact.learnt.tiling
+        tiling = self.learnt.tiling
         return Places.around(
-            self.exact.learnt.readings.points,
-            self.exact.options.reach,
+            self.learnt.readings.points,
+            self.options.reach,
             tiling.grid.centres[index],
             0.5 * tiling.grid.size + tiling.blend,
         )
 
-    def _forget(self) -> None:
-        held = sum(tile.nbytes for tile in self.made.values() if isinstance(tile, CompiledTile))
-        while held > MEMORY and len(self.made) > 1:
-            _, oldest = self.made.popitem(last=False)
-            held -= oldest.nbytes if isinstance(oldest, CompiledTile) else 0
+    def make_all(self, progress: Count) -> int:
+        """Have all tiles of a map in its store, solved and compiled, and nothing else.
 
+        A store that is full ends it: the other tiles are made when they are needed. None is held
+        in memory.
 
-@dataclass(frozen=True)
-class CompiledMap:
-    """A harmonic map whose field and gradient come from grids, within 5 nT and 20 nT/m.
+        Parameters
+        ----------
+        progress
+            Called with the number of tiles that are done and that of all.
 
-    That holds wherever the exact map is near readings; elsewhere the exact map answers.
-    Everything but field and gradient is that of the exact map.
+        Returns
+        -------
+        int
+            How many tiles the store has.
+        """
+        indices, lock, done = range(len(self.tiles)), Lock(), 0
+        solved = [solved_entry(self.learnt, index) for index in indices]
+        compiled = [compiled_entry(self.learnt, index, self.places(index)) for index in indices]
+        self.tiles.store.sweep([*solved, *compiled])
 
-    Attributes
-    ----------
-    exact
-        Map that it approximates, which answers far from readings.
-    tiles
-        Tiles of that map, compiled on first use.
-    """
+        def make(index: int) -> bool:
+            nonlocal done
+            if not self.tiles.store.takes_more:
+                return False
+            self.compiled(index, self.tiles.made(index))
+            with lock:
+                done += 1
+                progress(done, len(indices))
+            return self.tiles.store.takes_more
 
-    exact: ExactMap
-    tiles: CompiledTiles
+        return sum(in_threads(make, indices))
 
-    @classmethod
-    def of(cls, exact: ExactMap) -> "CompiledMap":
-        """Return the compiled form of a map; tiles are compiled when they are first needed."""
-        return cls(exact, CompiledTiles.of(exact))
-
-    @property
-    def kind(self) -> str:
-        """Name of the map kind."""
-        return self.exact.kind
-
-    @property
-    def readings(self) -> TrainingSet:
-        """Readings in the map frame, merged."""
-        return self.exact.learnt.readings
-
-    @property
-    def summary(self) -> MapSummary:
-        """Figures of the map."""
-        return self.exact.summary
-
-    def query(self, points: FloatArray) -> FieldSample:
-        """Return field, gradient and variance; see ``FieldMap``."""
-        return self.exact.sample(
-            points, lambda near: (*self.field_and_gradient(near), self.variance(near))
-        )
-
-    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return field and gradient, also outside; see ``FieldMap``."""
-        points = checked_points(points)
-        if len(points) < SERIAL:
-            return self._said(points)
-        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-
-        def answer(rows: IntArray) -> None:
-            field[rows], gradient[rows] = self._said(points[rows])
-
-        in_threads(answer, np.array_split(by_place(points), max(SHARES, len(points) // PIECE)))
-        return field, gradient
-
-    def _said(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def blended(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the blended prediction of the tiles at points."""
         blend = Blend.of(len(points))
-        for visit in self.exact.learnt.tiling.visits(points):
-            tile = self.tiles.tile(visit.tile)
+        for visit in self.learnt.tiling.visits(points):
+            tile = self.tile(visit.tile)
             for start in range(0, len(visit.rows), AT_ONCE):
                 rows, share = visit.rows[start : start + AT_ONCE], visit.share[start:]
                 if isinstance(tile, CompiledTile):
@@ -221,29 +137,59 @@ class CompiledMap:
                     blend.add(rows, share, tile.field_and_gradient(points[rows]))
         return blend.field, blend.gradient
 
-    def variance(self, points: FloatArray) -> FloatArray:
-        """Return the variance per axis, also outside; see ``FieldMap``."""
-        return self.exact.variance(points)
-
-    def errors_over(self, points: FloatArray, /) -> ErrorModes:
-        """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
-        return self.exact.errors_over(points)
-
-    def updated(self, points: FloatArray, field: FloatArray, /) -> "CompiledMap":
-        """Return the map with more readings; see ``FieldMap``."""
-        return CompiledMap.of(self.exact.updated(points, field))
-
-    def to_state(self) -> MapState:
-        """Return the exact map as plain arrays and facts."""
-        return self.exact.to_state()
+    def _forget(self) -> None:
+        held = sum(tile.nbytes for tile in self.made.values() if isinstance(tile, CompiledTile))
+        while held > MEMORY and len(self.made) > 1:
+            _, oldest = self.made.popitem(last=False)
+            held -= oldest.nbytes if isinstance(oldest, CompiledTile) else 0
 
 
-def by_place(points: FloatArray) -> IntArray:
-    """Return the indices of points, shape (N,), in an order that stays in one place at a time.
+def compiled_to_arrays(compiled: CompiledTile | Tile) -> Arrays:
+    """Return a compiled tile as arrays; none for a tile that no grid is good enough for."""
+    if isinstance(compiled, Tile):
+        return {}
+    grid, near = compiled.grid, compiled.near
+    return {
+        "lower": grid.lower,
+        "spacing": np.array([grid.spacing]),
+        "coefficients": grid.coefficients,
+        "corner": near.corner,
+        "shape": np.array(near.shape),
+        "starts": near.starts,
+        "table": near.table,
+    }
 
-    Threads that are given parts of it meet few tiles in common.
+
+def compiled_from_arrays(tile: Tile, arrays: Arrays) -> CompiledTile | Tile:
+    """Return what ``compiled_to_arrays`` took apart, with the solved tile that it belongs to.
+
+    Raises
+    ------
+    MapError
+        If an array is missing, of the wrong shape, or makes no sense.
     """
-    across, along = (np.floor((at - at.min()) / BLOCK) for at in points[:, :2].T)
-    # Numbers of 16 bits are sorted in linear time; where they run over, places take turns.
-    numbers = (across * (along.max() + 1) + along) % 2**16
-    return np.argsort(numbers.astype(np.uint16), kind="stable")
+    if not arrays:
+        return tile
+    grid, near = grid_from_arrays(arrays), near_from_arrays(arrays)
+    return CompiledTile(tile, grid, near, TermSum.of(tile, sources_of(tile)))
+
+
+def grid_from_arrays(arrays: Arrays) -> PotentialGrid:
+    """Return the grid of a compiled tile."""
+    spacing = float(finite(arrays, "spacing", (1,))[0])
+    coefficients = floats(arrays, "coefficients", (None, None, None))  # NaN where not known
+    if spacing <= 0 or np.isinf(coefficients).any():
+        raise MapError("the grid has a spacing or coefficients that cannot be")
+    return PotentialGrid(finite(arrays, "lower", (3,)), spacing, coefficients)
+
+
+def near_from_arrays(arrays: Arrays) -> NearSources:
+    """Return the near sources of a compiled tile: no list may lead out of the table."""
+    nx, ny, nz = (int(count) for count in integers(arrays, "shape", (3,)))
+    table = finite(arrays, "table", (8, None))
+    if min(nx, ny, nz) < 0:
+        raise MapError("the cells of near sources are fewer than none")
+    starts = integers(arrays, "starts", (nx * ny * nz + 1,))
+    if starts[0] != 0 or starts[-1] != table.shape[1] or (np.diff(starts) < 0).any():
+        raise MapError("the lists of near sources do not fit their table")
+    return NearSources(finite(arrays, "corner", (3,)), (nx, ny, nz), starts, table)

@@ -12,9 +12,11 @@ import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.dipole_sum import SOFT, add_dipoles
-from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
+from l2m_gtsam.maps.harmonic.family import WeightPrior
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.symmetric import FAST, add_symmetric
+
+SOFT = 1e-3  # metres
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,6 @@ class Dipoles:
         count = len(self)
         return WeightPrior(np.full(count, log_variance), {"structure_scale": np.full(count, 2.0)})
 
-    def features(self, points: FloatArray) -> FloatArray:
-        """Return the field of each combination; see ``Family``."""
-        return features_of(self, points)
-
     def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
         """Write the field of so many units of each combination; see ``Family``."""
         moments = np.empty((3 * len(self.positions), 3, len(points)))
@@ -64,13 +62,6 @@ class Dipoles:
         field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
         add_dipoles(points, self.positions, self.moments(weights), field, gradient)
         return field, gradient
-
-    def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
-        """Return the potential; see ``Family``."""
-        r = points[:, None, :] - self.positions
-        # At a source itself the potential is not finite; a map must be.
-        square = np.maximum(np.einsum("nki,nki->nk", r, r), SOFT**2)
-        return np.asarray(-np.einsum("nki,ki,nk->n", r, self.moments(weights), square**-1.5))
 
     def moments(self, weights: FloatArray) -> FloatArray:
         """Return the moments of the sources in uT m^3, shape (K, 3)."""
@@ -108,3 +99,36 @@ def write_moment_rows(points: FloatArray, sources: FloatArray, rows: FloatArray)
                 else:
                     for n in range(count):
                         row[n] = fifth[n] * r[i, n] * r[j, n]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def add_dipoles(
+    points: FloatArray,
+    positions: FloatArray,
+    moments: FloatArray,
+    field: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add the field and gradient of all dipoles at points (N, 3); see ``Dipoles``."""
+    for n in range(len(points)):
+        bx = by = bz = xx = yy = zz = xy = xz = yz = 0.0
+        for k in range(len(positions)):
+            x, y = points[n, 0] - positions[k, 0], points[n, 1] - positions[k, 1]
+            z = points[n, 2] - positions[k, 2]
+            mx, my, mz = moments[k, 0], moments[k, 1], moments[k, 2]
+            # At a source itself the field is not finite; a map must be.
+            inverse = 1.0 / max(x * x + y * y + z * z, SOFT * SOFT)
+            cube = inverse * np.sqrt(inverse)
+            fifth = 3.0 * cube * inverse
+            pull = (mx * x + my * y + mz * z) * fifth
+            steep = -5.0 * pull * inverse
+            bx += x * pull - cube * mx
+            by += y * pull - cube * my
+            bz += z * pull - cube * mz
+            xx += pull + (2.0 * fifth * mx + steep * x) * x
+            yy += pull + (2.0 * fifth * my + steep * y) * y
+            zz += pull + (2.0 * fifth * mz + steep * z) * z
+            xy += fifth * (x * my + mx * y) + steep * x * y
+            xz += fifth * (x * mz + mx * z) + steep * x * z
+            yz += fifth * (y * mz + my * z) + steep * y * z
+        add_symmetric(n, bx, by, bz, xx, yy, zz, xy, xz, yz, field, gradient)

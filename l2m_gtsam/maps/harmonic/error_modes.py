@@ -24,8 +24,7 @@ from scipy.sparse import csr_array, tril
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid
 from l2m_gtsam.maps.harmonic.basis import batches
-from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
-from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.parallel.threads import in_threads

@@ -158,6 +158,8 @@ def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights
     """Return the posterior of the weights for a prior and a noise in uT."""
     D = np.exp(0.5 * log_variance)
     K = whitened_factor(normal, D, noise)
+    # With w = D v the posterior mean of v solves (I + D F^T F D / s^2) v = D F^T y / s^2: well
+    # conditioned whatever the range of the prior variances.
     u = D * normal.Fy / noise**2
     mean = D * cho_solve((K, True), u, check_finite=False)
     return Weights(mean, D, TriangularFactor.of(K))

@@ -108,6 +108,7 @@ def held_out_scores(work: Patchwork, shared: Hyperparameters, local: LocalOption
     total = sum(normals[1:], start=normals[0])
     scores = []
     for part, normal in zip(parts, normals, strict=True):
+        # Normal equations add up over readings: leaving a fold out is a subtraction.
         rest = total - normal
         own = local_hyperparameters(work.basis, rest, shared, local)
         weights = condition(rest, work.basis.prior(own).log_variance, own.noise)
@@ -120,6 +121,7 @@ def scores_of(basis: Basis, part: TrainingSet, weights: Weights, noise: float) -
     F = basis.features(part.points).reshape(-1, len(basis))
     root = weights.root(F)
     variance = np.repeat(noise**2 / part.weight, 3)
+    # A held-out reading errs by the map and by its own noise, independently.
     spread = np.sqrt(np.einsum("nm,nm->n", root, root) + variance)
     return np.asarray((part.field.ravel() - F @ weights.mean) / spread)
 

@@ -30,15 +30,9 @@ class Family(Protocol):
 
     def __len__(self) -> int:
         """Return the number m of weights."""
-        ...
 
     def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
         """Return the prior of the weights."""
-        ...
-
-    def features(self, points: FloatArray) -> FloatArray:
-        """Return the field of each weight at points, in uT per unit weight, shape (N, 3, m)."""
-        ...
 
     def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
         """Write the field that so many units of each weight make at points.
@@ -52,26 +46,50 @@ class Family(Protocol):
         rows
             For the field in uT, one weight after the other, shape (m, 3, N), in C order.
         """
-        ...
 
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the field (N, 3) in uT and its gradient (N, 3, 3) in uT/m for given weights."""
-        ...
-
-    def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
-        """Return the potential phi with ``B = grad phi`` in uT m, shape (N,)."""
-        ...
-
-
-def features_of(family: Family, points: FloatArray) -> FloatArray:
-    """Return the features of a family point by point, shape (N, 3, m); see ``Family``."""
-    rows = np.empty((len(family), 3, len(points)))
-    family.write_rows(points, np.ones(len(family)), rows)
-    return np.ascontiguousarray(rows.transpose(2, 1, 0))
 
 
 def no_slopes(variance: float, count: int) -> WeightPrior:
     """Return a prior that depends on no hyperparameter."""
     return WeightPrior(np.full(count, np.log(variance)), {})
+
+
+@dataclass(frozen=True)
+class UniformField:
+    """The same field everywhere.
+
+    Attributes
+    ----------
+    sigma
+        Prior standard deviation per axis in microtesla; wide, so that the data determine the field.
+    """
+
+    sigma: float
+
+    def __len__(self) -> int:
+        return 3
+
+    def prior(self, hyperparameters: Hyperparameters) -> WeightPrior:
+        """Return the prior of the weights; see ``Family``."""
+        return no_slopes(self.sigma**2, 3)
+
+    def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
+        """Write the same for all points; see ``Family``."""
+        rows[:] = np.diag(units)[:, :, None]
+
+    def field_and_gradient(
+        self, points: FloatArray, weights: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return field and gradient; see ``Family``."""
+        return np.tile(weights, (len(points), 1)), np.zeros((len(points), 3, 3))
+
+    def potential_on(
+        self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
+    ) -> FloatArray:
+        """Return the potential in uT m at the nodes of these axes, shape (nx, ny, nz)."""
+        x, y, z = np.ix_(weights[0] * x, weights[1] * y, weights[2] * z)
+        return np.asarray(x + y + z)

@@ -7,12 +7,11 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles, moment_features
-from l2m_gtsam.maps.harmonic.family import Family
+from l2m_gtsam.maps.harmonic.family import Family, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import Resolution
-from l2m_gtsam.maps.harmonic.uniform import UniformField
 from l2m_gtsam.maps.training import TrainingSet
 
 UNIFORM_SIGMA = 100.0  # microtesla; the Earth's field is at most 65

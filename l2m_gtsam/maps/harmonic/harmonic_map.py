@@ -1,32 +1,33 @@
 """A map of harmonic potentials: tiles of floor and ceiling modes, uniform field and sources."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, MapState
+from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, MapState
 from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
-from l2m_gtsam.maps.harmonic.blend import Blend
-from l2m_gtsam.maps.harmonic.compiled import CompiledMap, CompiledTiles
+from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
-from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
-from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
-from l2m_gtsam.maps.harmonic.making import make_all
+from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.harmonic.visits import Visit
+from l2m_gtsam.maps.harmonic.visits import Blend, Visit
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count
 
-KIND = "harmonic"
 EXACT = 1e-9  # share of the variance between points that may be left out
+
+SHARES = 4  # that points are divided into, for as many threads at most
+PIECE = 65_536  # about the most points of a share
+BLOCK = 0.5  # metres: what a map knows of a square of this size fits the processor's cache
+SERIAL = 6_000  # fewer points than this are not worth threads
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class HarmonicMap:
         One for each cell of the tiling, solved when first needed.
     """
 
+    kind: ClassVar[str] = "harmonic"
     learnt: Learnt
     options: HarmonicOptions
     tiles: Tiles
@@ -105,7 +107,7 @@ class HarmonicMap:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
         return error_modes(self.learnt, self.tiles, checked_points(points), self.options.errors)
 
-    def updated(self, points: FloatArray, field: FloatArray) -> "HarmonicMap":
+    def updated(self, points: FloatArray, field: FloatArray, /) -> "HarmonicMap":
         """Return the map with more readings and the same prior of the whole; see ``FieldMap``.
 
         Only tiles that the new readings take part in are solved again, with scales of their own
@@ -143,12 +145,12 @@ class HarmonicMap:
         return replace(self, tiles=Tiles(self.learnt, self.tiles.solved, store))
 
     def make_tiles(self, progress: Count) -> int:
-        """Have all tiles in the store, as far as it takes them; see ``make_all``."""
-        return make_all(CompiledTiles.of(self), progress)
+        """Have all tiles in the store, as far as it takes them; see ``CompiledTiles``."""
+        return CompiledTiles.of(self.learnt, self.options, self.tiles).make_all(progress)
 
     def to_state(self) -> MapState:
         """Return the map as plain arrays and facts."""
-        return learnt_to_state(KIND, self.learnt, self.options)
+        return learnt_to_state(self.kind, self.learnt, self.options)
 
     @property
     def readings(self) -> TrainingSet:
@@ -158,16 +160,18 @@ class HarmonicMap:
     @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
-        return summary_of(KIND, self.learnt)
-
-    @property
-    def kind(self) -> str:
-        """Name of the map kind."""
-        return KIND
+        return summary_of(self.kind, self.learnt)
 
     def query(self, points: FloatArray) -> FieldSample:
         """Return field, gradient and variance; see ``FieldMap``."""
-        return self.sample(points, self._answers)
+        points = checked_points(points)
+        away, _ = self.readings.tree.query(points, distance_upper_bound=self.options.reach)
+        near = np.flatnonzero(np.isfinite(away))
+        known = unknown(len(points))
+        # Values elsewhere would not be used.
+        known.field[near], known.gradient[near], known.variance[near] = self._answers(points[near])
+        known.inside[near] = known.variance[near].sum(axis=1) <= self.learnt.most_variance
+        return masked(known)
 
     def _answers(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return field, gradient and variance at points, also outside."""
@@ -185,32 +189,10 @@ class HarmonicMap:
             variance[visit.rows[found.own]] = found.variance
         return blend.field, blend.gradient, variance
 
-    def compile(self) -> CompiledMap:
+    def compile(self) -> "CompiledMap":
         """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster."""
-        return CompiledMap.of(self)
-
-    def sample(
-        self,
-        points: FloatArray,
-        answers: Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]],
-    ) -> FieldSample:
-        """Return what is known at points; see ``query``.
-
-        Parameters
-        ----------
-        points
-            In the map frame in metres, shape (N, 3).
-        answers
-            Gives field, gradient and variance of points. It is called for those near a reading
-            alone: values at others would not be used.
-        """
-        points = checked_points(points)
-        away, _ = self.learnt.readings.tree.query(points, distance_upper_bound=self.options.reach)
-        near = np.flatnonzero(np.isfinite(away))
-        known = unknown(len(points))
-        known.field[near], known.gradient[near], known.variance[near] = answers(points[near])
-        known.inside[near] = known.variance[near].sum(axis=1) <= self.learnt.most_variance
-        return masked(known)
+        compiled = CompiledTiles.of(self.learnt, self.options, self.tiles)
+        return CompiledMap(self.learnt, self.options, self.tiles, compiled)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""
@@ -266,3 +248,54 @@ class HarmonicMap:
         rest = self.variance(points).ravel() - covariance.diagonal()
         covariance[np.diag_indices_from(covariance)] += np.maximum(rest, 0.0)
         return np.asarray(covariance.reshape(count, 3, count, 3))
+
+
+@dataclass(frozen=True)
+class CompiledMap(HarmonicMap):
+    """A harmonic map whose field and gradient come from grids, within 5 nT and 20 nT/m.
+
+    That holds wherever the exact map is near readings; elsewhere the exact tiles answer.
+    Everything but field and gradient is that of the exact map.
+
+    Attributes
+    ----------
+    compiled
+        The tiles, compiled on first use.
+    """
+
+    compiled: CompiledTiles
+
+    def compile(self) -> "CompiledMap":
+        """Return the map itself."""
+        return self
+
+    def _answers(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return *self.field_and_gradient(points), self.variance(points)
+
+    def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Return field and gradient, also outside; see ``FieldMap``."""
+        points = checked_points(points)
+        if len(points) < SERIAL:
+            return self.compiled.blended(points)
+        field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
+
+        def answer(rows: IntArray) -> None:
+            field[rows], gradient[rows] = self.compiled.blended(points[rows])
+
+        in_threads(answer, np.array_split(by_place(points), max(SHARES, len(points) // PIECE)))
+        return field, gradient
+
+    def updated(self, points: FloatArray, field: FloatArray, /) -> "CompiledMap":
+        """Return the map with more readings; see ``FieldMap``."""
+        return super().updated(points, field).compile()
+
+
+def by_place(points: FloatArray) -> IntArray:
+    """Return the indices of points, shape (N,), in an order that stays in one place at a time.
+
+    Threads that are given parts of it meet few tiles in common.
+    """
+    across, along = (np.floor((at - at.min()) / BLOCK) for at in points[:, :2].T)
+    # Numbers of 16 bits are sorted in linear time; where they run over, places take turns.
+    numbers = (across * (along.max() + 1) + along) % 2**16
+    return np.argsort(numbers.astype(np.uint16), kind="stable")

@@ -8,19 +8,13 @@ from pydantic import Field, TypeAdapter
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import grid_from
 from l2m_gtsam.maps.harmonic.basis import Basis
-from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
-from l2m_gtsam.maps.harmonic.explanation import (
-    UNJUDGED,
-    Explanation,
-)
+from l2m_gtsam.maps.harmonic.explanation import UNJUDGED, Explanation
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
 from l2m_gtsam.maps.harmonic.local import LocalOptions
-from l2m_gtsam.maps.harmonic.search import (
-    SearchOptions,
-)
+from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.maps.harmonic.structure import Sources, StructureOptions
 from l2m_gtsam.maps.harmonic.tiling import (
     Resolution,
@@ -37,6 +31,15 @@ from l2m_gtsam.maps.training import TrainingSet, joined, merged
 from l2m_gtsam.options import Options
 
 KNOWN = 0.5  # of the readings' variance: a map that explains less is no better than their mean
+
+
+class ErrorOptions(Options):
+    """How finely the map's error is resolved."""
+
+    places: int = Field(default=100, ge=10)
+    """The most places of a tile that its modes are chosen at, spread over the drive."""
+    rest: float = Field(default=0.02, gt=0, lt=1)
+    """Share of the map's variance at these places that may stay without correlation."""
 
 
 class HarmonicOptions(Options):

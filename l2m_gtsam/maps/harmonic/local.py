@@ -35,10 +35,7 @@ class LocalOptions(Options):
 
 
 def local_hyperparameters(
-    basis: Basis,
-    normal: Normal,
-    shared: Hyperparameters,
-    options: LocalOptions,
+    basis: Basis, normal: Normal, shared: Hyperparameters, options: LocalOptions
 ) -> Hyperparameters:
     """Return the most likely scales and depths of one tile, given those of the map.
 

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.family import WeightPrior, features_of
+from l2m_gtsam.maps.harmonic.family import WeightPrior
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.harmonic.wave_rows import wave_table, write_wave_rows
-from l2m_gtsam.maps.harmonic.wave_sum import add_waves
+from l2m_gtsam.maps.harmonic.symmetric import FAST, add_symmetric
 
 FLOOR, CEILING = "floor", "ceiling"
 
@@ -77,10 +77,7 @@ class Modes:
         log_variance = 2 * np.log(scale) + 3 * np.log(2 * h) - 2 * k * h - np.log(k)
         return WeightPrior(
             log_variance + self._log_share,
-            {
-                f"{self.side}_scale": np.full(len(k), 2.0),
-                f"{self.side}_depth": 3.0 - 2.0 * k * h,
-            },
+            {f"{self.side}_scale": np.full(len(k), 2.0), f"{self.side}_depth": 3.0 - 2.0 * k * h},
         )
 
     @cached_property
@@ -103,10 +100,6 @@ class Modes:
         share = np.where((self.numbers == 0).any(axis=1), 2.0, 4.0) / np.prod(self.size)
         return np.asarray(np.log(2 * np.pi * share))
 
-    def features(self, points: FloatArray) -> FloatArray:
-        """Return the field of each mode; see ``Family``."""
-        return features_of(self, points)
-
     def write_rows(self, points: FloatArray, units: FloatArray, rows: FloatArray) -> None:
         """Write the field of so many units of each mode; see ``Family``."""
         kz, which = self._growths
@@ -122,13 +115,6 @@ class Modes:
         steps = np.pi / self.size
         add_waves(points, steps, self.z, self.numbers, self.kz, weights, field, gradient)
         return field, gradient
-
-    def potential(self, points: FloatArray, weights: FloatArray) -> FloatArray:
-        """Return the potential; see ``Family``."""
-        cos_x, _, cos_y, _ = self._tables(points)
-        p, q = self.numbers.T
-        growth = np.exp(self.kz[:, None] * (points[:, 2] - self.z))
-        return np.asarray(weights @ (cos_x[p] * cos_y[q] * growth))
 
     def potential_on(
         self, x: FloatArray, y: FloatArray, z: FloatArray, weights: FloatArray
@@ -185,3 +171,124 @@ def left_out(scale: float, depth: float, k_max: float, away: FloatArray) -> Floa
     # Spectrum of Bz, integrated by parts: k^2 exp(-k b) from k_max to infinity.
     tail = k_max**2 / b + 2 * k_max / b**2 + 2 / b**3
     return np.asarray(scale**2 * (2 * depth) ** 3 * np.exp(-k_max * b) * tail)
+
+
+def wave_table(phase: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return cosines and sines of the first multiples of phases (N,), from 0, shapes (count, N)."""
+    cosines, sines = np.empty((count, len(phase))), np.empty((count, len(phase)))
+    write_multiples(np.cos(phase), np.sin(phase), cosines, sines)
+    return cosines, sines
+
+
+@njit(cache=True, nogil=True)
+def write_multiples(c: FloatArray, s: FloatArray, cosines: FloatArray, sines: FloatArray) -> None:
+    """Write cosines and sines of multiples of phases with these, (N,); see ``turned``."""
+    for n in range(len(c)):
+        cosines[0, n], sines[0, n] = 1.0, 0.0
+    for p in range(1, len(cosines)):
+        for n in range(len(c)):
+            cosines[p, n], sines[p, n] = turned(cosines[p - 1, n], sines[p - 1, n], c[n], s[n])
+
+
+@njit(cache=True, nogil=True)
+def write_wave_rows(
+    cos_x: FloatArray,
+    sin_x: FloatArray,
+    cos_y: FloatArray,
+    sin_y: FloatArray,
+    numbers: IntArray,
+    growth: FloatArray,
+    which: IntArray,
+    factors: FloatArray,
+    rows: FloatArray,
+) -> None:
+    """Write the field of modes, one mode after the other.
+
+    Parameters
+    ----------
+    cos_x, sin_x, cos_y, sin_y
+        By half waves and points, shapes (p, N) and (q, N).
+    numbers
+        Half waves of each mode, shape (m, 2).
+    growth, which
+        Exponentials by growth and points, shape (d, N), and which of them a mode has, shape (m,).
+    factors
+        Of each mode's field along x, y and z, shape (3, m).
+    rows
+        Field in uT, shape (m, 3, N).
+    """
+    for m in range(len(numbers)):
+        p, q = numbers[m, 0], numbers[m, 1]
+        cx, sx, cy, sy, e = cos_x[p], sin_x[p], cos_y[q], sin_y[q], growth[which[m]]
+        write_product(sx, cy, e, factors[0, m], rows[m, 0])
+        write_product(cx, sy, e, factors[1, m], rows[m, 1])
+        write_product(cx, cy, e, factors[2, m], rows[m, 2])
+
+
+@njit(cache=True, nogil=True, inline="always")
+def write_product(
+    x: FloatArray, y: FloatArray, e: FloatArray, factor: float, row: FloatArray
+) -> None:
+    """Write the product of three functions and a factor at points, all of shape (N,).
+
+    One row at a time: among more arrays loops would not run in vector registers.
+    """
+    for n in range(len(e)):
+        row[n] = x[n] * e[n] * y[n] * factor
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def add_waves(
+    points: FloatArray,
+    steps: FloatArray,
+    z: float,
+    numbers: IntArray,
+    kz: FloatArray,
+    weights: FloatArray,
+    field: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add the field and gradient of all waves at points (N, 3); see ``Modes``."""
+    p_most, q_most = 0, 0
+    for m in range(len(numbers)):
+        p_most, q_most = max(p_most, numbers[m, 0]), max(q_most, numbers[m, 1])
+    cos_x, sin_x = np.empty(p_most + 1), np.empty(p_most + 1)
+    cos_y, sin_y = np.empty(q_most + 1), np.empty(q_most + 1)
+    for n in range(len(points)):
+        write_phases(points[n, 0] * steps[0], cos_x, sin_x)
+        write_phases(points[n, 1] * steps[1], cos_y, sin_y)
+        bx = by = bz = xx = yy = zz = xy = xz = yz = 0.0
+        for m in range(len(numbers)):
+            p, q = numbers[m, 0], numbers[m, 1]
+            kx, ky, k = p * steps[0], q * steps[1], kz[m]
+            w = weights[m] * np.exp((points[n, 2] - z) * k)
+            cc, sc = w * cos_x[p] * cos_y[q], w * kx * sin_x[p] * cos_y[q]
+            cs, ss = w * ky * cos_x[p] * sin_y[q], w * kx * ky * sin_x[p] * sin_y[q]
+            bx -= sc
+            by -= cs
+            bz += k * cc
+            xx -= kx * kx * cc
+            yy -= ky * ky * cc
+            zz += k * k * cc
+            xy += ss
+            xz -= k * sc
+            yz -= k * cs
+        add_symmetric(n, bx, by, bz, xx, yy, zz, xy, xz, yz, field, gradient)
+
+
+@njit(cache=True, nogil=True)
+def write_phases(phase: float, cosines: FloatArray, sines: FloatArray) -> None:
+    """Write the cosine and sine of all multiples of a phase."""
+    cosines[0], sines[0] = 1.0, 0.0
+    c, s = np.cos(phase), np.sin(phase)
+    for p in range(1, len(cosines)):
+        cosines[p], sines[p] = turned(cosines[p - 1], sines[p - 1], c, s)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def turned(cosine: float, sine: float, c: float, s: float) -> tuple[float, float]:
+    """Return the cosine and sine of an angle turned by another.
+
+    A multiple by so many turns is as exact as that many roundings, far cheaper than a cosine.
+    """
+    return cosine * c - sine * s, sine * c + cosine * s

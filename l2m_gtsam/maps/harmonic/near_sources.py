@@ -20,6 +20,7 @@ from scipy.special import binom
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialLattice
+from l2m_gtsam.maps.harmonic.symmetric import add_symmetric
 
 ORDER = 7  # of the polynomial: the smooth part is as smooth as the grid's spline
 TAYLOR = binom(-1.5, np.arange(ORDER + 1))  # of (1 + t)^(-3/2)
@@ -101,11 +102,6 @@ class NearSources:
     def nbytes(self) -> int:
         """Memory in bytes."""
         return self.starts.nbytes + self.table.nbytes
-
-    def add_to(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> None:
-        """Add field in uT and gradient in uT/m at points (N, 3) to those of the smooth part."""
-        if self.table.size:
-            add_near(points, self.corner, self.shape, self.starts, self.table, field, gradient)
 
 
 def near_sources(
@@ -330,15 +326,4 @@ def add_near(
             xy -= a * (mx * y + my * x) + c * x * y
             xz -= a * (mx * z + mz * x) + c * x * z
             yz -= a * (my * z + mz * y) + c * y * z
-        field[n, 0] += bx
-        field[n, 1] += by
-        field[n, 2] += bz
-        gradient[n, 0, 0] += xx
-        gradient[n, 1, 1] += yy
-        gradient[n, 2, 2] += zz
-        gradient[n, 0, 1] += xy
-        gradient[n, 1, 0] += xy
-        gradient[n, 0, 2] += xz
-        gradient[n, 2, 0] += xz
-        gradient[n, 1, 2] += yz
-        gradient[n, 2, 1] += yz
+        add_symmetric(n, bx, by, bz, xx, yy, zz, xy, xz, yz, field, gradient)

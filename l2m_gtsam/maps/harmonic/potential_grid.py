@@ -22,7 +22,6 @@ from l2m_gtsam.maps.harmonic.spline import (
     BELOW,
     HALF_TAPS,
     WIDTH,
-    covered_places,
     spline_coefficients,
     spline_derivatives,
 )
@@ -89,18 +88,6 @@ class PotentialGrid:
     lower: FloatArray
     spacing: float
     coefficients: FloatArray
-
-    def covers(self, points: FloatArray) -> BoolArray:
-        """Return whether the grid holds all that a point needs, shape (N,).
-
-        Parameters
-        ----------
-        points
-            Metres, shape (N, 3).
-        """
-        covered = np.empty(len(points), dtype=np.bool_)
-        covered_places(points, self.lower, self.spacing, self.coefficients, covered)
-        return covered
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m; NaN where not covered.

@@ -140,6 +140,7 @@ def best_gain(s: FloatArray, q: FloatArray) -> FloatArray:
     q
         Their pull on the weights, shape (K, 3).
     """
+    # In the axes of the information the three components of a moment are independent.
     values, vectors = np.linalg.eigh(s)
     values = np.maximum(values, 1e-12)
     pull = np.einsum("kij,ki->kj", vectors, q) ** 2

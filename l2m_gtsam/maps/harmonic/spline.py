@@ -14,7 +14,8 @@ import numpy as np
 from numba import njit
 from scipy import ndimage
 
-from l2m_gtsam.data import BoolArray, FloatArray
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.harmonic.symmetric import FAST
 
 DEGREE = 7
 WIDTH = DEGREE + 1  # coefficients per axis that a point needs
@@ -77,10 +78,6 @@ PIECES = np.tile(spline_pieces(), 3)  # once for each axis
 # run in vector registers.
 UNSIGNED = np.uint64
 
-# Sums in any order and fused products let the stencil run in vector registers; what breaks NaN
-# stays off.
-FAST = {"reassoc", "contract", "nsz"}
-
 
 @njit(cache=True, nogil=True)
 def stencil_start(
@@ -95,28 +92,6 @@ def stencil_start(
     if within and 0 <= k <= shape[2] - WIDTH:
         return int(i), int(j), int(k)
     return -1, -1, -1
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def covered_places(
-    points: FloatArray,
-    lower: FloatArray,
-    spacing: float,
-    coefficients: FloatArray,
-    covered: BoolArray,
-) -> None:
-    """Find which points have all they need."""
-    for n in range(len(points)):
-        i, j, k = stencil_start(points[n], lower, spacing, coefficients.shape)
-        covered[n] = False
-        if i < 0:
-            continue
-        total = 0.0
-        for a in range(WIDTH):
-            for b in range(WIDTH):
-                for c in range(WIDTH):
-                    total += coefficients[i + a, j + b, k + c]
-        covered[n] = not np.isnan(total)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)

@@ -12,12 +12,7 @@ from l2m_gtsam.maps.grid import grid_from
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import ORIGIN, HarmonicOptions, Learnt, reach_of
 from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources
-from l2m_gtsam.maps.harmonic.tiling import (
-    LEAST_CORE,
-    Resolution,
-    Tiling,
-    blend_of,
-)
+from l2m_gtsam.maps.harmonic.tiling import LEAST_CORE, Resolution, Tiling, blend_of
 from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
 from l2m_gtsam.maps.training import FURTHEST, TrainingSet, training_set
 

@@ -193,6 +193,7 @@ def structures_of(centres: FloatArray, options: StructureOptions) -> IntArray:
     """Return the structure of each voxel: touching voxels of one cell of ``piece``, (K,)."""
     if not len(centres):
         return np.empty(0, dtype=np.int64)
+    # Neighbours by a face, an edge or a corner: a cube's diagonal is 1.73 edges.
     touching = cKDTree(centres).query_pairs(1.8 * options.edge, output_type="ndarray")
     graph = coo_array(
         (np.ones(len(touching)), (touching[:, 0], touching[:, 1])), shape=(len(centres),) * 2

@@ -4,7 +4,7 @@ from numba import njit
 
 from l2m_gtsam.data import FloatArray
 
-# Sums in any order and fused products: loops over terms run in vector registers.
+# Sums in any order and fused products: loops run in vector registers. What breaks NaN stays off.
 FAST = {"reassoc", "contract", "nsz"}
 
 

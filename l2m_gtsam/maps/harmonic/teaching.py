@@ -3,15 +3,23 @@
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.evidence import normal_of
-from l2m_gtsam.maps.harmonic.explanation import (
-    explanation_of,
-    patchwork,
+from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.dipoles import Dipoles
+from l2m_gtsam.maps.harmonic.evidence import (
+    Normal,
+    evidence,
+    inverse_of,
+    marginalised,
+    normal_of,
+    whitened_factor,
 )
+from l2m_gtsam.maps.harmonic.explanation import explanation_of, patchwork
 from l2m_gtsam.maps.harmonic.furnish import COARSE
+from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
 from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
@@ -23,7 +31,6 @@ from l2m_gtsam.maps.harmonic.search import (
     residuals_of,
     unvisited,
 )
-from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import FEWEST, TrainingSet, merged
@@ -33,6 +40,10 @@ from l2m_gtsam.parallel.threads import in_threads
 # readings are roughest.
 JUDGED, JUDGED_ROUGH = 12, 4
 GROWTH = 1.5  # of the sources, after which the prior is learnt anew
+RANGE = (1e-4, 1e3)  # of a strength, relative to the map's structure_scale
+# A structure of which the readings determine less than half a weight is no structure.
+LEAST_DETERMINED = 0.5
+STEPS = 25
 
 
 def learn_map(raw: TrainingSet, sources: Sources, options: HarmonicOptions) -> Learnt:
@@ -165,3 +176,63 @@ def with_strengths(plain: Learnt) -> Learnt:
             if home[structure] == tile:
                 strengths[structure] = strength
     return replace(plain, strengths=strengths)
+
+
+def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparameters) -> list[float]:
+    """Return the strength of each structure among a basis's families, in their order.
+
+    Automatic relevance determination: the marginal likelihood is raised over the logarithm of
+    every strength; a structure without evidence shrinks, and is given the strength 0 where the
+    readings determine less than half a weight of it.
+
+    Parameters
+    ----------
+    basis
+        With the structures at the strength to start from.
+    normal
+        Sums over the readings, for m weights.
+    hyperparameters
+        Scales in uT, depths in metres and noise in uT of the map.
+    """
+    structures = [
+        (np.arange(columns.start, columns.stop), family.strength)
+        for columns, family in zip(basis.columns, basis.families, strict=True)
+        if isinstance(family, Dipoles)
+    ]
+    if not structures:
+        return []
+    kept = np.concatenate([columns for columns, _ in structures])
+    owner = np.repeat(np.arange(len(structures)), [len(columns) for columns, _ in structures])
+    noise, prior = hyperparameters.noise, basis.prior(hyperparameters).log_variance
+    # Floor, ceiling and uniform field stay as they are: integrated out once, not at each step.
+    alone, given = marginalised(normal, kept, prior, noise), prior[kept]
+    start = np.log([strength for _, strength in structures])
+
+    def cost(x: FloatArray) -> tuple[float, FloatArray]:
+        # A prior variance goes with the square of the strength, hence the factors of two.
+        result = evidence(alone, given + 2 * (x - start)[owner], noise)
+        slope = np.bincount(owner, result.slopes().by_log_variance).astype(np.float64)
+        return -result.value, -2 * slope
+
+    low, high = np.log(RANGE)
+    end = minimize(
+        cost,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=Bounds(low, high),
+        options={"maxiter": STEPS, "ftol": 1e-7},
+    )
+    determined = determined_weights(alone, given + 2 * (end.x - start)[owner], noise)
+    # Effective number of weights that the readings determine (MacKay 1992), by structure.
+    count = np.bincount(owner, determined)
+    return [
+        float(np.exp(x)) if c >= LEAST_DETERMINED else 0.0
+        for x, c in zip(end.x, count, strict=True)
+    ]
+
+
+def determined_weights(normal: Normal, log_variance: FloatArray, noise: float) -> FloatArray:
+    """Return the share of each weight's prior variance that the readings removed, shape (m,)."""
+    K = whitened_factor(normal, np.exp(0.5 * log_variance), noise)
+    return np.asarray(1.0 - np.diag(inverse_of(K)))

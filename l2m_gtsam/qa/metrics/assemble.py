@@ -7,12 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Recording
 from l2m_gtsam.qa.metrics.coverage import directions, drive_metrics
-from l2m_gtsam.qa.metrics.evidence import (
-    DriveEvidence,
-    Queryable,
-    SensorEvidence,
-    sensor_evidence,
-)
+from l2m_gtsam.qa.metrics.evidence import DriveEvidence, Queryable, SensorEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import (
     autocorrelation,
     curve_errors,

@@ -15,7 +15,6 @@ class Queryable(Protocol):
 
     def query(self, points: FloatArray, /) -> FieldSample:
         """Return field, gradient, variance and whether the map has data there."""
-        ...
 
 
 @dataclass(frozen=True)

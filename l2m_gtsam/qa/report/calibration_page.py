@@ -66,10 +66,7 @@ class SensorSection:
 
 
 def calibration_page(
-    result: CalibrationResult,
-    metrics: Metrics,
-    options: QaOptions,
-    progress: Progress = silent,
+    result: CalibrationResult, metrics: Metrics, options: QaOptions, progress: Progress = silent
 ) -> str:
     """Return the report on a calibration as HTML.
 

@@ -16,11 +16,7 @@ from l2m_gtsam.qa.report.figures.map import residual_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.localisation import judge_localisation, localisation_thresholds
-from l2m_gtsam.records.localisation_file import (
-    LocalisationRecord,
-    RefinedSensor,
-    SensorRecord,
-)
+from l2m_gtsam.records.localisation_file import LocalisationRecord, RefinedSensor, SensorRecord
 from l2m_gtsam.records.verdict import SensorVerdict
 from l2m_gtsam.solve.rank import PARAMETERS
 

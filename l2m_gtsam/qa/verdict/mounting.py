@@ -109,10 +109,7 @@ def _gains(case: Case) -> list[Reason]:
     skew = max(map(abs, found.skew_deg)) if known.all() else 0.0
     text = f"Its {'xyz'[axis]} axis reads {found.scale[axis]:.2f} times the field."
     skewed = f"Two of its axes are {skew:.0f}° away from a right angle."
-    return [
-        *options.scale.reasons(off[axis], text),
-        *options.skew_deg.reasons(skew, skewed),
-    ]
+    return [*options.scale.reasons(off[axis], text), *options.skew_deg.reasons(skew, skewed)]
 
 
 def _hard_iron(case: Case) -> list[Reason]:

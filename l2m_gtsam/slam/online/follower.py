@@ -18,15 +18,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from l2m_factors import (
-    D,
-    MapBatch,
-    StepError,
-    T,
-    Whitening,
-    X,
-    key_pose_factor,
-)
+from l2m_factors import D, MapBatch, StepError, T, Whitening, X, key_pose_factor
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import IntArray
 from l2m_gtsam.progress import Progress
@@ -232,12 +224,7 @@ class Follower:
         fixed = None if self._free else self._drive.sensors.fixed()
         batch = MapBatch(self._map, readings, fixed)
         for each in pending.accepted:
-            yield key_pose_factor(
-                batch,
-                each.step.key_pose,
-                each.whitening,
-                step=each.step,
-            )
+            yield key_pose_factor(batch, each.step.key_pose, each.whitening, step=each.step)
 
     def _hand_over(self, last: int) -> None:
         """Begin a new section at the last key pose of this one."""

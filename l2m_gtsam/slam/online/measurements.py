@@ -11,13 +11,7 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place_readings
-from l2m_gtsam.slam.online.belief import (
-    POSE,
-    SENSOR,
-    Belief,
-    PredictedBelief,
-    WhitenedMeasurement,
-)
+from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, PredictedBelief, WhitenedMeasurement
 from l2m_gtsam.slam.pose_graph import stated_information_root
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening

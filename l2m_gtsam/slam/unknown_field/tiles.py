@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import ComplexityPenalty
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
+from l2m_gtsam.maps.harmonic.family import UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.furnish import UNIFORM_SIGMA
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
@@ -18,7 +19,6 @@ from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
 from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_area
-from l2m_gtsam.maps.harmonic.uniform import UniformField
 from l2m_gtsam.maps.training import merged, training_set
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place_readings

@@ -83,8 +83,7 @@ class ScalingOptions(Options):
     """Readings per second on the drive, of which the wanted number is taken, evenly."""
     site: SiteOptions = SiteOptions(
         scenario=ScenarioOptions(
-            noise=NoiseOptions(field=0.2),
-            calibration_sampling=SamplingOptions(field_rate=10.0),
+            noise=NoiseOptions(field=0.2), calibration_sampling=SamplingOptions(field_rate=10.0)
         ),
         sync=SyncOptions(thin_distance_m=0.0, thin_angle_deg=0.0),
     )

@@ -11,14 +11,7 @@ from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.cli.tables.calibration import disagreement_note
-from l2m_gtsam.data import (
-    Distortion,
-    FieldSample,
-    FloatArray,
-    KnownSensor,
-    Recording,
-    SourceFile,
-)
+from l2m_gtsam.data import Distortion, FieldSample, FloatArray, KnownSensor, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration

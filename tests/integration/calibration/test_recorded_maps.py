@@ -13,8 +13,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import solve_one_key
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings
 from l2m_gtsam.maps.build import MapOptions, build_map
-from l2m_gtsam.maps.harmonic.compiled import CompiledMap
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.records.calibration import Uncertainty
 
 MAPPED = slice(0, 5)  # runs of the array that make its map

@@ -13,12 +13,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import BagError, UnitsError
 from l2m_gtsam.storage.bag import read_fields, read_recording, read_trajectory
-from l2m_gtsam.storage.bag_options import (
-    BagOptions,
-    ColumnOptions,
-    PoseFileOptions,
-    RegressorTopic,
-)
+from l2m_gtsam.storage.bag_options import BagOptions, ColumnOptions, PoseFileOptions, RegressorTopic
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.regressors import read_scalars
 from l2m_gtsam.storage.units import Unit
@@ -243,6 +238,26 @@ def test_damaged_ulogs_are_one_line(tmp_path: Path) -> None:
             read_recording(path, BagOptions())
         assert str(error.value).startswith(f"{path}: ")
         assert "\n" not in str(error.value)
+
+
+def test_a_ulog_of_strangers_is_no_danger(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Times that do not fit, names that are none, and what the parser prints of damage."""
+    mag = {"magnetometer_ga": 3}
+    late = np.asarray(9.1e15 + 20_000.0 * np.arange(COUNT), dtype=np.float64)
+    path = write_ulog(tmp_path / "late.ulg", [("vehicle_magnetometer", 0, mag, late, readings())])
+    with pytest.raises(BagError, match="damaged: times on /vehicle_magnetometer are those of no"):
+        read_fields(path, BagOptions())
+    stamps = np.asarray(20_000.0 * np.arange(1, COUNT + 1), dtype=np.float64)
+    odd = ("class", 0, {"a b": 1, "class": 1, "1st": 1}, stamps, readings())
+    good = ("vehicle_magnetometer", 0, mag, stamps, readings(0.01))
+    path = write_ulog(tmp_path / "odd.ulg", [good, odd])
+    data = bytearray(path.read_bytes())
+    path.write_bytes(data + b"\x05\x00D\xff\x00abc")  # of a topic that is not there
+    (found,) = read_fields(path, BagOptions())
+    np.testing.assert_allclose(found.field, readings(), rtol=1e-6)
+    assert capfd.readouterr().out == ""
 
 
 def test_poses_of_a_file_beside_a_log(tmp_path: Path) -> None:

@@ -10,14 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.calibrate import calibrate
-from l2m_gtsam.data import (
-    Distortion,
-    FieldSample,
-    FloatArray,
-    Recording,
-    ScalarSeries,
-    SourceFile,
-)
+from l2m_gtsam.data import Distortion, FieldSample, FloatArray, Recording, ScalarSeries, SourceFile
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.qa.fleet import rotations_apart
 from l2m_gtsam.qa.metrics.changes import compare_calibrations
@@ -26,12 +19,7 @@ from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresho
 from l2m_gtsam.recording.drive_trace import trace_of
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
 from l2m_gtsam.records.sensor_models import MovingField
-from l2m_gtsam.records.validation import (
-    CalibrationPart,
-    DriveValidation,
-    NamedSource,
-    Validation,
-)
+from l2m_gtsam.records.validation import CalibrationPart, DriveValidation, NamedSource, Validation
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.record_files import read_validation, write_validation
 from l2m_gtsam.validation.validate import joint_covariance, validate

@@ -8,9 +8,9 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
-from l2m_gtsam.maps.harmonic.error_options import ErrorOptions
 from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.learnt import ErrorOptions
 from l2m_gtsam.maps.harmonic.tile import Tile
 from tests.worlds.harmonic import PRIOR, fitted_map, queries, within_survey
 

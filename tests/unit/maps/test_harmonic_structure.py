@@ -10,7 +10,6 @@ from l2m_gtsam.maps.harmonic.dipoles import moment_features
 from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.frame import tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of, dipoles_of
-from l2m_gtsam.maps.harmonic.strengths import learn_strengths
 from l2m_gtsam.maps.harmonic.structure import (
     NO_SOURCES,
     SIGHT,
@@ -18,9 +17,10 @@ from l2m_gtsam.maps.harmonic.structure import (
     StructureOptions,
     candidate_sources,
 )
-from l2m_gtsam.maps.harmonic.teaching import learn_map
+from l2m_gtsam.maps.harmonic.teaching import learn_map, learn_strengths
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.training import TrainingSet, training_set
+from tests.reference.potentials import features
 from tests.worlds.harmonic import GIVEN, OPTIONS
 
 DRIVE = np.column_stack(
@@ -143,7 +143,7 @@ def test_combinations_leave_out_only_what_no_reading_sees() -> None:
     np.testing.assert_allclose(gram, np.eye(len(seen)), atol=1e-12)
     local, moments = frame.localise(points), rng.normal(size=count)
     field = moment_features(local, seen.positions) @ moments
-    kept = seen.features(local) @ (seen.combinations.T @ moments)
+    kept = features(seen, local) @ (seen.combinations.T @ moments)
     # Each combination that is left out holds less than FINE of the best one's energy, and the
     # best of so many holds more than its share of the field's.
     assert np.sum((field - kept) ** 2) < FINE * count**2 * np.sum(field**2)

@@ -15,6 +15,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
     resolution_of,
     tiling_of,
 )
+from tests.reference.potentials import features
 from tests.worlds.harmonic import GIVEN
 
 POSITIVE = st.floats(0.05, 20.0)
@@ -61,12 +62,12 @@ def test_readings_tell_of_a_mode_what_the_resolution_assumes() -> None:
     """4 pi s^2 (2h)^3 k exp(-2kh) density / sigma^2 against the normal matrix of readings."""
     edge, count = 6.0, 4000
     xy = np.random.default_rng(5).uniform(0, edge, (count, 2))
-    F = modes_up_to(FLOOR, np.full(2, edge), 0.0, 5.0)
-    features = F.features(np.column_stack([xy, np.zeros(count)]))
-    information = np.einsum("nim,nim->m", features, features) / GIVEN.noise**2
-    k, h = np.abs(F.kz), GIVEN.floor_depth
-    both = (F.numbers > 0).all(axis=1)
-    ratio = np.exp(F.prior(GIVEN).log_variance) * information
+    modes = modes_up_to(FLOOR, np.full(2, edge), 0.0, 5.0)
+    F = features(modes, np.column_stack([xy, np.zeros(count)]))
+    information = np.einsum("nim,nim->m", F, F) / GIVEN.noise**2
+    k, h = np.abs(modes.kz), GIVEN.floor_depth
+    both = (modes.numbers > 0).all(axis=1)
+    ratio = np.exp(modes.prior(GIVEN).log_variance) * information
     formula = 4 * np.pi * GIVEN.floor_scale**2 * (2 * h) ** 3 * k * np.exp(-2 * k * h)
     formula *= count / edge**2 / GIVEN.noise**2
     # Random places average a wave's square to 1 / sqrt(4000): 2 %, of 60 modes the worst 6 %.

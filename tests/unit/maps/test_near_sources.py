@@ -3,7 +3,7 @@ import pytest
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
-from l2m_gtsam.maps.harmonic.near_sources import PointSources, near_sources
+from l2m_gtsam.maps.harmonic.near_sources import PointSources, add_near, near_sources
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialLattice
 
 RADIUS = 0.7
@@ -29,7 +29,8 @@ def exact(of: PointSources, points: FloatArray) -> tuple[FloatArray, FloatArray]
 
 def near(of: PointSources, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     field, gradient = np.zeros((len(points), 3)), np.zeros((len(points), 3, 3))
-    near_sources(of, LOWER, UPPER, RADIUS).add_to(points, field, gradient)
+    near = near_sources(of, LOWER, UPPER, RADIUS)
+    add_near(points, near.corner, near.shape, near.starts, near.table, field, gradient)
     return field, gradient
 
 

@@ -6,12 +6,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.simulate.hall_drives import (
-    CLEARANCE_M,
-    HallSurvey,
-    calibration_drive,
-    survey,
-)
+from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, HallSurvey, calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import (
     EARTH,
     HALF_AREA,

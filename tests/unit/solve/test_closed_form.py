@@ -14,10 +14,12 @@ from l2m_gtsam.solve.closed_form import (
     RidgeRule,
     Weighting,
     fit_distortion,
+    generalised_cross_validation,
+    l_curve,
+    ridge_path,
     ridge_unit,
     row_weights,
 )
-from l2m_gtsam.solve.ridge import generalised_cross_validation, l_curve, ridge_path
 
 
 def pairs(seed: int, count: int, noise: float) -> tuple[FloatArray, FloatArray, Distortion]:

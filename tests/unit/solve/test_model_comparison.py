@@ -14,12 +14,15 @@ from scipy.signal import lfilter
 from l2m_gtsam.cli.tables.calibration import model_table
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.sensor_models import Coefficients, Model, Samples
-from l2m_gtsam.solve.model_choice import HeldOut, Trial, choose, reason_of
 from l2m_gtsam.solve.model_comparison import (
+    HeldOut,
     ModelOptions,
+    Trial,
+    choose,
     compare_models,
     correlation_of,
     predicted,
+    reason_of,
     segments_of,
 )
 from l2m_gtsam.solve.model_fits import Fit, Solution, Spread, compress, fit_model

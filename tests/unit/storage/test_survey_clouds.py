@@ -1,5 +1,6 @@
 """Clouds that surveyors deliver, as the formats' own libraries write them."""
 
+import struct
 from pathlib import Path
 
 import laspy
@@ -63,6 +64,23 @@ def test_damaged_files_are_one_line(tmp_path: Path, suffix: str) -> None:
             read_cloud(path)
         assert str(error.value).startswith(f"{path}: ")
         assert "\n" not in str(error.value)
+
+
+def test_more_than_fits_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    """Else laspy counts to four thousand million, and what unpacks LAZ ends the program."""
+    content = bytearray(las(tmp_path / "good.laz").read_bytes())
+    path = tmp_path / "bad.laz"
+    many = content.copy()
+    struct.pack_into("<I", many, 100, 2**32 - 1)  # records
+    path.write_bytes(many)
+    with pytest.raises(MapError, match="declares 4294967295 records"):
+        read_cloud(path)
+    (start,) = struct.unpack_from("<I", content, 96)
+    (table,) = struct.unpack_from("<q", content, start)
+    struct.pack_into("<I", content, table + 4, 2**32 - 1)  # chunks
+    path.write_bytes(content)
+    with pytest.raises(MapError, match="declares 4294967295 chunks of 500 points"):
+        read_cloud(path)
 
 
 def test_geographic_coordinates_are_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from l2m_gtsam.errors import ConfigError, MapError, Notice
-from l2m_gtsam.maps.harmonic.compiled_arrays import near_from_arrays
+from l2m_gtsam.maps.harmonic.compiled import near_from_arrays
 from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, Entry
 from l2m_gtsam.storage import tile_folder
 from l2m_gtsam.storage.tile_folder import (

@@ -181,11 +181,7 @@ def rejected_figure(path: LocalisedTrajectory, sensors: Sequence[SensorRecord]) 
 
 
 def _bars(
-    axes: Axes,
-    edges: Sequence[float],
-    foot: FloatArray | float,
-    height: FloatArray,
-    **style: Any,
+    axes: Axes, edges: Sequence[float], foot: FloatArray | float, height: FloatArray, **style: Any
 ) -> None:
     """Draw bars upwards from a line; values grow downwards on this axis."""
     feet = np.broadcast_to(foot, height.shape)

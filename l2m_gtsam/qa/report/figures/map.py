@@ -138,13 +138,7 @@ def _map(picture: MapPicture, values: Rows, label: str, colours: str) -> tuple[F
 
 
 def draw_map(
-    figure: Figure,
-    axes: Axes,
-    image: FloatArray,
-    extent: Row,
-    label: str,
-    colours: str,
-    **bar: Any,
+    figure: Figure, axes: Axes, image: FloatArray, extent: Row, label: str, colours: str, **bar: Any
 ) -> None:
     """Draw values over the map, its colours from the first to the last hundredth of them.
 

@@ -1,0 +1,1 @@
+"""Methods that others published, written from their papers, for comparison."""
