@@ -96,7 +96,7 @@ async function tabbed(browser) {
   await page.setViewport(WINDOWS[0]);
   await page.goto(address);
   const stops = [];
-  for (let k = 0; k < 12; k += 1) {
+  for (let k = 0; k < 24; k += 1) {
     await page.keyboard.press("Tab");
     stops.push(
       await page.evaluate(() => {
