@@ -18,6 +18,7 @@ from l2m_gtsam.records.calibration import (
     Uncertainty,
 )
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
+from l2m_gtsam.storage.result_set import check_set
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
 FORMAT = "l2m-calibration"
@@ -141,6 +142,7 @@ def read_calibration(path: Path) -> CalibrationResult:
     CalibrationError
         The file is missing, damaged or something else.
     """
+    check_set(path, CalibrationError)
     found = read_checked(path, _FILE, _as_record, added=("distortion", "judgement"))
     if found.judgement is not None and not found.judgement.verdict.follows:
         raise CalibrationError(

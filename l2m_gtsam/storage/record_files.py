@@ -19,6 +19,7 @@ from l2m_gtsam.records.metrics import Metrics, Record
 from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.result_set import check_set
 
 MAX_BYTES = 100_000_000  # figures of a hundred sensors are some megabytes
 MAX_OUTCOME_BYTES = 10_000_000  # a hundred sensors are some 100 kB
@@ -214,6 +215,7 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
     CalibrationError
         The file is missing, damaged or something else.
     """
+    check_set(path, CalibrationError)
     raw = read_content(path, MAX_BYTES, CalibrationError, f"no such file; {writer}")
     try:
         return adapter.validate_json(raw)
