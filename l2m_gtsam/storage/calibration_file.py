@@ -142,8 +142,8 @@ def read_calibration(path: Path) -> CalibrationResult:
     CalibrationError
         The file is missing, damaged or something else.
     """
-    check_set(path, CalibrationError)
     found = read_checked(path, _FILE, _as_record, added=("distortion", "judgement"))
+    check_set(path, CalibrationError)
     if found.judgement is not None and not found.judgement.verdict.follows:
         raise CalibrationError(
             f"{path}: verdict.level: {found.judgement.verdict.level.upper()} does not follow from "

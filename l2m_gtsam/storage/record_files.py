@@ -215,10 +215,11 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
     CalibrationError
         The file is missing, damaged or something else.
     """
-    check_set(path, CalibrationError)
     raw = read_content(path, MAX_BYTES, CalibrationError, f"no such file; {writer}")
     try:
-        return adapter.validate_json(raw)
+        found = adapter.validate_json(raw)
     except ValidationError as error:
         fault = first_fault(error)
         raise CalibrationError(f"{path}: not a {kind} file of this program: {fault}") from error
+    check_set(path, CalibrationError)
+    return found

@@ -1,6 +1,5 @@
 """Results as a set: all or none, known by one fingerprint, refused when they are mixed."""
 
-import os
 import shutil
 from pathlib import Path
 
@@ -142,4 +141,4 @@ def test_names_outside_are_not_removed(tmp_path: Path) -> None:
     result_set.finish(out)
     assert precious.exists()
     assert not ready.exists()
-    assert os.listdir(out)
+    assert there(out) == dict.fromkeys(NAMES, "old")
