@@ -21,7 +21,10 @@ Value = TypeVar("Value")
 
 LOOPBACK = "127.0.0.1"
 CONNECT_S = 20  # a scheduler that is there answers at once
-NO_PAGES = {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+NO_PAGES: dict[str, list[str]] = {
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
 DIED = "every worker that began it died; give the workers more memory"
 
 
