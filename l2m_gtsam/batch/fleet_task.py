@@ -27,8 +27,9 @@ from l2m_gtsam.storage.drive_lists import (
     read_manifest,
 )
 from l2m_gtsam.storage.files import folder_names, printable, source_file
+from l2m_gtsam.storage.parts import sweep
 from l2m_gtsam.storage.record_files import write_outcome
-from l2m_gtsam.storage.result_set import SET_FILE
+from l2m_gtsam.storage.result_set import SET_FILE, finish
 
 PAGE_FILE, CSV_FILE, PARQUET_FILE = "index.html", "fleet.csv", "fleet.parquet"
 
@@ -302,7 +303,9 @@ def _clear(folder: Path) -> None:
     files = [folder / name for name in (OUTCOME_FILE, *RESULTS, PDF_FILE, SET_FILE)]
     check_outputs(*files)
     try:
+        finish(folder)
         for file in files:
+            sweep(file)
             file.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error

@@ -15,7 +15,8 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.options import first_fault
 from l2m_gtsam.records.fleet import DATE, VERDICTS, DriveOutcome, SensorRow
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.records.metrics import Metrics, Record
+from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path

@@ -17,7 +17,7 @@ from typing import Literal
 from pydantic import TypeAdapter, ValidationError
 
 from l2m_gtsam.errors import L2MError, OutputError
-from l2m_gtsam.records.metrics import Record
+from l2m_gtsam.records.record import Record
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.parts import only_one, part_folder

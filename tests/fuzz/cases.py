@@ -9,7 +9,7 @@ from pathlib import Path
 from random import Random
 
 from tests.fuzz.corpus import CASE, OUT, Sound
-from tests.fuzz.runner import BAD, GOOD, Ended, run_case
+from tests.fuzz.runner import BAD, GOOD, MORE_CPU_S, MOST_CPU_S, Ended, run_case
 
 OUT_NAME = "out"
 
@@ -75,7 +75,8 @@ def ended(case: Case, keep: Path | None = None) -> Ended:
             else word
             for word in case.words
         ]
-        found = run_case(words, folder, out)
+        most_s = MORE_CPU_S if case.sound.computes else MOST_CPU_S
+        found = run_case(words, folder, out, most_s)
         if found.how in BAD and keep is not None:
             kept = keep / f"{case.number}-{found.how.replace(' ', '_')}"
             kept.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tests.fuzz.cases import run_cases, table
-from tests.fuzz.corpus import Sound, quick_corpus, whole_corpus
+from tests.fuzz.corpus import Sound, make_demo, quick_corpus, whole_corpus
 from tests.fuzz.runner import BAD, import_commands
 
 FILES = Path(__file__).parents[1] / "files"
@@ -27,6 +27,7 @@ def main() -> None:
     if asked.demo is None:
         corpus = quick_corpus(corpus_folder, files)
     else:
+        make_demo(asked.demo.resolve())
         corpus = whole_corpus(corpus_folder, files, asked.demo.resolve())
     import_commands()
     run(range(asked.first, asked.first + asked.cases), corpus, asked.out)

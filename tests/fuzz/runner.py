@@ -15,7 +15,8 @@ from time import monotonic, sleep
 from l2m_gtsam.cli import app
 from tests.fuzz.readers import READERS
 
-MOST_CPU_S = 20
+MOST_CPU_S = 20  # of a command that reads
+MORE_CPU_S = 60  # of one that computes: sound files take up to 20
 MOST_WALL_S = 240  # on a machine that others use, too
 MOST_BYTES = 3 << 29  # 1.5 GiB
 MORE_ADDRESSES = 6 << 30  # keeps the machine from harm when a case takes all memory
@@ -42,7 +43,7 @@ class Ended:
     peak_bytes: int
 
 
-def run_case(words: Sequence[str], folder: Path, out: Path) -> Ended:
+def run_case(words: Sequence[str], folder: Path, out: Path, most_s: int = MOST_CPU_S) -> Ended:
     """Run a command in a folder, in a process that ends with it.
 
     Parameters
@@ -53,22 +54,24 @@ def run_case(words: Sequence[str], folder: Path, out: Path) -> Ended:
         Working folder, with the input.
     out
         What is written begins with this name, if anything is.
+    most_s
+        Seconds of a core that it may take.
     """
     log = folder / "said.log"
     number = os.fork()
     if number == 0:
-        _child(words, folder, log)
+        _child(words, folder, log, most_s)
     status, usage, late = _awaited(number)
     said = log.read_text(encoding="utf-8", errors="replace")
     log.unlink()
     cpu_s, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
-    how = _judged(status, said, late or cpu_s > MOST_CPU_S, peak)
+    how = _judged(status, said, late or cpu_s > most_s, peak)
     if how in GOOD.values() and (left := _left_over(folder, out, status)):
         how, said = "left over", f"{left}\n{said}"
     return Ended(how, said, cpu_s, peak)
 
 
-def _child(words: Sequence[str], folder: Path, log: Path) -> None:
+def _child(words: Sequence[str], folder: Path, log: Path, most_s: int) -> None:
     """Run the command and end the process."""
     try:
         os.chdir(folder)
@@ -80,7 +83,7 @@ def _child(words: Sequence[str], folder: Path, log: Path) -> None:
         with contextlib.suppress(ValueError, OSError):
             own = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
             resource.setrlimit(resource.RLIMIT_AS, (own + MORE_ADDRESSES,) * 2)
-        resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_S + 5, MOST_CPU_S + 6))
+        resource.setrlimit(resource.RLIMIT_CPU, (most_s + 5, most_s + 6))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         if words[0] == "read":
             _replace_command(READERS[words[1]], Path(words[2]))
