@@ -19,6 +19,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--demo", type=Path, help="folder of `l2m demo`, for commands that compute")
+    parser.add_argument("--computing", action="store_true", help="of a demonstration's files alone")
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
     corpus_folder = (asked.out / "corpus").resolve()
@@ -28,7 +29,8 @@ def main() -> None:
         corpus = quick_corpus(corpus_folder, files)
     else:
         make_demo(asked.demo.resolve())
-        corpus = whole_corpus(corpus_folder, files, asked.demo.resolve())
+        whole = whole_corpus(corpus_folder, files, asked.demo.resolve())
+        corpus = [each for each in whole if each.computes or not asked.computing]
     import_commands()
     run(range(asked.first, asked.first + asked.cases), corpus, asked.out)
 
