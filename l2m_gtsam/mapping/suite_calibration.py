@@ -7,9 +7,9 @@ from importlib.metadata import version
 import numpy as np
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
-from l2m_gtsam.errors import MapError
+from l2m_gtsam.errors import L2MError, MapError
 from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteCalibrationOptions
-from l2m_gtsam.mapping.suite_solver import SuiteSolution, solve_suite
+from l2m_gtsam.mapping.suite_solver import SuiteSolution, SuiteStep, first_step, solve_suite
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.joining import joined
@@ -25,6 +25,7 @@ from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.rotation import polar_rotation
 
 REACH = 5.0  # standard deviations of a clock for which readings need poses around them
+NOTICED = 0.1  # share of the residuals' squares; sensors as assumed explain 16 S / 3 N of them
 UNDETERMINED = 0.5  # share of the prior sigma above which the drive does not determine a parameter
 PARAMETERS = (
     *("t_lidar_mag x", "t_lidar_mag y", "t_lidar_mag z"),
@@ -36,11 +37,15 @@ PARAMETERS = (
 
 @dataclass(frozen=True)
 class SuiteDrive:
-    """The drive of a suite: one recording, or several joined, and its readings with poses."""
+    """The drive of a suite: one recording, or several joined, and its readings with poses.
+
+    ``assumed`` are the S sensors' parameters before the survey, shape (S, 16).
+    """
 
     recording: Recording
     readings: Readings
     counts: tuple[SyncCounts, ...]
+    assumed: FloatArray
 
     def at(self, offset: FloatArray) -> Readings:
         """Return the readings with the poses at their stamps and these clock offsets, (S,)."""
@@ -77,17 +82,63 @@ def calibrate_suite(
     SyncError
         Readings and poses do not overlap.
     """
-    drive = suite_drive(recordings, options)
-    known = [(assumed or {}).get(name, KnownSensor.ideal(name)) for name in drive.readings.sensors]
-    start = np.stack([_parameters(each) for each in known])
-    solution = solve_suite(drive.at, start, options, progress)
+    drive = suite_drive(recordings, assumed, options)
+    solution = solve_suite(drive.at, drive.assumed, options, progress)
     return _result(drive, solution, options)
 
 
-def suite_drive(recordings: Sequence[Recording], options: SuiteCalibrationOptions) -> SuiteDrive:
+@one_blas_thread()
+def suite_doubts(
+    recordings: Sequence[Recording],
+    assumed: Mapping[str, KnownSensor] | None,
+    options: SuiteCalibrationOptions,
+) -> tuple[str, ...]:
+    """Return a sentence where other sensors would explain a survey much better than the assumed.
+
+    A map of sensors that are not what is assumed is wrong everywhere, and its noise hides it: the
+    field that one place has under two headings is averaged. One step of the scoring that calibrates
+    a suite tells how much of the residuals' squares the sensors would explain.
+
+    Parameters
+    ----------
+    recordings, assumed
+        As in ``calibrate_suite``.
+    options
+        Of the calibration; fewer windows, readings and modes are enough here.
+    """
+    few = options.model_copy(update={"windows": 2, "readings": 800, "modes": 200})
+    try:
+        drive = suite_drive(recordings, assumed, few)
+        step = first_step(drive.at, drive.assumed, few)
+    except L2MError:  # a survey too small to judge its sensors by: the map has its own checks
+        return ()
+    if step.explained < NOTICED:
+        return ()
+    return (
+        (
+            "the survey's sensors look uncalibrated: a first step towards other values explains "
+            f"{step.explained:.0%} of what the map takes for noise (largest change: "
+            f"{_largest(step)}); calibrate them with `l2m map suite`, then build the map with "
+            "--suite"
+        ),
+    )
+
+
+def _largest(step: SuiteStep) -> str:
+    """Return the sensor's parameter that moves by the most of its sigmas."""
+    sensor, k = np.unravel_index(np.argmax(np.abs(step.sigmas)), step.sigmas.shape)
+    return f"{step.names[sensor]}, {PARAMETERS[k]}"
+
+
+def suite_drive(
+    recordings: Sequence[Recording],
+    assumed: Mapping[str, KnownSensor] | None,
+    options: SuiteCalibrationOptions,
+) -> SuiteDrive:
     """Return drives of a suite as one, with readings that have poses whatever their clocks."""
     recording = joined(recordings)
-    reach = REACH * options.clock_s
+    stated = [abs(each.time_offset) for each in (assumed or {}).values()]
+    reach = REACH * options.clock_s + max(stated, default=0.0)
     synchronised = synchronise(recording, options.sync, reach)
     readings = synchronised.readings
     if stuck := [readings.sensors[index] for index in stuck_sensors(readings)]:
@@ -95,11 +146,15 @@ def suite_drive(recordings: Sequence[Recording], options: SuiteCalibrationOption
             f"{recording.source.path}: the sensor {stuck[0]!r} is stuck on one value; choose the "
             "others with `bag.fields`"
         )
-    return SuiteDrive(recording, readings, synchronised.counts)
+    known = [(assumed or {}).get(name, KnownSensor.ideal(name)) for name in readings.sensors]
+    start = np.stack([_parameters(each) for each in known])
+    return SuiteDrive(recording, readings, synchronised.counts, start)
 
 
 def _parameters(sensor: KnownSensor) -> FloatArray:
-    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector(), [0.0]])
+    """Return (t, C row by row, H, time offset), shape (16,)."""
+    offset = [sensor.time_offset]
+    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector(), offset])
 
 
 def _result(

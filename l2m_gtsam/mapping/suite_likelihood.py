@@ -60,8 +60,9 @@ class SuiteCalibrationOptions(Options):
     """The most readings of one of them."""
     modes: int = Field(default=300, ge=50)
     """About how many waves describe the field in one of them; time goes with the square."""
-    rounds: int = Field(default=6, ge=1)
-    """How often strength and depth of the field's sources are learnt anew, at the most."""
+    rounds: int = Field(default=20, ge=1)
+    """How often strength and depth of the field's sources are learnt anew, at the most. Sensors on
+    a planar robot settle slowly (about eight rounds): scale and depth of the field trade."""
     steps: int = Field(default=10, ge=1)
     """The most steps of the solve in one round."""
 

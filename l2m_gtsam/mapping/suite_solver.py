@@ -139,6 +139,40 @@ def solve_suite(
     return SuiteSolution(found, found.residuals(), converged, round_ + 1)
 
 
+@dataclass(frozen=True)
+class SuiteStep:
+    """The first scoring step from the assumed sensors.
+
+    Attributes
+    ----------
+    names
+        Of the S sensors.
+    sigmas
+        Change of (t, C row by row, H, time offset) in the sigmas of the scoring, shape (S, 16).
+    explained
+        Share of the residuals' squares that it takes away.
+    """
+
+    names: tuple[str, ...]
+    sigmas: FloatArray
+    explained: float
+
+
+def first_step(
+    readings_at: ReadingsAt, assumed: FloatArray, options: SuiteCalibrationOptions
+) -> SuiteStep:
+    """Return the first step of ``solve_suite``, for the price of one evaluation.
+
+    Raises
+    ------
+    MapError
+        There are too few readings.
+    """
+    problem = SuiteProblem(readings_at, assumed, options)
+    readings = readings_at(assumed[:, -1])
+    return problem.step(windows_over(readings, assumed, options), assumed, readings.sensors)
+
+
 class SuiteProblem:
     """The likelihood of a drive and what is assumed of its sensors.
 
@@ -177,6 +211,19 @@ class SuiteProblem:
         return SuiteRound(
             sensors, windows, score.residuals, self._covariance(score, alike), settled
         )
+
+    def step(self, windows: SuiteWindows, sensors: FloatArray, names: tuple[str, ...]) -> SuiteStep:
+        """Return one scoring step in given windows.
+
+        Residuals are white by the noise of the windows' prior, so that the gain ``slope^T step``
+        is the fall of their sum of squares, and their number what it is a share of.
+        """
+        score = self._scored(windows, sensors)
+        covariance = self._covariance(score, 1.0)
+        step = covariance @ score.slope
+        count = sum(residual.size for residual in score.residuals)
+        sigmas = (step / np.sqrt(np.diag(covariance))).reshape(sensors.shape)
+        return SuiteStep(names, sigmas, float(score.slope @ step) / count)
 
     def _covariance(self, score: SuiteLikelihood, alike: float) -> FloatArray:
         """Return the covariance where so many readings count as one, shape (16 S, 16 S)."""

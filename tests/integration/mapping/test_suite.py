@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, Trajectory
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
-from l2m_gtsam.mapping.suite_calibration import calibrate_suite
+from l2m_gtsam.mapping.suite_calibration import calibrate_suite, suite_doubts
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
@@ -110,6 +110,21 @@ def test_a_map_of_the_suite_counts_its_clocks(
     # Poses between two samples are interpolated: 0.02 uT here.
     assert misfits[1] < 0.13
     assert misfits[0] > 2 * misfits[1]
+
+
+def test_sensors_that_are_not_as_assumed_are_noticed(
+    found: tuple[tuple[KnownSensor, ...], Recording, CalibrationResult],
+) -> None:
+    """True sensors are believed; ideal ones and an offset of 2 uT that is not there are not."""
+    truth, recording, _ = found
+    true = {each.sensor: replace(each, time_offset=-CLOCK) for each in truth}
+    wrong = replace(truth[0].distortion, H=truth[0].distortion.H + 2.0 * np.eye(3)[0])
+    off = true | {truth[0].sensor: replace(true[truth[0].sensor], distortion=wrong)}
+    assert suite_doubts([recording], true, QUICK) == ()
+    assert "look uncalibrated" in suite_doubts([recording], None, QUICK)[0]
+    (doubt,) = suite_doubts([recording], off, QUICK)
+    assert "mag_00, H" in doubt
+    assert "l2m map suite" in doubt
 
 
 def test_a_drive_that_never_turns_says_what_it_does_not_tell() -> None:
