@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-SHARED = ("worlds", "drives", "support", "reference")
+SHARED = ("worlds", "drives", "support", "reference", "fuzz")
 """Folders of ``tests`` that tests and benchmarks may import from."""
 
 

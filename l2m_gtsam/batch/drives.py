@@ -33,6 +33,7 @@ from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.inspect import BagReport, inspect_bag
 from l2m_gtsam.storage.record_files import write_metrics
 from l2m_gtsam.storage.rerun_file import require_rerun, write_scene
+from l2m_gtsam.storage.result_set import published
 
 CALIBRATION_FILE = "calibration.yaml"
 OVERVIEW_FILE = "overview.png"
@@ -127,14 +128,13 @@ def calibrate_drive(
     result = replace(unjudged, judgement=judgement_of(unjudged, metrics, config.qa))
     drives = [each.trajectory for each in recording.parts]
     figure = calibration_figure(metrics.map, drives, result, truth)
-    ensure_folder(out)
-    if view is not None:
-        ensure_folder(view.parent)
-    write_calibration(out / CALIBRATION_FILE, result)
-    write_metrics(out / METRICS_FILE, metrics)
-    save_figure(figure, out / OVERVIEW_FILE)
+    with published(out, CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE) as stage:
+        write_calibration(stage / CALIBRATION_FILE, result)
+        write_metrics(stage / METRICS_FILE, metrics)
+        save_figure(figure, stage / OVERVIEW_FILE)
     progress(FIGURES, 1.0)
     if view is not None:
+        ensure_folder(view.parent)
         write_scene(view, scene_of(recording, found))
     return Appraised(result, metrics)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder
+from l2m_gtsam.batch.files import SavedMap, check_outputs
 from l2m_gtsam.batch.fleet_task import (
     CSV_FILE,
     OUTCOME_FILE,
@@ -25,7 +25,7 @@ from l2m_gtsam.batch.fleet_task import (
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
-from l2m_gtsam.progress import Progress, counter
+from l2m_gtsam.progress import Count, Progress, counter
 from l2m_gtsam.qa.fleet import with_outliers
 from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.fleet_page import fleet_page
@@ -33,7 +33,9 @@ from l2m_gtsam.records.fleet import DriveOutcome, FleetRow
 from l2m_gtsam.records.verdict import Level, worst
 from l2m_gtsam.storage.files import atomic_path, printable, source_file
 from l2m_gtsam.storage.fleet_table import write_csv, write_parquet
+from l2m_gtsam.storage.parts import only_one
 from l2m_gtsam.storage.record_files import read_outcome
+from l2m_gtsam.storage.result_set import made, published
 
 COUNTS = {"bag", "calibration", "qa"}  # parts of a configuration that a drive's results depend on
 WORK = Work(map_of, open_map, calibrated_drive, lost_drive)
@@ -93,19 +95,29 @@ def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) ->
     check_outputs(*(out / name for name in (PAGE_FILE, CSV_FILE, PARQUET_FILE)))
     fleet_options = load_config(order.config).fleet
     tasks = fleet_tasks(drives, out)
-    count = counter("fleet", progress)
+    with made(out), only_one(out):
+        return _computed(tasks, out, fleet_options, cluster, counter("fleet", progress))
+
+
+def _computed(
+    tasks: Sequence[FleetTask],
+    out: Path,
+    options: FleetOptions,
+    cluster: ClusterOptions,
+    count: Count,
+) -> Fleet:
+    """Compute what is missing; write page and tables of all drives."""
     outcomes: dict[str, DriveOutcome] = {}
     for task in tasks:
         if (there := _there(task)) is not None:
             outcomes[task.drive.folder] = there
             count(len(outcomes), len(tasks))
     missing = [task for task in tasks if task.drive.folder not in outcomes]
-    ensure_folder(out)
     for task, outcome in computed(WORK, missing, cluster):
         outcomes[task.drive.folder] = outcome
         count(len(outcomes), len(tasks))
     rows = [row for task in tasks for row in _rows(task.drive, outcomes[task.drive.folder])]
-    return _publish(out, rows, fleet_options, Fleet((), len(tasks), len(missing), ()))
+    return _publish(out, rows, options, Fleet((), len(tasks), len(missing), ()))
 
 
 def fleet_tasks(listed: Sequence[FleetDrive], out: Path) -> list[FleetTask]:
@@ -177,10 +189,11 @@ def _rows(drive: FleetDrive, outcome: DriveOutcome) -> list[FleetRow]:
 def _publish(out: Path, rows: Sequence[FleetRow], options: FleetOptions, fleet: Fleet) -> Fleet:
     """Write page and tables; return the fleet with its rows."""
     marked = with_outliers(sorted(rows, key=_order), options)
-    write_csv(out / CSV_FILE, marked)
-    notes = write_parquet(out / PARQUET_FILE, marked)
-    with atomic_path(out / PAGE_FILE) as temporary:
-        temporary.write_text(fleet_page(marked, options), encoding="utf-8", errors="replace")
+    with published(out, PAGE_FILE, CSV_FILE, PARQUET_FILE) as stage:
+        write_csv(stage / CSV_FILE, marked)
+        notes = write_parquet(stage / PARQUET_FILE, marked)
+        with atomic_path(stage / PAGE_FILE) as temporary:
+            temporary.write_text(fleet_page(marked, options), encoding="utf-8", errors="replace")
     return replace(fleet, rows=marked, notes=notes)
 
 

@@ -10,7 +10,7 @@ from time import perf_counter
 
 from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, calibrate_drive
 from l2m_gtsam.batch.files import OpenMap, SavedMap, check_outputs, ensure_folder
-from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_calibration
+from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, calibration_results, report_calibration
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
@@ -27,7 +27,9 @@ from l2m_gtsam.storage.drive_lists import (
     read_manifest,
 )
 from l2m_gtsam.storage.files import folder_names, printable, source_file
+from l2m_gtsam.storage.parts import sweep
 from l2m_gtsam.storage.record_files import write_outcome
+from l2m_gtsam.storage.result_set import SET_FILE, finish
 
 PAGE_FILE, CSV_FILE, PARQUET_FILE = "index.html", "fleet.csv", "fleet.parquet"
 
@@ -270,8 +272,9 @@ def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
 def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float) -> DriveOutcome:
     recording = read_drive_on(saved, task.drive.bag, task.config, silent)
     saved.check_frame(recording)
-    found = calibrate_drive(recording, opened, task.config, task.out, silent)
-    verdict = report_calibration(task.out, found, task.config.qa)
+    with calibration_results(task.out) as stage:
+        found = calibrate_drive(recording, opened, task.config, stage, silent)
+        verdict = report_calibration(stage, found, task.config.qa)
     return DriveOutcome(
         key=task.key(recording.source.sha256),
         start=_start(recording),
@@ -297,11 +300,12 @@ def _unexpected(path: Path, error: Exception) -> str:
 
 def _clear(folder: Path) -> None:
     """Remove results of an earlier bag, map or configuration: they must not pass for new ones."""
-    files = [folder / name for name in (OUTCOME_FILE, *RESULTS, PDF_FILE)]
+    files = [folder / name for name in (OUTCOME_FILE, *RESULTS, PDF_FILE, SET_FILE)]
     check_outputs(*files)
     try:
-        # What a killed run was about to write has a name of its own.
-        for file in [*files, *folder.glob(".*.part")]:
+        finish(folder)
+        for file in files:
+            sweep(file)
             file.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error

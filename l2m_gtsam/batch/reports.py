@@ -4,12 +4,14 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, Appraised
+from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, Appraised
 from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
@@ -28,6 +30,7 @@ from l2m_gtsam.records.verdict import Judgement, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.record_files import read_metrics, read_slam, write_slam
+from l2m_gtsam.storage.result_set import published
 
 SLAM_FILE = "slam.json"
 
@@ -59,17 +62,23 @@ def report_localisation(folder: Path, config: Path | None, page: Path) -> Judgem
         options = saved_options(source, found.options, QaOptions, "qa")
     judgement = judgement_of_localisation(found, options)
     record = replace(found, judgement=judgement)
-    write_slam_report(page, record, options)
-    if judgement != found.judgement:
-        write_slam(source, record)
+    with published(folder, adds=True) as stage:
+        write_slam_report(stage / page.name, record, options)
+        if judgement != found.judgement:
+            write_slam(stage / SLAM_FILE, record)
     return judgement
 
 
 def write_slam_report(page: Path, record: LocalisationRecord, options: QaOptions) -> None:
     """Write the report on a localisation."""
     text = localisation_page(record, options)
-    with atomic_path(page) as temporary:
-        temporary.write_text(text, encoding="utf-8", errors="replace")
+    with published(page.parent, page.name, adds=True) as stage:
+        _write_page(stage / page.name, text)
+
+
+def _write_page(path: Path, page: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, encoding="utf-8", errors="replace")
 
 
 BROWSERS = (
@@ -165,6 +174,27 @@ def report_folder(
     return judgement
 
 
+@contextmanager
+def calibration_results(out: Path) -> Iterator[Path]:
+    """Give a hidden folder for a calibration and its report, which are published together.
+
+    Parameters
+    ----------
+    out
+        Where they are to be.
+
+    Raises
+    ------
+    OutputError
+        They cannot be written, or the folder holds a localisation, too.
+    """
+    names = (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE, REPORT_FILE, PDF_FILE)
+    check_outputs(*(out / name for name in names))
+    holds_localisation(out)
+    with published(out, *names) as stage:
+        yield stage
+
+
 def report_calibration(
     folder: Path, found: Appraised, options: QaOptions, progress: Progress | None = None
 ) -> Verdict:
@@ -221,9 +251,10 @@ def _report_calibration(folder: Path, config: Path | None, progress: Progress) -
     check_names([each.sensor for each in found.sensors], options)
     judgement = judgement_of(found, metrics, options)
     result = replace(found, judgement=judgement)
-    write_report(folder, result, metrics, options, progress)
-    if judgement != found.judgement:
-        write_calibration(source, result)
+    with published(folder, adds=True) as stage:
+        write_report(stage, result, metrics, options, progress)
+        if judgement != found.judgement:
+            write_calibration(stage / CALIBRATION_FILE, result)
     return judgement
 
 
@@ -245,8 +276,8 @@ def write_report(
     """
     check_names([each.sensor for each in result.sensors], options)
     page = calibration_page(result, metrics, options, progress)
-    with atomic_path(folder / REPORT_FILE) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="replace")
+    with published(folder, REPORT_FILE, adds=True) as stage:
+        _write_page(stage / REPORT_FILE, page)
     return judge(result, metrics, options)
 
 

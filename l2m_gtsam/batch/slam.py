@@ -6,7 +6,7 @@ from itertools import chain
 from pathlib import Path
 
 from l2m_gtsam.batch.drives import METRICS_FILE
-from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder
+from l2m_gtsam.batch.files import SavedMap, check_outputs
 from l2m_gtsam.batch.maps import write_map
 from l2m_gtsam.batch.reports import REPORT_FILE, SLAM_FILE, write_slam_report
 from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow, scan_start
@@ -43,6 +43,7 @@ from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.point_cloud2 import has_clouds
 from l2m_gtsam.storage.pose_files import read_tum
 from l2m_gtsam.storage.record_files import write_slam
+from l2m_gtsam.storage.result_set import published
 from l2m_gtsam.storage.trajectory_files import LocalisedMotion, write_trajectory_bag, write_tum
 
 # Along what a scan does not show a fix says nothing, nor do some hundreds of them; more than this
@@ -250,11 +251,13 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     unjudged = localisation_record(found.result, found.solution, context)
     judgement = judgement_of_localisation(unjudged, config.qa)
     record = replace(unjudged, judgement=judgement)
-    ensure_folder(out)
-    _write(found, record, config, out)
-    if saved is None:
-        _write_map(found, config, out)
-    write_slam_report(out / REPORT_FILE, record, config.qa)
+    # A map that was read may be there from an exploration.
+    names = [name for name in FILES if name != MAP_FILE or saved is None]
+    with published(out, *names) as stage:
+        _write(found, record, config, stage)
+        if saved is None:
+            _write_map(found, config, stage)
+        write_slam_report(stage / REPORT_FILE, record, config.qa)
     return SlamOutcome(found.result, record, judgement.verdict)
 
 
@@ -316,7 +319,6 @@ def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path)
     write_trajectory_bag(out / BAG_FILE, LocalisedMotion(result.trajectory, velocity, odometry))
     with atomic_path(out / GRAPH_FILE) as temporary:
         write_g2o(temporary, found.solution)
-    (out / REFINED_FILE).unlink(missing_ok=True)  # of an earlier run, which these files replace
     if result.calibration is not None:
         refined = replace(
             result.calibration,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, saved_options
+from l2m_gtsam.batch.files import SavedMap, check_outputs, saved_options
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.calibration.calibrate import VERSIONED
 from l2m_gtsam.calibration.options import CalibrationOptions
@@ -29,6 +29,7 @@ from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import atomic_path, source_file
 from l2m_gtsam.storage.record_files import write_validation
+from l2m_gtsam.storage.result_set import published
 from l2m_gtsam.validation.validate import validate
 
 VALIDATION_FILE = "validation.json"
@@ -206,7 +207,7 @@ def _source(role: str, path: Path) -> NamedSource:
 
 def _write(folder: Path, found: Validation) -> None:
     page = validation_page(found)
-    ensure_folder(folder)
-    write_validation(folder / VALIDATION_FILE, found)
-    with atomic_path(folder / PAGE_FILE) as temporary:
-        temporary.write_text(page, encoding="utf-8", errors="replace")
+    with published(folder, VALIDATION_FILE, PAGE_FILE) as stage:
+        write_validation(stage / VALIDATION_FILE, found)
+        with atomic_path(stage / PAGE_FILE) as temporary:
+            temporary.write_text(page, encoding="utf-8", errors="replace")

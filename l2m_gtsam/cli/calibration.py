@@ -184,14 +184,15 @@ def calibrate(
     """Calibrate every magnetometer of one drive or several; write a picture and a report, too."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import CALIBRATION_FILE, OVERVIEW_FILE, calibrate_bags
-        from l2m_gtsam.batch.reports import REPORT_FILE, report_calibration
+        from l2m_gtsam.batch.reports import REPORT_FILE, calibration_results, report_calibration
         from l2m_gtsam.config import load_config, with_poses, with_uncertainty
 
         drives = [*(bags or ()), *(more or ())]
         chosen = with_poses(load_config(config), drives, poses or (), times)
         chosen = with_uncertainty(chosen, uncertainty)
-        found = calibrate_bags(drives, map_path, chosen, out, progress, view=view)
-        verdict = report_calibration(out, found, chosen.qa, progress)
+        with calibration_results(out) as stage:
+            found = calibrate_bags(drives, map_path, chosen, stage, progress, view=view)
+            verdict = report_calibration(stage, found, chosen.qa, progress)
     _print_calibration(found.result, models, wide)
     print_verdict(verdict)
     written = [out / name for name in (CALIBRATION_FILE, OVERVIEW_FILE, REPORT_FILE)]

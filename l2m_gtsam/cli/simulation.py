@@ -61,7 +61,7 @@ def demo(
     with shown_progress() as progress:
         from l2m_gtsam.batch.drives import OVERVIEW_FILE, calibrate_bag
         from l2m_gtsam.batch.maps import build_map_file
-        from l2m_gtsam.batch.reports import REPORT_FILE, report_folder
+        from l2m_gtsam.batch.reports import REPORT_FILE, calibration_results, report_folder
         from l2m_gtsam.batch.simulation import STRUCTURE_FILE, SUITE_FILE, bag_name, simulate_bags
         from l2m_gtsam.cli.tables.calibration import consistency_note, truth_table
         from l2m_gtsam.config import Config
@@ -72,8 +72,9 @@ def demo(
         mapping, drive = (out / bag_name(each, BagKind.MCAP) for each in ("mapping", "calibration"))
         cloud = str(out / STRUCTURE_FILE)
         build_map_file([mapping], map_path, chosen, out / SUITE_FILE, progress, cloud)
-        result = calibrate_bag(drive, map_path, chosen, out, progress, truth)
-        report_folder(out, None, progress)
+        with calibration_results(out) as stage:
+            result = calibrate_bag(drive, map_path, chosen, stage, progress, truth)
+            report_folder(stage, None, progress)
     print_table(truth_table(result, truth), wide)
     say(consistency_note(result, truth))
     picture, page = out / OVERVIEW_FILE, out / REPORT_FILE

@@ -21,6 +21,10 @@ Value = TypeVar("Value")
 
 LOOPBACK = "127.0.0.1"
 CONNECT_S = 20  # a scheduler that is there answers at once
+NO_PAGES: dict[str, list[str]] = {
+    "distributed.scheduler.http.routes": [],
+    "distributed.worker.http.routes": [],
+}
 DIED = "every worker that began it died; give the workers more memory"
 
 
@@ -78,7 +82,7 @@ def computed(
     """
     if not keys:
         return
-    with _client(options) as client:
+    with connected(options) as client:
         from distributed.scheduler import KilledWorker
 
         alone: list[Key] = []
@@ -145,11 +149,12 @@ def _finished(
 
 
 @contextmanager
-def _client(options: ClusterOptions) -> "Iterator[Client]":
+def connected(options: ClusterOptions) -> "Iterator[Client]":
     """Yield a connection to the workers, and stop those that were started here."""
     try:
+        import cryptography  # noqa: F401 - the keys of a local cluster need it, and say so late
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client, LocalCluster, Security
     except ImportError as error:
         raise ClusterError("Dask is missing: pip install 'l2m-gtsam[cluster]'") from error
     if options.scheduler is not None:
@@ -161,14 +166,16 @@ def _client(options: ClusterOptions) -> "Iterator[Client]":
             _await_worker(client, options.scheduler)
             yield client
         return
-    # Each worker has a core to itself, and so one thread for everything.
+    # Whoever talks to a scheduler runs code as its owner: keys of this run alone, never on a disk,
+    # keep out other users of the machine. Each worker has a core to itself, and one thread.
     one = {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, THREADS: 1}
     with (
-        dask.config.set({"distributed.nanny.pre-spawn-environ": one}),
+        dask.config.set({**NO_PAGES, "distributed.nanny.pre-spawn-environ": one}),
         LocalCluster(
             n_workers=options.workers,
             threads_per_worker=1,
-            host=LOOPBACK,
+            host=f"tls://{LOOPBACK}",
+            security=Security.temporary(),
             dashboard_address=f"{LOOPBACK}:0",
             memory_limit=None,
         ) as cluster,

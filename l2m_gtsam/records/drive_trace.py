@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from l2m_gtsam.records.metrics import Record, Row
+from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.records.record import Record
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from l2m_gtsam.records.metrics import Record, Row
+from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.records.record import Record
 
 VERDICTS = ("pass", "warn", "fail")
 """On a sensor."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, RigidTransform, SourceFile, Trajectory
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.metrics import Record
+from l2m_gtsam.records.record import Record
 
 
 class LocalisationStatus(StrEnum):

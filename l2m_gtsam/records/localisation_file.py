@@ -4,8 +4,9 @@ Positions are in metres, fields in microtesla, angles in degrees, times in secon
 covariances, which are in rad and m. A number that does not exist is NaN.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from l2m_gtsam.records.localisation import (
     DriftFigures,
@@ -16,7 +17,8 @@ from l2m_gtsam.records.localisation import (
     SensorUse,
     StartVerdict,
 )
-from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Record, Row, Rows, Series
+from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Row, Rows, Series
+from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.validation import ChiSquare, NamedSource
 from l2m_gtsam.records.verdict import Judgement
 
@@ -38,6 +40,12 @@ class PoseRecord(Record):
         translation (m), along the axes of the lidar, (6, 6); absent where it is unknown.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "p": "3",
+        "quaternion_xyzw": "4",
+        "covariance": "6 6",
+    }
+
     stamp_ns: int
     p: Row
     quaternion_xyzw: Row
@@ -56,6 +64,12 @@ class OdometryRecord(Record):
         How sure it is by then: along x, y, z of the map in m, and about them in degrees.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "p": "3",
+        "quaternion_xyzw": "4",
+        "sigma": "6",
+    }
+
     p: Row
     quaternion_xyzw: Row
     sigma: Row
@@ -72,6 +86,13 @@ class Timeline(Record):
     used, rejected, outside
         That counted, that the map does not explain, that it has no data for.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "used": "N",
+        "rejected": "N",
+        "outside": "N",
+        "edges": "N+1",
+    }
 
     edges: Row
     used: tuple[int, ...]
@@ -116,6 +137,13 @@ class RefinedSensor(Record):
         of it: at most this if that covariance was true.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "before": "15",
+        "sigma_before": "15",
+        "after": "15",
+        "sigma_after": "15",
+    }
+
     sensor: str
     before: Row
     sigma_before: Row
@@ -156,6 +184,13 @@ class TruthRecord(Record):
         Distances, and squared errors in units of their covariances, K of each; NaN there, too.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "path": "N 3",
+        "odometry_m": "N",
+        "localised_m": "N",
+        "squared": "N",
+    }
+
     poses: int
     odometry: PoseErrors
     localised: PoseErrors
@@ -192,6 +227,12 @@ class StartCandidateRecord(Record):
     log_likelihood, inside, explained, chi2_per_dof
         Of the readings looked at, and how they fit.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "p": "3",
+        "quaternion_xyzw": "4",
+        "covariance": "6 6",
+    }
 
     p: Row
     quaternion_xyzw: Row

@@ -4,20 +4,14 @@ Positions are in metres, fields in microtesla, angles in degrees, times in secon
 does not exist is NaN. Rows of axes are in the order x, y, z.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pydantic import ConfigDict
+from l2m_gtsam.records.record import Record
 
 Row = tuple[float, ...]
 Rows = tuple[Row, ...]
-
-
-@dataclass(frozen=True)
-class Record:
-    """A part of a file in JSON; numbers that are not finite are text there."""
-
-    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(ser_json_inf_nan="strings")
 
 
 @dataclass(frozen=True)
@@ -65,6 +59,11 @@ class DriveRepeat(Record):
     largest
         Largest part of that difference in sigmas: of t, of C and of H.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "estimate": "15",
+        "sigma": "15",
+    }
 
     bag: str
     estimate: Row
@@ -162,6 +161,12 @@ class Mounting(Record):
         Which axes of the lidar its axes lie along.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "scale": "3",
+        "skew_deg": "3",
+        "turned_about": "3",
+    }
+
     scale: Row
     skew_deg: Row
     angle_deg: float
@@ -190,6 +195,11 @@ class FitFigures(Record):
     without_map
         What is left of the readings, per axis, if the field is taken to be uniform.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "mean": "3",
+        "rms": "3",
+    }
 
     readings: int
     sensor_noise: float
@@ -225,6 +235,12 @@ class Normalised(Record):
         Share of those beyond the 95 % quantile; 0.05 is consistent.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "std": "3",
+        "counts": "N",
+        "edges": "N+1",
+    }
+
     std: Row
     edges: Row
     counts: tuple[int, ...]
@@ -246,6 +262,11 @@ class Autocorrelation(Record):
     independent
         How many independent readings they are worth.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "lags": "N",
+        "correlation": "N",
+    }
 
     lags: tuple[int, ...]
     correlation: Row
@@ -272,6 +293,10 @@ class Directions(Record):
         Between the highest and the lowest angle of the field over the lidar's xy plane.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "spread": "3",
+    }
+
     covered: float
     spread: Row
     tilt_deg: float
@@ -290,6 +315,12 @@ class CurveErrors(Record):
     after_std
         Standard deviation of the difference after the calibration per axis.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "before_axes": "3",
+        "after_axes": "3",
+        "after_std": "3",
+    }
 
     before: float
     after: float
@@ -317,6 +348,18 @@ class Series(Record):
     drive
         Which drive each is of, from 0, length N; absent where there is one.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "seconds": "N",
+        "place": "N 3",
+        "residual": "N 3",
+        "normalised": "N 3",
+        "rejected": "N",
+        "before": "N 3",
+        "after": "N 3",
+        "map": "N 3",
+        "drive": "N",
+    }
 
     seconds: Row
     place: Rows
@@ -362,6 +405,12 @@ class MapPicture(Record):
         Length of the field and its standard deviation per axis; NaN where the map has no data.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "extent": "4",
+        "strength": "N M",
+        "sigma": "N M",
+    }
+
     extent: Row
     height: float
     strength: Rows
@@ -385,6 +434,10 @@ class DriveMetrics(Record):
     heading
         Share of the headings that were driven, in steps of 15 degrees.
     """
+
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "path": "N 3",
+    }
 
     path: Rows
     seconds: float

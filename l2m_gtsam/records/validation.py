@@ -10,7 +10,8 @@ from typing import Annotated
 
 from pydantic import AliasChoices, Field
 
-from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Record, Row, Series
+from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Row, Series
+from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.verdict import Threshold, Verdict
 
 

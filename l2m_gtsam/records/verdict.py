@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from pydantic import AliasChoices, Field
 
-from l2m_gtsam.records.metrics import Record
+from l2m_gtsam.records.record import Record
 
 
 class Level(StrEnum):

@@ -1,6 +1,5 @@
 """Simulated recordings as real bags."""
 
-import tempfile
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -18,6 +17,7 @@ from l2m_gtsam.errors import OutputError
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.simulate.sensors import NoiseOptions
+from l2m_gtsam.storage.parts import part_folder
 from l2m_gtsam.storage.ros_messages import (
     NANOSECONDS,
     Channel,
@@ -184,11 +184,11 @@ def write_bag(
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         # rosbag2 repeats the folder's name inside, so the name is right and its parent temporary.
-        with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as parent:
-            unfinished = Path(parent) / path.name
+        with part_folder(path) as parent:
+            unfinished = parent / path.name
             _write(unfinished, kind, recording, options or WriterOptions(), beside or Beside())
             if path.is_dir():  # a folder that is not empty cannot be renamed over
-                path.rename(Path(parent) / "replaced")
+                path.rename(parent / "replaced")
             unfinished.rename(path)
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error

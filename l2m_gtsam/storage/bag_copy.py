@@ -1,7 +1,6 @@
 """A new bag of the same kind as another, which appears when it is complete or not at all."""
 
 import sqlite3
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -29,6 +28,7 @@ from rosbags.rosbag2.storage_mcap import McapReader
 
 from l2m_gtsam.errors import OutputError
 from l2m_gtsam.storage.open_bag import Bag, typestore
+from l2m_gtsam.storage.parts import part_folder
 from l2m_gtsam.storage.ros_messages import ros1, ros2
 
 SUFFIX = {StoragePlugin.MCAP: ".mcap", StoragePlugin.SQLITE3: ".db3"}
@@ -147,9 +147,9 @@ def bag_copy(source: Bag, out: Path) -> Iterator[BagCopy]:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         # rosbag2 repeats the folder's name inside, so the name is right and its parent temporary.
-        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as parent:
+        with part_folder(out) as parent:
             single = _is_single(out)
-            unfinished = Path(parent) / (out.stem if single else out.name)
+            unfinished = parent / (out.stem if single else out.name)
             with _writer(source.reader, unfinished) as writer:
                 yield BagCopy(source, writer)
             finished = unfinished / (unfinished.name + out.suffix) if single else unfinished

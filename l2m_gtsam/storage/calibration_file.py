@@ -18,6 +18,7 @@ from l2m_gtsam.records.calibration import (
     Uncertainty,
 )
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
+from l2m_gtsam.storage.result_set import check_set
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
 FORMAT = "l2m-calibration"
@@ -142,6 +143,7 @@ def read_calibration(path: Path) -> CalibrationResult:
         The file is missing, damaged or something else.
     """
     found = read_checked(path, _FILE, _as_record, added=("distortion", "judgement"))
+    check_set(path, CalibrationError)
     if found.judgement is not None and not found.judgement.verdict.follows:
         raise CalibrationError(
             f"{path}: verdict.level: {found.judgement.verdict.level.upper()} does not follow from "

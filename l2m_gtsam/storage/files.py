@@ -2,11 +2,10 @@
 
 import hashlib
 import os
-import secrets
 import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Protocol, TextIO
@@ -14,6 +13,7 @@ from typing import Protocol, TextIO
 from l2m_gtsam.data import SourceFile
 from l2m_gtsam.errors import L2MError, OutputError
 from l2m_gtsam.storage.bounded import open_regular, opened
+from l2m_gtsam.storage.parts import part_file
 
 MAX_TEXT_BYTES = 500_000_000  # a day of poses at 50 Hz
 
@@ -75,16 +75,12 @@ def renamed_path(path: Path) -> Iterator[Path]:
     """
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: cannot be written: it exists and is not a regular file")
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
-        temporary.touch(exist_ok=False)
-        yield temporary
-        temporary.replace(path)
+        with part_file(path) as temporary:
+            yield temporary
+            temporary.replace(path)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

@@ -147,8 +147,12 @@ class Bag:
                 break
             except Exception as error:
                 raise BagError(_damaged(self.path, error)) from error
-            if record_ns > LATEST_NS:
-                raise BagError(f"{self.path}: damaged: a message is recorded at {record_ns} ns")
+            # SQLite keeps in a column whatever is written to it.
+            if not isinstance(record_ns, int) or not -LATEST_NS <= record_ns <= LATEST_NS:
+                raise BagError(f"{self.path}: damaged: a message is recorded at {record_ns!r} ns")
+            if not isinstance(raw, bytes | bytearray | memoryview):
+                topic = connection.topic
+                raise BagError(f"{self.path}: damaged: a message on {topic} is {raw!r:.20}")
             received += 1
             yield RawMessage(connection, record_ns, raw)
         if progress is not None:

@@ -15,10 +15,12 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.options import first_fault
 from l2m_gtsam.records.fleet import DATE, VERDICTS, DriveOutcome, SensorRow
 from l2m_gtsam.records.localisation_file import LocalisationRecord
-from l2m_gtsam.records.metrics import Metrics, Record
+from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.result_set import check_set
 
 MAX_BYTES = 100_000_000  # figures of a hundred sensors are some megabytes
 MAX_OUTCOME_BYTES = 10_000_000  # a hundred sensors are some 100 kB
@@ -216,7 +218,9 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
     """
     raw = read_content(path, MAX_BYTES, CalibrationError, f"no such file; {writer}")
     try:
-        return adapter.validate_json(raw)
+        found = adapter.validate_json(raw)
     except ValidationError as error:
         fault = first_fault(error)
         raise CalibrationError(f"{path}: not a {kind} file of this program: {fault}") from error
+    check_set(path, CalibrationError)
+    return found

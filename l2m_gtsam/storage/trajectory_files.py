@@ -1,6 +1,5 @@
 """Trajectories written as text in TUM's format, and as ROS 2 has them: ``trajectory.mcap``."""
 
-import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.parts import part_folder
 from l2m_gtsam.storage.ros_messages import odometry_channel, ros2, transform_channel, write_channels
 
 HEADER = "# stamp (s)  x y z (m)  qx qy qz qw: the lidar in the map\n"
@@ -83,9 +83,9 @@ def write_trajectory_bag(path: Path, motion: LocalisedMotion) -> None:
     stamps = np.concatenate([channel.stamp_ns for channel in channels])
     with (
         atomic_path(path) as temporary,
-        tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder,
+        part_folder(path) as folder,
     ):
-        bag = Path(folder) / path.stem  # rosbag2 makes a folder, and repeats its name inside
+        bag = folder / path.stem  # rosbag2 makes a folder, and repeats its name inside
         with Ros2Writer(bag, version=8, storage_plugin=StoragePlugin.MCAP) as writer:
             write_channels(writer, dialect, channels, stamps)
         (bag / f"{bag.name}.mcap").replace(temporary)

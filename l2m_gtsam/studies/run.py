@@ -22,6 +22,8 @@ from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.parts import only_one
+from l2m_gtsam.storage.result_set import made
 from l2m_gtsam.studies.study import Study
 
 Opts = TypeVar("Opts", bound=Options)
@@ -104,6 +106,19 @@ def run_study(
     ClusterError
         See ``computed``.
     """
+    with made(out), only_one(out):
+        return _run(study, options, out, cluster, progress, command)
+
+
+def _run(
+    study: Study[Opts, Cell, Summary],
+    options: Opts,
+    out: Path,
+    cluster: ClusterOptions,
+    progress: Progress,
+    command: str,
+) -> StudyFile[Opts, Summary]:
+    """Compute and write a study in a folder that no other run writes to."""
     keys = study.keys(options)
     folder = CellFolder.opened(out / CELLS, study, options)
     finished = {key: cell for key in keys if (cell := folder.read(key)) is not None}

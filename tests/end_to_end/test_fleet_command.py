@@ -32,6 +32,7 @@ from l2m_gtsam.batch.fleet_task import (
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.fleet import DriveOutcome
+from l2m_gtsam.storage.result_set import SET_FILE
 from tests.drives.fleets import Place, make_place, not_a_bag, truncated, vehicle
 from tests.support.command_line import Finished, complaint_here, l2m
 
@@ -125,7 +126,7 @@ NUMBER = re.compile(r"(?<![\w#])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w])")
 def test_a_drive_has_what_calibrate_writes(run: Run, tmp_path: Path) -> None:
     bag = run.bags / "truck_1" / "day_0.bag"
     l2m("calibrate", bag, "--map", run.place.map, "--config", run.place.config, "--out", tmp_path)
-    assert {each.name for each in tmp_path.iterdir()} == set(RESULTS)
+    assert {each.name for each in tmp_path.iterdir()} == {*RESULTS, SET_FILE}
     for name in RESULTS:
         ours, own = ((folder / name) for folder in (run.out / "truck_1/day_0", tmp_path))
         if ours.suffix == ".png":
@@ -274,7 +275,7 @@ def test_results_of_an_earlier_bag_do_not_stay(run: Run, tmp_path: Path) -> None
     not_a_bag(bag)
     tasks = fleet_tasks(fleet_drives(there.order), there.out)
     (task,) = (each for each in tasks if each.drive.folder == "truck_1/day_0")
-    (task.out / ".report.html.12ab.part").write_text("of a run that was killed")
+    (task.out / ".report.html.12ab34cd.part").write_text("of a run that was killed")
     outcome = calibrated_drive(task, open_map(there.place.map))
     assert outcome.lasting
     assert {each.name for each in task.out.iterdir()} == {OUTCOME_FILE}

@@ -1,0 +1,38 @@
+"""What all records that are files have in common: numbers as JSON has them, arrays that fit."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from pydantic import ConfigDict
+
+
+def _fits(value: Sequence[Any], shape: Sequence[str], lengths: dict[str, int]) -> bool:
+    """Return whether rows in rows have a shape; letters that have no length yet get one."""
+    letter, _, more = shape[0].partition("+")
+    if letter.isdigit():
+        expected = int(letter)
+    else:
+        expected = lengths.setdefault(letter, len(value) - int(more or 0)) + int(more or 0)
+    if len(value) != expected:
+        return False
+    return len(shape) == 1 or all(_fits(row, shape[1:], lengths) for row in value)
+
+
+@dataclass(frozen=True)
+class Record:
+    """A part of a file in JSON; numbers that are not finite are text there."""
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(ser_json_inf_nan="strings")
+    SHAPES: ClassVar[Mapping[str, str]] = {}
+    """Of arrays, as `N 3`: letters are lengths that fields share, `N+1` is one more."""
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError for arrays whose shapes do not fit together."""
+        lengths: dict[str, int] = {}
+        for name, shape in self.SHAPES.items():
+            value = getattr(self, name)
+            if value is not None and not _fits(value, shape.split(), lengths):
+                known = ", ".join(f"{letter} = {length}" for letter, length in lengths.items())
+                where = f" with {known}" if known else ""
+                raise ValueError(f"{name} must have the shape ({shape}){where}")

@@ -1,0 +1,53 @@
+"""Files changed at random: a short run for the gate, a long one for `make study`."""
+
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.fuzz.cases import Case, case_of, ended, run_cases, table
+from tests.fuzz.corpus import Sound, make_demo, quick_corpus, whole_corpus
+from tests.fuzz.run import FILES, run
+from tests.fuzz.runner import BAD, GOOD, import_commands
+
+SHORT = 88  # cases, four of each file
+LONG = "L2M_FUZZ_CASES"  # environment variable: how many cases of the long run
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> list[Sound]:
+    import_commands()
+    return quick_corpus(tmp_path_factory.mktemp("corpus"), FILES.resolve())
+
+
+def test_sound_files_are_read(corpus: list[Sound]) -> None:
+    """Else their changes would all be refused for one reason."""
+    for number, sound in enumerate(corpus):
+        words = sound.commands[0]
+        found = ended(Case(number, sound, "none", words, sound.path.read_bytes()))
+        assert found.how == GOOD[0], (sound.kind, found)
+
+
+def test_a_case_is_the_same_each_time(corpus: list[Sound]) -> None:
+    for number in range(len(corpus)):
+        assert case_of(corpus, number) == case_of(corpus, number)
+
+
+def test_nothing_breaks_it(corpus: list[Sound], tmp_path: Path) -> None:
+    ends = {case.name: end for case, end in run_cases(corpus, range(SHORT), tmp_path)}
+    assert not {name: end for name, end in ends.items() if end.how in BAD}
+    assert {end.how for end in ends.values()} >= {GOOD[0], GOOD[2]}
+
+
+@pytest.mark.study
+def test_nothing_breaks_it_for_long(tmp_path: Path) -> None:
+    demo = tmp_path / "demo"
+    make_demo(demo)
+    folder = tmp_path / "corpus"
+    folder.mkdir()
+    import_commands()
+    whole = whole_corpus(folder, FILES.resolve(), demo)
+    ends: Counter[tuple[str, str]] = run(range(int(os.environ.get(LONG, "10000"))), whole, tmp_path)
+    print(table(ends))
+    assert not [end for end in ends if end[1] in BAD]
