@@ -271,8 +271,8 @@ def _unsolved(
         status, message = (
             SensorStatus.NO_READINGS,
             (
-                f"none of its {usable - outside} readings inside the map fits any distortion: is the "
-                "sensor saturated, and is it the right map with poses in its frame?"
+                f"none of its {usable - outside} readings inside the map fits any distortion: is "
+                "the sensor saturated, and is it the right map with poses in its frame?"
             ),
         )
     rotation = _no_rotation()
