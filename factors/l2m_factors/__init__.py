@@ -3,6 +3,7 @@
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.complexity import ComplexityPenalty, effective_parameters_factor
 from l2m_factors.field_map import DifferentiableMap
+from l2m_factors.fixed_axes_step import fixed_axes_step_factor
 from l2m_factors.key_pose_readings import (
     Calibrations,
     KeyPoseReadings,
@@ -64,6 +65,7 @@ __all__ = [
     "distortion_prior",
     "effective_parameters_factor",
     "field_rate",
+    "fixed_axes_step_factor",
     "held_directions",
     "key_pose_factor",
     "key_pose_residuals",

@@ -37,6 +37,8 @@ from l2m_gtsam.solve.explain import movement
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 
+COVERED = 0.5  # share of the lidar's places, above which a map is that of the drive
+
 
 @dataclass(frozen=True)
 class Calibrated:
@@ -131,7 +133,8 @@ def calibrated(
     )
     sensors = sensor_verdicts(drive, options)
     if not solution.solved:
-        raise CalibrationError(_nothing_solved(recording, map_source, sensors))
+        covered = bool(np.mean(field_map.query(recording.trajectory.p).inside) > COVERED)
+        raise CalibrationError(_nothing_solved(recording, map_source, sensors, covered))
     verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
     result = CalibrationResult(
         sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
@@ -215,9 +218,18 @@ def _in_own_time(stretch: Disagreement, recording: Recording) -> Disagreement:
 
 
 def _nothing_solved(
-    recording: Recording, map_source: SourceFile | None, sensors: tuple[SensorCalibration, ...]
+    recording: Recording,
+    map_source: SourceFile | None,
+    sensors: tuple[SensorCalibration, ...],
+    covered: bool,
 ) -> str:
+    """Return why; ``covered`` is whether the map has data where the lidar was."""
     place = map_source.path if map_source else "the map"
+    if covered:
+        return (
+            f"{recording.source.path}: no sensor can be solved, although {place} covers the drive: "
+            f"{sensors[0].sensor}: {sensors[0].message}"
+        )
     if any(sensor.status is SensorStatus.OUTSIDE_MAP for sensor in sensors):
         low, high = recording.trajectory.p.min(axis=0), recording.trajectory.p.max(axis=0)
         return (

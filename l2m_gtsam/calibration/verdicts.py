@@ -267,6 +267,14 @@ def _unsolved(
     )
     if usable < needed:
         status, message = SensorStatus.NO_READINGS, _why_silent(usable, counts, moved, needed)
+    elif usable - outside >= needed:
+        status, message = (
+            SensorStatus.NO_READINGS,
+            (
+                f"none of its {usable - outside} readings inside the map fits any distortion: is "
+                "the sensor saturated, and is it the right map with poses in its frame?"
+            ),
+        )
     rotation = _no_rotation()
     return SensorCalibration(
         sensor=name,

@@ -12,7 +12,7 @@ with independent weights, whose variances are the spectral density at the eigenf
 number. The uniform field ``u_0`` has three weights of its own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -72,15 +72,15 @@ class PotentialBasis:
         """
         size = np.asarray(high - low, dtype=np.float64)
         waves = smallest_waves(size, count)
-        squared = np.einsum("ni,ni->n", waves, waves)
-        density = (2 * np.pi * prior.length**2) ** 1.5 * np.exp(-0.5 * squared * prior.length**2)
+        made = cls(np.asarray(low, dtype=np.float64), size, waves, np.empty(0))
+        return replace(made, variance=made.variances(prior))
+
+    def variances(self, prior: PotentialHyperparameters) -> FloatArray:
+        """Return the variances of the weights by a prior, shape (m,)."""
+        squared = np.einsum("ni,ni->n", self.waves, self.waves) * prior.length**2
+        density = (2 * np.pi * prior.length**2) ** 1.5 * np.exp(-0.5 * squared)
         uniform = np.full(AXES, prior.uniform**2)
-        return cls(
-            np.asarray(low, dtype=np.float64),
-            size,
-            waves,
-            np.concatenate([uniform, prior.sigma**2 * density]),
-        )
+        return np.concatenate([uniform, prior.sigma**2 * density])
 
     def __len__(self) -> int:
         return len(self.variance)

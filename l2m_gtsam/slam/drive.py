@@ -176,6 +176,11 @@ class KnownSensors:
     noise: FloatArray
     covariance: FloatArray
 
+    def loosened(self, distortion: float, offset: float) -> "KnownSensors":
+        """Return them with less certain C, and H in uT: by these standard deviations more."""
+        more = np.concatenate([np.zeros(3), np.full(9, distortion**2), np.full(3, offset**2)])
+        return replace(self, covariance=self.covariance + np.diag(more))
+
     def fixed(self) -> Calibrations:
         """Return them as constants of factors."""
         return Calibrations(self.t, self.distortion, self.offset)

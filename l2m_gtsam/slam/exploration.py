@@ -19,8 +19,12 @@ from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
+from l2m_gtsam.slam.unknown_field.whole_smoother import map_whole_drive
 
 NO_REVISITS = "no place was revisited: readings of an unknown field remove little drift then"
+NOTHING_GAINED = (
+    "the poses are those of odometry: the readings are no likelier at poses that they correct"
+)
 NO_FIELD = (
     "no field explains the readings at poses that odometry allows: is the calibration that of "
     "these sensors, and does the odometry jump?"
@@ -94,16 +98,25 @@ def explore(
     scaled = drive.with_scale_as_drift(options.drift.over_m)
     by_scans = solve_pose_graph(scaled, options.robust.confidence)
     drive = replace(drive, links=drive.links[by_scans.believed])
-    prior = drive_prior(drive, by_scans.poses, options.tiles)
-    progress("learning the field's prior", 1.0)
-    mapped = map_drive(drive, by_scans.poses, prior, options, progress)
+    mapped = None
+    if len(drive.sensors.names) == 1 and not len(drive.links):
+        mapped = map_whole_drive(drive, by_scans.poses, options, progress)
+    if mapped is None:
+        prior = drive_prior(drive, by_scans.poses, options.tiles)
+        progress("learning the field's prior", 1.0)
+        mapped = map_drive(drive, by_scans.poses, prior, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, mapped.solution, by_scans, kept)
     explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
     result = replace(
         explored_result(result, explored),
-        notes=(*notes, *result.notes, *([] if explored.returned else [NO_REVISITS])),
+        notes=(
+            *notes,
+            *result.notes,
+            *([] if explored.returned else [NO_REVISITS]),
+            *([] if mapped.gained else [NOTHING_GAINED]),
+        ),
         bag=recording.source,
         explored=explored,
     )

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Trajectory
-from l2m_gtsam.errors import CalibrationError, SyncError
+from l2m_gtsam.errors import CalibrationError, ConfigError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
@@ -27,7 +27,7 @@ from l2m_gtsam.slam.drive import (
 )
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.smoother import localise_drive
@@ -89,7 +89,13 @@ def localise(
         Readings and poses do not overlap, or there are fewer than two poses.
     MapError
         The start was searched for, and several places of the map fit or none.
+    ConfigError
+        Odometry is to know its steps along fixed axes, in a map.
     """
+    if options.drift.axes is StepAxes.FIXED:
+        raise ConfigError(
+            "`slam.drift.axes: fixed` works without a map: leave out --map, or give `vehicle`"
+        )
     drive, notes = prepared(recording, calibration, options, evidence)
     solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
     search = None

@@ -17,7 +17,7 @@ from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.recording.odometry_jumps import Jump, RepairedOdometry
 from l2m_gtsam.recording.sync import has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
-from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, SlamOptions, Usage
+from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions, SlamOptions, StepAxes, Usage
 
 # Rounding and interpolation may make eigenvalues of a step's covariance slightly negative.
 ROUNDING = 1e-6
@@ -39,6 +39,9 @@ class OdometrySteps:
         Whether the recording states these covariances.
     scale
         Standard deviation of a relative error that all lengths share; 0 for none.
+    fixed_axes
+        Steps along the axes of the first key pose in metres, shape (K - 1, 3), where odometry knows
+        them along fixed axes; None where it knows them along those of the vehicle.
     """
 
     R: FloatArray
@@ -46,6 +49,7 @@ class OdometrySteps:
     covariance: FloatArray
     stated: bool
     scale: float = 0.0
+    fixed_axes: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.p)
@@ -57,7 +61,14 @@ class OdometrySteps:
 
     def until(self, count: int) -> "OdometrySteps":
         """Return so many first steps."""
-        return replace(self, R=self.R[:count], p=self.p[:count], covariance=self.covariance[:count])
+        fixed = None if self.fixed_axes is None else self.fixed_axes[:count]
+        return replace(
+            self,
+            R=self.R[:count],
+            p=self.p[:count],
+            covariance=self.covariance[:count],
+            fixed_axes=fixed,
+        )
 
     def with_scale_as_drift(self, over_m: float) -> "OdometrySteps":
         """Return steps for solvers without a scale variable.
@@ -118,6 +129,9 @@ def odometry_steps(
     R_back = trajectory.R[rows[:-1]].transpose(0, 2, 1)
     R = R_back @ trajectory.R[rows[1:]]
     p = np.einsum("nij,nj->ni", R_back, np.diff(trajectory.p[rows], axis=0))
+    fixed = None
+    if options.axes is StepAxes.FIXED:
+        fixed = np.diff(trajectory.p[rows], axis=0) @ trajectory.R[rows[0]]
     stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
     if stated is not None:  # the repair of jumps has put their covariance into the poses'
         return OdometrySteps(
@@ -126,11 +140,12 @@ def odometry_steps(
             stated + isotropic_covariance(options.least_deg, options.least_m),
             stated=True,
             scale=options.scale,
+            fixed_axes=fixed,
         )
     covariance = drift_covariance(R, p, options)
     for jump in jumps:
         covariance[np.searchsorted(rows, jump.row)] += jump.covariance
-    return OdometrySteps(R, p, covariance, stated=False, scale=options.scale)
+    return OdometrySteps(R, p, covariance, stated=False, scale=options.scale, fixed_axes=fixed)
 
 
 def _stated(

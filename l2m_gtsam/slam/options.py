@@ -72,6 +72,19 @@ class TileOptions(Options):
         return self.core + 2 * self.margin
 
 
+class WholeFieldOptions(Options):
+    """The one field of a drive with a single sensor, where there is no map."""
+
+    waves: int = Field(default=500, ge=50, le=2000)
+    """The most eigenfunctions. Where the field has more detail, it is described by tiles."""
+    offset: float = Field(default=10.0, gt=0)
+    """Standard deviation per axis of what steel on the vehicle adds to the readings beyond the
+    calibration, uT. It is estimated even where the calibration is fixed: the poses would have to
+    explain it."""
+    distortion: float = Field(default=0.01, gt=0)
+    """And of the entries of C."""
+
+
 class CalibrationUse(StrEnum):
     """What becomes of the sensors' calibration."""
 
@@ -84,6 +97,13 @@ class Usage(StrEnum):
 
     USED = "used"
     IGNORED = "ignored"
+
+
+class StepAxes(StrEnum):
+    """Along which axes odometry knows its steps."""
+
+    VEHICLE = "vehicle"
+    FIXED = "fixed"
 
 
 class KeyPoseOptions(Options):
@@ -119,6 +139,10 @@ class DriftOptions(Options):
     """Standard deviation of a relative error that all lengths share, as with wheels. It is
     estimated with the poses, and the other sigmas are of the remaining errors. With their wide
     defaults it is not needed."""
+    axes: StepAxes = StepAxes.VEHICLE
+    """Along which axes steps are known: `vehicle`, as by wheels or scans, where an error of the
+    heading turns all later steps; or `fixed`, as by beacons, where it turns none. The latter works
+    off line and without a map."""
     stated: Usage = Usage.USED
     """Whether covariances that a recording states of its odometry count instead, where they grow
     along the drive."""
@@ -126,6 +150,12 @@ class DriftOptions(Options):
     """No step is known better than this,"""
     least_deg: float = Field(default=0.02, gt=0)
     """nor than this in rotation. Both are also added to what a recording states."""
+
+    @model_validator(mode="after")
+    def _scale_along_the_vehicle(self) -> "DriftOptions":
+        if self.scale and self.axes is StepAxes.FIXED:
+            raise ValueError("`scale` and `axes: fixed`: a scale is that of wheels, give one")
+        return self
 
 
 class StartPoseOptions(Options):
@@ -182,5 +212,7 @@ class SlamOptions(Options):
     each other are left out with the same `confidence`."""
     tiles: TileOptions = TileOptions()
     """How the field is described where there is no map."""
+    whole_field: WholeFieldOptions = WholeFieldOptions()
+    """How it is described there where the drive has one sensor."""
     max_iterations: int = Field(default=50, ge=1)
     """The most steps of the optimiser in each round."""

@@ -11,7 +11,15 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from l2m_factors import D, G, T, X, held_directions, scaled_step_factor
+from l2m_factors import (
+    D,
+    G,
+    T,
+    X,
+    fixed_axes_step_factor,
+    held_directions,
+    scaled_step_factor,
+)
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.slam.drive import MAP, Drive, KnownSensors, Links, StartPose, as_pose
 from l2m_gtsam.slam.map_prediction import poses_in
@@ -32,6 +40,10 @@ def start_factor(start: StartPose) -> gtsam.NonlinearFactor:
 def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.NonlinearFactor:
     """Return odometry's factor from a key pose to the next, its length corrected for an error."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
+    if drive.steps.fixed_axes is not None:
+        way = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
+        turn = gtsam.Rot3(drive.steps.R[number])
+        return fixed_axes_step_factor(number, turn, (1 + scale_error) * way, noise)
     return gtsam.BetweenFactorPose3(
         X(number), X(number + 1), drive.step(number, scale_error), noise
     )

@@ -27,7 +27,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from l2m_factors import D, G, T, X
+from l2m_factors import D, G, M, T, X
 from l2m_gtsam.calibration.optimise import TOLERANCE, Ending, LinearSolver, Optimised, refused
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
@@ -35,6 +35,7 @@ from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
 
+LAST = (ord("T"), ord("D"))
 TOGETHER = 200  # poses: the covariance of so many is 11 MB
 
 
@@ -80,6 +81,17 @@ def weights_first(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gt
     """Return the minimum-degree ordering that eliminates tiles' weights first."""
     weights = [key for key in values.keys() if gtsam.symbolChr(key) == ord("M")]  # noqa: SIM118
     return gtsam.Ordering.ColamdConstrainedFirstNonlinearFactorGraph(graph, weights, False)
+
+
+def weights_last(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Ordering:
+    """Return the minimum-degree ordering that eliminates a single tile's weights last.
+
+    They and their anchor are on all factors: eliminated first they would connect all poses.
+    """
+    keys = list(values.keys())
+    sensors = [key for key in keys if gtsam.symbolChr(key) in LAST]
+    last = [*sensors, X(0), M(0)]
+    return gtsam.Ordering.ColamdConstrainedLastNonlinearFactorGraph(graph, last, True)
 
 
 def _optimizer(

@@ -29,6 +29,7 @@ from l2m_gtsam.storage.rosbags_bounds import (
     MOST_SEQUENCE,
     bound_rosbags,
     check_definition,
+    check_names,
     check_sizes,
 )
 
@@ -234,6 +235,7 @@ def _check_content(path: Path, reader: Ros1Reader | Ros2Reader) -> None:
     """Refuse an open bag that declares what cannot be held in memory."""
     try:
         check_sizes(reader)
+        check_names(reader)
     except Exception as error:
         raise BagError(_damaged(path, error)) from error
 

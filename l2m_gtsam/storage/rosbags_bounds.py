@@ -160,6 +160,14 @@ def check_sizes(reader: Ros1Reader | Ros2Reader) -> None:
             storage.dbconn.limit(SQLITE_LIMIT_LENGTH, MOST_CHUNK)
 
 
+def check_names(reader: Ros1Reader | Ros2Reader) -> None:
+    """Raise an UnpackingError for an open bag whose topics or types are no text, but numbers."""
+    for each in reader.connections:
+        for name in (each.topic, each.msgtype, each.msgdef.data):
+            if not isinstance(name, str):
+                raise UnpackingError(f"names a topic or its type {name!r:.40}, which is no text")
+
+
 def storages(reader: Ros2Reader) -> list[Any]:
     """Return what reads the files of a bag: a folder has several."""
     return getattr(reader.storage, "storages", None) or [reader.storage]

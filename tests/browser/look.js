@@ -98,6 +98,7 @@ async function tabbed(browser) {
   const stops = [];
   for (let k = 0; k < 24; k += 1) {
     await page.keyboard.press("Tab");
+    if (await page.evaluate(() => document.activeElement === document.body)) break; // all were seen
     stops.push(
       await page.evaluate(() => {
         const at = document.activeElement;

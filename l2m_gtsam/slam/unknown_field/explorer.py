@@ -66,7 +66,7 @@ class Explorer:
     Raises
     ------
     ConfigError
-        Calibrations are to be refined.
+        Calibrations are to be refined, or odometry knows its steps along fixed axes.
     """
 
     def __init__(
@@ -81,6 +81,8 @@ class Explorer:
                 "`slam.calibration: refined` works off line where there is no map; on line give "
                 "`fixed`"
             )
+        if drive.steps.fixed_axes is not None:
+            raise ConfigError("`slam.drift.axes: fixed` works off line; on line give `vehicle`")
         drive = drive.with_scale_as_drift(options.drift.over_m)
         self._drive, self._options = drive, options
         self._pace = ExploringOptions() if pace is None else pace

@@ -19,8 +19,8 @@ from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings, predict
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
+from l2m_gtsam.slam.unknown_field.linear_field import AXES, LinearField
 from l2m_gtsam.slam.unknown_field.tiles import (
-    AXES,
     Anchoring,
     FieldPrior,
     WaveTile,
@@ -48,7 +48,7 @@ class OccupiedTile:
     number: int
     anchor: int
     rows: IntArray
-    field: WaveTile
+    field: LinearField
     placed: PlacedReadings
 
     def robust_weights(self, sensors: KnownSensors, noise: FloatArray) -> FloatArray:
@@ -67,19 +67,21 @@ class OccupiedTile:
 
     def prediction(self, weights: FloatArray, sensors: KnownSensors) -> MapPrediction:
         """Return the tile's prediction of its readings, in the anchor's frame."""
-        return predict(_TileMap(self.field, weights), self.placed, sensors)
+        return predict(FieldWithWeights(self.field, weights), self.placed, sensors)
 
 
-class _TileMap:
-    """A tile with known weights, as a map in the anchor's frame."""
+class FieldWithWeights:
+    """A field with known weights, as a map in the frame of its anchor."""
 
-    def __init__(self, tile: WaveTile, weights: FloatArray) -> None:
+    def __init__(self, tile: LinearField, weights: FloatArray) -> None:
         self._tile, self._weights = tile, weights
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
         return self._tile.field_and_gradient(points, self._weights)
 
     def query(self, points: FloatArray) -> FieldSample:
+        """Return the same with the variance of what the weights do not hold."""
         field, gradient = self.field_and_gradient(points)
         inside = np.ones(len(points), bool)
         return FieldSample(field, gradient, self._tile.unresolved(points), inside)
@@ -118,7 +120,7 @@ class TiledDrive:
         for number, anchor in enumerate(anchoring.anchor.tolist()):
             rows = np.flatnonzero(owner == number)
             if len(rows):
-                where = _relative_place(motions.readings[rows], poses, anchor, sensors)
+                where = relative_place(motions.readings[rows], poses, anchor, sensors)
                 field = WaveTile.about(prior, R[anchor].T @ axes[anchor], where.x)
                 tiles.append(OccupiedTile(number, anchor, rows, field, where))
         return cls(anchoring, tuple(tiles))
@@ -129,7 +131,7 @@ class TiledDrive:
         """Return the same tiles with their readings at another estimate."""
         own = motions.readings
         tiles = (
-            replace(tile, placed=_relative_place(own[tile.rows], poses, tile.anchor, sensors))
+            replace(tile, placed=relative_place(own[tile.rows], poses, tile.anchor, sensors))
             for tile in self.tiles
         )
         return TiledDrive(self.anchoring, tuple(tiles))
@@ -212,9 +214,10 @@ class TiledDrive:
         return graph
 
 
-def _relative_place(
+def relative_place(
     readings: KeyPoseReadings, poses: list[gtsam.Pose3], anchor: int, sensors: KnownSensors
 ) -> PlacedReadings:
+    """Return readings at the poses of their key poses in the frame of an anchor."""
     origin = poses[anchor]
     own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
     return place_readings(readings, own, sensors)

@@ -10,7 +10,9 @@ Odometry drifts out of the reach of the longest waves, too. So the drive is firs
 piece by piece: each is initialised by the one before.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -50,6 +52,10 @@ PIECE_M = 30.0  # path length over which odometry drifts less than the longest w
 AWAY_M = 5.0  # path length after which entering a tile again closes a loop
 
 
+Divided = Callable[[RelativeMotions, list[gtsam.Pose3], KnownSensors], TiledDrive]
+EliminationOrder = Callable[[gtsam.NonlinearFactorGraph, gtsam.Values], gtsam.Ordering]
+
+
 @dataclass(frozen=True)
 class FieldSolution:
     """A drive and the field along it.
@@ -62,11 +68,15 @@ class FieldSolution:
         Number of tiles with readings.
     returns
         Numbers of the key poses that revisit a tile.
+    gained
+        Whether the readings are likelier at these poses than at those of odometry; if not, these
+        are odometry's.
     """
 
     solution: DriveSolution
     tiles: int
     returns: IntArray
+    gained: bool = True
 
 
 def map_drive(
@@ -92,7 +102,7 @@ def map_drive(
         Called with a stage and the fraction of it that is done.
     """
     poses, sensors = incremental_poses(drive, initial, prior, options, progress), drive.sensors
-    problem = TiledProblem(drive, prior, options)
+    problem = TiledProblem(drive, partial(TiledDrive.partition, prior=prior), options)
     for stage, (scale, mu) in enumerate(STAGES[:-1]):
         progress("solving poses and field", stage / len(STAGES))
         solved = problem.solved(poses, sensors, scale, mu)
@@ -116,7 +126,8 @@ def incremental_poses(
     for end in np.arange(PIECE_M, path[-1], PIECE_M):
         progress("following the drive", float(end / path[-1]))
         count = int(np.searchsorted(path, end))
-        part = TiledProblem(drive.until(count), prior, options)
+        divided = partial(TiledDrive.partition, prior=prior)
+        part = TiledProblem(drive.until(count), divided, options)
         solved = part.solved(poses[:count], drive.sensors, *STAGES[0])
         shift = solved.poses[-1].compose(poses[count - 1].inverse())
         poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
@@ -143,14 +154,23 @@ class TiledProblem:
     ----------
     drive
         K key poses with odometry, N readings and L scan links.
-    prior
-        Of every tile of the field.
+    divided
+        Divides the drive into tiles at an estimate of its motions, key poses and sensors.
     options
         Loss, calibration's use, and limit of iterations.
+    ordering
+        Elimination order of a graph's variables.
     """
 
-    def __init__(self, drive: Drive, prior: FieldPrior, options: SlamOptions) -> None:
-        self._drive, self._prior, self._options = drive, prior, options
+    def __init__(
+        self,
+        drive: Drive,
+        divided: Divided,
+        options: SlamOptions,
+        ordering: EliminationOrder = weights_first,
+    ) -> None:
+        self._drive, self._divided, self._options = drive, divided, options
+        self._ordering = ordering
         self._odometry, self._links = odometry_graph(drive), link_graph(drive.links)
         self._free = options.calibration is CalibrationUse.REFINED
 
@@ -169,7 +189,7 @@ class TiledProblem:
             Convexity of the loss.
         """
         motions = RelativeMotions.along(self._drive, poses)
-        tiled = TiledDrive.partition(motions, poses, sensors, self._prior)
+        tiled = self._divided(motions, poses, sensors)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
         values.insert(scale_values(self._drive))
@@ -190,7 +210,7 @@ class TiledProblem:
         if self._free:
             graph.push_back(calibration_graph(self._drive.sensors))
             values.insert(calibration_values(sensors))
-        order = weights_first(graph, values)
+        order = self._ordering(graph, values)
         end = levenberg_marquardt(graph, values, order, self._options.max_iterations)
         found = list(poses_in(end.values, len(poses)).values())
         after = sensors_in(end.values, sensors)
@@ -199,7 +219,7 @@ class TiledProblem:
     def finished(self, solved: TiledRound) -> FieldSolution:
         """Return a solved stage with its covariances and residuals."""
         drive, sensors = self._drive, solved.sensors
-        order = weights_first(solved.graph, solved.values)
+        order = self._ordering(solved.graph, solved.values)
         marginals = Marginals(solved.graph.linearize(solved.values), order)
         motions = RelativeMotions.along(drive, solved.poses)
         tiled = solved.tiled.moved(motions, solved.poses, sensors)

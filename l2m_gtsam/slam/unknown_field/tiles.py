@@ -4,10 +4,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import ComplexityPenalty
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.family import UniformField
@@ -23,15 +21,12 @@ from l2m_gtsam.maps.training import merged, training_set
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.options import TileOptions
+from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 
 # Widening of the waves' prior: steel is not spread evenly, and with the prior as learnt a stretch
 # with more of it was estimated too low, by 0.1-0.4 m with sigmas of 0.04 m. The bias falls with the
 # square of this factor; the loss is small, for readings are dense along the path.
 WIDER = 10.0
-REWEIGHTINGS = 15
-AXES = 3
-SIDE_M = 1e-3  # of a finite difference
-LARGE = 2.0  # length of a whitened residual beyond which a reading is downweighted
 
 
 @dataclass(frozen=True)
@@ -98,7 +93,7 @@ def drive_prior(drive: Drive, poses: list[gtsam.Pose3], options: TileOptions) ->
 
 
 @dataclass(frozen=True)
-class WaveTile:
+class WaveTile(LinearField):
     """Uniform field, floor and ceiling waves of a level box about an anchor, in its frame.
 
     Attributes
@@ -163,68 +158,6 @@ class WaveTile:
         vertical = left_out(h.floor_scale, h.floor_depth, kept.floor, z)
         vertical = vertical + left_out(h.ceiling_scale, h.ceiling_depth, kept.ceiling, over)
         return np.asarray(vertical[:, None] * np.array([0.5, 0.5, 1.0]))
-
-    def robust_weights(
-        self, points: FloatArray, field: FloatArray, variance: FloatArray
-    ) -> FloatArray:
-        """Return a robust estimate of the weights from readings with outliers, shape (m,).
-
-        Iteratively reweighted least squares with Huber weights.
-
-        Parameters
-        ----------
-        points, field
-            Readings in the anchor's frame, metres and uT, shapes (N, 3).
-        variance
-            Of each one's noise per axis in uT^2, shape (N, 3).
-        """
-        root = 1 / np.sqrt(variance)
-        F = (self.features(points) * root[:, :, None]).reshape(-1, len(self))
-        y, trust = (field * root).ravel(), np.ones(len(points))
-        weights: FloatArray = np.zeros(len(self))
-        for _ in range(REWEIGHTINGS):
-            by = np.repeat(trust, AXES)
-            information = F.T @ (F * by[:, None]) + np.eye(len(self))
-            weights = np.asarray(np.linalg.solve(information, F.T @ (by * y)))
-            off = np.linalg.norm((F @ weights - y).reshape(-1, AXES), axis=1)
-            trust = 1 / np.maximum(off / LARGE, 1.0)
-        return weights
-
-    def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
-        """Return the readings' information about the weights, (m, m); see ``penalty``."""
-        F = (self.features(points) / np.sqrt(variance)[:, :, None]).reshape(-1, len(self))
-        return np.asarray(F.T @ F)
-
-    def penalty(
-        self, points: FloatArray, variance: FloatArray, past_information: FloatArray | None = None
-    ) -> ComplexityPenalty:
-        """Return each reading's share of the effective number of parameters (Mallows' C_p).
-
-        Parameters
-        ----------
-        points
-            In the anchor's frame in metres, shape (N, 3).
-        variance
-            Of each reading's noise per axis in uT^2, shape (N, 3).
-        taught
-            Information of other readings about the weights, shape (m, m).
-        """
-        known = np.eye(len(self)) + self.information(points, variance)
-        lower = cholesky(
-            known if past_information is None else known + past_information, lower=True
-        )
-        spread = cho_solve((lower, True), np.eye(len(self)))
-        root = 1 / np.sqrt(variance)[:, :, None]
-        share = root * (self.features(points) @ spread)
-        value = np.sqrt(np.einsum("nam,nam->n", share, share))
-        by_features = root * (share @ spread) / value[:, None, None]
-        steps = SIDE_M * np.eye(AXES)
-        slopes = [
-            np.einsum("nam,nam->n", by_features, self.features(points + step))
-            for step in (*steps, *-steps)
-        ]
-        slope = (np.stack(slopes[:AXES], axis=1) - np.stack(slopes[AXES:], axis=1)) / (2 * SIDE_M)
-        return ComplexityPenalty(points, value, slope)
 
 
 @dataclass(frozen=True)

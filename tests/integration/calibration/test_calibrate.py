@@ -1,6 +1,6 @@
 """Recording in, verdict on every sensor out; and the file that carries it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -198,6 +198,15 @@ class ElsewhereWorld(DipoleWorld):
         return replace(sample, inside=np.zeros(len(points), dtype=np.bool_))
 
 
+@dataclass(frozen=True)
+class HallWorld(DipoleWorld):
+    """A world that is known within 20 m."""
+
+    def query(self, points: FloatArray) -> FieldSample:
+        sample = super().query(points)
+        return replace(sample, inside=np.linalg.norm(points, axis=1) < 20.0)
+
+
 def test_a_map_of_another_place_is_named(
     world: DipoleWorld, sensors: tuple[KnownSensor, ...]
 ) -> None:
@@ -206,6 +215,30 @@ def test_a_map_of_another_place_is_named(
     recording = recorded_drive(world, sensors[:2])
     with pytest.raises(CalibrationError, match=r"office.npz does not cover the drive drive.bag"):
         calibrate(recording, elsewhere, OPTIONS, source)
+
+
+def test_a_sensor_that_is_put_far_away_is_no_map_of_another_place(
+    world: DipoleWorld, sensors: tuple[KnownSensor, ...]
+) -> None:
+    hall = HallWorld(world.uniform, world.positions, world.moments)
+    options = OPTIONS.model_copy(update={"start": {sensors[0].sensor: (50.0, 0.0, 0.0)}})
+    recording = recorded_drive(world, sensors[:1])
+    with pytest.raises(CalibrationError) as error:
+        calibrate(recording, hall, options, SourceFile("hall.npz", "0"))
+    told = str(error.value)
+    assert "no sensor can be solved, although hall.npz covers the drive: mag_00: " in told
+    assert "lie outside the map" in told
+
+
+def test_readings_that_are_all_wrong_are_no_map_of_another_place(
+    world: DipoleWorld, sensors: tuple[KnownSensor, ...]
+) -> None:
+    recording = recorded_drive(world, sensors[:1])
+    noise = np.random.default_rng(3).choice([-4800.0, 4800.0], recording.series[0].field.shape)
+    series = (replace(recording.series[0], field=noise),)
+    with pytest.raises(CalibrationError) as error:
+        calibrate(replace(recording, series=series), world, OPTIONS)
+    assert "although the map covers the drive: mag_00: none of its" in str(error.value)
 
 
 def test_a_given_start_is_not_looked_for(

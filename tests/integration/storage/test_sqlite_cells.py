@@ -11,6 +11,19 @@ from l2m_gtsam.storage.inspect import inspect_bag
 from tests.drives.bags import Entry, ros, write
 
 
+@pytest.mark.parametrize("column", ["name", "type"])
+def test_topics_that_are_no_text(tmp_path: Path, column: str) -> None:
+    dialect = ros("sqlite3")
+    message = dialect.magnetic(1, (1e-5, 2e-5, 4e-5))
+    bag = write(tmp_path, "sqlite3", [Entry("/mag", "sensor_msgs/MagneticField", 1, message)])
+    file = next(bag.glob("*.db3"))
+    with sqlite3.connect(file) as base:
+        base.execute(f"UPDATE topics SET {column} = ?", (b"/mag",))  # noqa: S608
+    base.close()
+    with pytest.raises(BagError, match="not a readable bag"):
+        inspect_bag(file, BagOptions())
+
+
 @pytest.mark.parametrize("value", [1.5, None, "x", b"\0", 2**62, -(2**62)])
 @pytest.mark.parametrize("column", ["timestamp", "data"])
 def test_other_cells_are_one_line(tmp_path: Path, column: str, value: object) -> None:

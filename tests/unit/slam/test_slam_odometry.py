@@ -165,3 +165,21 @@ def test_prior_of_a_calibration_is_its_covariance(seed: int) -> None:
     np.testing.assert_allclose(W @ covariance @ W.T, np.eye(15), atol=1e-6)
     exact = stated_information_root(np.zeros((15, 15)))
     assert np.isfinite(exact).all()
+
+
+def test_a_scale_is_not_that_of_fixed_axes() -> None:
+    with pytest.raises(ValueError, match="axes: fixed"):
+        DriftOptions.model_validate({"axes": "fixed", "scale": 0.01})
+
+
+def test_steps_along_fixed_axes_are_those_of_the_first_pose() -> None:
+    """Put together along its axes they lead to the last pose, whatever the headings are."""
+    rng = np.random.default_rng(5)
+    R = Rotation.random(9, random_state=5).as_matrix()
+    made = Trajectory(np.arange(9) * 10**9, R, rng.normal(size=(9, 3)), "map", "lidar")
+    options = DriftOptions.model_validate({"axes": "fixed"})
+    steps = odometry_steps(made, np.arange(9), options)
+    assert steps.fixed_axes is not None
+    end = made.p[0] + made.R[0] @ steps.fixed_axes.sum(axis=0)
+    np.testing.assert_allclose(end, made.p[-1], atol=1e-12)  # rounding
+    assert steps.until(3).fixed_axes is not None

@@ -185,8 +185,9 @@ def calibration_figure(
     place.set_title(f"map at z = {picture.height:.2f} m", loc="right")
     place.legend(loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     solved = [s for s in result.sensors if s.residuals is not None]
-    _draw_vehicle(above, solved, truth, (0, 1))
-    _draw_vehicle(side, solved, truth, (0, 2))
+    factor = enlargement(solved, TOP)
+    _draw_vehicle(above, solved, truth, TOP, factor)
+    _draw_vehicle(side, solved, truth, SIDE, factor)
     above.set_title("sensors on the vehicle, from above")
     side.set_title("from the side")
     above.legend(loc="lower left", bbox_to_anchor=(0, 1.08), ncols=2, fontsize="small")
@@ -197,27 +198,27 @@ def _draw_vehicle(
     axes: Axes,
     sensors: list[SensorCalibration],
     truth: tuple[KnownSensor, ...],
-    plane: tuple[int, int],
+    view: Viewpoint,
+    factor: int,
 ) -> None:
-    names = "xyz"
-    rows = list(plane)
+    names, rows = "xyz", list(view.axes)
     for known in truth:
         axes.plot(*known.t_lidar_mag[rows], "+", color=TRUTH, markersize=10)
     for sensor in sensors:
         at = sensor.t_lidar_mag[rows]
         axes.plot(*at, ".", color=ESTIMATE, markersize=5)
-        if (region := _ellipse(sensor, rows)) is not None:
-            region.set(color=ESTIMATE, alpha=0.35)
+        if (region := _ellipse(sensor, rows, factor)) is not None:
+            region.set(facecolor="none", edgecolor=ESTIMATE, linewidth=1.4, zorder=3)
             axes.add_patch(region)
-        axes.annotate(
-            sensor.sensor, tuple(at), xytext=(4, 4), textcoords="offset points", fontsize=7
-        )
+    _name(axes, sensors, view)
     axes.plot(0, 0, "s", color="0.4", markersize=8)
-    axes.annotate("lidar", (0, 0), xytext=(6, -10), textcoords="offset points", fontsize=7)
-    axes.plot([], [], ".", color=ESTIMATE, label="estimate, 95 % ellipse")
+    axes.annotate(
+        "lidar", (0, 0), xytext=(-8, -12), textcoords="offset points", ha="right", fontsize=SMALL
+    )
+    axes.plot([], [], ".", color=ESTIMATE, label=f"estimate, 95 % ellipse{_drawn(factor)}")
     if truth:
         axes.plot([], [], "+", color=TRUTH, label="truth")
-    axes.set(xlabel=f"{names[plane[0]]} (m)", ylabel=f"{names[plane[1]]} (m)")
+    axes.set(xlabel=f"{names[rows[0]]} (m)", ylabel=f"{names[rows[1]]} (m)")
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.2)
     axes.grid(alpha=0.3)

@@ -1,0 +1,53 @@
+r"""A step of odometry whose way is measured along fixed axes, whatever the heading is.
+
+A vehicle that measures its way against fixed axes, such as a ship by a beacon, turns no step by an
+error of its heading. With the turn R and the way d along the axes of the frame of the poses
+
+.. math::
+    e = [Log(R^T R_k^T R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d)]
+"""
+
+import gtsam
+import numpy as np
+
+from l2m_factors.field_map import FloatArray
+from l2m_factors.keys import X
+from l2m_factors.motion import skew
+
+
+def fixed_axes_step_factor(
+    key_pose: int, turn: gtsam.Rot3, way: FloatArray, noise: gtsam.noiseModel.Base
+) -> gtsam.CustomFactor:
+    """Return what odometry says of the way from ``X(k)`` to ``X(k+1)`` along fixed axes.
+
+    Parameters
+    ----------
+    key_pose
+        Number k of the key pose before the step.
+    turn
+        The next key pose's axes in its frame.
+    way
+        From one to the next along the axes that poses are in, metres, shape (3,).
+    noise
+        Of a right perturbation of the next pose, rotation (rad) before translation (m).
+    """
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        before, after = values.atPose3(X(key_pose)), values.atPose3(X(key_pose + 1))
+        turned = before.rotation().between(after.rotation())
+        off = turn.between(turned)
+        back = after.rotation().matrix().T
+        apart = back @ (after.translation() - before.translation() - way)
+        if jacobians is not None:
+            by_turn = gtsam.Rot3.LogmapDerivative(gtsam.Rot3.Logmap(off))
+            by_before, by_after = np.zeros((6, 6)), np.zeros((6, 6))
+            by_before[:3, :3] = -by_turn @ turned.matrix().T
+            by_before[3:, 3:] = -turned.matrix().T
+            by_after[:3, :3], by_after[3:, 3:] = by_turn, np.eye(3)
+            by_after[3:, :3] = skew(apart[None])[0]
+            jacobians[0], jacobians[1] = by_before, by_after
+        return np.concatenate([gtsam.Rot3.Logmap(off), apart])
+
+    return gtsam.CustomFactor(noise, [X(key_pose), X(key_pose + 1)], error)

@@ -1,0 +1,98 @@
+"""A field that is linear in weights of unit prior variance: first weights, effective parameters."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky
+
+from l2m_factors import ComplexityPenalty
+from l2m_gtsam.data import FloatArray
+
+AXES = 3
+REWEIGHTINGS = 15
+SIDE_M = 1e-3  # of a finite difference
+LARGE = 2.0  # length of a whitened residual beyond which a reading is downweighted
+
+
+class LinearField(ABC):
+    """Features of m weights, in the frame of the key pose that the field is fixed to."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Return m."""
+
+    @abstractmethod
+    def features(self, points: FloatArray, /) -> FloatArray:
+        """Return the field of weights of unit prior variance in uT, shape (N, 3, m)."""
+
+    @abstractmethod
+    def field_and_gradient(
+        self, points: FloatArray, weights: FloatArray, /
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
+
+    @abstractmethod
+    def unresolved(self, points: FloatArray) -> FloatArray:
+        """Return the variance per axis of what the weights do not hold, uT^2, shape (N, 3)."""
+
+    def robust_weights(
+        self, points: FloatArray, field: FloatArray, variance: FloatArray
+    ) -> FloatArray:
+        """Return a robust estimate of the weights from readings with outliers, shape (m,).
+
+        Iteratively reweighted least squares with Huber weights.
+
+        Parameters
+        ----------
+        points, field
+            Readings in the anchor's frame, metres and uT, shapes (N, 3).
+        variance
+            Of each one's noise per axis in uT^2, shape (N, 3).
+        """
+        root = 1 / np.sqrt(variance)
+        F = (self.features(points) * root[:, :, None]).reshape(-1, len(self))
+        y, trust = (field * root).ravel(), np.ones(len(points))
+        weights: FloatArray = np.zeros(len(self))
+        for _ in range(REWEIGHTINGS):
+            by = np.repeat(trust, AXES)
+            information = F.T @ (F * by[:, None]) + np.eye(len(self))
+            weights = np.asarray(np.linalg.solve(information, F.T @ (by * y)))
+            off = np.linalg.norm((F @ weights - y).reshape(-1, AXES), axis=1)
+            trust = 1 / np.maximum(off / LARGE, 1.0)
+        return weights
+
+    def information(self, points: FloatArray, variance: FloatArray) -> FloatArray:
+        """Return the readings' information about the weights, (m, m); see ``penalty``."""
+        F = (self.features(points) / np.sqrt(variance)[:, :, None]).reshape(-1, len(self))
+        return np.asarray(F.T @ F)
+
+    def penalty(
+        self, points: FloatArray, variance: FloatArray, past_information: FloatArray | None = None
+    ) -> ComplexityPenalty:
+        """Return each reading's share of the effective number of parameters (Mallows' C_p).
+
+        Parameters
+        ----------
+        points
+            In the anchor's frame in metres, shape (N, 3).
+        variance
+            Of each reading's noise per axis in uT^2, shape (N, 3).
+        taught
+            Information of other readings about the weights, shape (m, m).
+        """
+        known = np.eye(len(self)) + self.information(points, variance)
+        lower = cholesky(
+            known if past_information is None else known + past_information, lower=True
+        )
+        spread = cho_solve((lower, True), np.eye(len(self)))
+        root = 1 / np.sqrt(variance)[:, :, None]
+        share = root * (self.features(points) @ spread)
+        value = np.sqrt(np.einsum("nam,nam->n", share, share))
+        by_features = root * (share @ spread) / value[:, None, None]
+        steps = SIDE_M * np.eye(AXES)
+        slopes = [
+            np.einsum("nam,nam->n", by_features, self.features(points + step))
+            for step in (*steps, *-steps)
+        ]
+        slope = (np.stack(slopes[:AXES], axis=1) - np.stack(slopes[AXES:], axis=1)) / (2 * SIDE_M)
+        return ComplexityPenalty(points, value, slope)

@@ -1,0 +1,66 @@
+"""One field for a drive with one sensor: a recorded model ship, drifted as published."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import Distortion
+from l2m_gtsam.records.calibration import CalibrationResult, Uncertainty
+from l2m_gtsam.slam.exploration import NOTHING_GAINED, explore
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.studies.slam.recipes import DriftRecipe, Form, drifted
+from l2m_gtsam.studies.slam.recordings import SHIP, TrueDrive, ship_run
+from tests.drives.calibrations import sensor
+
+NOISE_UT = 1.5
+
+
+def ideal() -> CalibrationResult:
+    """Return a calibration that undoes nothing, as the recording comes without one."""
+    entry = replace(
+        sensor(covariance=1e-10 * np.eye(15), noise=NOISE_UT, time_offset=None),
+        t_lidar_mag=np.zeros(3),
+        distortion=Distortion.identity(),
+        R_lidar_mag=np.eye(3),
+    )
+    return CalibrationResult((entry,), 0, Uncertainty.FULL, (), (), None, None, {}, {})
+
+
+def stated(form: Form) -> SlamOptions:
+    """Return what the recipe's errors come to over 10 m, or 75 steps, and nothing else."""
+    axes = "fixed" if form is Form.WORLD else "vehicle"
+    drift = {"position_share": 0.0225, "rotation_deg_per_m": 0.16, "axes": axes}
+    return SlamOptions.model_validate({"drift": drift})
+
+
+def rms(one: np.ndarray, other: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum((one - other) ** 2, axis=1))))
+
+
+def errors(drive: TrueDrive, form: Form, seed: int) -> tuple[float, float, tuple[str, ...]]:
+    """Return the rms errors of odometry and of the poses in metres, and the notes."""
+    odometry = drifted(drive.truth, DriftRecipe(), form, seed)
+    result = explore(drive.recording(odometry), ideal(), stated(form), lambda *_: None).result
+    rows = np.searchsorted(drive.truth.stamp_ns, result.trajectory.stamp_ns)
+    truth = drive.truth.p[rows]
+    return rms(result.odometry.p, truth), rms(result.trajectory.p, truth), result.notes
+
+
+@pytest.mark.study
+@pytest.mark.parametrize("run", [1, 2])
+def test_most_of_a_ships_drift_goes(shared_data: Path, run: int) -> None:
+    """One drive scatters; with tiles odometry became worse on both runs."""
+    before, after, notes = errors(ship_run(shared_data / SHIP, run), Form.WORLD, 0)
+    assert NOTHING_GAINED not in notes
+    assert after < 0.5 * before
+
+
+def test_without_a_field_the_poses_are_those_of_odometry(shared_data: Path) -> None:
+    """Readings of noise alone, the same field everywhere: nothing tells one place from another."""
+    drive, rng = ship_run(shared_data / SHIP, 2), np.random.default_rng(1)
+    uniform = drive.truth.R.transpose(0, 2, 1) @ np.array([20.0, 0.0, -40.0])
+    flat = replace(drive, field=uniform + rng.normal(0, NOISE_UT, uniform.shape))
+    before, after, _ = errors(flat, Form.VEHICLE, 0)
+    assert after <= 1.05 * before
