@@ -106,7 +106,7 @@ def suite_doubts(
     options
         Of the calibration; fewer windows, readings and modes are enough here.
     """
-    few = options.model_copy(update={"windows": 2, "readings": 800, "modes": 200})
+    few = options.model_copy(update={"windows": 4, "readings": 600, "modes": 200})
     try:
         drive = suite_drive(recordings, assumed, few)
         step = first_step(drive.at, drive.assumed, few)

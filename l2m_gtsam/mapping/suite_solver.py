@@ -12,6 +12,7 @@ from functools import reduce
 from operator import add
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.mapping.suite_likelihood import (
@@ -150,7 +151,7 @@ class SuiteStep:
     sigmas
         Change of (t, C row by row, H, time offset) in the sigmas of the scoring, shape (S, 16).
     explained
-        Share of the residuals' squares that it takes away.
+        Share of the residuals' squares that steps of the other windows take away in each.
     """
 
     names: tuple[str, ...]
@@ -213,17 +214,32 @@ class SuiteProblem:
         )
 
     def step(self, windows: SuiteWindows, sensors: FloatArray, names: tuple[str, ...]) -> SuiteStep:
-        """Return one scoring step in given windows.
+        """Return the scoring step of all windows, and how far steps of some explain the others.
 
-        Residuals are white by the noise of the windows' prior, so that the gain ``slope^T step``
-        is the fall of their sum of squares, and their number what it is a share of.
+        Sensors are the same in all windows; what the waves of one window leave out is not. So each
+        window is asked what the step of the others gains in it, ``g^T d - d^T I d / 2``. Residuals
+        are white by the noise of the windows' prior: twice that is the fall of their squares' sum.
         """
-        score = self._scored(windows, sensors)
-        covariance = self._covariance(score, 1.0)
-        step = covariance @ score.slope
-        count = sum(residual.size for residual in score.residuals)
+        scores = self._window_scores(windows, sensors)
+        total = reduce(add, scores)
+        covariance = self._covariance(total, 1.0)
+        step = covariance @ total.slope
+        fall = 0.0
+        for own in scores:
+            others = total.information - own.information + self._information
+            d = cho_solve(cho_factor(others), total.slope - own.slope)
+            fall += float(2 * own.slope @ d - d @ own.information @ d)
+        count = sum(residual.size for residual in total.residuals)
         sigmas = (step / np.sqrt(np.diag(covariance))).reshape(sensors.shape)
-        return SuiteStep(names, sigmas, float(score.slope @ step) / count)
+        return SuiteStep(names, sigmas, fall / count)
+
+    def _window_scores(self, windows: SuiteWindows, sensors: FloatArray) -> list[SuiteLikelihood]:
+        """Return the likelihood of each window, without what is assumed."""
+        readings = self._readings_at(sensors[:, -1])
+        return [
+            suite_likelihood(replace(part, readings=readings[rows]), sensors, windows.prior)
+            for part, rows in zip(windows.parts, windows.rows, strict=True)
+        ]
 
     def _covariance(self, score: SuiteLikelihood, alike: float) -> FloatArray:
         """Return the covariance where so many readings count as one, shape (16 S, 16 S)."""
@@ -244,12 +260,7 @@ class SuiteProblem:
 
     def _scored(self, windows: SuiteWindows, sensors: FloatArray) -> SuiteLikelihood:
         """Return the posterior: slope and value with what is assumed, information without."""
-        readings = self._readings_at(sensors[:, -1])
-        parts = [
-            suite_likelihood(replace(part, readings=readings[rows]), sensors, windows.prior)
-            for part, rows in zip(windows.parts, windows.rows, strict=True)
-        ]
-        total = reduce(add, parts)
+        total = reduce(add, self._window_scores(windows, sensors))
         off = (sensors - self._assumed).ravel()
         pull = self._information @ off
         return SuiteLikelihood(

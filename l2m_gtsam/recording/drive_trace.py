@@ -10,8 +10,12 @@ from l2m_gtsam.records.drive_trace import DriveTrace
 
 # Of a trace: about a kilobyte, and still several in a tenth of a drive that was cut out.
 POSES = 40
-# Poses that were written with millimetres, or are between those that were kept, are as far apart.
+# Poses that were written with millimetres are as far apart.
 NEAR_M = 0.002
+# Between poses that were kept a vehicle leaves the straight line by a dt^2 / 8 at most: those of a
+# thinned copy are as far from it. Robots and carts turn and brake with less.
+ACCELERATION = 2.0
+LONGEST_S = 1.5  # where poses are further apart nothing is compared
 # In the part that both have: a vehicle that stands is at one place on many drives.
 FEWEST, MOVED_M = 3, 0.1
 
@@ -47,15 +51,26 @@ def is_of(trace: DriveTrace, stamp_ns: IntArray, p: FloatArray) -> bool:
     """
     if not len(stamp_ns):
         return False
-    start, end = int(stamp_ns[0]), int(stamp_ns[-1])
-    shared = [k for k, stamp in enumerate(trace.stamp_ns) if start <= stamp <= end]
-    if len(shared) < FEWEST:
-        return False
+    start = int(stamp_ns[0])
     # From the start on: nanoseconds since 1970 have more digits than a float.
-    seconds = 1e-9 * (stamp_ns - start)
-    at = [1e-9 * (trace.stamp_ns[k] - start) for k in shared]
-    there = np.array([trace.p[k] for k in shared], dtype=np.float64)
+    seconds = 1e-9 * (stamp_ns - start).astype(np.float64)
+    at = 1e-9 * (np.array(trace.stamp_ns, dtype=np.int64) - start).astype(np.float64)
+    there = np.reshape(np.array(trace.p, dtype=np.float64), (-1, 3))
+    inside = (at >= 0) & (at <= seconds[-1])
+    at, there = at[inside], there[inside]
+    gaps = _gaps(seconds, at)
+    at, there, gaps = at[gaps < LONGEST_S], there[gaps < LONGEST_S], gaps[gaps < LONGEST_S]
+    if len(at) < FEWEST:
+        return False
     here = np.stack([np.interp(at, seconds, axis) for axis in p.T], axis=1)
     moved = float(np.linalg.norm(np.ptp(there, axis=0)))
-    near = np.linalg.norm(here - there, axis=1) < NEAR_M
-    return moved > MOVED_M and bool(near.all())
+    tolerance = NEAR_M + ACCELERATION * gaps**2 / 8
+    near = np.linalg.norm(here - there, axis=1) < tolerance
+    return moved > MOVED_M + 2 * tolerance.max() and bool(near.all())
+
+
+def _gaps(seconds: FloatArray, at: FloatArray) -> FloatArray:
+    """Return the seconds between the poses on both sides of some times; zero at a pose."""
+    after = np.searchsorted(seconds, at)
+    before = np.searchsorted(seconds, at, side="right") - 1
+    return np.asarray(seconds[np.minimum(after, len(seconds) - 1)] - seconds[before])

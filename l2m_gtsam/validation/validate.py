@@ -30,6 +30,10 @@ SAME_MAP = (
     "This is the map that it was calibrated with: errors of the map that the calibration took over "
     "do not show. A map of another survey would show them."
 )
+NO_TRACES = (
+    "The calibration's file is older than poses in it: only the hash of its drive was compared, "
+    "and a copy of that drive would not be recognised."
+)
 UNJUDGED = "The calibration was not judged: its file holds no verdict."
 FAILED = "The calibration itself was judged FAIL when it was computed: calibration.yaml says why."
 NOT_CORRELATED = (
@@ -309,6 +313,8 @@ def doubts_and_notes(
     doubts, notes = [f"Of the map: {each}." for each in of_map], list[str]()
     if same_content(calibration.map, map_source):
         notes.append(SAME_MAP)
+    if not calibration.traces:
+        notes.append(NO_TRACES)
     judged = calibration.judgement
     if judged is None:
         notes.append(UNJUDGED)

@@ -189,13 +189,16 @@ def test_an_old_calibration_counts_as_not_judged(place: CalibratedYard, tmp_path
 
 
 def test_an_edited_verdict_is_refused(place: CalibratedYard, tmp_path: Path) -> None:
-    """A level that does not follow from the reasons beside it."""
+    """Beside its run's results it is not theirs; alone, the level contradicts its reasons."""
     shutil.copy(place.calibration.parent / "metrics.json", tmp_path)
     edited = tmp_path / "calibration.yaml"
     shutil.copy(place.calibration, edited)
     l2m("report", tmp_path, "--config", config(tmp_path, "fail"))
     edited.write_text(edited.read_text().replace("level: fail", "level: pass", 1))
-    run = ended("export", edited, "--format", "json", "--out", tmp_path / "x")
+    beside = ended("export", edited, "--format", "json", "--out", tmp_path / "x")
+    assert "is not of the run" in one_line(beside)
+    (alone := tmp_path / "alone").mkdir()
+    run = ended("export", shutil.copy(edited, alone), "--format", "json", "--out", tmp_path / "x")
     assert "verdict.level: PASS does not follow from its reasons" in one_line(run)
 
 

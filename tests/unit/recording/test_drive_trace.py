@@ -49,6 +49,16 @@ def test_a_drive_that_was_written_with_millimetres_is_recognised(seed: int) -> N
     assert recognised(replace(drive, p=np.round(drive.p, 3), stamp_ns=stamps), seed)
 
 
+@given(st.integers(0, 50), st.integers(2, 10), st.integers(0, 1))
+def test_a_thinned_drive_is_recognised(seed: int, every: int, phase: int) -> None:
+    """Poses that were throttled, down to one a second, and no other drive with so few."""
+    few = curve(seed)[np.arange(phase, 600, every)]
+    assert recognised(few, seed)
+    assert not recognised(few, seed + 1)
+    # half a metre beside it, as two vehicles drive
+    assert not recognised(moved(few, np.array([0.0, 0.5, 0.0])), seed)
+
+
 @given(st.integers(0, 50), st.integers(1, 50))
 def test_another_drive_is_none(seed: int, more: int) -> None:
     drive = curve(seed)
