@@ -44,13 +44,13 @@ def test_a_corridor_with_clouds_drift_and_truth(tmp_path: Path) -> None:
     out = tmp_path / "sim"
     l2m("simulate", "--options", options(tmp_path), "--kind", "mcap", "--out", out)
     bag = out / "calibration_mcap"
-    listed = l2m("inspect", bag).out
+    listed = l2m("inspect", bag, "--wide").out
     for topic, kind in (
         ("/points", "sensor_msgs/PointCloud2"),
         ("/ground_truth", "geometry_msgs/PoseStamped"),
         ("/odometry", "nav_msgs/Odometry"),
     ):
-        (line,) = [line for line in listed.splitlines() if f" {topic} " in line]
+        (line,) = [line for line in listed.splitlines() if line.startswith(f"{topic} ")]
         assert f" {kind} " in line
     odometry = read_trajectory(bag, BagOptions())
     xyzw = Rotation.from_matrix(odometry.R).as_quat()
