@@ -144,7 +144,9 @@ def slice_map(
         Along the longer side.
     """
     cell = float((high - low).max()) / cells
-    x, y = (np.arange(low[k], high[k] + cell, cell) for k in (0, 1))
+    # The longer side is a whole number of cells, of which rounding must not make one more.
+    counts = np.ceil((high - low) / cell - 1e-6).astype(int) + 1
+    x, y = (low[k] + cell * np.arange(counts[k]) for k in (0, 1))
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     sample = field_map.query(np.column_stack([grid, np.full(len(grid), height)]))
     sigma = np.sqrt(np.where(sample.inside[:, None], sample.variance, np.nan).mean(axis=1))
