@@ -59,9 +59,9 @@ def open_floor() -> Place:
 def warehouse_with_structure() -> Place:
     scenario = simulate(ScenarioOptions())
     suite = {known.sensor: known for known in scenario.suite}
-    readings = suite_readings([scenario.mapping.recording], suite, Config().mapping.sync)
-    rows = np.linspace(0, len(readings) - 1, READINGS).astype(int)
-    return Place(readings.points[rows], readings.field[rows], scenario.cloud)
+    read = suite_readings([scenario.mapping.recording], suite, Config().mapping.sync)
+    rows = np.linspace(0, len(read.points) - 1, READINGS).astype(int)
+    return Place(read.points[rows], read.field[rows], scenario.cloud)
 
 
 def row(place: Place) -> list[str]:

@@ -466,12 +466,20 @@ class KnownSensor:
         C and H.
     time_offset
         Of its clock in seconds: a reading's pose is that at stamp + offset.
+    covariance
+        Of (t, C row by row, H, time offset) in m, 1, uT and s, shape (16, 16); absent where they
+        count as exact.
+    common
+        What its errors have in common with those of the other sensors of its file: the covariance
+        of two of them is ``common_i @ common_j.T``, shape (16, r). Absent where it is nothing.
     """
 
     sensor: str
     t_lidar_mag: FloatArray
     distortion: Distortion
     time_offset: float = 0.0
+    covariance: FloatArray | None = None
+    common: FloatArray | None = None
 
     @classmethod
     def ideal(cls, sensor: str) -> "KnownSensor":

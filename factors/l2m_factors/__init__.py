@@ -10,7 +10,7 @@ from l2m_factors.key_pose_readings import (
     KeyPoseResiduals,
     key_pose_residuals,
 )
-from l2m_factors.keys import D, G, M, P, Q, S, T, X
+from l2m_factors.keys import D, G, M, P, Q, S, T, U, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import MapBatch, key_pose_factor
 from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
@@ -54,6 +54,7 @@ __all__ = [
     "TileBatch",
     "TileField",
     "TilePlaces",
+    "U",
     "UncertainReadings",
     "WeightedField",
     "WhiteRows",

@@ -41,6 +41,11 @@ def Q(sensor: int) -> int:
     return int(gtsam.symbol("Q", sensor))
 
 
+def U() -> int:
+    """Return the key of the errors of the sensors that surveyed: Vector, unit variance each."""
+    return int(gtsam.symbol("U", 0))
+
+
 def G() -> int:
     """Return the key of the share by which all ways are longer than odometry has them: double."""
     return int(gtsam.symbol("G", 0))

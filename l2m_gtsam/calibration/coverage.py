@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import cholesky
 from scipy.linalg.lapack import dpotri, dtrtri
 
-from l2m_factors import M, P, map_weights_information, pose_errors_prior
+from l2m_factors import M, P, U, map_weights_information, pose_errors_prior
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.moving_fields import MovingFields
 from l2m_gtsam.calibration.pose_errors import PoseKnots, pose_seconds
@@ -39,6 +39,13 @@ class MapErrors(Protocol):
     def features(self, points: FloatArray, tile: int, /) -> FloatArray:
         """Return A of a tile at points in uT, shape (N, 3, r)."""
 
+    @property
+    def common(self) -> int:
+        """Number s of the errors that the whole map has in common, of unit variance."""
+
+    def common_features(self, points: FloatArray, tile: int, /) -> FloatArray:
+        """Return what they do to a tile at points in uT, shape (N, 3, s)."""
+
 
 @runtime_checkable
 class UncertainMap(Protocol):
@@ -52,6 +59,7 @@ class NothingShared:
     """A map whose errors are independent: one tile with one weight that no reading feels."""
 
     covariance = np.eye(1)
+    common = 0
 
     def errors_over(self, points: FloatArray, /) -> "NothingShared":
         """Return the same for any places."""
@@ -69,6 +77,10 @@ class NothingShared:
         """Return that it does nothing, shape (N, 3, 1)."""
         return np.zeros((len(points), 3, 1))
 
+    def common_features(self, points: FloatArray, tile: int, /) -> FloatArray:
+        """Return no errors in common, shape (N, 3, 0)."""
+        return np.empty((len(points), 3, 0))
+
 
 @dataclass(frozen=True)
 class Group:
@@ -82,6 +94,8 @@ class Group:
         Of the view, shape (n,).
     features
         The map's error per weight of the tile, map frame, in uT, shape (n, 3, r).
+    common
+        The same for the errors of the survey's sensors, shape (n, 3, s).
     """
 
     sensor: int
@@ -89,6 +103,7 @@ class Group:
     segment: int
     rows: IntArray
     features: FloatArray
+    common: FloatArray
 
 
 @dataclass(frozen=True)
@@ -111,6 +126,8 @@ class Coverage:
         When each pose was taken, as the knots count, shape (N,).
     moving
         The sensors that feel recorded numbers.
+    common
+        Number of errors that the whole map has from the sensors that surveyed.
     """
 
     groups: tuple[Group, ...]
@@ -120,6 +137,7 @@ class Coverage:
     knots: PoseKnots | None
     seconds: FloatArray
     moving: MovingFields = field(default_factory=MovingFields)
+    common: int = 0
 
     @cached_property
     def root_information(self) -> FloatArray:
@@ -132,7 +150,8 @@ class Coverage:
         """Number of weights of each key of the graph."""
         knots = 0 if self.knots is None else len(self.knots.seconds)
         tiles = {M(tile): size for tile, size in self.tiles.items()}
-        return tiles | {P(knot): POSE for knot in range(knots)} | self.moving.sizes
+        suite = {U(): self.common} if self.common else {}
+        return tiles | {P(knot): POSE for knot in range(knots)} | suite | self.moving.sizes
 
     @property
     def columns(self) -> dict[int, slice]:
@@ -148,6 +167,9 @@ class Coverage:
         graph.add(map_weights_information(self.tiles, information))
         if self.knots is not None:
             graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
+        if self.common:
+            unit = gtsam.noiseModel.Unit.Create(self.common)
+            graph.add(gtsam.PriorFactorVector(U(), np.zeros(self.common), unit))
         graph.push_back(self.moving.prior())
         return graph
 
@@ -176,20 +198,23 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
     map_errors = errors.errors_over(x)
     owner, rest, groups = map_errors.owner(x), np.empty_like(x), []
 
-    def asked(tile: int) -> tuple[IntArray, FloatArray]:
+    def asked(tile: int) -> tuple[IntArray, FloatArray, FloatArray]:
         rows = np.flatnonzero(owner == tile)
-        return rows, map_errors.features(x[rows], tile)
+        at = x[rows]
+        return rows, map_errors.features(at, tile), map_errors.common_features(at, tile)
 
     tiles = list(map_errors.sizes())
-    for tile, (rows, features) in zip(tiles, in_threads(asked, tiles), strict=True):
+    for tile, (rows, features, common) in zip(tiles, in_threads(asked, tiles), strict=True):
         shared = np.einsum("nir,nir->ni", features, features)
         rest[rows] = np.maximum(view.map_variance[rows] - shared, 0.0)
         for own in together(readings, segment, rows, whole=knots is None):
             first = rows[own[0]]
             where = int(readings.sensor[first]), tile, int(segment[first])
-            groups.append(Group(*where, rows[own], features[own]))
+            groups.append(Group(*where, rows[own], features[own], common[own]))
     lower = cholesky(map_errors.covariance, lower=True, check_finite=False)
-    return Coverage(tuple(groups), rest, map_errors.sizes(), lower, knots, seconds)
+    return Coverage(
+        tuple(groups), rest, map_errors.sizes(), lower, knots, seconds, common=map_errors.common
+    )
 
 
 def together(

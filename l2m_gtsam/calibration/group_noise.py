@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-from l2m_factors import M, P, SharedError
+from l2m_factors import M, P, SharedError, U
 from l2m_gtsam.calibration.coverage import Coverage, Group
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.pose_errors import PoseKnots, error_of_poses
@@ -101,6 +101,7 @@ def group_noise(
     shared = [
         (
             SharedError(M(group.tile), R_lidar_map[group.rows] @ group.features),
+            *_of_suite(group, R_lidar_map),
             *coverage.moving.errors(group.sensor, None if q is None else q[group.rows]),
         )
         for group in coverage.groups
@@ -141,6 +142,13 @@ def pose_share(
     knots, seconds = coverage.knots, coverage.seconds
     weights, at_knots = knots.weights(seconds), knots.at_knots(seconds)
     return PoseShare(knots, seconds, F, C @ F, weights, at_knots)
+
+
+def _of_suite(group: Group, R_lidar_map: FloatArray) -> tuple[SharedError, ...]:
+    """Return what the survey's sensors did to all readings, if they do not count as exact."""
+    if not group.common.shape[2]:
+        return ()
+    return (SharedError(U(), R_lidar_map[group.rows] @ group.common),)
 
 
 def _inverse_root(covariance: FloatArray) -> FloatArray:

@@ -1,16 +1,21 @@
 """Recordings of a mapping suite -> map. Pure: no files, no terminal."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
+from l2m_gtsam.mapping.suite_shifts import suite_errors
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.maps.training import TrainingSet, checked_readings
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.suite_errors import SuiteErrors, errors_together
+from l2m_gtsam.maps.training import checked_readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
@@ -33,6 +38,31 @@ class MappingOptions(Options):
     """How `l2m map compare` holds readings out."""
     suite: SuiteCalibrationOptions = SuiteCalibrationOptions()
     """How `l2m map suite` calibrates the sensors that map."""
+
+
+@dataclass(frozen=True)
+class SurveyReadings:
+    """What sensors of a suite read, in the map frame.
+
+    Attributes
+    ----------
+    points, field
+        Where, in metres, and what, in uT, shapes (N, 3).
+    suite
+        What errors of the sensors do to that; absent where they count as exact.
+    """
+
+    points: FloatArray
+    field: FloatArray
+    suite: SuiteErrors | None = None
+
+    def followed_by(self, other: "SurveyReadings") -> "SurveyReadings":
+        """Return these readings and others."""
+        return SurveyReadings(
+            np.concatenate([self.points, other.points]),
+            np.concatenate([self.field, other.field]),
+            errors_together(self.suite, other.suite, len(self.points)),
+        )
 
 
 @one_blas_thread()
@@ -64,8 +94,8 @@ def map_recordings(
     SyncError
         Readings and poses of a recording do not overlap.
     """
-    readings = suite_readings(recordings, suite, options.sync)
-    return build_map(readings.points, readings.field, options.model, cloud)
+    read = suite_readings(recordings, suite, options.sync)
+    return build_map(read.points, read.field, options.model, cloud, read.suite)
 
 
 @one_blas_thread()
@@ -91,8 +121,10 @@ def update_map(
     MapError, SyncError
         As in ``map_recordings``.
     """
-    readings = suite_readings(recordings, suite, options.sync)
-    return field_map.updated(readings.points, readings.field)
+    read = suite_readings(recordings, suite, options.sync)
+    if isinstance(field_map, HarmonicMap):
+        return field_map.updated(read.points, read.field, read.suite)
+    return field_map.updated(read.points, read.field)
 
 
 @one_blas_thread()
@@ -121,7 +153,7 @@ def compare_recordings(
     MapError, SyncError
         As in ``map_recordings``, or the readings fill too few patches.
     """
-    readings = suite_readings(recordings, suite, options.sync)
+    read = suite_readings(recordings, suite, options.sync)
     built = dict.fromkeys(options.compare.kinds, 0)
 
     def build(points: FloatArray, field: FloatArray, kind: str) -> FieldMap:
@@ -133,30 +165,34 @@ def compare_recordings(
         progress(stage, built[kind] / options.compare.folds)
         return field_map
 
-    return compare_maps(readings.points, readings.field, options.compare, build)
+    return compare_maps(read.points, read.field, options.compare, build)
 
 
 @one_blas_thread()
 def suite_readings(
     recordings: Sequence[Recording], suite: Mapping[str, KnownSensor] | None, sync: SyncOptions
-) -> TrainingSet:
+) -> SurveyReadings:
     """Return what a suite read, in the map frame; see ``map_recordings``."""
     frames = sorted({recording.trajectory.frame for recording in recordings})
     if len(frames) > 1:
         named = ", ".join(f"{r.source.path} in {r.trajectory.frame!r}" for r in recordings)
         msg = f"the recordings' poses are in different frames: {named}; one map frame is needed"
         raise MapError(msg)
-    points, fields = [], []
+    drives = []
     for recording in recordings:
         known = [_known(series.sensor, suite, recording) for series in recording.series]
         offset = np.array([each.time_offset for each in known])
         readings = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0))).readings
         _refuse_stuck(readings, recording)
-        if offset.any():
+        uncertain = any(each.covariance is not None for each in known)
+        if offset.any() or uncertain:
             readings = with_offsets(readings, recording.trajectory, offset)
-        points.append(sensor_positions(readings, known))
-        fields.append(map_fields(readings, known))
-    return checked_readings(np.concatenate(points), np.concatenate(fields))
+        points, field = sensor_positions(readings, known), map_fields(readings, known)
+        errors = suite_errors(readings, known) if uncertain else None
+        drives.append(SurveyReadings(points, field, errors))
+    read = reduce(SurveyReadings.followed_by, drives)
+    checked_readings(read.points, read.field)
+    return read
 
 
 def _refuse_stuck(readings: Readings, recording: Recording) -> None:

@@ -14,6 +14,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
+from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.options import Options
 
 
@@ -51,32 +52,35 @@ class MapKind:
     Attributes
     ----------
     fit
-        From positions and readings in the map frame, (N, 3) each, in metres and microtesla, and
-        the LiDAR's structure cloud, in metres, (M, 3), if there is one and the kind uses it.
+        From positions and readings in the map frame, (N, 3) each, in metres and microtesla, the
+        LiDAR's structure cloud, in metres, (M, 3), if there is one and the kind uses it, and what
+        errors of the sensors do to the readings, which only a kind that knows its own errors uses.
     load
         From a stored state.
     uses_structure
         Whether the kind has a use for a structure cloud.
     """
 
-    fit: Callable[[FloatArray, FloatArray, MapOptions, FloatArray | None], FieldMap]
+    fit: Callable[
+        [FloatArray, FloatArray, MapOptions, FloatArray | None, SuiteErrors | None], FieldMap
+    ]
     load: Callable[[MapState], FieldMap]
     uses_structure: bool = False
 
 
 KINDS = {
     "harmonic": MapKind(
-        lambda p, b, o, cloud: HarmonicMap.fit(p, b, o.harmonic, cloud),
+        lambda p, b, o, cloud, suite: HarmonicMap.fit(p, b, o.harmonic, cloud, suite),
         HarmonicMap.from_state,
         uses_structure=True,
     ),
     "sliding_gp": MapKind(
-        lambda p, b, o, _: SlidingGP.fit(p, b, o.sliding_gp), SlidingGP.from_state
+        lambda p, b, o, *_: SlidingGP.fit(p, b, o.sliding_gp), SlidingGP.from_state
     ),
     "bilinear": MapKind(
-        lambda p, b, o, _: BilinearMap.fit(p, b, o.bilinear), BilinearMap.from_state
+        lambda p, b, o, *_: BilinearMap.fit(p, b, o.bilinear), BilinearMap.from_state
     ),
-    "dense_gp": MapKind(lambda p, b, o, _: DenseGP.fit(p, b, o.dense_gp), DenseGP.from_state),
+    "dense_gp": MapKind(lambda p, b, o, *_: DenseGP.fit(p, b, o.dense_gp), DenseGP.from_state),
 }
 """Every kind of map. A new kind is its own file, its line here and its options above."""
 
@@ -97,6 +101,7 @@ def build_map(
     field: FloatArray,
     options: MapOptions | None = None,
     cloud: FloatArray | None = None,
+    suite: SuiteErrors | None = None,
 ) -> FieldMap:
     """Return a map of readings.
 
@@ -110,6 +115,8 @@ def build_map(
         Defaults where absent.
     cloud
         Structure that a LiDAR saw: points of the map frame in metres, shape (M, 3).
+    suite
+        What errors of the sensors do to the readings; absent where they count as exact.
 
     Raises
     ------
@@ -119,7 +126,7 @@ def build_map(
     options = MapOptions() if options is None else options
     if cloud is not None:
         refuse_structure(options.kind)
-    return KINDS[options.kind].fit(points, field, options, cloud)
+    return KINDS[options.kind].fit(points, field, options, cloud, suite)
 
 
 def map_from_state(state: MapState) -> FieldMap:

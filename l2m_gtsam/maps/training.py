@@ -193,12 +193,18 @@ def merged(readings: TrainingSet, edge: float, independent: int) -> TrainingSet:
     independent
         The most that the readings of one cube are worth.
     """
-    cubes = np.floor(readings.points / edge)
-    _, owner = np.unique(cubes.astype(np.int64), axis=0, return_inverse=True)
+    owner = cubes_of(readings.points, edge)
     worth = np.bincount(owner, readings.weight)
     columns = (np.hstack([readings.points, readings.field]) * readings.weight[:, None]).T
     means = np.column_stack([np.bincount(owner, column) for column in columns]) / worth[:, None]
     return TrainingSet(means[:, :3], means[:, 3:], np.minimum(worth, independent))
+
+
+def cubes_of(points: FloatArray, edge: float) -> IntArray:
+    """Return the number of the cube of an edge in metres that each point, (N, 3), is in, (N,)."""
+    cubes = np.floor(points / edge)
+    _, owner = np.unique(cubes.astype(np.int64), axis=0, return_inverse=True)
+    return np.asarray(owner)
 
 
 def joined(first: TrainingSet, second: TrainingSet) -> TrainingSet:

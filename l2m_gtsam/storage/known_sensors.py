@@ -1,16 +1,18 @@
 """Files of sensors whose place and distortion are known: truths, mapping suites, calibrations."""
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
 from l2m_gtsam.data import Distortion, KnownSensor, Matrix, Vector
 from l2m_gtsam.errors import Notice
 from l2m_gtsam.records.calibration import SensorStatus, TimeOffset
 from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.storage.known_errors import StatedErrors
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
 
 
@@ -34,6 +36,22 @@ class _Known(_Finite):
         if np.linalg.cond(C) > 1e6:  # gains a million apart are no magnetometer's
             raise ValueError("C cannot be inverted, so that its readings say nothing of the field")
         return C
+
+
+class _Stated(_Known):
+    """A sensor with what a file says of its errors."""
+
+    errors: StatedErrors = StatedErrors()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_errors(cls, entry: Any) -> Any:
+        return {**entry, "errors": entry} if isinstance(entry, dict) else entry
+
+    @model_validator(mode="after")
+    def _credible(self) -> Self:
+        self.errors.known()
+        return self
 
 
 class _Judged(_Finite):
@@ -69,7 +87,7 @@ class ListedSensor(_Known):
 
 
 class _KnownFile(_Finite):
-    sensors: dict[str, _Known] = Field(min_length=1)
+    sensors: dict[str, _Stated] = Field(min_length=1)
     verdict: _Judged | None = None
 
     @field_validator("sensors", mode="before")
@@ -126,7 +144,8 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     """Return the sensors of a truth, of a mapping suite or of a calibration, by name.
 
     Without C and H an entry is free of distortion: C = I, H = 0; without a time offset its clock is
-    that of the poses. Sensors that a calibration could not solve are left out. A `Notice` says that
+    that of the poses; without covariance and sigmas its values count as exact. Sensors that a
+    calibration could not solve are left out. A `Notice` says that
     a calibration was judged FAIL.
 
     Raises
@@ -137,7 +156,10 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     found = read_checked(path, _FILE)
     if found.verdict is not None and found.verdict.level is Level.FAIL:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
-    return {name: _known(name, entry) for name, entry in found.sensors.items()}
+    return {
+        name: replace(_known(name, entry), covariance=entry.errors.known())
+        for name, entry in found.sensors.items()
+    }
 
 
 def read_listed_sensors(path: Path) -> dict[str, ListedSensor]:

@@ -11,7 +11,7 @@ from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, KnownSensor, Readings
 from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
-from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.sync import SyncOptions, synchronise
@@ -95,7 +95,8 @@ def surveyed(options: SiteOptions) -> SurveyedSite:
     """Return the site and its survey."""
     scenario = simulate(options.scenario)
     suite = {sensor.sensor: sensor for sensor in scenario.suite}
-    survey = suite_readings([scenario.mapping.recording], suite, options.mapping.sync)
+    read = suite_readings([scenario.mapping.recording], suite, options.mapping.sync)
+    survey = checked_readings(read.points, read.field)
     return SurveyedSite(scenario.world, scenario.plan, survey, scenario.cloud)
 
 

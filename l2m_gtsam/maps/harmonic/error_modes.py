@@ -13,9 +13,15 @@ concerned.
 Tiles share readings, so their errors are correlated. The part of ``beta`` that the survey's noise
 makes is ``-A_b(X)^T W n / sigma^2`` at the survey's places X; over the readings that two tiles
 share it gives their covariance. The other part, the prior's, counts as independent between tiles.
+
+Errors of the sensors that surveyed are wrong readings, ``E eta``, with one eta for the whole map.
+They move the posterior mean of every tile by ``dw_b = L L^T F^T W E eta / sigma^2``, a field that
+no tile's own posterior knows of. A shift d of all readings alike is taken out of E before: it moves
+the map as it is, by ``-G d``, since its prior was learnt from the shifted readings, too.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg.lapack import dpstrf
@@ -27,9 +33,12 @@ from l2m_gtsam.maps.harmonic.basis import batches
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
 
+FieldAndGradient = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 NEGLIGIBLE = 1e-15  # share of the variance at places
+FELT = 0.01  # of the noise, root mean square over a drive: what matters to ten thousand readings
 
 
 @dataclass(frozen=True)
@@ -66,6 +75,39 @@ class TileModes:
 
 
 @dataclass(frozen=True)
+class SuiteModes:
+    """The error that the survey's sensors brought into a map, for unit variance of s numbers.
+
+    Attributes
+    ----------
+    weights
+        Of each tile for one unit of each, shape (m, s).
+    shift
+        Of the map as a whole, metres in the map frame, shape (3, s).
+    slope
+        The map's field and gradient: those that solvers see, so that a shift of the map and one of
+        all sensors are the same to the last digit.
+    """
+
+    weights: dict[int, FloatArray]
+    shift: FloatArray
+    slope: FieldAndGradient
+
+    def features(self, modes: TileModes, points: FloatArray, tile: int) -> FloatArray:
+        """Return what a unit of each does to a tile at points, uT, shape (N, 3, s)."""
+        if not self.shift.shape[1]:
+            return np.empty((len(points), 3, 0))
+        _, gradient = self.slope(points)
+        moved = replace(modes, weights=self.weights[tile]).features(points)
+        return np.asarray(moved - gradient @ self.shift)
+
+    def among(self, chosen: FloatArray) -> "SuiteModes":
+        """Return other numbers, of which each is a combination of these, shape (s, k)."""
+        weights = {tile: each @ chosen for tile, each in self.weights.items()}
+        return SuiteModes(weights, self.shift @ chosen, self.slope)
+
+
+@dataclass(frozen=True)
 class ErrorModes:
     """The map's error over a drive.
 
@@ -77,11 +119,19 @@ class ErrorModes:
         Modes of each tile that the drive crosses, by the tile's index.
     covariance
         Of all beta together, tile by tile in their order, shape (K, K).
+    suite
+        What the survey's sensors brought into all of the map.
     """
 
     grid: Grid
     tiles: dict[int, TileModes]
     covariance: FloatArray
+    suite: SuiteModes
+
+    @property
+    def common(self) -> int:
+        """Number s of errors of the survey's sensors, of unit variance."""
+        return int(self.suite.shift.shape[1])
 
     def sizes(self) -> dict[int, int]:
         """Return the number of beta of each tile."""
@@ -97,9 +147,17 @@ class ErrorModes:
         """Return A of a tile at points, shape (N, 3, r)."""
         return self.tiles[tile].features(points)
 
+    def common_features(self, points: FloatArray, tile: int) -> FloatArray:
+        """Return what the errors of the survey's sensors do to a tile, uT, shape (N, 3, s)."""
+        return self.suite.features(self.tiles[tile], points, tile)
+
 
 def error_modes(
-    learnt: Learnt, tiles: Tiles, points: FloatArray, options: ErrorOptions
+    learnt: Learnt,
+    tiles: Tiles,
+    points: FloatArray,
+    options: ErrorOptions,
+    slope: FieldAndGradient,
 ) -> ErrorModes:
     """Return the error of a map over places.
 
@@ -111,6 +169,8 @@ def error_modes(
         Where a drive reads the field, metres, shape (N, 3).
     options
         Number of places and share of variance left out.
+    slope
+        The map's field and gradient at points.
     """
     owner = learnt.tiling.grid.block_of(points)
     crossed = np.unique(owner).tolist()
@@ -122,7 +182,65 @@ def error_modes(
         return TileModes(tiles[index], tiles[index].unwhitened(directions))
 
     found = dict(zip(crossed, in_threads(modes, crossed), strict=True))
-    return ErrorModes(learnt.tiling.grid, found, joint_covariance(learnt, found))
+    suite = suite_modes(learnt, found, points, owner, options, slope)
+    return ErrorModes(learnt.tiling.grid, found, joint_covariance(learnt, found), suite)
+
+
+def suite_modes(
+    learnt: Learnt,
+    tiles: dict[int, TileModes],
+    points: FloatArray,
+    owner: IntArray,
+    options: ErrorOptions,
+    slope: FieldAndGradient,
+) -> SuiteModes:
+    """Return what errors of the survey's sensors do over places, as numbers of unit variance.
+
+    Of their sixteen errors each, the combinations stay that a drive feels.
+    """
+    if learnt.suite is None or not tiles:
+        return SuiteModes({}, np.empty((3, 0)), slope)
+    suite, weight = learnt.suite, learnt.readings.weight
+    # The covariance may be singular, where errors are known or the same.
+    squares, turned = np.linalg.eigh(suite.covariance)
+    root = turned * np.sqrt(np.maximum(squares, 0.0))
+    shift = suite.mean_shift(weight)
+
+    def moved(index: int) -> FloatArray:
+        return np.asarray(moved_weights(learnt, suite, index, tiles[index].tile, shift) @ root)
+
+    weights = dict(zip(tiles, in_threads(moved, list(tiles)), strict=True))
+    every, gram = SuiteModes(weights, shift @ root, slope), np.zeros((len(root), len(root)))
+    for index, each in tiles.items():
+        rows = np.flatnonzero(owner == index)
+        some = rows[np.linspace(0, len(rows) - 1, min(options.places, len(rows))).astype(int)]
+        seen = every.features(each, points[some], index).reshape(-1, len(root))
+        gram += seen.T @ seen * (len(rows) / len(some))
+    squares, turned = np.linalg.eigh(gram)
+    least = 3 * len(points) * (FELT * learnt.hyperparameters.noise) ** 2
+    return every.among(turned[:, squares > least])
+
+
+def moved_weights(
+    learnt: Learnt, suite: SuiteErrors, index: int, tile: Tile, shift: FloatArray
+) -> FloatArray:
+    """Return what a unit of each error of the survey's sensors does to a tile, (m, 16 S).
+
+    The ``shift`` of all readings, (3, 16 S) metres, is left out.
+    """
+    rows = learnt.members[index]
+    readings = learnt.readings[rows]
+    _, gradient = tile.field_and_gradient(readings.points)
+    wrong = suite.of_field(rows, gradient) + gradient @ shift
+    wrong *= readings.weight[:, None, None]
+    pulled = np.zeros((len(tile.basis), wrong.shape[2]))
+    for at in batches(len(rows)):
+        F = tile.basis.features(readings.points[at])
+        pulled += F.reshape(-1, len(pulled)).T @ wrong[at].reshape(-1, wrong.shape[2])
+    # L L^T by the factor: neither covariance nor inverse is formed.
+    white = np.ascontiguousarray(pulled * tile.weights.prior_sigma[:, None])
+    tile.weights.factor.solve_rows(white)
+    return np.asarray(tile.unwhitened(white) / tile.hyperparameters.noise**2)
 
 
 def leading(root: FloatArray, rest: float) -> FloatArray:

@@ -17,8 +17,15 @@ from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.visits import Blend, Visit
+from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.tile_store import TileStore
-from l2m_gtsam.maps.training import TrainingSet, additional_set, checked_points, training_set
+from l2m_gtsam.maps.training import (
+    TrainingSet,
+    additional_set,
+    checked_points,
+    cubes_of,
+    training_set,
+)
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count
 
@@ -73,6 +80,7 @@ class HarmonicMap:
         field: FloatArray,
         options: HarmonicOptions | None = None,
         cloud: FloatArray | None = None,
+        suite: SuiteErrors | None = None,
     ) -> "HarmonicMap":
         """Return the map of readings.
 
@@ -86,6 +94,8 @@ class HarmonicMap:
             Defaults where absent.
         cloud
             Points of the structure that a LiDAR saw, in the map frame in metres, shape (M, 3).
+        suite
+            What errors of the sensors do to the readings; absent where they count as exact.
 
         Raises
         ------
@@ -96,7 +106,11 @@ class HarmonicMap:
         readings, sources = training_set(points, field), NO_SOURCES
         if cloud is not None:
             sources = candidate_sources(checked_points(cloud), readings.points, options.structure)
-        return cls.condition(learn_map(readings, sources, options), options)
+        learnt = learn_map(readings, sources, options)
+        if suite is not None:
+            owner = cubes_of(readings.points, options.merge)
+            learnt = replace(learnt, suite=suite.averaged(owner, readings.weight))
+        return cls.condition(learnt, options)
 
     @classmethod
     def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
@@ -105,16 +119,19 @@ class HarmonicMap:
 
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
-        return error_modes(self.learnt, self.tiles, checked_points(points), self.options.errors)
+        points, options = checked_points(points), self.options.errors
+        return error_modes(self.learnt, self.tiles, points, options, self.field_and_gradient)
 
-    def updated(self, points: FloatArray, field: FloatArray, /) -> "HarmonicMap":
+    def updated(
+        self, points: FloatArray, field: FloatArray, suite: SuiteErrors | None = None, /
+    ) -> "HarmonicMap":
         """Return the map with more readings and the same prior of the whole; see ``FieldMap``.
 
         Only tiles that the new readings take part in are solved again, with scales of their own
         anew; whether the field is explained is judged anew as well.
         """
         new = additional_set(points, field)
-        learnt = explained(self.learnt.extended(new, self.options), self.options)
+        learnt = explained(self.learnt.extended(new, self.options, suite), self.options)
         # A new reading may have moved an old one that it was merged with.
         box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap + self.options.merge
         away, _ = cKDTree(new.points[:, :2]).query(learnt.tiling.grid.centres, p=np.inf)
@@ -235,7 +252,7 @@ class HarmonicMap:
         if not count:
             return np.empty((0, 3, 0, 3))
         every = ErrorOptions(places=max(count, 10), rest=EXACT)
-        errors = error_modes(self.learnt, self.tiles, points, every)
+        errors = error_modes(self.learnt, self.tiles, points, every, self.field_and_gradient)
         A = np.zeros((3 * count, len(errors.covariance)))
         owner, start = errors.owner(points), 0
         for tile, size in errors.sizes().items():
@@ -285,9 +302,11 @@ class CompiledMap(HarmonicMap):
         in_threads(answer, np.array_split(by_place(points), max(SHARES, len(points) // PIECE)))
         return field, gradient
 
-    def updated(self, points: FloatArray, field: FloatArray, /) -> "CompiledMap":
+    def updated(
+        self, points: FloatArray, field: FloatArray, suite: SuiteErrors | None = None, /
+    ) -> "CompiledMap":
         """Return the map with more readings; see ``FieldMap``."""
-        return super().updated(points, field).compile()
+        return super().updated(points, field, suite).compile()
 
 
 def by_place(points: FloatArray) -> IntArray:

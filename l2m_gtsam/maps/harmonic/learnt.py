@@ -26,8 +26,9 @@ from l2m_gtsam.maps.harmonic.tiling import (
     surveyed_area,
     tiling_of,
 )
+from l2m_gtsam.maps.suite_errors import SuiteErrors, errors_together
 from l2m_gtsam.maps.survey import survey_doubts
-from l2m_gtsam.maps.training import TrainingSet, joined, merged
+from l2m_gtsam.maps.training import TrainingSet, cubes_of, joined, merged
 from l2m_gtsam.options import Options
 
 KNOWN = 0.5  # of the readings' variance: a map that explains less is no better than their mean
@@ -132,6 +133,9 @@ class Learnt:
         How far the prior of a tile may differ.
     origin
         How it was learnt; does not enter predictions.
+    suite
+        What errors of the sensors that surveyed do to the readings; absent where they count as
+        exact.
     """
 
     readings: TrainingSet
@@ -142,6 +146,7 @@ class Learnt:
     resolution: Resolution
     local: LocalOptions
     origin: Origin
+    suite: SuiteErrors | None = None
 
     @cached_property
     def members(self) -> list[IntArray]:
@@ -173,9 +178,16 @@ class Learnt:
         strong = [s for s in near if self.strengths[s] > 0]
         return [self.sources.pieces[s] for s in strong], self.strengths[strong]
 
-    def extended(self, new: TrainingSet, options: HarmonicOptions) -> "Learnt":
-        """Return the same prior and tiles, with more readings and the tiles that they need."""
+    def extended(
+        self, new: TrainingSet, options: HarmonicOptions, suite: SuiteErrors | None = None
+    ) -> "Learnt":
+        """Return the same prior and tiles, with more readings and the tiles that they need.
+
+        ``suite`` is what errors of their sensors do to the new readings.
+        """
         together = joined(self.readings, new)
+        owner = cubes_of(together.points, options.merge)
+        errors = errors_together(self.suite, suite, len(self.readings))
         survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(together))))
         readings = merged(together, options.merge, options.independent)
         grid = self.tiling.grid
@@ -186,6 +198,7 @@ class Learnt:
             readings=readings,
             tiling=replace(self.tiling, grid=wider),
             origin=replace(self.origin, readings=self.origin.readings + len(new), survey=survey),
+            suite=None if errors is None else errors.averaged(owner, together.weight),
         )
 
 

@@ -13,6 +13,7 @@ from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import ORIGIN, HarmonicOptions, Learnt, reach_of
 from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources
 from l2m_gtsam.maps.harmonic.tiling import LEAST_CORE, Resolution, Tiling, blend_of
+from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
 from l2m_gtsam.maps.training import FURTHEST, TrainingSet, training_set
 
@@ -21,6 +22,7 @@ LEAST_SIZE = 0.4 * LEAST_CORE  # equal tiles over an extent may be half as large
 # Given hyperparameters may lie outside the bounds of learning; powers and squares of these are
 # still far from the ends of float64.
 LEAST, MOST = 1e-9, 1e9
+ROUNDING = 1e-9  # of a covariance's largest entry
 
 
 def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapState:
@@ -38,6 +40,14 @@ def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapS
         "resolution": np.array([learnt.resolution.floor, learnt.resolution.ceiling]),
     }
     origin = ORIGIN.dump_python(learnt.origin, mode="json")
+    if (suite := learnt.suite) is not None:
+        # Three digits are enough for an error; names go with the facts.
+        arrays |= {
+            "suite_covariance": suite.covariance,
+            "suite_pairs": np.stack([suite.reading, suite.sensor]),
+            "suite_shift": suite.shift.astype(np.float32),
+        }
+        origin |= {"suite": list(suite.sensors)}
     return MapState(kind, arrays, options.model_dump(mode="json"), origin)
 
 
@@ -60,8 +70,9 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
     resolution = resolution_from_state(state)
     tiling = tiling_from_state(state, readings, resolution, options)
     local = options.effective_local
+    suite = suite_from_state(state, len(readings))
     learnt = Learnt(
-        readings, hyperparameters, sources, strengths, tiling, resolution, local, origin
+        readings, hyperparameters, sources, strengths, tiling, resolution, local, origin, suite
     )
     return learnt, options
 
@@ -131,3 +142,33 @@ def sources_from_state(state: MapState) -> tuple[Sources, FloatArray]:
     if not (fits and numbered and ((strengths >= 0) & (strengths <= MOST)).all()):
         raise damaged("sources are", "positions, structures and strengths disagree")
     return Sources(positions, structure), strengths
+
+
+def suite_from_state(state: MapState, count: int) -> SuiteErrors | None:
+    """Return what errors of the sensors do to so many readings, after checks; none in most maps."""
+    if "suite_covariance" not in state.arrays:
+        return None
+    names = state.provenance.get("suite")
+    covariance, pairs, shift = (
+        state_array(state, f"suite_{name}") for name in ("covariance", "pairs", "shift")
+    )
+    if not isinstance(names, list) or not names or not all(isinstance(n, str) for n in names):
+        raise damaged("suite is", "its sensors have no names")
+    size = SIZE * len(names)
+    if (
+        covariance.shape != (size, size)
+        or pairs.ndim != 2
+        or shift.shape != (*pairs.shape[1:], SHIFT, SIZE)
+        or len(pairs) != 2
+    ):
+        raise damaged("suite is", "its arrays do not have the shapes needed")
+    numbers = pairs.astype(np.int64)
+    most = np.array([[count], [len(names)]])
+    if not ((numbers >= 0).all() and (numbers < most).all() and (numbers == pairs).all()):
+        raise damaged("suite is", "its readings or sensors do not exist")
+    finite = np.isfinite(covariance).all() and np.isfinite(shift).all()
+    if not (finite and np.array_equal(covariance, covariance.T)):
+        raise damaged("suite is", "its covariance is none or an effect is not finite")
+    if np.linalg.eigvalsh(covariance).min() < -ROUNDING * np.abs(covariance).max():
+        raise damaged("suite is", "its covariance has a negative direction")
+    return SuiteErrors(tuple(names), covariance, numbers[0], numbers[1], shift)

@@ -1,0 +1,130 @@
+r"""What errors of the sensors that surveyed do to the readings of a map.
+
+A sensor's errors are those of ``(t, C row by row, H, time offset)``, 16 numbers. They move a
+reading, ``dx``, and change it, ``dy``. What the map is given is then wrong by
+``dy - G dx``, G the field's gradient there. All readings of a sensor share its errors, at every
+place and in every pass: more readings do not average them out (Schmidt 1966 calls such numbers
+"considered").
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from l2m_gtsam.data import FloatArray, IntArray
+
+SIZE = 16  # errors of a sensor: t, C row by row, H, time offset
+SHIFT = 6  # of a reading: its position, then its field
+
+
+@dataclass(frozen=True)
+class SuiteErrors:
+    """How readings of S sensors hang on the sensors' errors.
+
+    A reading of a map may be an average over several sensors: P pairs of a reading and a sensor
+    that has a share in it.
+
+    Attributes
+    ----------
+    sensors
+        Names, S of them.
+    covariance
+        Of all sensors' errors in m, 1, uT and s, shape (16 S, 16 S).
+    reading, sensor
+        Of each pair, shapes (P,).
+    shift
+        What a unit of each error does to position and field of the reading, both in the map frame,
+        m and uT, shape (P, 6, 16).
+    """
+
+    sensors: tuple[str, ...]
+    covariance: FloatArray
+    reading: IntArray
+    sensor: IntArray
+    shift: FloatArray
+
+    def averaged(self, owner: IntArray, weight: FloatArray) -> "SuiteErrors":
+        """Return the errors of averages over readings.
+
+        Parameters
+        ----------
+        owner
+            Average that each reading goes into, shape (N,).
+        weight
+            Of each reading, shape (N,).
+        """
+        share = (weight / np.bincount(owner, weight)[owner])[self.reading]
+        pair = owner[self.reading] * len(self.sensors) + self.sensor
+        pairs, at = np.unique(pair, return_inverse=True)
+        shift = np.zeros((len(pairs), SHIFT, SIZE))
+        np.add.at(shift, at, self.shift * share[:, None, None])
+        reading, sensor = np.divmod(pairs, len(self.sensors))
+        return replace(self, reading=reading, sensor=sensor, shift=shift)
+
+    def followed_by(self, other: "SuiteErrors", first: int) -> "SuiteErrors":
+        """Return the errors of these readings and of others that are numbered from ``first`` on.
+
+        The same sensors with the same covariance have the same errors in both; others have none
+        in common.
+        """
+        same = self.sensors == other.sensors
+        if same and np.array_equal(self.covariance, other.covariance):
+            sensors, covariance, shifted = self.sensors, self.covariance, other.sensor
+        else:
+            sensors = (*self.sensors, *other.sensors)
+            covariance = block_diag(self.covariance, other.covariance)
+            shifted = other.sensor + len(self.sensors)
+        return SuiteErrors(
+            sensors,
+            covariance,
+            np.concatenate([self.reading, other.reading + first]),
+            np.concatenate([self.sensor, shifted]),
+            np.concatenate([self.shift, other.shift]),
+        )
+
+    def mean_shift(self, weight: FloatArray) -> FloatArray:
+        """Return how far a unit of each error moves readings of these weights, (N,), on average.
+
+        In the map frame in metres, shape (3, 16 S).
+        """
+        shift = np.zeros((len(self.sensors), 3, SIZE))
+        np.add.at(shift, self.sensor, self.shift[:, :3] * weight[self.reading, None, None])
+        return np.asarray(shift.transpose(1, 0, 2).reshape(3, -1) / weight.sum())
+
+    def of_field(self, rows: IntArray, gradient: FloatArray) -> FloatArray:
+        """Return what a unit of each error does to the field that readings stand for.
+
+        Parameters
+        ----------
+        rows
+            Which readings, sorted, shape (n,).
+        gradient
+            G there in uT/m, shape (n, 3, 3).
+
+        Returns
+        -------
+        FloatArray
+            uT, shape (n, 3, 16 S).
+        """
+        at = np.searchsorted(rows, self.reading)
+        known = np.flatnonzero(rows[np.minimum(at, len(rows) - 1)] == self.reading)
+        n, at = len(rows), at[known]
+        change = self.shift[known, 3:] - gradient[at] @ self.shift[known, :3]
+        effect = np.zeros((n, len(self.sensors), 3, SIZE))
+        effect[at, self.sensor[known]] = change  # each pair is there once
+        return np.asarray(effect.transpose(0, 2, 1, 3).reshape(n, 3, -1))
+
+
+def errors_together(
+    before: SuiteErrors | None, after: SuiteErrors | None, first: int
+) -> SuiteErrors | None:
+    """Return the errors of readings and of others after them; see ``SuiteErrors.followed_by``.
+
+    Absent are those of sensors that count as exact.
+    """
+    if after is None:
+        return before
+    if before is None:
+        return replace(after, reading=after.reading + first)
+    return before.followed_by(after, first)

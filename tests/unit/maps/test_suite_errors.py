@@ -1,0 +1,192 @@
+"""Errors of the sensors that surveyed, carried by the map that was made of their readings."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from l2m_gtsam.data import FloatArray, MapState
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors, errors_together
+from l2m_gtsam.maps.training import cubes_of, merged, training_set
+from tests.worlds.harmonic import OPTIONS, POST, readings, within_survey
+
+SIGMA = np.repeat([0.005, 0.01, 0.5, 0.002], [3, 9, 3, 1])
+
+
+def errors(count: int, sensors: int = 2, seed: int = 0) -> SuiteErrors:
+    """Return errors of so many readings, which sensors take in turn."""
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(SIZE * sensors, SIZE * sensors)) / np.sqrt(SIZE * sensors)
+    root *= np.tile(SIGMA, sensors)[:, None]
+    shift = rng.normal(size=(count, SHIFT, SIZE))
+    names = tuple(f"s{i}" for i in range(sensors))
+    return SuiteErrors(names, root @ root.T, np.arange(count), np.arange(count) % sensors, shift)
+
+
+def effect(suite: SuiteErrors, count: int, slope: FloatArray) -> FloatArray:
+    """Return what all errors do to the field of all readings, shape (N, 3, 16 S)."""
+    return suite.of_field(np.arange(count), slope)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_averages_have_the_average_effect(seed: int, sensors: int) -> None:
+    rng, count = np.random.default_rng(seed), 30
+    suite = errors(count, sensors, seed)
+    # Every average has a reading.
+    owner = np.concatenate([np.arange(6), rng.integers(0, 6, count - 6)])
+    weight, slope = rng.uniform(0.5, 5, count), rng.normal(size=(6, 3, 3))
+    told = effect(suite.averaged(owner, weight), 6, slope)
+    single = effect(suite, count, slope[owner])
+    for each in range(6):
+        own = owner == each
+        expected = np.average(single[own], axis=0, weights=weight[own])
+        np.testing.assert_allclose(told[each], expected, atol=1e-12)
+
+
+def test_the_same_sensors_have_the_same_errors_in_two_surveys() -> None:
+    one, other = errors(10), errors(5, seed=0)
+    both = errors_together(one, other, 10)
+    assert both is not None
+    assert both.sensors == one.sensors
+    strange = errors_together(one, errors(5, seed=1), 10)
+    assert strange is not None
+    assert len(strange.covariance) == 2 * len(one.covariance)
+    assert errors_together(None, None, 10) is None
+    late = errors_together(None, other, 10)
+    assert late is not None
+    np.testing.assert_array_equal(late.reading, other.reading + 10)
+
+
+@pytest.fixture(scope="module")
+def uncertain() -> HarmonicMap:
+    points, field = readings()
+    return HarmonicMap.fit(points, field, OPTIONS, POST, errors(len(points)))
+
+
+def test_the_map_moves_as_its_errors_say(uncertain: HarmonicMap) -> None:
+    """The posterior means of wrong readings, computed, against the features: linear algebra."""
+    points, field = readings()
+    # Large ones, so that a drive feels all combinations: the posterior mean is linear.
+    suite, learnt = errors(len(points)), uncertain.learnt
+    suite = replace(suite, covariance=1e8 * suite.covariance)
+    # Readings are changed as they were taken; positions stay, whose shift is a change of field.
+    still = replace(suite, shift=np.concatenate([0 * suite.shift[:, :3], suite.shift[:, 3:]], 1))
+    ours = HarmonicMap.fit(points, field, OPTIONS, POST, still)
+    unit = np.random.default_rng(2).normal(size=SIZE * 2)
+    squares, turned = np.linalg.eigh(suite.covariance)
+    eta = turned @ (np.sqrt(np.maximum(squares, 0)) * unit)
+    raw = training_set(points, field)
+    wrong = merged(raw, OPTIONS.merge, OPTIONS.independent).field + (
+        still.averaged(cubes_of(points, OPTIONS.merge), raw.weight).of_field(
+            np.arange(len(learnt.readings)), np.zeros((len(learnt.readings), 3, 3))
+        )
+        @ eta
+    )
+    moved = HarmonicMap.condition(
+        replace(learnt, readings=replace(learnt.readings, field=wrong)), OPTIONS
+    )
+    at = within_survey()
+    told, owner = ours.errors_over(at), ours.learnt.tiling.grid.block_of(at)
+    # Unit variances and errors are a rotation apart.
+    assert told.common == len(eta)
+    seen = np.concatenate([told.common_features(at[owner == i], i) for i in told.sizes()])
+    changed = np.concatenate(
+        [
+            moved.tiles[i].field_and_gradient(at[owner == i])[0]
+            - ours.tiles[i].field_and_gradient(at[owner == i])[0]
+            for i in told.sizes()
+        ]
+    )
+    unitary, *_ = np.linalg.lstsq(seen.reshape(-1, told.common), changed.ravel(), rcond=None)
+    np.testing.assert_allclose(seen @ unitary, changed, atol=1e-6 * np.abs(changed).max())
+    # The numbers that make this change are as likely as the errors they come from.
+    assert unitary @ unitary == pytest.approx(unit @ unit, rel=1e-5)
+
+
+def test_a_shift_of_all_readings_moves_the_map_as_it_is() -> None:
+    points, field = readings()
+    shift = np.zeros((len(points), SHIFT, SIZE))
+    shift[:, 2, 2] = 1.0  # all heights alike
+    covariance = np.zeros((SIZE, SIZE))
+    covariance[2, 2] = 0.1**2
+    every = np.arange(len(points))
+    suite = SuiteErrors(("mag",), covariance, every, 0 * every, shift)
+    ours = HarmonicMap.fit(points, field, OPTIONS, POST, suite).compile()
+    at = within_survey()
+    told, owner = ours.errors_over(at), ours.learnt.tiling.grid.block_of(at)
+    assert told.common == 1
+    _, gradient = ours.field_and_gradient(at)
+    for index in told.sizes():
+        seen = told.common_features(at[owner == index], index)[:, :, 0]
+        sign = np.sign(told.suite.shift[2, 0])
+        expected = -0.1 * sign * gradient[owner == index][:, :, 2]
+        np.testing.assert_allclose(seen, expected, atol=1e-9 * np.abs(expected).max())
+
+
+def test_errors_that_no_drive_feels_are_left_out() -> None:
+    points, field = readings()
+    small = errors(len(points))
+    small = replace(small, covariance=1e-12 * small.covariance)
+    ours = HarmonicMap.fit(points, field, OPTIONS, POST, small)
+    assert ours.errors_over(within_survey()).common == 0
+
+
+def test_a_map_keeps_its_errors(uncertain: HarmonicMap) -> None:
+    again = map_from_state(uncertain.to_state())
+    assert isinstance(again, HarmonicMap)
+    assert again.learnt.suite is not None
+    assert again.learnt.suite.sensors == ("s0", "s1")
+    at = within_survey(20)
+    one, other = uncertain.errors_over(at), again.errors_over(at)
+    assert one.common == other.common
+    for index in one.sizes():
+        here = at[one.owner(at) == index]
+        a, b = (each.common_features(here, index) for each in (one, other))
+        # Kept with seven digits; the sign of a combination is nobody's.
+        np.testing.assert_allclose(a @ a.transpose(0, 2, 1), b @ b.transpose(0, 2, 1), rtol=1e-5)
+
+
+def test_more_readings_keep_the_errors_of_the_old_ones(uncertain: HarmonicMap) -> None:
+    points, field = readings(50, seed=4)
+    exact = uncertain.updated(points, field)
+    assert exact.learnt.suite is not None
+    assert exact.learnt.suite.reading.max() < len(exact.learnt.readings)
+    same = uncertain.updated(points, field, errors(len(points)))
+    assert same.learnt.suite is not None
+    assert same.learnt.suite.sensors == ("s0", "s1")
+    # Readings of the old cubes and of the new ones: all have a share in the errors.
+    assert len(np.unique(same.learnt.suite.reading)) == len(same.learnt.readings)
+
+
+def damage(state: MapState, **arrays: FloatArray) -> MapState:
+    return replace(state, arrays={**state.arrays, **arrays})
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("suite_covariance", lambda a: a[:-1]),
+        ("suite_covariance", lambda a: a * np.nan),
+        ("suite_covariance", lambda a: -a),
+        ("suite_covariance", lambda a: a + np.triu(a, 1)),
+        ("suite_pairs", lambda a: a - 1),
+        ("suite_pairs", lambda a: a + 10**6),
+        ("suite_pairs", lambda a: a[0]),
+        ("suite_pairs", lambda a: a + 0.5),
+        ("suite_shift", lambda a: a[1:]),
+        ("suite_shift", lambda a: a * np.inf),
+    ],
+)
+def test_a_damaged_suite_is_refused_in_one_line(
+    uncertain: HarmonicMap, name: str, change: object
+) -> None:
+    state = uncertain.to_state()
+    assert callable(change)
+    with np.errstate(invalid="ignore"), pytest.raises(MapError, match="suite is") as refused:
+        map_from_state(damage(state, **{name: change(state.arrays[name])}))
+    assert "\n" not in str(refused.value)
