@@ -1,30 +1,32 @@
 r"""Whether parts of a drive scatter about the whole as the covariance says, whatever the model.
 
-At the optimum the score, the gradient of the cost by a sensor's parameters, is zero over all
-readings, but not over a part of them. The scatter of the scores of disjoint parts gives the
-variance of the estimate for errors of any size that are correlated within a part in any way: the
-cluster-robust, or sandwich, covariance (Liang and Zeger, Biometrika 73, 1986)
+At the optimum the gradient of the cost is zero over all readings, but not over a part of them. What
+each part pulls the estimate by is its score, and the scatter of the scores of disjoint parts gives
+the variance of the estimate for errors of any size that are correlated within a part in any way:
+the cluster-robust, or sandwich, covariance (Liang and Zeger, Biometrika 73, 1986)
 
 .. math::
-    P \Big(\sum_b g_b g_b^T\Big) P, \qquad g_b = J_b^T e_b
+    \sum_b g_b g_b^T, \qquad g_b = Y_b^T e_b, \qquad Y_b = X_b \Sigma_{\cdot, own}
 
-with the white Jacobian and residual of part b and the covariance P that the model states. The
-residuals are those after the estimated errors of map and poses: what is shared counts once.
+with the white Jacobian X by all variables, their covariance :math:`\Sigma` that the model states,
+and the white residual e of part b. The residuals are those after the estimated errors of map and
+poses: what is shared counts once.
 
 A fit makes its own residuals smaller. Under the model
 
 .. math::
-    \mathrm E\, g_b g_b^T = J_b^T (I - X_b \Sigma X_b^T) J_b
+    \mathrm E\, g_b g_b^T = Y_b^T (I - X_b \Sigma X_b^T) Y_b .
 
-with the Jacobian X of all variables and their covariance :math:`\Sigma`. Compared with that the
-scatter has no bias by few parts (Bell and McCaffrey, Survey Methodology 28, 2002), and its own
-spread follows, so that chance is not taken for an excess.
+Compared with that the scatter has no bias by few parts (Bell and McCaffrey, Survey Methodology 28,
+2002), and its own spread follows, so that chance is not taken for an excess. The covariance grows
+by the ratio of both, but for what stated errors of the survey's sensors make of it: the map is made
+of readings like the drive's, with errors that last like theirs; a stated error is what it is.
 
 An error that is the same in all parts, as a shift of the whole map, is not seen.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -32,13 +34,40 @@ from scipy.linalg import cholesky, solve_triangular
 from l2m_gtsam.calibration.joint_information import Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
-from l2m_gtsam.records.calibration import Unmodelled
+from l2m_gtsam.records.calibration import EXPLAINED, Unmodelled
 from l2m_gtsam.solve.chi_square import quantile
 
 HALVINGS = 4  # into sixteen parts; eight are pairs of them
 FALSE_ALARMS = 0.002  # of calibrations whose errors are as modelled
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15), "offset": slice(15, 16)}
+NONE = np.empty(0, dtype=np.int64)
 TESTS = 4 * len(BLOCKS)  # of a sensor: parts by time and by place, of two sizes
+
+
+@dataclass(frozen=True)
+class Excess:
+    """How far the scatter of a drive's parts exceeds the model's.
+
+    Attributes
+    ----------
+    factors
+        Variances found over those expected.
+    brought
+        The covariance of (t, C row by row, H, time offset) by the model if the survey's sensors
+        were exact, shape (16, 16).
+    """
+
+    factors: Unmodelled = EXPLAINED
+    brought: FloatArray = field(default_factory=lambda: np.zeros((SENSOR, SENSOR)))
+
+    def widened(self, covariance: FloatArray) -> FloatArray:
+        """Return a covariance of the model, (16, 16), with what the scatter adds to it.
+
+        What is infinite, as not determined, stays so.
+        """
+        scale, known = self.factors.scale, np.isfinite(np.diag(covariance))
+        added = self.brought * (np.outer(scale, scale) - 1)
+        return np.asarray(covariance + np.where(np.outer(known, known), added, 0.0))
 
 
 @dataclass(frozen=True)
@@ -71,10 +100,9 @@ class Scores:
         sigma = np.sqrt(np.diag(covariance)[block])
         correlation = covariance[block, block] / np.outer(sigma, sigma)
         lower = cholesky(correlation, lower=True)
-        # White influence of a score on the block's estimates.
-        influence = solve_triangular(lower, covariance[block] / sigma[:, None], lower=True)
-        found = float(((self.found @ influence.T) ** 2).sum())
-        parts = influence @ self.expected @ influence.T
+        white = solve_triangular(lower, np.diag(1 / sigma), lower=True)
+        found = float(((self.found[:, block] @ white.T) ** 2).sum())
+        parts = white @ self.expected[:, block, block] @ white.T
         expected = float(np.trace(parts.sum(axis=0)))
         spread = float(2 * (parts * parts.transpose(0, 2, 1)).sum())  # variance of ``found``
         if not (expected > 0 and spread > 0):
@@ -86,8 +114,13 @@ class Scores:
 
 
 def unmodelled(
-    readings: Readings, rows: Sequence[Rows], own: IntArray, covariance: FloatArray, tests: int
-) -> Unmodelled:
+    readings: Readings,
+    rows: Sequence[Rows],
+    own: IntArray,
+    covariance: FloatArray,
+    tests: int,
+    stated: IntArray = NONE,
+) -> Excess:
     """Return how far variances of one sensor exceed those that the model explains.
 
     Parameters
@@ -102,21 +135,24 @@ def unmodelled(
         Of all n variables, shape (n, n).
     tests
         Number of sensors that are tested together.
+    stated
+        Where the errors of the survey's sensors stand, shape (s,).
     """
     used = np.unique(np.concatenate([each.readings for each in rows])) if rows else np.empty(0)
     if len(used) < 2**HALVINGS:
-        return Unmodelled()
+        return Excess()
     P, alarms = covariance[np.ix_(own, own)], FALSE_ALARMS / (TESTS * tests)
     labels = np.full(len(readings), -1)
     largest = dict.fromkeys(BLOCKS, 1.0)
     for axes in (readings.stamp_ns[used, None].astype(np.float64), readings.p_map_lidar[used]):
         labels[used] = halved(axes, HALVINGS)
-        white = gathered(rows, labels, own, len(covariance))
+        white = gathered(rows, labels, own, covariance)
         for merged in (white, white.paired()):
-            scores = merged.scores(own, covariance)
+            scores = merged.scores(covariance)
             for name, block in BLOCKS.items():
                 largest[name] = max(largest[name], scores.ratio(P, block, alarms))
-    return Unmodelled(**largest)
+    across, theirs = covariance[np.ix_(own, stated)], covariance[np.ix_(stated, stated)]
+    return Excess(Unmodelled(**largest), P - across @ np.linalg.solve(theirs, across.T))
 
 
 def halved(points: FloatArray, times: int) -> IntArray:
@@ -149,21 +185,25 @@ class Gathered:
     Attributes
     ----------
     found
-        ``J_b^T e_b``, shape (B, 16).
+        ``Y_b^T e_b``, shape (B, 16).
+    brought
+        ``Y_b^T Y_b``, shape (B, 16, 16).
     crossed
-        ``X_b^T J_b`` with all n variables, shape (B, n, 16).
+        ``X_b^T Y_b`` with all n variables, shape (B, n, 16).
     """
 
     found: FloatArray
+    brought: FloatArray
     crossed: FloatArray
 
     def paired(self) -> "Gathered":
         """Return the same for parts twice as large."""
-        return Gathered(self.found[::2] + self.found[1::2], self.crossed[::2] + self.crossed[1::2])
+        sums = (each[::2] + each[1::2] for each in (self.found, self.brought, self.crossed))
+        return Gathered(*sums)
 
-    def scores(self, own: IntArray, covariance: FloatArray) -> Scores:
+    def scores(self, covariance: FloatArray) -> Scores:
         """Return scores, and what is expected of them."""
-        expected = self.crossed[:, own].copy()
+        expected = self.brought.copy()
         for at, crossed in zip(expected, self.crossed, strict=True):
             # Of thousands of variables a part touches hundreds.
             touched = np.flatnonzero(crossed.any(axis=1))
@@ -172,7 +212,9 @@ class Gathered:
         return Scores(self.found, expected)
 
 
-def gathered(rows: Sequence[Rows], labels: IntArray, own: IntArray, count: int) -> Gathered:
+def gathered(
+    rows: Sequence[Rows], labels: IntArray, own: IntArray, covariance: FloatArray
+) -> Gathered:
     """Return the sums of white rows by the labels of their readings.
 
     White rows of readings that were whitened together hold what each adds to those before it: they
@@ -186,17 +228,18 @@ def gathered(rows: Sequence[Rows], labels: IntArray, own: IntArray, count: int) 
         Part of each reading of the view.
     own
         Where the sensor's parameters stand among all variables, shape (16,).
-    count
-        Number of all variables.
+    covariance
+        Of all n variables, shape (n, n).
     """
-    parts = 2**HALVINGS
-    found, crossed = np.zeros((parts, SENSOR)), np.zeros((parts, count, SENSOR))
+    parts, influence = 2**HALVINGS, covariance[:, own]
+    found, brought = np.zeros((parts, SENSOR)), np.zeros((parts, SENSOR, SENSOR))
+    crossed = np.zeros((parts, len(covariance), SENSOR))
     for each in rows:
-        order = np.argsort(each.columns)
-        mine = order[np.searchsorted(each.columns, own, sorter=order)]
-        J, label = each.jacobian[:, mine], np.repeat(labels[each.readings], 3)
+        Y, label = each.jacobian @ influence[each.columns], np.repeat(labels[each.readings], 3)
         for part in np.unique(label):
             taken: BoolArray = label == part
-            found[part] += J[taken].T @ each.residual[taken]
-            crossed[part, each.columns] += each.jacobian[taken].T @ J[taken]
-    return Gathered(found, crossed)
+            y = Y[taken]
+            found[part] += y.T @ each.residual[taken]
+            brought[part] += y.T @ y
+            crossed[part, each.columns] += each.jacobian[taken].T @ y
+    return Gathered(found, brought, crossed)

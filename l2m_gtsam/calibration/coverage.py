@@ -40,11 +40,15 @@ class MapErrors(Protocol):
         """Return A of a tile at points in uT, shape (N, 3, r)."""
 
     @property
-    def common(self) -> int:
-        """Number s of the errors that the whole map has in common, of unit variance."""
+    def spread(self) -> FloatArray:
+        """Standard deviations of the s errors that the whole map has in common, one at least."""
+
+    @property
+    def shift(self) -> FloatArray:
+        """How far a unit of each of them moves the map as a whole, metres, shape (3, s)."""
 
     def common_features(self, points: FloatArray, tile: int, /) -> FloatArray:
-        """Return what they do to a tile at points in uT, shape (N, 3, s)."""
+        """Return what they do to a tile at points beside that shift, uT, shape (N, 3, s)."""
 
 
 @runtime_checkable
@@ -59,7 +63,7 @@ class NothingShared:
     """A map whose errors are independent: one tile with one weight that no reading feels."""
 
     covariance = np.eye(1)
-    common = 0
+    spread, shift = np.empty(0), np.empty((3, 0))
 
     def errors_over(self, points: FloatArray, /) -> "NothingShared":
         """Return the same for any places."""
@@ -95,7 +99,7 @@ class Group:
     features
         The map's error per weight of the tile, map frame, in uT, shape (n, 3, r).
     common
-        The same for the errors of the survey's sensors, shape (n, 3, s).
+        The same for the errors of the survey's sensors beside a shift of the map, (n, 3, s).
     """
 
     sensor: int
@@ -126,8 +130,11 @@ class Coverage:
         When each pose was taken, as the knots count, shape (N,).
     moving
         The sensors that feel recorded numbers.
-    common
-        Number of errors that the whole map has from the sensors that surveyed.
+    spread
+        Standard deviations of the errors that the whole map has from the sensors that surveyed,
+        shape (s,). As variables of the graph they have unit variance; see ``JointInformation``.
+    shift
+        How far a unit of each moves the map as a whole, metres in the map frame, shape (3, s).
     """
 
     groups: tuple[Group, ...]
@@ -137,7 +144,8 @@ class Coverage:
     knots: PoseKnots | None
     seconds: FloatArray
     moving: MovingFields = field(default_factory=MovingFields)
-    common: int = 0
+    spread: FloatArray = field(default_factory=lambda: np.empty(0))
+    shift: FloatArray = field(default_factory=lambda: np.empty((3, 0)))
 
     @cached_property
     def root_information(self) -> FloatArray:
@@ -150,7 +158,7 @@ class Coverage:
         """Number of weights of each key of the graph."""
         knots = 0 if self.knots is None else len(self.knots.seconds)
         tiles = {M(tile): size for tile, size in self.tiles.items()}
-        suite = {U(): self.common} if self.common else {}
+        suite = {U(): len(self.spread)} if len(self.spread) else {}
         return tiles | {P(knot): POSE for knot in range(knots)} | suite | self.moving.sizes
 
     @property
@@ -167,9 +175,9 @@ class Coverage:
         graph.add(map_weights_information(self.tiles, information))
         if self.knots is not None:
             graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
-        if self.common:
-            unit = gtsam.noiseModel.Unit.Create(self.common)
-            graph.add(gtsam.PriorFactorVector(U(), np.zeros(self.common), unit))
+        if count := len(self.spread):
+            unit = gtsam.noiseModel.Unit.Create(count)
+            graph.add(gtsam.PriorFactorVector(U(), np.zeros(count), unit))
         graph.push_back(self.moving.prior())
         return graph
 
@@ -213,7 +221,14 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
             groups.append(Group(*where, rows[own], features[own], common[own]))
     lower = cholesky(map_errors.covariance, lower=True, check_finite=False)
     return Coverage(
-        tuple(groups), rest, map_errors.sizes(), lower, knots, seconds, common=map_errors.common
+        groups=tuple(groups),
+        rest=rest,
+        tiles=map_errors.sizes(),
+        lower=lower,
+        knots=knots,
+        seconds=seconds,
+        spread=map_errors.spread,
+        shift=map_errors.shift,
     )
 
 

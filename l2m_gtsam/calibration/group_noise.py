@@ -1,5 +1,6 @@
 """Shared errors and noise of each group of readings, at an estimate."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,10 +99,11 @@ def group_noise(
     own = reading_covariance(estimate.noise[readings.sensor], share, view.trust)
     R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
     q = readings.regressors
+    of_suite = suite_share(readings, field_map, coverage, estimate)
     shared = [
         (
             SharedError(M(group.tile), R_lidar_map[group.rows] @ group.features),
-            *_of_suite(group, R_lidar_map),
+            *of_suite(group),
             *coverage.moving.errors(group.sensor, None if q is None else q[group.rows]),
         )
         for group in coverage.groups
@@ -131,6 +133,27 @@ def group_noise(
     )
 
 
+def suite_share(
+    readings: Readings, field_map: QueryableMap, coverage: Coverage, estimate: Estimate
+) -> Callable[[Group], tuple[SharedError, ...]]:
+    """Return what tells how the survey's sensors go into a group's readings; not at all if exact.
+
+    A shift of the map counts with the slope that the sensors' places see: a shift of all of them is
+    the same, and nothing in the readings must tell one from the other.
+    """
+    if not len(coverage.spread):
+        return lambda _: ()
+    R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
+    x = np.einsum("nij,nj->ni", readings.R_map_lidar, estimate.t[readings.sensor])
+    _, gradient = field_map.field_and_gradient(x + readings.p_map_lidar)
+
+    def share(group: Group) -> tuple[SharedError, ...]:
+        moved = group.common - gradient[group.rows] @ coverage.shift
+        return (SharedError(U(), R_lidar_map[group.rows] @ moved),)
+
+    return share
+
+
 def pose_share(
     readings: Readings, field_map: QueryableMap, coverage: Coverage, estimate: Estimate
 ) -> PoseShare | None:
@@ -142,13 +165,6 @@ def pose_share(
     knots, seconds = coverage.knots, coverage.seconds
     weights, at_knots = knots.weights(seconds), knots.at_knots(seconds)
     return PoseShare(knots, seconds, F, C @ F, weights, at_knots)
-
-
-def _of_suite(group: Group, R_lidar_map: FloatArray) -> tuple[SharedError, ...]:
-    """Return what the survey's sensors did to all readings, if they do not count as exact."""
-    if not group.common.shape[2]:
-        return ()
-    return (SharedError(U(), R_lidar_map[group.rows] @ group.common),)
 
 
 def _inverse_root(covariance: FloatArray) -> FloatArray:

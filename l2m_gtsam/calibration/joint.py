@@ -8,7 +8,7 @@ import numpy as np
 
 from l2m_factors import BatchedReadings
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.cluster_robust import unmodelled
+from l2m_gtsam.calibration.cluster_robust import Excess, unmodelled
 from l2m_gtsam.calibration.contradictions import Contradiction, contradictions
 from l2m_gtsam.calibration.determined import determinacies
 from l2m_gtsam.calibration.factor_graph import (
@@ -83,14 +83,19 @@ class SensorSolution:
     shared_root: FloatArray | None = None
     unmodelled: Unmodelled = EXPLAINED
 
-    def widened(self, excess: Unmodelled) -> "SensorSolution":
-        """Return the same with larger covariances; correlations stay."""
-        scale, root = excess.scale, self.shared_root
+    def widened(self, excess: Excess) -> "SensorSolution":
+        """Return the same with larger covariances; correlations with other sensors stay."""
+        if excess.factors == EXPLAINED:
+            return self
+        covariance, root = excess.widened(self.joint_covariance), self.shared_root
+        known = np.isfinite(np.diag(covariance))
+        scale = np.ones(len(covariance))
+        scale[known] = np.sqrt(np.diag(covariance)[known] / np.diag(self.joint_covariance)[known])
         return replace(
             self,
-            joint_covariance=self.joint_covariance * np.outer(scale, scale),
+            joint_covariance=covariance,
             shared_root=None if root is None else scale[:-1, None] * root,
-            unmodelled=excess,
+            unmodelled=excess.factors,
         )
 
     @property

@@ -71,6 +71,8 @@ class JointInformation:
         Lower triangle of the covariance of all variables in units of ``scale``, shape (n, n).
     step
         To the least cost, shape (n,).
+    loose
+        What the covariance of all variables has beyond that of the system, a root, shape (n, k).
     """
 
     columns: Mapping[int, slice]
@@ -78,6 +80,7 @@ class JointInformation:
     scale: FloatArray
     half: FloatArray
     step: FloatArray
+    loose: FloatArray
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Return the covariance of the variables of some keys, in their order."""
@@ -93,6 +96,38 @@ class JointInformation:
         symmetric *= self.scale
         symmetric *= self.scale[:, None]
         return symmetric
+
+    def loosened(self, key: int, spread: FloatArray) -> "JointInformation":
+        """Return the same where unit variables of a key have these standard deviations in truth.
+
+        A deviation of one is as far as the system is linear. What the readings say of such a
+        variable, the information beyond its prior's, stays as it is; its covariance with all others
+        grows with its own.
+        """
+        half, columns = self.half.copy(order="K"), []
+        for at, deviation in enumerate(spread, start=self.columns[key].start):
+            if deviation <= 1:
+                continue
+            column = np.concatenate([half[at, :at], half[at:, at]])
+            variance = column[at] * self.scale[at] ** 2
+            said = max(1 / variance - 1, 0.0)
+            grown = 1 / (1 / deviation**2 + said)
+            column *= self.scale[at] * np.sqrt(grown - variance) / variance
+            half += np.outer(column, column)
+            columns.append(column * self.scale)
+        if not columns:
+            return self
+        return replace(self, half=half, loose=np.column_stack(columns))
+
+    def loose_among(self, sensors: tuple[int, ...]) -> FloatArray:
+        """Return what ``among`` has beyond the system's covariance."""
+        keys = [key for sensor in sensors for key in keys_of(sensor)]
+        root = self.loose[columns_at(self.columns, keys)]
+        return np.asarray(root @ root.T)
+
+    def of_system(self, sensors: tuple[int, ...]) -> FloatArray:
+        """Return ``among`` as the system has it."""
+        return self.among(sensors) - self.loose_among(sensors)
 
     def after_step(self, rows: Rows) -> Rows:
         """Return rows with the residual after the step."""
@@ -184,7 +219,7 @@ def joint_information(
         lower = root_by_qr(rows, weights, scale)
     step = scale * cho_solve((lower, True), scale * pull, check_finite=False)
     half, _ = dpotri(lower, lower=1, overwrite_c=1)
-    return JointInformation(columns, rows, scale, half, step)
+    return JointInformation(columns, rows, scale, half, step, np.empty((count, 0)))
 
 
 def root_by_qr(rows: Sequence[Rows], weights: FloatArray, scale: FloatArray) -> FloatArray:
@@ -221,7 +256,8 @@ def root_by_qr(rows: Sequence[Rows], weights: FloatArray, scale: FloatArray) -> 
 
 def columns_at(columns: Mapping[int, slice], keys: Sequence[int]) -> IntArray:
     """Return where the variables of some keys stand, in their order."""
-    return np.concatenate([np.arange(columns[key].start, columns[key].stop) for key in keys])
+    at = [np.arange(columns[key].start, columns[key].stop) for key in keys]
+    return np.concatenate([NO_READINGS, *at])
 
 
 def rows_of_factors(

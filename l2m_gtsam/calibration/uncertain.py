@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import D, Q, UncertainReadings, uncertain_block_factor, uncertain_reading_factor
+from l2m_factors import D, Q, U, UncertainReadings, uncertain_block_factor, uncertain_reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.cluster_robust import unmodelled
 from l2m_gtsam.calibration.contradictions import contradictions
@@ -409,7 +409,9 @@ class UncertainProblem:
         owner = {key: s for s in self._view.sensors for key in keys_of(s)}
         rows += rows_of_factors(self._sensor_priors.linearize(values), columns, owner)
         at = np.concatenate([values.atVector(key) for key in self._prior.coverage.sizes])
-        return joint_information(columns, rows, self._prior.information, at)
+        joint = joint_information(columns, rows, self._prior.information, at)
+        spread = self._prior.coverage.spread
+        return joint.loosened(U(), spread) if len(spread) else joint
 
     def noise(
         self, joint: JointInformation, values: gtsam.Values, estimate: Estimate
@@ -428,7 +430,11 @@ class UncertainProblem:
         """Return covariance and figures of every sensor."""
         residual, sensors = self._residuals(values), tuple(self._view.sensors)
         linear = self.graph.linearize(values)
-        among = joint_covariance(linear, values, joint.among)
+        system = joint_covariance(linear, values, joint.of_system)
+
+        def among(chosen: tuple[int, ...]) -> FloatArray:
+            return system(chosen) + joint.loose_among(chosen)
+
         missed = contradictions(self._known, values, among)
         every = among(sensors)
         root = covariance_root(every, np.sqrt(np.diag(every)))
@@ -454,8 +460,8 @@ class UncertainProblem:
         self, joint: JointInformation, solved: Sequence[SensorSolution]
     ) -> tuple[SensorSolution, ...]:
         """Return solutions whose covariances hold what the scatter of parts of the drive shows."""
-        covariance = joint.full
-        widened = []
+        covariance, widened = joint.full, []
+        stated = columns_at(joint.columns, [U()] if len(self._prior.coverage.spread) else [])
         for found in solved:
             s = found.sensor
             rows = [
@@ -464,7 +470,7 @@ class UncertainProblem:
                 if each.sensor == s and len(each.readings)
             ]
             own = columns_at(joint.columns, keys_of(s))
-            excess = unmodelled(self._view.readings, rows, own, covariance, len(solved))
+            excess = unmodelled(self._view.readings, rows, own, covariance, len(solved), stated)
             widened.append(found.widened(excess))
         return tuple(widened)
 

@@ -195,10 +195,10 @@ class Disagreement:
 
 @dataclass(frozen=True)
 class Unmodelled:
-    """How many times larger variances are than noise, map and poses explain.
+    """How many times larger the scatter of a drive's parts is than noise, map and poses explain.
 
-    Found from the scatter of parts of the drive; the covariances that are reported hold it. One
-    where the scatter is what is expected, or differs from it by no more than chance.
+    The covariances that are reported hold it, in the share of them that comes from the readings.
+    One where the scatter is what is expected, or differs from it by no more than chance.
 
     Attributes
     ----------

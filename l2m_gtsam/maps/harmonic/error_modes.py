@@ -20,7 +20,6 @@ no tile's own posterior knows of. A shift d of all readings alike is taken out o
 the map as it is, by ``-G d``, since its prior was learnt from the shifted readings, too.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,8 +35,8 @@ from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
 
-FieldAndGradient = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 NEGLIGIBLE = 1e-15  # share of the variance at places
+LINEAR = 0.002  # metres over which a field that varies over decimetres is linear
 FELT = 0.01  # of the noise, root mean square over a drive: what matters to ten thousand readings
 
 
@@ -76,7 +75,7 @@ class TileModes:
 
 @dataclass(frozen=True)
 class SuiteModes:
-    """The error that the survey's sensors brought into a map, for unit variance of s numbers.
+    """The error that the survey's sensors brought into a map, as s numbers.
 
     Attributes
     ----------
@@ -84,27 +83,27 @@ class SuiteModes:
         Of each tile for one unit of each, shape (m, s).
     shift
         Of the map as a whole, metres in the map frame, shape (3, s).
-    slope
-        The map's field and gradient: those that solvers see, so that a shift of the map and one of
-        all sensors are the same to the last digit.
+    spread
+        Standard deviation of each, shape (s,): one, or more where a deviation of the whole would
+        shift the map further than its field is linear.
     """
 
     weights: dict[int, FloatArray]
     shift: FloatArray
-    slope: FieldAndGradient
+    spread: FloatArray
 
     def features(self, modes: TileModes, points: FloatArray, tile: int) -> FloatArray:
-        """Return what a unit of each does to a tile at points, uT, shape (N, 3, s)."""
+        """Return what a unit of each does to a tile at points beside the shift, uT, (N, 3, s)."""
         if not self.shift.shape[1]:
             return np.empty((len(points), 3, 0))
-        _, gradient = self.slope(points)
-        moved = replace(modes, weights=self.weights[tile]).features(points)
-        return np.asarray(moved - gradient @ self.shift)
+        return replace(modes, weights=self.weights[tile]).features(points)
 
     def among(self, chosen: FloatArray) -> "SuiteModes":
         """Return other numbers, of which each is a combination of these, shape (s, k)."""
+        spread = np.maximum(np.linalg.norm(self.shift @ chosen, axis=0) / LINEAR, 1.0)
+        chosen = chosen / spread
         weights = {tile: each @ chosen for tile, each in self.weights.items()}
-        return SuiteModes(weights, self.shift @ chosen, self.slope)
+        return SuiteModes(weights, self.shift @ chosen, spread)
 
 
 @dataclass(frozen=True)
@@ -129,9 +128,14 @@ class ErrorModes:
     suite: SuiteModes
 
     @property
-    def common(self) -> int:
-        """Number s of errors of the survey's sensors, of unit variance."""
-        return int(self.suite.shift.shape[1])
+    def spread(self) -> FloatArray:
+        """Standard deviations of the s errors of the survey's sensors, one at least."""
+        return self.suite.spread
+
+    @property
+    def shift(self) -> FloatArray:
+        """How far a unit of each of them moves the map as a whole, metres, shape (3, s)."""
+        return self.suite.shift
 
     def sizes(self) -> dict[int, int]:
         """Return the number of beta of each tile."""
@@ -148,7 +152,7 @@ class ErrorModes:
         return self.tiles[tile].features(points)
 
     def common_features(self, points: FloatArray, tile: int) -> FloatArray:
-        """Return what the errors of the survey's sensors do to a tile, uT, shape (N, 3, s)."""
+        """Return what they do to a tile beside that shift, uT, shape (N, 3, s)."""
         return self.suite.features(self.tiles[tile], points, tile)
 
 
@@ -157,7 +161,6 @@ def error_modes(
     tiles: Tiles,
     points: FloatArray,
     options: ErrorOptions,
-    slope: FieldAndGradient,
 ) -> ErrorModes:
     """Return the error of a map over places.
 
@@ -169,8 +172,6 @@ def error_modes(
         Where a drive reads the field, metres, shape (N, 3).
     options
         Number of places and share of variance left out.
-    slope
-        The map's field and gradient at points.
     """
     owner = learnt.tiling.grid.block_of(points)
     crossed = np.unique(owner).tolist()
@@ -182,7 +183,7 @@ def error_modes(
         return TileModes(tiles[index], tiles[index].unwhitened(directions))
 
     found = dict(zip(crossed, in_threads(modes, crossed), strict=True))
-    suite = suite_modes(learnt, found, points, owner, options, slope)
+    suite = suite_modes(learnt, found, points, owner, options)
     return ErrorModes(learnt.tiling.grid, found, joint_covariance(learnt, found), suite)
 
 
@@ -192,14 +193,13 @@ def suite_modes(
     points: FloatArray,
     owner: IntArray,
     options: ErrorOptions,
-    slope: FieldAndGradient,
 ) -> SuiteModes:
     """Return what errors of the survey's sensors do over places, as numbers of unit variance.
 
     Of their sixteen errors each, the combinations stay that a drive feels.
     """
     if learnt.suite is None or not tiles:
-        return SuiteModes({}, np.empty((3, 0)), slope)
+        return SuiteModes({}, np.empty((3, 0)), np.empty(0))
     suite, weight = learnt.suite, learnt.readings.weight
     # The covariance may be singular, where errors are known or the same.
     squares, turned = np.linalg.eigh(suite.covariance)
@@ -210,11 +210,15 @@ def suite_modes(
         return np.asarray(moved_weights(learnt, suite, index, tiles[index].tile, shift) @ root)
 
     weights = dict(zip(tiles, in_threads(moved, list(tiles)), strict=True))
-    every, gram = SuiteModes(weights, shift @ root, slope), np.zeros((len(root), len(root)))
+    every = SuiteModes(weights, shift @ root, np.ones(len(root)))
+    gram = np.zeros((len(root), len(root)))
     for index, each in tiles.items():
         rows = np.flatnonzero(owner == index)
         some = rows[np.linspace(0, len(rows) - 1, min(options.places, len(rows))).astype(int)]
-        seen = every.features(each, points[some], index).reshape(-1, len(root))
+        at = points[some]
+        _, gradient = each.tile.field_and_gradient(at)
+        seen = every.features(each, at, index) - gradient @ every.shift
+        seen = seen.reshape(-1, len(root))
         gram += seen.T @ seen * (len(rows) / len(some))
     squares, turned = np.linalg.eigh(gram)
     least = 3 * len(points) * (FELT * learnt.hyperparameters.noise) ** 2

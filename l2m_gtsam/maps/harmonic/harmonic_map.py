@@ -120,7 +120,7 @@ class HarmonicMap:
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
         points, options = checked_points(points), self.options.errors
-        return error_modes(self.learnt, self.tiles, points, options, self.field_and_gradient)
+        return error_modes(self.learnt, self.tiles, points, options)
 
     def updated(
         self, points: FloatArray, field: FloatArray, suite: SuiteErrors | None = None, /
@@ -252,7 +252,7 @@ class HarmonicMap:
         if not count:
             return np.empty((0, 3, 0, 3))
         every = ErrorOptions(places=max(count, 10), rest=EXACT)
-        errors = error_modes(self.learnt, self.tiles, points, every, self.field_and_gradient)
+        errors = error_modes(self.learnt, self.tiles, points, every)
         A = np.zeros((3 * count, len(errors.covariance)))
         owner, start = errors.owner(points), 0
         for tile, size in errors.sizes().items():
