@@ -1,7 +1,7 @@
 """Mapping drives -> the sensors of their suite, with no map and no calibration. Pure."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 
 import numpy as np
@@ -27,6 +27,7 @@ from l2m_gtsam.solve.rotation import polar_rotation
 REACH = 5.0  # standard deviations of a clock for which readings need poses around them
 NOTICED = 0.1  # share of the residuals' squares; sensors as assumed explain 16 S / 3 N of them
 UNDETERMINED = 0.5  # share of the prior sigma above which the drive does not determine a parameter
+TOGETHER = 1.5  # variance of a direction in sigmas; errors that are independent have one
 PARAMETERS = (
     *("t_lidar_mag x", "t_lidar_mag y", "t_lidar_mag z"),
     *(f"C[{i},{j}]" for i in range(3) for j in range(3)),
@@ -161,7 +162,11 @@ def _result(
     drive: SuiteDrive, solution: SuiteSolution, options: SuiteCalibrationOptions
 ) -> CalibrationResult:
     """Return a solution as a calibration."""
-    sensors = tuple(_sensor(drive, solution, i) for i in range(len(drive.readings.sensors)))
+    common = errors_in_common(solution.last.covariance)
+    sensors = tuple(
+        replace(_sensor(drive, solution, i), common=common[SIZE * i : SIZE * (i + 1)])
+        for i in range(len(drive.readings.sensors))
+    )
     recording = drive.recording
     return CalibrationResult(
         sensors=sensors,
@@ -176,6 +181,23 @@ def _result(
         bags=tuple(each.source for each in recording.drives),
         notes=tuple(n for part in recording.parts for n in (*part.notes, *part.origins)),
     )
+
+
+def errors_in_common(covariance: FloatArray) -> FloatArray:
+    """Return a root of what the errors of several sensors have in common, shape (16 S, r).
+
+    The principal directions in which errors of several parameters go together, a height of the
+    whole suite first; what a covariance has beside them is each sensor's own.
+
+    Parameters
+    ----------
+    covariance
+        Of (t, C row by row, H, time offset) of S sensors, shape (16 S, 16 S).
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    squares, turned = np.linalg.eigh(covariance / np.outer(sigma, sigma))
+    several = squares > TOGETHER if len(covariance) > SIZE else np.zeros(len(squares), dtype=bool)
+    return np.asarray(sigma[:, None] * turned[:, several] * np.sqrt(squares[several]))
 
 
 def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibration:

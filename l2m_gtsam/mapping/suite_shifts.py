@@ -60,9 +60,11 @@ def suite_covariance(known: Sequence[KnownSensor]) -> FloatArray:
     """Return the covariance of all sensors' errors, shape (16 S, 16 S)."""
     exact = np.zeros((SIZE, SIZE))
     own = [exact if each.covariance is None else each.covariance for each in known]
-    common = [each.common for each in known if each.common is not None]
-    if len(common) != len(known):
-        return np.asarray(block_diag(*own))
-    together = np.concatenate(common)
+    ranks = [each.common.shape[1] for each in known if each.common is not None]
+    common = np.zeros((len(known), SIZE, max(ranks, default=0)))
+    for root, each in zip(common, known, strict=True):
+        if each.common is not None:
+            root[:, : each.common.shape[1]] = each.common
+    together = common.reshape(SIZE * len(known), -1)
     alone = [each - root @ root.T for each, root in zip(own, common, strict=True)]
     return np.asarray(together @ together.T + block_diag(*alone))

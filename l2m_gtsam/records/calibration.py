@@ -19,6 +19,7 @@ from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
 
 Row15 = Annotated[list[float], Field(min_length=15, max_length=15)]
+Rows16 = Annotated[list[list[float]], Field(min_length=16, max_length=16)]
 
 
 @dataclass(frozen=True)
@@ -277,6 +278,10 @@ class SensorCalibration:
         Paths of those of several drives in which nothing usable was read.
     unmodelled
         How far the covariance exceeds what noise, map and poses explain.
+    common
+        Of a suite that was calibrated from its own survey: what the errors of (t, C row by row, H,
+        time offset) have in common with those of its other sensors. The covariance of two of them
+        is ``common_i @ common_j.T``; it is part of ``covariance``. Shape (16, r).
     """
 
     sensor: str
@@ -301,6 +306,7 @@ class SensorCalibration:
     moving: Annotated[tuple[MovingField, ...], KeyedBy("name")] = ()
     missing_in: tuple[str, ...] = ()
     unmodelled: Unmodelled = EXPLAINED
+    common: Annotated[FloatArray, InFile(Rows16, np.atleast_2d)] | None = None
 
     @property
     def offset_correlation(self) -> FloatArray:

@@ -75,6 +75,10 @@ MODEL = {
         "how many times larger variances are than noise, map and poses explain, from the scatter "
         "of parts of the drive; covariance and sigmas hold it; absent where nothing is"
     ),
+    "common": (
+        "of a suite calibrated from its own survey: rows for the parameters in covariance_order "
+        "and the time offset; the covariance of two sensors i and j is common_i @ common_j.T"
+    ),
     "verdict": (
         "what the report concludes, with its reasons; thresholds: the options `qa` it was judged "
         "by; earlier: what the same numbers were judged before, by other thresholds"
@@ -87,7 +91,7 @@ SENSOR_KEYS = (
     *("R_lidar_mag", "rotation_sigma", "rotation_covariance", "transforms", "noise"),
     *("undetermined", "from_priors", "residuals", "readings", "outside_map", "rejected", "start"),
     *("time_offset", "moving", "models", "not_compared", "missing_in"),
-    *("unmodelled", "covariance"),
+    *("unmodelled", "common", "covariance"),
 )
 """In the order of the file; the matrix of 15 rows comes last, since it hides what follows it."""
 
@@ -209,7 +213,7 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
     if sensor.unmodelled == EXPLAINED:
         values["unmodelled"] = None
     entry = _without_empty({key: values[key] for key in SENSOR_KEYS}, "missing_in")
-    return _without_empty(entry, "unmodelled")
+    return _without_empty(_without_empty(entry, "unmodelled"), "common")
 
 
 def source_entries(result: CalibrationResult) -> dict[str, Any]:

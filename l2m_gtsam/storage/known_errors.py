@@ -27,6 +27,7 @@ class StatedErrors(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
     covariance: Any = None
+    common: Any = None
     t_sigma: Any = None
     C_sigma: Any = None
     H_sigma: Any = None
@@ -51,6 +52,27 @@ class StatedErrors(BaseModel):
                 cross = _numbers("time_offset.cross_covariance", clock.cross_covariance, (TAU,))
                 own[:TAU, TAU] = own[TAU, :TAU] = cross
         return None if own is None else _proper(own)
+
+    def in_common(self) -> FloatArray | None:
+        """Return the root of what is common with the file's other sensors, (16, r); none if not.
+
+        Raises
+        ------
+        ValueError
+            It is no part of the covariance.
+        """
+        if self.common is None:
+            return None
+        root, own = _numbers("common", self.common, None), self.known()
+        if root.ndim != 2 or len(root) != SIZE or not np.isfinite(root).all():
+            raise ValueError(f"common has shape {root.shape}; {SIZE} rows of numbers are needed")
+        if own is None:
+            raise ValueError("common is part of a covariance, which is missing")
+        sigma = np.sqrt(np.diag(own))
+        scale = np.where(sigma > 0, sigma, 1.0)
+        if np.linalg.eigvalsh((own - root @ root.T) / np.outer(scale, scale)).min() < -ROUNDING:
+            raise ValueError("common is larger than the covariance that it is part of")
+        return root
 
 
 def _of_sigmas(stated: StatedErrors, clock: StatedClock) -> FloatArray | None:

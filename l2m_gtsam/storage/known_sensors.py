@@ -50,6 +50,7 @@ class _Stated(_Known):
 
     @model_validator(mode="after")
     def _credible(self) -> Self:
+        self.errors.in_common()
         self.errors.known()
         return self
 
@@ -157,7 +158,11 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     if found.verdict is not None and found.verdict.level is Level.FAIL:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
     return {
-        name: replace(_known(name, entry), covariance=entry.errors.known())
+        name: replace(
+            _known(name, entry),
+            covariance=entry.errors.known(),
+            common=entry.errors.in_common(),
+        )
         for name, entry in found.sensors.items()
     }
 

@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Trajectory
 from l2m_gtsam.mapping.map_building import map_fields, sensor_positions
+from l2m_gtsam.mapping.suite_calibration import errors_in_common
 from l2m_gtsam.mapping.suite_shifts import TIME, suite_covariance, suite_errors
 from l2m_gtsam.maps.suite_errors import SIZE
 from l2m_gtsam.recording.sync import TWIST_S, with_offsets
@@ -99,3 +100,18 @@ def test_an_exact_sensor_beside_others_has_no_errors() -> None:
     covariance = suite_covariance([exact, other])
     assert not covariance[:SIZE].any()
     assert covariance[SIZE:, SIZE:] == pytest.approx(other.covariance)
+
+
+def test_errors_in_common_are_found_in_a_joint_covariance() -> None:
+    """A height that all sensors share, and errors of their own."""
+    count = 3
+    own = np.diag(np.tile(np.repeat([0.001, 0.01, 0.2, 0.001], [3, 9, 3, 1]) ** 2, count))
+    height = np.zeros(SIZE * count)
+    height[2::SIZE] = 0.1
+    joint = own + np.outer(height, height)
+    root = errors_in_common(joint)
+    np.testing.assert_allclose(np.abs(root).max(axis=0), 0.1, rtol=0.01)
+    left = joint - root @ root.T
+    assert np.linalg.eigvalsh(left).min() > -1e-12
+    np.testing.assert_allclose(np.diag(left), np.diag(own), rtol=0.7)
+    assert errors_in_common(np.diag(np.arange(1.0, SIZE + 1))).shape == (SIZE, 0)

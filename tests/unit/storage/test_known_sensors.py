@@ -64,6 +64,9 @@ def test_what_a_calibration_left_open_is_open(tmp_path: Path) -> None:
         ({"covariance": (np.eye(15) + np.eye(15, k=1)).tolist()}, "covariance"),
         ({"covariance": (np.eye(15) - 0.9 * np.ones((15, 15))).tolist()}, "covariance"),
         ({"covariance": np.full((15, 15), np.nan).tolist()}, "covariance"),
+        ({"common": np.ones((16, 2)).tolist()}, "common"),
+        ({"covariance": np.eye(15).tolist(), "common": [[1.0]]}, "common"),
+        ({"covariance": np.eye(15).tolist(), "common": np.ones((16, 1)).tolist()}, "common"),
     ],
 )
 def test_impossible_errors_are_refused_in_one_line(
