@@ -59,6 +59,15 @@ class UncertainMap(Protocol):
         """Return the map's error over places, shape (N, 3), in metres."""
 
 
+@runtime_checkable
+class KnowsSurvey(Protocol):
+    """A map that knows how well the sensors that surveyed were known."""
+
+    @property
+    def sensors_uncertain(self) -> bool:
+        """Whether errors of the sensors are stated."""
+
+
 class NothingShared:
     """A map whose errors are independent: one tile with one weight that no reading feels."""
 

@@ -363,6 +363,8 @@ class CalibrationResult:
         The verdict with its thresholds; absent where nobody judged it.
     traces
         What its drives are recognised by, whatever file they are in.
+    exact
+        What counts as exact, for want of errors that are stated.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
@@ -378,6 +380,7 @@ class CalibrationResult:
     notes: tuple[str, ...] = ()
     judgement: Judgement | None = None
     traces: tuple[DriveTrace, ...] = ()
+    exact: tuple[str, ...] = ()
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

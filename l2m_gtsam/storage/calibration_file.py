@@ -83,6 +83,7 @@ MODEL = {
         "what the report concludes, with its reasons; thresholds: the options `qa` it was judged "
         "by; earlier: what the same numbers were judged before, by other thresholds"
     ),
+    "exact": "what counts as exact, for want of stated errors: sigmas know nothing of its errors",
     "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
@@ -126,6 +127,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "uncertainty": plain["uncertainty"],
         "doubts": plain["doubts"],
         "notes": plain["notes"],
+        "exact": plain["exact"],
         "disagreements": disagreements,
         **source_entries(result),
         "traces": plain["traces"],

@@ -175,6 +175,11 @@ class HarmonicMap:
         return self.learnt.readings
 
     @property
+    def sensors_uncertain(self) -> bool:
+        """Whether errors of the sensors that surveyed are stated."""
+        return self.learnt.suite is not None
+
+    @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
         return summary_of(self.kind, self.learnt)

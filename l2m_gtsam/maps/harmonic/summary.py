@@ -28,6 +28,7 @@ def summary_of(kind: str, learnt: Learnt) -> MapSummary:
             "hyperparameters": learnt.origin.learning.described,
             "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
             "sources": described(learnt),
+            "survey's sensors": "as sure as stated" if learnt.suite else "taken for exact",
             "field": judged(learnt.origin.explanation),
             "tiles": len(learnt.tiling),
             "tile (m)": float(learnt.tiling.grid.size),

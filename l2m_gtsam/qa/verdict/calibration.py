@@ -72,7 +72,14 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
         more = f"The place differs from the map along {len(shared) - MANY} more stretches."
         reasons.append(Reason(Level.WARN, more))
     # A map of another place is no evidence on this one.
-    return _wrong_map(cases) or [*_on_drive(cases), *reasons]
+    return _wrong_map(cases) or [*_on_drive(cases), *reasons, *_exact(result)]
+
+
+def _exact(result: CalibrationResult) -> list[Reason]:
+    """Return what the sigmas know no errors of."""
+    if not result.exact:
+        return []
+    return [Reason(Level.PASS, f"Taken for exact: {', '.join(result.exact)}.")]
 
 
 def _wrong_map(cases: tuple[Case, ...]) -> list[Reason]:
