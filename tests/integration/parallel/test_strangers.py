@@ -8,7 +8,7 @@ from urllib.request import urlopen
 
 import pytest
 from distributed import Client, Security
-from distributed.comm import connect
+from distributed.comm.core import connect
 
 from l2m_gtsam.parallel.cluster import ClusterOptions, connected
 
