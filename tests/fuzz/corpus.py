@@ -75,7 +75,7 @@ def quick_corpus(folder: Path, files: Path) -> list[Sound]:
     """
     calibration, metrics = files / "calibration.yaml", files / "metrics.json"
     bags = [drive(folder, kind) for kind in ("ros1", "sqlite3", "mcap")]
-    sounds = [Sound(f"bag {each.suffix}", each, BAGS[each.suffix], INSPECT) for each in bags]
+    sounds = [Sound(f"bag {each.suffix}", each, BAGS[each.suffix], LOOK) for each in bags]
     exports = [("export", CASE, "--format", each, "--out", OUT) for each in EXPORTS]
     validate = ("validate", "--calibration", CASE, "--compare", str(calibration))
     despite = tuple((*each, "--despite-verdict") for each in exports)
@@ -91,6 +91,7 @@ def quick_corpus(folder: Path, files: Path) -> list[Sound]:
 
 
 INSPECT = (("inspect", CASE),)
+LOOK = (*INSPECT, ("config", "--for", CASE))
 
 
 def _texts(folder: Path, files: Path, bag: Path) -> list[Sound]:
@@ -229,6 +230,8 @@ def whole_corpus(folder: Path, files: Path, demo: Path) -> list[Sound]:
     truth, config = demo / "slam" / "trajectory.tum", folder / "drive.yaml"
     options = {"slam": {"drift": {"scale": 0.0}}, "bag": {"units": "auto"}}
     config.write_text(json.dumps(options))
+    fleet = folder / "fleet.yaml"
+    fleet.write_text(json.dumps([{"bag": str(bag), "vehicle": "v"}]))
     known = ("--calibration", str(result))
     on_map = ("--map", str(field_map))
     use = ("--calibration", CASE, "--out", OUT, "--despite-verdict")
@@ -264,6 +267,9 @@ def whole_corpus(folder: Path, files: Path, demo: Path) -> list[Sound]:
         Sound("configuration of a drive", config, PLAIN_YAML, (
             ("calibrate", str(bag), *on_map, "--config", CASE, "--out", OUT),
             ("slam", str(bag), *on_map, *known, "--config", CASE, "--out", OUT),
+        )),
+        Sound("fleet", fleet, PLAIN_YAML, (
+            ("batch", CASE, *on_map, "--out", OUT, "--workers", "1"),
         )),
         Sound("truth", truth, WORDS, (
             ("slam", str(bag), *on_map, *known, "--truth", CASE, "--out", OUT),
