@@ -9,20 +9,21 @@ from random import Random
 import pytest
 
 from tests.fuzz.corpus import make_demo
-from tests.fuzz.kills import BAD, Killed, commands, kill_all, killed, prepared, table
+from tests.fuzz.kills import kill_all, killed
 from tests.fuzz.runner import import_commands
+from tests.fuzz.trials import BAD, Command, commands, prepared, table
 
 FILES = Path(__file__).parents[1] / "files"
 KILLS = 6  # of a command that takes half a second
 ALL = 200  # in the studies
 
 
-def test_a_killed_report_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
+def test_a_killed_comparison_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     import_commands()
     names = ("calibration.yaml", "metrics.json")
     other = ("validate", "--calibration", "HERE/calibration.yaml")
     compared = (*other, "--compare", "HERE/calibration.yaml", "--out", "OUT")
-    command = Killed("validate", compared, compared, tuple(FILES / each for each in names))
+    command = Command("validate", compared, compared, tuple(FILES / each for each in names))
     trial = prepared(command, tmp_path / "validate")
     left = [killed(trial, Random(seed)) for seed in range(KILLS)]  # noqa: S311 - repeatable
     assert not [each for each in left if each[0] in BAD]
