@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from l2m_gtsam.calibration.joint_information import Rows
+from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
 from l2m_gtsam.records.calibration import Unmodelled
@@ -86,7 +86,7 @@ class Scores:
 
 
 def unmodelled(
-    readings: Readings, rows: Sequence[Rows], own: IntArray, covariance: FloatArray, tests: int
+    readings: Readings, rows: Sequence[Rows], own: IntArray, covariance: HalfCovariance, tests: int
 ) -> Unmodelled:
     """Return how far variances of one sensor exceed those that the model explains.
 
@@ -99,14 +99,14 @@ def unmodelled(
     own
         Where its sixteen parameters stand among all n variables, shape (16,).
     covariance
-        Of all n variables, shape (n, n).
+        Of all n variables.
     tests
         Number of sensors that are tested together.
     """
     used = np.unique(np.concatenate([each.readings for each in rows])) if rows else np.empty(0)
     if len(used) < 2**HALVINGS:
         return Unmodelled()
-    P, alarms = covariance[np.ix_(own, own)], FALSE_ALARMS / (TESTS * tests)
+    P, alarms = covariance.among(own), FALSE_ALARMS / (TESTS * tests)
     labels = np.full(len(readings), -1)
     largest = dict.fromkeys(BLOCKS, 1.0)
     for axes in (readings.stamp_ns[used, None].astype(np.float64), readings.p_map_lidar[used]):
@@ -161,14 +161,13 @@ class Gathered:
         """Return the same for parts twice as large."""
         return Gathered(self.found[::2] + self.found[1::2], self.crossed[::2] + self.crossed[1::2])
 
-    def scores(self, own: IntArray, covariance: FloatArray) -> Scores:
+    def scores(self, own: IntArray, covariance: HalfCovariance) -> Scores:
         """Return scores, and what is expected of them."""
         expected = self.crossed[:, own].copy()
         for at, crossed in zip(expected, self.crossed, strict=True):
             # Of thousands of variables a part touches hundreds.
             touched = np.flatnonzero(crossed.any(axis=1))
-            own_part = crossed[touched]
-            at -= own_part.T @ covariance[np.ix_(touched, touched)] @ own_part
+            at -= covariance.across(touched, crossed[touched])
         return Scores(self.found, expected)
 
 

@@ -56,6 +56,65 @@ class Rows:
 
 
 @dataclass(frozen=True)
+class HalfCovariance:
+    """A covariance Sigma of n variables as its half U, with ``U + U^T = Sigma``.
+
+    Between one matrix on both sides U is as good as the whole, and half as much to read.
+
+    Attributes
+    ----------
+    scale
+        Unit of each variable, shape (n,).
+    half
+        U in these units, upper triangular, shape (n, n).
+    """
+
+    scale: FloatArray
+    half: FloatArray
+
+    @classmethod
+    def of(cls, covariance: FloatArray) -> "HalfCovariance":
+        """Return a covariance that is there as a whole, shape (n, n)."""
+        half = np.triu(covariance)
+        half[np.diag_indices_from(half)] *= 0.5
+        return cls(np.ones(len(half)), half)
+
+    @classmethod
+    def from_factor(cls, lower: FloatArray, scale: FloatArray) -> "HalfCovariance":
+        """Return the inverse of a scaled information from its Cholesky factor, which it overwrites.
+
+        Parameters
+        ----------
+        lower
+            The factor with zeros above its diagonal, in Fortran order, shape (n, n).
+        scale
+            Unit of each variable, shape (n,).
+        """
+        inverse, _ = dpotri(lower, lower=1, overwrite_c=1)  # above the diagonal zeros stay
+        inverse[np.diag_indices_from(inverse)] *= 0.5
+        return cls(scale, inverse.T)
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    def among(self, at: IntArray) -> FloatArray:
+        """Return the covariance of some variables in their order, shape (k, k)."""
+        half = self.half[np.ix_(at, at)]
+        return np.asarray((half + half.T) * self.scale[at] * self.scale[at, None])
+
+    def across(self, at: IntArray, A: FloatArray) -> FloatArray:
+        """Return ``A^T Sigma A`` for A of some variables, shape (k, m); the result is (m, m)."""
+        scaled = A * self.scale[at, None]
+        half = scaled.T @ self.half[np.ix_(at, at)] @ scaled
+        return np.asarray(half + half.T)
+
+    def trace(self, at: IntArray, J: FloatArray) -> float:
+        """Return the trace of ``J Sigma J^T`` for J by some variables, shape (m, k)."""
+        scaled = J * self.scale[at]
+        return 2 * float(np.vdot(scaled @ self.half[np.ix_(at, at)], scaled))
+
+
+@dataclass(frozen=True)
 class JointInformation:
     """A linear system solved.
 
@@ -65,34 +124,20 @@ class JointInformation:
         Where each key's variables stand among all n.
     rows
         What it is made of beside the prior of the weights.
-    scale
-        Of each variable: its sigma if all others were known, shape (n,).
-    half
-        Lower triangle of the covariance of all variables in units of ``scale``, shape (n, n).
+    every
+        Covariance of all variables, each in units of its sigma if all others were known.
     step
         To the least cost, shape (n,).
     """
 
     columns: Mapping[int, slice]
     rows: Sequence[Rows]
-    scale: FloatArray
-    half: FloatArray
+    every: HalfCovariance
     step: FloatArray
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Return the covariance of the variables of some keys, in their order."""
-        at, scale = columns_at(self.columns, keys), self.scale
-        low, high = np.minimum.outer(at, at), np.maximum.outer(at, at)
-        return np.asarray(self.half[high, low] * scale[at] * scale[at, None])
-
-    @property
-    def full(self) -> FloatArray:
-        """Covariance of all variables, shape (n, n)."""
-        lower = np.tril(self.half)
-        symmetric = lower + np.tril(lower, -1).T
-        symmetric *= self.scale
-        symmetric *= self.scale[:, None]
-        return symmetric
+        return self.every.among(columns_at(self.columns, keys))
 
     def after_step(self, rows: Rows) -> Rows:
         """Return rows with the residual after the step."""
@@ -135,18 +180,9 @@ class JointInformation:
         """Trace of ``J Sigma J^T`` over the rows of each sensor."""
         traces: dict[int, float] = {}
         for rows in self.rows:
-            traces[rows.sensor] = traces.get(rows.sensor, 0.0) + self._share(rows)
+            share = self.every.trace(rows.columns, rows.jacobian)
+            traces[rows.sensor] = traces.get(rows.sensor, 0.0) + share
         return traces
-
-    def _share(self, rows: Rows) -> float:
-        """Return the trace of ``J Sigma J^T`` of some rows."""
-        order = np.argsort(rows.columns)
-        at = rows.columns[order]
-        J = rows.jacobian[:, order] * self.scale[at]
-        # Of a symmetric matrix the lower triangle is enough: its diagonal counts half.
-        half = np.tril(self.half[np.ix_(at, at)])
-        half[np.diag_indices_from(half)] *= 0.5
-        return 2 * float(np.vdot(J @ half, J))
 
 
 def joint_information(
@@ -183,8 +219,7 @@ def joint_information(
     except LinAlgError:
         lower = root_by_qr(rows, weights, scale)
     step = scale * cho_solve((lower, True), scale * pull, check_finite=False)
-    half, _ = dpotri(lower, lower=1, overwrite_c=1)
-    return JointInformation(columns, rows, scale, half, step)
+    return JointInformation(columns, rows, HalfCovariance.from_factor(lower, scale), step)
 
 
 def root_by_qr(rows: Sequence[Rows], weights: FloatArray, scale: FloatArray) -> FloatArray:

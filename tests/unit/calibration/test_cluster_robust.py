@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_gtsam.calibration.cluster_robust import BLOCKS, gathered, halved, unmodelled
-from l2m_gtsam.calibration.joint_information import Rows
+from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.calibration import EXPLAINED, Unmodelled
@@ -27,8 +27,12 @@ class Fitted:
     covariance: FloatArray
     error: FloatArray
 
+    @property
+    def half(self) -> HalfCovariance:
+        return HalfCovariance.of(self.covariance)
+
     def unmodelled(self) -> Unmodelled:
-        return unmodelled(self.readings, self.rows, OWN, self.covariance, 1)
+        return unmodelled(self.readings, self.rows, OWN, self.half, 1)
 
 
 def fitted(rng: np.random.Generator, lasting: float = 0.0) -> Fitted:
@@ -72,7 +76,7 @@ def test_expected_scores_are_those_of_many_fits() -> None:
     rng = np.random.default_rng(1)
     one = fitted(rng)
     labels = halved(one.readings.stamp_ns[:, None].astype(np.float64), 4)
-    scores = gathered(one.rows, labels, OWN, len(one.covariance)).scores(OWN, one.covariance)
+    scores = gathered(one.rows, labels, OWN, len(one.covariance)).scores(OWN, one.half)
     X = np.vstack([each.jacobian for each in one.rows])
     # e = (I - X P X^T) noise + prior's share; its covariance is I - X P X^T.
     left = np.eye(len(X)) - X @ one.covariance @ X.T
@@ -120,7 +124,7 @@ def test_an_error_that_lasts_is_found_and_counted() -> None:
 def test_few_readings_tell_nothing() -> None:
     one = fitted(np.random.default_rng(5), lasting=5.0)
     few = [Rows(0, r.columns, r.jacobian[:3], r.residual[:3], r.readings[:1]) for r in one.rows]
-    assert unmodelled(one.readings, few, OWN, one.covariance, 1) == EXPLAINED
+    assert unmodelled(one.readings, few, OWN, one.half, 1) == EXPLAINED
 
 
 @given(
