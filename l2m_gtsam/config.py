@@ -14,10 +14,10 @@ from l2m_gtsam.options import Options
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.shown import shown, shown_value
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.yaml_file import read_yaml
+from l2m_gtsam.text.shown import shown, shown_value
 
 Model = TypeVar("Model", bound=BaseModel)
 

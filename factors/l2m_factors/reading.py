@@ -70,9 +70,22 @@ class BatchedReadings:
         """Return the keys that this sensor's factors depend on."""
         return self._keys[sensor]
 
-    def residuals(self, values: gtsam.Values, sensor: int) -> ReadingResiduals:
-        """Return the residuals of all readings, evaluated anew if this sensor's values changed."""
-        if self._seen.get(sensor) != self.stamp(values, sensor):
+    def residuals(
+        self, values: gtsam.Values, sensor: int, stamp: bytes | None = None
+    ) -> ReadingResiduals:
+        """Return the residuals of all readings, evaluated anew if this sensor's values changed.
+
+        Parameters
+        ----------
+        values
+            Of all variables.
+        sensor
+            Whose values are compared with those of the last evaluation.
+        stamp
+            These, if the caller knows them.
+        """
+        stamp = self.stamp(values, sensor) if stamp is None else stamp
+        if self._seen.get(sensor) != stamp:
             self._evaluate(values)
         return self._residuals
 
@@ -86,19 +99,22 @@ class BatchedReadings:
         """Numbers of parameters of each of ``keys_of``."""
         return [3, *([12] if self._fixed is None else []), *([1] if self._timed else [])]
 
-    def jacobian(self, values: gtsam.Values, sensor: int) -> FloatArray:
+    def jacobian(self, residuals: ReadingResiduals) -> FloatArray:
         """Return the derivatives by all parameters of a sensor, shape (N, 3, sum of widths)."""
-        residuals = self.residuals(values, sensor)
         if self._derived is None or self._derived[0] is not residuals:
             self._derived = residuals, np.concatenate(self.jacobians(residuals), axis=2)
         return self._derived[1]
 
     def stamp(self, values: gtsam.Values, sensor: int) -> bytes:
-        """Return the sensor's values as bytes, which compare faster than arrays."""
-        stamp: bytes = values.atPoint3(T(sensor)).tobytes()
+        """Return the sensor's values as bytes, which compare faster than arrays.
+
+        They are those of ``keys_of``, one after the other.
+        """
+        keys = self._keys[sensor]  # making a key anew takes as long as reading its value
+        stamp: bytes = values.atPoint3(keys[0]).tobytes()
         if self._fixed is None:
-            stamp += values.atVector(D(sensor)).tobytes()
-        return stamp + struct.pack("d", values.atDouble(S(sensor))) if self._timed else stamp
+            stamp += values.atVector(keys[1]).tobytes()
+        return stamp + struct.pack("d", values.atDouble(keys[-1])) if self._timed else stamp
 
     def _variables(self, sensor: int) -> list[int]:
         distortion = [D(sensor)] if self._fixed is None else []

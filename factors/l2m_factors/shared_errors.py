@@ -13,13 +13,14 @@ where the graph is linearised; it changes over decimetres.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 import numpy.typing as npt
 
 from l2m_factors.field_map import FloatArray, Jacobians
-from l2m_factors.keys import D, M, P
+from l2m_factors.keys import M, P
 from l2m_factors.reading import BatchedReadings
 
 POSE = 6  # rotation and translation
@@ -60,6 +61,27 @@ class WhiteRows:
     blocks: tuple[slice, ...]
 
 
+class State(NamedTuple):
+    """What follows from the values that n readings were last evaluated at.
+
+    Attributes
+    ----------
+    stamp
+        The values as bytes.
+    C
+        Soft iron, shape (3, 3).
+    shared
+        Sum of the shared errors in the lidar frame in uT, shape (n, 3).
+    residual
+        ``e`` in uT, shape (n, 3).
+    """
+
+    stamp: bytes
+    C: FloatArray
+    shared: FloatArray
+    residual: FloatArray
+
+
 class UncertainReadings:
     """Readings of one sensor that share errors, evaluated together.
 
@@ -94,7 +116,7 @@ class UncertainReadings:
         widths = [each.features.shape[2] for each in errors]
         ends = np.cumsum([0, *batch.widths, *widths]).tolist()
         self._blocks = tuple(slice(*pair) for pair in pairwise(ends))
-        self._seen = b""
+        self._state = State(b"", np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
         self._white = np.empty(0)
         self._linearised: WhiteRows | None = None
 
@@ -103,16 +125,21 @@ class UncertainReadings:
 
     def residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``e`` in uT, shape (n, 3)."""
-        C = values.atVector(D(self.sensor))[:9].reshape(3, 3)
-        e = self._batch.residuals(values, self.sensor).residual[self._rows]
-        return np.asarray(e + self._shared(values) @ C.T)
+        self.white_residual(values)
+        return self._state.residual
 
     def white_residual(self, values: gtsam.Values) -> FloatArray:
         """Return ``W e``, shape (3 n,), evaluated anew only if the values changed."""
-        stamp = self._stamp(values)
-        if stamp != self._seen:
-            self._white = whitened(self._W, self.residual(values)[:, :, None]).ravel()
-            self._linearised, self._seen = None, stamp
+        own = self._batch.stamp(values, self.sensor)
+        weights = np.concatenate([values.atVector(key) for key in self._weights])
+        stamp = own + weights.tobytes()
+        if stamp != self._state.stamp:
+            C = np.frombuffer(own)[self._blocks[1]][:9].reshape(3, 3)
+            shared = self._features @ weights
+            e = self._batch.residuals(values, self.sensor, own).residual[self._rows] + shared @ C.T
+            self._state = State(stamp, C, shared, e)
+            self._white = whitened(self._W, e[:, :, None]).ravel()
+            self._linearised = None
         return self._white
 
     def linearised(self, values: gtsam.Values) -> WhiteRows:
@@ -124,27 +151,16 @@ class UncertainReadings:
         return self._linearised
 
     def _jacobian(self, values: gtsam.Values) -> FloatArray:
-        """Return derivatives by all variables, shape (n, 3, k)."""
-        own = self._batch.jacobian(values, self.sensor)
+        """Return derivatives by all variables, shape (n, 3, k), where the residual was taken."""
+        state, by_C = self._state, self._blocks[1].start
+        own = self._batch.jacobian(self._batch.residuals(values, self.sensor))
         J = np.empty((len(self), 3, self._blocks[-1].stop))
         J[:, :, : own.shape[2]] = own[self._rows]
-        by_C, more = self._blocks[1].start, self._shared(values)
         for axis in range(3):
             first = by_C + 3 * axis
-            J[:, axis, first : first + 3] += more
-        C = values.atVector(D(self.sensor))[:9].reshape(3, 3)
-        np.matmul(C, self._features, out=J[:, :, own.shape[2] :])
+            J[:, axis, first : first + 3] += state.shared
+        np.matmul(state.C, self._features, out=J[:, :, own.shape[2] :])
         return J
-
-    def _shared(self, values: gtsam.Values) -> FloatArray:
-        """Return the sum of the errors in the lidar frame in uT, shape (n, 3)."""
-        weights = np.concatenate([values.atVector(key) for key in self._weights])
-        return np.asarray(self._features @ weights)
-
-    def _stamp(self, values: gtsam.Values) -> bytes:
-        """Return the values as bytes, which compare faster than arrays."""
-        weights = (values.atVector(key).tobytes() for key in self._weights)
-        return b"".join((self._batch.stamp(values, self.sensor), *weights))
 
 
 def uncertain_block_factor(readings: UncertainReadings) -> gtsam.CustomFactor:

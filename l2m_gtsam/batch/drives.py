@@ -28,9 +28,10 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.plan import DrivePlan
 from l2m_gtsam.storage.bag import has_fields, read_trajectory
+from l2m_gtsam.storage.bag_report import BagReport
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.files import source_file
-from l2m_gtsam.storage.inspect import BagReport, inspect_bag
+from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.record_files import write_metrics
 from l2m_gtsam.storage.rerun_file import require_rerun, write_scene
 from l2m_gtsam.storage.result_set import published
@@ -107,7 +108,7 @@ def calibrate_bags(
     saved = SavedMap.read(map_path)
     recording = read_drives_on(saved, bags, config, progress)
     field_map, source = saved.open(progress, recording.parts), source_file(map_path)
-    opened = OpenMap(field_map, source)
+    opened = OpenMap(field_map, source, saved.doubts)
     return calibrate_drive(recording, opened, config, out, progress, truth, view)
 
 
@@ -124,7 +125,8 @@ def calibrate_drive(
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
     metrics = evaluate(recording, found, config.calibration, config.qa, progress)
-    unjudged = replace(found.result, options=config.model_dump(mode="json"))
+    doubts = (*found.result.doubts, *opened.doubts)
+    unjudged = replace(found.result, options=config.model_dump(mode="json"), doubts=doubts)
     result = replace(unjudged, judgement=judgement_of(unjudged, metrics, config.qa))
     drives = [each.trajectory for each in recording.parts]
     figure = calibration_figure(metrics.map, drives, result, truth)

@@ -15,11 +15,14 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.options import Options, first_fault
 from l2m_gtsam.progress import Count, Progress, counter
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_recording
+from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import load_map
 from l2m_gtsam.storage.regressors import read_scalars
 from l2m_gtsam.storage.tile_folder import tiles_beside
 
+USED = ("suite", "calibration")  # of a map: what it was made with besides readings
 SavedOptions = TypeVar("SavedOptions", bound=Options)
 
 
@@ -103,10 +106,11 @@ def check_bags(bags: Sequence[Path]) -> None:
 
 @dataclass(frozen=True)
 class OpenMap:
-    """A map that is ready to be asked, and the file that it came from."""
+    """A map that is ready to be asked, the file that it came from, and what speaks against it."""
 
     field_map: FieldMap
     source: SourceFile
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -141,6 +145,11 @@ class SavedMap:
     def updates(self) -> list[Any]:
         """What the file says of the updates that it went through."""
         return self._list_of("updates")
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What speaks against the calibrations that it was made with, half a sentence each."""
+        return doubts_of_origin(self.state.provenance)
 
     def open(self, progress: Progress, drives: Sequence[Recording] = ()) -> FieldMap:
         """Return the map, ready to be asked.
@@ -177,6 +186,30 @@ class SavedMap:
     def _list_of(self, name: str) -> list[Any]:
         entries = self.state.provenance.get(name)
         return entries if isinstance(entries, list) else []
+
+
+def used_file(path: Path, judgement: Level | None) -> dict[str, Any]:
+    """Return what a map's file says of a calibration that it was made with."""
+    verdict = {"verdict": Level.FAIL.value} if judgement is Level.FAIL else {}
+    return {**vars(source_file(path)), **verdict}
+
+
+def doubts_of_origin(provenance: dict[str, Any]) -> tuple[str, ...]:
+    """Return which calibrations that a map was made with were judged FAIL, half a sentence each.
+
+    Parameters
+    ----------
+    provenance
+        What the file of a map says of itself; it may have been tampered with.
+    """
+    updates = provenance.get("updates")
+    parts = [provenance, *(updates if isinstance(updates, list) else [])]
+    found = [part.get(name) for part in parts if isinstance(part, dict) for name in USED]
+    return tuple(
+        f"it was made with {each.get('path')}, whose verdict is FAIL"
+        for each in found
+        if isinstance(each, dict) and each.get("verdict") == Level.FAIL
+    )
 
 
 def saved_options(path: Path, options: Any, model: type[SavedOptions], *names: str) -> SavedOptions:

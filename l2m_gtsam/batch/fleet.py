@@ -17,12 +17,13 @@ from l2m_gtsam.batch.fleet_task import (
     FleetOrder,
     FleetTask,
     calibrated_drive,
+    digest_of,
     fleet_drives,
     lost_drive,
     map_of,
     open_map,
 )
-from l2m_gtsam.config import Config, load_config
+from l2m_gtsam.config import Config, load_config, with_poses
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 from l2m_gtsam.progress import Count, Progress, counter
@@ -132,10 +133,10 @@ def fleet_tasks(listed: Sequence[FleetDrive], out: Path) -> list[FleetTask]:
     tasks = [
         FleetTask(
             drive,
-            configs[drive.config],
+            (config := _with_poses(configs[drive.config], drive)),
             out / drive.folder,
             maps[drive.map_path],
-            digests[drive.config],
+            _with_pose_files(digests[drive.config], config, drive),
         )
         for drive in drives
     ]
@@ -145,7 +146,28 @@ def fleet_tasks(listed: Sequence[FleetDrive], out: Path) -> list[FleetTask]:
 
 def _absolute(drive: FleetDrive) -> FleetDrive:
     """Return a drive that workers in other folders find."""
-    return replace(drive, bag=drive.bag.absolute(), map_path=drive.map_path.absolute())
+    return replace(
+        drive,
+        bag=drive.bag.absolute(),
+        map_path=drive.map_path.absolute(),
+        poses=drive.poses and drive.poses.absolute(),
+        pose_times=drive.pose_times and drive.pose_times.absolute(),
+    )
+
+
+def _with_poses(config: Config, drive: FleetDrive) -> Config:
+    """Return the configuration of a drive with the poses that the manifest names."""
+    poses = [] if drive.poses is None else [drive.poses]
+    return with_poses(config, [drive.bag], poses, drive.pose_times)
+
+
+def _with_pose_files(digest: str, config: Config, drive: FleetDrive) -> str:
+    """Return the digest of a configuration and of what files with a drive's poses hold."""
+    options = config.bag.pose_file
+    files = [path for path in (options.of(drive.bag), options.times) if path is not None]
+    if not files:
+        return digest
+    return hashlib.sha256("".join([digest, *map(digest_of, files)]).encode()).hexdigest()
 
 
 def _map_digest(path: Path) -> str:

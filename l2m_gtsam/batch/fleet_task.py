@@ -71,6 +71,8 @@ class FleetDrive:
         When it was, UTC, ISO 8601, where the stamps are not to be asked; else empty.
     folder
         For the results, relative to that of the fleet, with slashes.
+    poses, pose_times
+        Files with its poses, and with their times, where they are not in the bag.
     """
 
     bag: Path
@@ -80,6 +82,8 @@ class FleetDrive:
     listed: str
     date: str = ""
     folder: str = ""
+    poses: Path | None = None
+    pose_times: Path | None = None
 
     @property
     def name(self) -> str:
@@ -137,10 +141,21 @@ def _listed(order: FleetOrder, entry: ManifestEntry) -> FleetDrive:
     date = "" if entry.date is None else entry.date.strftime(DATE)
     folder = order.source.parent
     listed = "\0".join(
-        _seen_from(folder, path) for path in (entry.bag, entry.map, entry.config) if path
+        _seen_from(folder, path)
+        for path in (entry.bag, entry.map, entry.config, entry.poses)
+        if path
     )
     config = entry.config or order.config
-    return FleetDrive(entry.bag, map_path, config, entry.vehicle, listed, date)
+    return FleetDrive(
+        entry.bag,
+        map_path,
+        config,
+        entry.vehicle,
+        listed,
+        date,
+        poses=entry.poses,
+        pose_times=entry.pose_times,
+    )
 
 
 def _seen_from(folder: Path, path: Path) -> str:
@@ -227,7 +242,7 @@ def open_map(path: Path) -> FleetMap:
     """Open a map, once for all drives on it; whatever happens is the reason of their rows."""
     try:
         saved = SavedMap.read(path)
-        opened = OpenMap(saved.open(silent), source_file(path))
+        opened = OpenMap(saved.open(silent), source_file(path), saved.doubts)
         return FleetMap(opened, SavedMap(path, replace(saved.state, arrays={})))
     except L2MError as error:
         return FleetMap(None, None, str(error))
@@ -263,7 +278,7 @@ def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
     except OutputError:
         raise
     except L2MError as error:
-        digest = _digest(task.drive.bag)
+        digest = digest_of(task.drive.bag)
         return _failed(task, str(error), begun, digest)
     except Exception as error:  # one drive is not the end of all others
         return _failed(task, _unexpected(task.drive.bag, error), begun)
@@ -311,10 +326,10 @@ def _clear(folder: Path) -> None:
         raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
 
 
-def _digest(bag: Path) -> str:
-    """Return the digest of a bag; empty where it cannot be read now, but may be later."""
+def digest_of(path: Path) -> str:
+    """Return the digest of a file; empty where it cannot be read now, but may be later."""
     try:
-        return source_file(bag).sha256
+        return source_file(path).sha256
     except L2MError:
         return ""
 

@@ -6,7 +6,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder
+from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, used_file
 from l2m_gtsam.batch.survey import read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
@@ -19,7 +19,6 @@ from l2m_gtsam.maps.field_map import FieldMap, MapSummary
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.report.figures.map import map_figure
 from l2m_gtsam.qa.report.svg import save_figure
-from l2m_gtsam.storage.files import source_file
 from l2m_gtsam.storage.map_file import save_map
 
 
@@ -85,7 +84,7 @@ def build_map_file(
     provenance = {
         "bags": [vars(recording.source) for recording in survey.recordings],
         "suite_doubts": list(doubts),
-        "suite": None if suite is None else vars(source_file(suite)),
+        "suite": None if suite is None else used_file(suite, survey.suite_level),
         "structure": None if survey.structure is None else survey.structure.provenance,
         "lidar": None if scanned is None else scanned.provenance,
         "frame": survey.recordings[0].trajectory.frame,
@@ -137,7 +136,7 @@ def update_map_file(
     added = [vars(recording.source) for recording in survey.recordings]
     update = {
         "bags": added,
-        "suite": None if suite is None else vars(source_file(suite)),
+        "suite": None if suite is None else used_file(suite, survey.suite_level),
         "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
         "version": version("l2m-gtsam"),
     }

@@ -256,7 +256,7 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     with published(out, *names) as stage:
         _write(found, record, config, stage)
         if saved is None:
-            _write_map(found, config, stage)
+            _write_map(found, config, stage, failed=bool(judged))
         write_slam_report(stage / REPORT_FILE, record, config.qa)
     return SlamOutcome(found.result, record, judgement.verdict)
 
@@ -332,12 +332,13 @@ def _write(found: _Found, record: LocalisationRecord, config: Config, out: Path)
     write_slam(out / SLAM_FILE, record)
 
 
-def _write_map(found: _Found, config: Config, out: Path) -> None:
+def _write_map(found: _Found, config: Config, out: Path, *, failed: bool) -> None:
     """Write the field that a drive met as a map: its poses are those that were found."""
-    result = found.result
+    result, used = found.result, found.result.calibration_source
+    level = {"verdict": Level.FAIL.value} if failed else {}
     provenance = {
         "bags": [vars(found.recording.source)],
-        "calibration": None if (used := result.calibration_source) is None else vars(used),
+        "calibration": None if used is None else {**vars(used), **level},
         "frame": result.trajectory.frame,
         "config": config.model_dump(mode="json", include={"bag", "slam", "mapping"}),
         "version": version("l2m-gtsam"),

@@ -16,11 +16,12 @@ from l2m_gtsam.lidar.surface import smoothed
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import write_calibration
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions, TopicCloud, read_cloud_topic
 from l2m_gtsam.storage.files import source_file
-from l2m_gtsam.storage.known_sensors import read_known_sensors
+from l2m_gtsam.storage.known_sensors import level_of, read_known_sensors
 from l2m_gtsam.storage.point_cloud2 import cloud_topic
 
 # What a map file takes: 120 MB.
@@ -58,11 +59,14 @@ class MappingDrives:
         Sensors of the mapping suite by name; absent where all are ideal.
     structure
         What a LiDAR saw, if that was given.
+    suite_level
+        The verdict on the file of the suite, if it has one.
     """
 
     recordings: list[Recording]
     suite: dict[str, KnownSensor] | None
     structure: StructureCloud | None
+    suite_level: Level | None = None
 
     @property
     def cloud(self) -> FloatArray | None:
@@ -79,13 +83,14 @@ def read_survey(
 ) -> MappingDrives:
     """Return everything that a map is made of; files before bags, which take longer."""
     known = None if suite is None else read_known_sensors(suite)
+    level = None if suite is None else level_of(suite)
     options = config.mapping.structure
     is_file = structure is not None and _names_file(structure)
     cloud = _structure_file(Path(structure or ""), options) if is_file else None
     recordings = [read_drive_or_follow(bag, config, progress) for bag in bags]
     if structure is not None and not is_file:
         cloud = _structure_topic(structure, bags, recordings, config, progress)
-    return MappingDrives(recordings, known, cloud)
+    return MappingDrives(recordings, known, cloud, level)
 
 
 def _names_file(structure: str) -> bool:
@@ -213,6 +218,9 @@ def calibrate_suite_file(
     assumed = None if known is None else read_known_sensors(known)
     recordings = [read_drive(bag, config, progress) for bag in bags]
     found = calibrate_suite(recordings, assumed, config.mapping.suite, progress)
+    if known is not None and level_of(known) is Level.FAIL:
+        doubt = f"what was known of the sensors is {known}, whose verdict is FAIL"
+        found = replace(found, doubts=(*found.doubts, doubt))
     result = replace(found, options=config.model_dump(mode="json", include={"bag", "mapping"}))
     ensure_folder(out.parent)
     write_calibration(out, result)

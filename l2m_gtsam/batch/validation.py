@@ -1,6 +1,6 @@
 """Calibrations tested on other drives, and beside older ones."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -197,7 +197,10 @@ def _tested(
     recording = read_drive_on(saved, bag, config, progress)
     field_map = saved.open(progress, [recording])
     source, chance = source_file(map_path), config.qa.validation.chance
-    return validate(recording, field_map, new, config.calibration, chance, source, progress)
+    found = validate(recording, field_map, new, config.calibration, chance, source, progress)
+    return replace(
+        found, doubts=(*found.doubts, *(f"Of the map: {each}." for each in saved.doubts))
+    )
 
 
 def _source(role: str, path: Path) -> NamedSource:

@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
-from l2m_gtsam.calibration.joint_information import Rows
+from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
 from l2m_gtsam.records.calibration import EXPLAINED, Unmodelled
@@ -117,7 +117,7 @@ def unmodelled(
     readings: Readings,
     rows: Sequence[Rows],
     own: IntArray,
-    covariance: FloatArray,
+    covariance: HalfCovariance,
     tests: int,
     stated: IntArray = NONE,
 ) -> Excess:
@@ -132,7 +132,7 @@ def unmodelled(
     own
         Where its sixteen parameters stand among all n variables, shape (16,).
     covariance
-        Of all n variables, shape (n, n).
+        Of all n variables.
     tests
         Number of sensors that are tested together.
     stated
@@ -141,7 +141,7 @@ def unmodelled(
     used = np.unique(np.concatenate([each.readings for each in rows])) if rows else np.empty(0)
     if len(used) < 2**HALVINGS:
         return Excess()
-    P, alarms = covariance[np.ix_(own, own)], FALSE_ALARMS / (TESTS * tests)
+    P, alarms = covariance.among(own), FALSE_ALARMS / (TESTS * tests)
     labels = np.full(len(readings), -1)
     largest = dict.fromkeys(BLOCKS, 1.0)
     for axes in (readings.stamp_ns[used, None].astype(np.float64), readings.p_map_lidar[used]):
@@ -151,7 +151,7 @@ def unmodelled(
             scores = merged.scores(covariance)
             for name, block in BLOCKS.items():
                 largest[name] = max(largest[name], scores.ratio(P, block, alarms))
-    across, theirs = covariance[np.ix_(own, stated)], covariance[np.ix_(stated, stated)]
+    across, theirs = covariance.columns(stated)[own], covariance.among(stated)
     return Excess(Unmodelled(**largest), P - across @ np.linalg.solve(theirs, across.T))
 
 
@@ -201,19 +201,18 @@ class Gathered:
         sums = (each[::2] + each[1::2] for each in (self.found, self.brought, self.crossed))
         return Gathered(*sums)
 
-    def scores(self, covariance: FloatArray) -> Scores:
+    def scores(self, covariance: HalfCovariance) -> Scores:
         """Return scores, and what is expected of them."""
         expected = self.brought.copy()
         for at, crossed in zip(expected, self.crossed, strict=True):
             # Of thousands of variables a part touches hundreds.
             touched = np.flatnonzero(crossed.any(axis=1))
-            own_part = crossed[touched]
-            at -= own_part.T @ covariance[np.ix_(touched, touched)] @ own_part
+            at -= covariance.across(touched, crossed[touched])
         return Scores(self.found, expected)
 
 
 def gathered(
-    rows: Sequence[Rows], labels: IntArray, own: IntArray, covariance: FloatArray
+    rows: Sequence[Rows], labels: IntArray, own: IntArray, covariance: HalfCovariance
 ) -> Gathered:
     """Return the sums of white rows by the labels of their readings.
 
@@ -229,9 +228,9 @@ def gathered(
     own
         Where the sensor's parameters stand among all variables, shape (16,).
     covariance
-        Of all n variables, shape (n, n).
+        Of all n variables.
     """
-    parts, influence = 2**HALVINGS, covariance[:, own]
+    parts, influence = 2**HALVINGS, covariance.columns(own)
     found, brought = np.zeros((parts, SENSOR)), np.zeros((parts, SENSOR, SENSOR))
     crossed = np.zeros((parts, len(covariance), SENSOR))
     for each in rows:

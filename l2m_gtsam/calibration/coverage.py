@@ -162,6 +162,14 @@ class Coverage:
         root, _ = dtrtri(self.lower, lower=1)
         return np.asarray(root)
 
+    @cached_property
+    def tile_information(self) -> FloatArray:
+        """Information of all tiles' weights, shape (K, K)."""
+        lower, _ = dpotri(self.lower, lower=1)  # above its diagonal as the root: zero
+        whole = lower + lower.T
+        whole[np.diag_indices_from(whole)] = lower.diagonal()
+        return np.asarray(whole)
+
     @property
     def sizes(self) -> dict[int, int]:
         """Number of weights of each key of the graph."""
@@ -180,8 +188,13 @@ class Coverage:
     def prior(self) -> gtsam.NonlinearFactorGraph:
         """Return the prior of all weights, which is linear in them."""
         graph = gtsam.NonlinearFactorGraph()
-        information, _ = dpotri(self.lower, lower=1)  # the lower triangle
-        graph.add(map_weights_information(self.tiles, information))
+        graph.add(map_weights_information(self.tiles, self.tile_information))
+        graph.push_back(self.prior_beside_tiles())
+        return graph
+
+    def prior_beside_tiles(self) -> gtsam.NonlinearFactorGraph:
+        """Return the prior of the weights of knots and of recorded numbers."""
+        graph = gtsam.NonlinearFactorGraph()
         if self.knots is not None:
             graph.push_back(pose_errors_prior(self.knots.correlation.tolist()))
         if count := len(self.spread):

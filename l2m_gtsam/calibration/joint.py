@@ -18,7 +18,7 @@ from l2m_gtsam.calibration.factor_graph import (
     reading_graph,
     whitened_jacobian,
 )
-from l2m_gtsam.calibration.joint_information import Rows
+from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.marginals import covariance_by_qr, joint_covariance
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import Ending, optimise, polish
@@ -241,8 +241,8 @@ def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         residual = problem.batch.residuals(values, s).residual[rows]
         white = (W[rows] @ residual[:, :, None]).ravel()
         own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
-        together = len(problem.view.sensors)
-        excess = unmodelled(problem.view.readings, [own], OWN, among((s,)), together)
+        covariance, together = HalfCovariance.of(among((s,))), len(problem.view.sensors)
+        excess = unmodelled(problem.view.readings, [own], OWN, covariance, together)
         widened.append(found.widened(excess))
     return tuple(widened)
 

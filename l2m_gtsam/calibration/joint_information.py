@@ -56,6 +56,89 @@ class Rows:
 
 
 @dataclass(frozen=True)
+class HalfCovariance:
+    """A covariance Sigma of n variables as its half U, with ``U + U^T = Sigma``.
+
+    Between one matrix on both sides U is as good as the whole, and half as much to read.
+
+    Attributes
+    ----------
+    scale
+        Unit of each variable, shape (n,).
+    half
+        U in these units, shape (n, n); upper triangular where it comes from a factor.
+    """
+
+    scale: FloatArray
+    half: FloatArray
+
+    @classmethod
+    def of(cls, covariance: FloatArray) -> "HalfCovariance":
+        """Return a covariance that is there as a whole, shape (n, n)."""
+        half = np.triu(covariance)
+        half[np.diag_indices_from(half)] *= 0.5
+        return cls(np.ones(len(half)), half)
+
+    @classmethod
+    def from_factor(cls, lower: FloatArray, scale: FloatArray) -> "HalfCovariance":
+        """Return the inverse of a scaled information from its Cholesky factor, which it overwrites.
+
+        Parameters
+        ----------
+        lower
+            The factor with zeros above its diagonal, in Fortran order, shape (n, n).
+        scale
+            Unit of each variable, shape (n,).
+        """
+        inverse, _ = dpotri(lower, lower=1, overwrite_c=1)  # above the diagonal zeros stay
+        inverse[np.diag_indices_from(inverse)] *= 0.5
+        return cls(scale, inverse.T)
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    def among(self, at: IntArray) -> FloatArray:
+        """Return the covariance of some variables in their order, shape (k, k)."""
+        half = self.half[np.ix_(at, at)]
+        return np.asarray((half + half.T) * self.scale[at] * self.scale[at, None])
+
+    def across(self, at: IntArray, A: FloatArray) -> FloatArray:
+        """Return ``A^T Sigma A`` for A of some variables, shape (k, m); the result is (m, m)."""
+        scaled = A * self.scale[at, None]
+        half = scaled.T @ self.half[np.ix_(at, at)] @ scaled
+        return np.asarray(half + half.T)
+
+    def columns(self, at: IntArray) -> FloatArray:
+        """Return the covariance of all variables with some, shape (n, k)."""
+        half = self.half[:, at] + self.half[at].T
+        return np.asarray(half * self.scale[:, None] * self.scale[at])
+
+    def loosened(self, at: IntArray, spread: FloatArray) -> "tuple[HalfCovariance, FloatArray]":
+        """Return the same where variables of unit prior have these standard deviations, (k,).
+
+        And a root of what that adds, shape (n, l): one column for each that is wider than one.
+        """
+        half, added = self.half, []
+        for variable, deviation in zip(at, spread, strict=True):
+            if deviation <= 1:
+                continue
+            column = HalfCovariance(self.scale, half).columns(np.array([variable]))[:, 0]
+            said = max(1 / column[variable] - 1, 0.0)
+            grown = 1 / (1 / deviation**2 + said)
+            column *= np.sqrt(grown - column[variable]) / column[variable]
+            white = column / self.scale
+            half = half + 0.5 * np.outer(white, white)
+            added.append(column)
+        root = np.column_stack([np.empty((len(self), 0)), *added])
+        return HalfCovariance(self.scale, half), root
+
+    def trace(self, at: IntArray, J: FloatArray) -> float:
+        """Return the trace of ``J Sigma J^T`` for J by some variables, shape (m, k)."""
+        scaled = J * self.scale[at]
+        return 2 * float(np.vdot(scaled @ self.half[np.ix_(at, at)], scaled))
+
+
+@dataclass(frozen=True)
 class JointInformation:
     """A linear system solved.
 
@@ -65,10 +148,8 @@ class JointInformation:
         Where each key's variables stand among all n.
     rows
         What it is made of beside the prior of the weights.
-    scale
-        Of each variable: its sigma if all others were known, shape (n,).
-    half
-        Lower triangle of the covariance of all variables in units of ``scale``, shape (n, n).
+    every
+        Covariance of all variables, each in units of its sigma if all others were known.
     step
         To the least cost, shape (n,).
     loose
@@ -77,25 +158,13 @@ class JointInformation:
 
     columns: Mapping[int, slice]
     rows: Sequence[Rows]
-    scale: FloatArray
-    half: FloatArray
+    every: HalfCovariance
     step: FloatArray
     loose: FloatArray
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
         """Return the covariance of the variables of some keys, in their order."""
-        at, scale = columns_at(self.columns, keys), self.scale
-        low, high = np.minimum.outer(at, at), np.maximum.outer(at, at)
-        return np.asarray(self.half[high, low] * scale[at] * scale[at, None])
-
-    @property
-    def full(self) -> FloatArray:
-        """Covariance of all variables, shape (n, n)."""
-        lower = np.tril(self.half)
-        symmetric = lower + np.tril(lower, -1).T
-        symmetric *= self.scale
-        symmetric *= self.scale[:, None]
-        return symmetric
+        return self.every.among(columns_at(self.columns, keys))
 
     def loosened(self, key: int, spread: FloatArray) -> "JointInformation":
         """Return the same where unit variables of a key have these standard deviations in truth.
@@ -104,20 +173,8 @@ class JointInformation:
         variable, the information beyond its prior's, stays as it is; its covariance with all others
         grows with its own.
         """
-        half, columns = self.half.copy(order="K"), []
-        for at, deviation in enumerate(spread, start=self.columns[key].start):
-            if deviation <= 1:
-                continue
-            column = np.concatenate([half[at, :at], half[at:, at]])
-            variance = column[at] * self.scale[at] ** 2
-            said = max(1 / variance - 1, 0.0)
-            grown = 1 / (1 / deviation**2 + said)
-            column *= self.scale[at] * np.sqrt(grown - variance) / variance
-            half += np.outer(column, column)
-            columns.append(column * self.scale)
-        if not columns:
-            return self
-        return replace(self, half=half, loose=np.column_stack(columns))
+        every, loose = self.every.loosened(columns_at(self.columns, [key]), spread)
+        return replace(self, every=every, loose=loose)
 
     def loose_among(self, sensors: tuple[int, ...]) -> FloatArray:
         """Return what ``among`` has beyond the system's covariance."""
@@ -170,18 +227,9 @@ class JointInformation:
         """Trace of ``J Sigma J^T`` over the rows of each sensor."""
         traces: dict[int, float] = {}
         for rows in self.rows:
-            traces[rows.sensor] = traces.get(rows.sensor, 0.0) + self._share(rows)
+            share = self.every.trace(rows.columns, rows.jacobian)
+            traces[rows.sensor] = traces.get(rows.sensor, 0.0) + share
         return traces
-
-    def _share(self, rows: Rows) -> float:
-        """Return the trace of ``J Sigma J^T`` of some rows."""
-        order = np.argsort(rows.columns)
-        at = rows.columns[order]
-        J = rows.jacobian[:, order] * self.scale[at]
-        # Of a symmetric matrix the lower triangle is enough: its diagonal counts half.
-        half = np.tril(self.half[np.ix_(at, at)])
-        half[np.diag_indices_from(half)] *= 0.5
-        return 2 * float(np.vdot(J @ half, J))
 
 
 def joint_information(
@@ -218,8 +266,8 @@ def joint_information(
     except LinAlgError:
         lower = root_by_qr(rows, weights, scale)
     step = scale * cho_solve((lower, True), scale * pull, check_finite=False)
-    half, _ = dpotri(lower, lower=1, overwrite_c=1)
-    return JointInformation(columns, rows, scale, half, step, np.empty((count, 0)))
+    every = HalfCovariance.from_factor(lower, scale)
+    return JointInformation(columns, rows, every, step, np.empty((count, 0)))
 
 
 def root_by_qr(rows: Sequence[Rows], weights: FloatArray, scale: FloatArray) -> FloatArray:

@@ -255,12 +255,17 @@ class WeightsPrior:
     @classmethod
     def of(cls, coverage: Coverage) -> "WeightsPrior":
         """Return the prior of the weights of a coverage."""
-        graph, zero, ordering = coverage.prior(), gtsam.Values(), gtsam.Ordering()
-        for key, size in coverage.sizes.items():
-            zero.insert(key, np.zeros(size))
-            ordering.push_back(key)
-        information, _ = graph.linearize(zero).hessian(ordering)
-        return cls(coverage, graph, np.asarray(information))
+        tiles = coverage.tile_information
+        information = np.zeros((sum(coverage.sizes.values()),) * 2)
+        information[: len(tiles), : len(tiles)] = tiles
+        if beside := list(coverage.sizes.items())[len(coverage.tiles) :]:
+            zero, ordering = gtsam.Values(), gtsam.Ordering()
+            for key, size in beside:
+                zero.insert(key, np.zeros(size))
+                ordering.push_back(key)
+            linear = coverage.prior_beside_tiles().linearize(zero)
+            information[len(tiles) :, len(tiles) :], _ = linear.hessian(ordering)
+        return cls(coverage, coverage.prior(), information)
 
 
 @dataclass(frozen=True)
@@ -460,8 +465,8 @@ class UncertainProblem:
         self, joint: JointInformation, solved: Sequence[SensorSolution]
     ) -> tuple[SensorSolution, ...]:
         """Return solutions whose covariances hold what the scatter of parts of the drive shows."""
-        covariance, widened = joint.full, []
         stated = columns_at(joint.columns, [U()] if len(self._prior.coverage.spread) else [])
+        widened = []
         for found in solved:
             s = found.sensor
             rows = [
@@ -470,7 +475,7 @@ class UncertainProblem:
                 if each.sensor == s and len(each.readings)
             ]
             own = columns_at(joint.columns, keys_of(s))
-            excess = unmodelled(self._view.readings, rows, own, covariance, len(solved), stated)
+            excess = unmodelled(self._view.readings, rows, own, joint.every, len(solved), stated)
             widened.append(found.widened(excess))
         return tuple(widened)
 

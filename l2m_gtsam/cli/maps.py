@@ -175,12 +175,13 @@ def map_compare(
 def map_info(map_path: MapArgument) -> None:
     """Say what a map is made of and what it covers."""
     with shown_progress() as progress:
+        from l2m_gtsam.batch.files import doubts_of_origin
         from l2m_gtsam.batch.maps import describe_map_file
         from l2m_gtsam.cli.tables.maps import map_table
 
         description = describe_map_file(map_path, progress)
     print_table(map_table(description))
-    warn(description.summary.doubts)
+    warn([*description.summary.doubts, *doubts_of_origin(description.provenance)])
 
 
 @map_app.command("plot")

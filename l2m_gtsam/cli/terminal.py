@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 import typer
 
-from l2m_gtsam.shown import shown
+from l2m_gtsam.text.shown import shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -148,6 +148,7 @@ def print_table(table: "Table", wide: bool = False) -> None:
     """
     from rich.console import Console
 
+    _show_control_characters(table)
     console = Console()
     known = console.is_terminal or "COLUMNS" in os.environ
     width = console.width if known else USUAL_WIDTH

@@ -1,11 +1,12 @@
-"""Jumps of odometry: steps that no vehicle makes, detected and removed. Pure arrays.
+"""Jumps of odometry: steps unlike the motion around them, detected and removed. Pure arrays.
 
 From one pose to the next a vehicle moves as just before and just after, up to its acceleration. A
-slipping wheel, a wrong scan match or a reset origin makes a step that differs by more. Such a step
-contains no information: the motion of its neighbours replaces it, and all later poses are moved
-rigidly.
+slipping wheel, a wrong scan match or a reset origin makes a step that differs by more: the motion
+of its neighbours replaces it, and all later poses are moved rigidly. A short pivot or a kerb may
+look the same; the recorded step is kept, for whoever has evidence (``slam.slips``).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,31 +14,37 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Trajectory
-from l2m_gtsam.geometry import carried_back, compose, moved
+from l2m_gtsam.geometry import between, carried_back, compose, moved
 from l2m_gtsam.options import Options
 
 NEIGHBOURS = 3  # steps before and after, from which the motion is predicted
 LEAST_STEPS = 4  # drives of fewer steps have no jumps
 ROUNDS = 20  # limit of detections without the jumps found before: a few are needed
 MAX_REPORTED = 3  # jumps that are reported one by one
+AXES = 3
+GAP = 2.0  # times the usual time of a step
+USUAL = 0.98  # share of a drive's accelerations; jumps are among the others
 
 
 class JumpOptions(Options):
-    """Which steps of odometry no vehicle can have made.
+    """Which steps of odometry are unlike the motion around them.
 
-    A step is held against the median motion of three steps before and three after. It is a jump
+    A step is compared with the median motion of three steps before and three after. It is a jump
     if it differs by more than all of these.
     """
 
-    position_m: float = Field(default=0.1, gt=0)
+    position_m: float = Field(default=0.05, gt=0)
     """Metres, or"""
-    rotation_deg: float = Field(default=5.0, gt=0)
+    rotation_deg: float = Field(default=3.0, gt=0)
     """degrees."""
-    acceleration_m_s2: float = Field(default=5.0, gt=0)
+    acceleration_m_s2: float = Field(default=4.0, gt=0)
     """What the vehicle may accelerate by in m/s^2, over the time of the step and from there to its
     neighbours,"""
     acceleration_deg_s2: float = Field(default=300.0, gt=0)
     """and how its turning may change in deg/s^2."""
+    accelerations: float = Field(default=5.0, ge=1)
+    """So many times what nearly all of the drive's own accelerations are within, where that is
+    less; not over gaps."""
     scatter: float = Field(default=10.0, ge=1)
     """So many times what half of the drive's own steps differ by: the noise of the poses."""
 
@@ -57,6 +64,8 @@ class Jump:
     covariance
         Of a right perturbation of the replacement, rotation (rad) before translation (m), shape
         (6, 6), by the differences of the drive's other steps from their neighbours.
+    recorded
+        The step as odometry has it: the pose after in the frame of the pose before.
     """
 
     row: int
@@ -64,6 +73,13 @@ class Jump:
     distance_m: float
     angle_deg: float
     covariance: FloatArray
+    recorded: RigidTransform
+
+    def __str__(self) -> str:
+        return (
+            f"odometry jumps by {self.distance_m:.2f} m and {self.angle_deg:.1f} deg "
+            f"{self.seconds:.1f} s after its first pose: the motion before and after replaces it"
+        )
 
 
 @dataclass(frozen=True)
@@ -91,20 +107,17 @@ class RepairedOdometry:
         return np.union1d(before, before + 1)
 
     def notes(self) -> tuple[str, ...]:
-        """Return a sentence on each of a few jumps, and how many more there are."""
-        notes = [
-            f"odometry jumps by {each.distance_m:.2f} m and {each.angle_deg:.1f} deg "
-            f"{each.seconds:.1f} s after its first pose: the motion before and after replaces it"
-            for each in self.jumps[:MAX_REPORTED]
-        ]
-        if len(self.jumps) > MAX_REPORTED:
-            notes.append(f"odometry jumps {len(self.jumps) - MAX_REPORTED} more times")
-        if self.left_out:
-            notes.append(
-                f"isolated poses of odometry, far from those before and after, are left out: "
-                f"{self.left_out}"
-            )
-        return tuple(notes)
+        """Return how many isolated poses were removed, if any, as a sentence."""
+        note = "isolated poses of odometry, far from those before and after, are left out"
+        return (f"{note}: {self.left_out}",) if self.left_out else ()
+
+
+def jump_notes(jumps: Sequence[Jump]) -> tuple[str, ...]:
+    """Return a sentence on each of a few jumps, and how many more there are."""
+    notes = [str(each) for each in jumps[:MAX_REPORTED]]
+    if len(jumps) > MAX_REPORTED:
+        notes.append(f"odometry jumps {len(jumps) - MAX_REPORTED} more times")
+    return tuple(notes)
 
 
 def without_jumps(trajectory: Trajectory, options: JumpOptions) -> RepairedOdometry:
@@ -235,7 +248,11 @@ def _compared(steps: _Steps, good: BoolArray, options: JumpOptions) -> _StepComp
         options.scatter * np.median(sizes, axis=0),
     )
     most = np.array([np.deg2rad(options.acceleration_deg_s2), options.acceleration_m_s2])
-    limits = np.maximum(limits, reach[:, None] * most)
+    own = options.accelerations * np.quantile(_changes(steps, good), USUAL, axis=0)
+    gap = steps.seconds > GAP * np.median(steps.seconds)  # in which the vehicle may have stopped
+    limits = np.maximum(
+        limits, reach[:, None] * np.where(gap[:, None], most, np.minimum(most, own))
+    )
     return replace(found, jumped=np.any(sizes > limits, axis=1))
 
 
@@ -255,8 +272,13 @@ def _about(steps: _Steps, good: BoolArray) -> tuple[FloatArray, FloatArray]:
 
 def _acceleration(steps: _Steps, good: BoolArray) -> FloatArray:
     """Return mean squares per axis of how velocities change between good steps, shape (2,)."""
+    return np.asarray(np.mean(_changes(steps, good) ** 2, axis=0) / AXES)
+
+
+def _changes(steps: _Steps, good: BoolArray) -> FloatArray:
+    """Return how fast velocities change between good steps, rad/s^2 and m/s^2, shape (M, 2)."""
     change = np.diff(steps.velocity()[good], axis=0) / np.diff(steps.middle[good])[:, None]
-    return np.asarray(np.mean(change.reshape(-1, 2, 3) ** 2, axis=(0, 2)))
+    return np.asarray(np.linalg.norm(change.reshape(-1, 2, AXES), axis=2))
 
 
 def _jump(trajectory: Trajectory, found: _StepComparison, row: int) -> Jump:
@@ -268,6 +290,9 @@ def _jump(trajectory: Trajectory, found: _StepComparison, row: int) -> Jump:
         distance_m=distance,
         angle_deg=float(np.rad2deg(angle)),
         covariance=np.diag(np.repeat(variance, 3)),
+        recorded=between(
+            *(RigidTransform(trajectory.R[k], trajectory.p[k]) for k in (row, row + 1))
+        ),
     )
 
 

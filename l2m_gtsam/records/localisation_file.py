@@ -313,6 +313,12 @@ class LocalisationRecord(Record):
         The verdict with its thresholds; files of older versions have none.
     """
 
+    SHAPES: ClassVar[Mapping[str, str]] = {
+        "poses": "K",
+        "odometry": "K",
+        "truth.path": "K 3",
+    }
+
     status: LocalisationStatus
     message: str
     notes: tuple[str, ...]

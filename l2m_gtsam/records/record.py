@@ -25,14 +25,26 @@ class Record:
 
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(ser_json_inf_nan="strings")
     SHAPES: ClassVar[Mapping[str, str]] = {}
-    """Of arrays, as `N 3`: letters are lengths that fields share, `N+1` is one more."""
+    """Of arrays, as `N 3`: letters are lengths that fields share, `N+1` is one more.
+
+    `inner.field` is an array of a record in this one.
+    """
 
     def __post_init__(self) -> None:
         """Raise a ValueError for arrays whose shapes do not fit together."""
         lengths: dict[str, int] = {}
         for name, shape in self.SHAPES.items():
-            value = getattr(self, name)
+            value = self._array(name)
             if value is not None and not _fits(value, shape.split(), lengths):
                 known = ", ".join(f"{letter} = {length}" for letter, length in lengths.items())
                 where = f" with {known}" if known else ""
                 raise ValueError(f"{name} must have the shape ({shape}){where}")
+
+    def _array(self, name: str) -> Any:
+        """Return a field, or one of a record in this one; None if either is absent."""
+        found: Any = self
+        for part in name.split("."):
+            if found is None:
+                return None
+            found = getattr(found, part)
+        return found

@@ -286,12 +286,15 @@ class CalibrationComparison(Record):
         How errors of both are taken to go together, as a sentence.
     same_bag
         Whether a drive took part in both.
+    failed
+        Which of both were judged FAIL: "new", "old".
     """
 
     sensors: tuple[ComparedSensor, ...]
     missing: tuple[NotValidated, ...]
     assumption: str
     same_bag: bool
+    failed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

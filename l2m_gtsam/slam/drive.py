@@ -1,5 +1,6 @@
 """A drive to be localised: odometry, readings and scans on key poses, calibrations, a start."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import gtsam
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import Calibrations, KeyPoseReadings
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, compose, moved
+from l2m_gtsam.recording.odometry_jumps import Jump, RepairedOdometry
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.scans import LoopClosure, PoseFix, ScanEvidence
 from l2m_gtsam.slam.odometry import OdometrySteps, drift_covariance
@@ -203,6 +205,25 @@ class StartPose:
 
 
 @dataclass(frozen=True)
+class OdometryJump:
+    """A step in which odometry jumps.
+
+    Attributes
+    ----------
+    step
+        Its number.
+    jump
+        What odometry recorded there.
+    covariance
+        Of a right perturbation of the recorded step if it is motion, (6, 6).
+    """
+
+    step: int
+    jump: Jump
+    covariance: FloatArray
+
+
+@dataclass(frozen=True)
 class Drive:
     """A drive to be localised.
 
@@ -220,6 +241,8 @@ class Drive:
         Calibrations of the S sensors.
     links
         L scan registrations of key poses.
+    jumps
+        Steps that continue the motion around them, for odometry jumps there.
     """
 
     stamp_ns: IntArray
@@ -228,6 +251,7 @@ class Drive:
     start: StartPose
     sensors: KnownSensors
     links: Links = field(default_factory=Links.none)
+    jumps: tuple[OdometryJump, ...] = ()
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
@@ -241,6 +265,7 @@ class Drive:
             steps=self.steps.until(count - 1),
             readings=self.readings[np.flatnonzero(self.readings.key_pose < count - 1)],
             links=self.links[links],
+            jumps=tuple(each for each in self.jumps if each.step < count - 1),
         )
 
     def dead_reckoning(self) -> list[gtsam.Pose3]:
@@ -256,9 +281,41 @@ class Drive:
             gtsam.Rot3(self.steps.R[number]), (1 + scale_error) * self.steps.p[number]
         )
 
+    def as_recorded(self, jumps: Sequence[OdometryJump]) -> "Drive":
+        """Return the drive with the recorded steps where odometry jumps."""
+        R, p, covariance = self.steps.R.copy(), self.steps.p.copy(), self.steps.covariance.copy()
+        for each in jumps:
+            R[each.step], p[each.step] = each.jump.recorded.R, each.jump.recorded.t
+            covariance[each.step] = each.covariance
+        return replace(self, steps=replace(self.steps, R=R, p=p, covariance=covariance))
+
     def with_scale_as_drift(self, over_m: float) -> "Drive":
         """Return the drive for solvers without a scale variable; see ``OdometrySteps``."""
         return replace(self, steps=self.steps.with_scale_as_drift(over_m))
+
+
+def odometry_jumps(
+    repaired: RepairedOdometry, rows: IntArray, options: DriftOptions
+) -> tuple[OdometryJump, ...]:
+    """Return the steps between key poses in which odometry jumps.
+
+    Parameters
+    ----------
+    repaired
+        Odometry.
+    rows
+        Rows of the key poses in it, shape (K,); those before and after each jump are among them.
+    options
+        Drift of odometry.
+    """
+    return tuple(
+        OdometryJump(
+            int(np.searchsorted(rows, each.row)),
+            each,
+            drift_covariance(each.recorded.R[None], each.recorded.t[None], options)[0],
+        )
+        for each in repaired.jumps
+    )
 
 
 def as_pose(transform: RigidTransform) -> gtsam.Pose3:

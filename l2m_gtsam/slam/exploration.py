@@ -14,10 +14,11 @@ from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.localisation import NO_SCANS, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.pose_graph import solve_pose_graph
+from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
+from l2m_gtsam.slam.slips import judged, with_open_jumps
 from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
+from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution, map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from l2m_gtsam.slam.unknown_field.whole_smoother import map_whole_drive
 
@@ -95,16 +96,11 @@ def explore(
     if options.start.position is None and options.start.quaternion_xyzw is None:
         drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
     progress("learning the field's prior", 0.0)
-    scaled = drive.with_scale_as_drift(options.drift.over_m)
-    by_scans = solve_pose_graph(scaled, options.robust.confidence)
+    by_scans = without_field(with_open_jumps(drive), options)
     drive = replace(drive, links=drive.links[by_scans.believed])
-    mapped = None
-    if len(drive.sensors.names) == 1 and not len(drive.links):
-        mapped = map_whole_drive(drive, by_scans.poses, options, progress)
-    if mapped is None:
-        prior = drive_prior(drive, by_scans.poses, options.tiles)
-        progress("learning the field's prior", 1.0)
-        mapped = map_drive(drive, by_scans.poses, prior, options, progress)
+    odometry = judged(drive, lambda each: solve_field(each, options, progress).solution)
+    drive = odometry.drive
+    mapped = solve_field(drive, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, mapped.solution, by_scans, kept)
@@ -113,6 +109,7 @@ def explore(
         explored_result(result, explored),
         notes=(
             *notes,
+            *odometry.notes,
             *result.notes,
             *([] if explored.returned else [NO_REVISITS]),
             *([] if mapped.gained else [NOTHING_GAINED]),
@@ -122,6 +119,24 @@ def explore(
     )
     points, field = field_samples(mapped.solution.drive, mapped.solution)
     return Exploration(result, mapped.solution, points, field)
+
+
+def without_field(drive: Drive, options: SlamOptions) -> PoseGraph:
+    """Solve a drive by odometry and scans alone."""
+    scaled = drive.with_scale_as_drift(options.drift.over_m)
+    return solve_pose_graph(scaled, options.robust.confidence)
+
+
+def solve_field(drive: Drive, options: SlamOptions, progress: Progress) -> FieldSolution:
+    """Estimate poses and field of a drive whose links are believed; arguments as of ``explore``."""
+    poses = without_field(drive, options).poses
+    if len(drive.sensors.names) == 1 and not len(drive.links):
+        mapped = map_whole_drive(drive, poses, options, progress)
+        if mapped is not None:
+            return mapped
+    prior = drive_prior(drive, poses, options.tiles)
+    progress("learning the field's prior", 1.0)
+    return map_drive(drive, poses, prior, options, progress)
 
 
 def explored_result(result: LocalisationResult, explored: Explored) -> LocalisationResult:

@@ -12,7 +12,7 @@ from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.dropouts import is_dead, mask_dropouts
-from l2m_gtsam.recording.odometry_jumps import without_jumps
+from l2m_gtsam.recording.odometry_jumps import RepairedOdometry, without_jumps
 from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult
@@ -24,12 +24,14 @@ from l2m_gtsam.slam.drive import (
     key_pose_links,
     key_pose_readings,
     link_stamps,
+    odometry_jumps,
 )
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
 from l2m_gtsam.slam.pose_graph import solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
+from l2m_gtsam.slam.slips import judged, with_open_jumps
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.start.search import find_start, start_found
@@ -102,16 +104,20 @@ def localise(
     if options.start.anywhere:
         search = find_start(drive, solver_map, options, progress)
         drive = replace(drive, start=start_found(search, options.start))
-    scaled = drive.with_scale_as_drift(options.drift.over_m)
-    by_scans = solve_pose_graph(scaled, options.robust.confidence)
+    by_scans = solve_pose_graph(
+        with_open_jumps(drive.with_scale_as_drift(options.drift.over_m)), options.robust.confidence
+    )
     drive = replace(drive, links=drive.links[by_scans.believed])
+    odometry = judged(drive, lambda each: localise_drive(each, solver_map, options, progress))
+    drive = odometry.drive
     solution = localise_drive(drive, solver_map, options, progress)
     maps = decoy_maps(drive, solver_map) if needs_misfit_test(solution) else ()
     decoys = [localise_drive(drive, each, options, progress) for each in maps]
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, decoys)
-    result = replace(result, notes=(*notes, *result.notes), bag=recording.source, start=search)
+    notes = (*notes, *odometry.notes, *result.notes)
+    result = replace(result, notes=notes, bag=recording.source, start=search)
     return Localisation(result, solution)
 
 
@@ -137,7 +143,9 @@ def prepared(
     """
     if len(recording.trajectory) < 2:
         raise SyncError(f"{recording.source.path}: odometry of one pose; two or more are needed")
-    repaired = without_jumps(recording.trajectory, options.jumps)
+    repaired = RepairedOdometry(recording.trajectory, (), 0)
+    if options.drift.axes is StepAxes.VEHICLE:  # a repair turns all that follows
+        repaired = without_jumps(recording.trajectory, options.jumps)
     odometry = repaired.trajectory
     masked = mask_dropouts(replace(recording, trajectory=odometry))
     calibrated, left_out = usable_sensors(masked.recording, calibration)
@@ -152,6 +160,7 @@ def prepared(
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
         links=key_pose_links(evidence, odometry, rows, options.drift),
+        jumps=odometry_jumps(repaired, rows, options.drift),
     )
     recorded = (note for part in recording.parts for note in part.notes)
     return drive, (*recorded, *repaired.notes(), *left_out, *masked.notes)

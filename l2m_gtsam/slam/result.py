@@ -46,7 +46,7 @@ def localisation_result(
     Parameters
     ----------
     drive
-        The drive before it was solved.
+        The drive before it was solved. Its drift is that of odometry as it was recorded.
     solution
         Solution of its graph.
     by_scans
@@ -56,7 +56,7 @@ def localisation_result(
     decoys
         Solutions in decoys of the map, if the misfit test was made.
     """
-    alone = drive.dead_reckoning()
+    alone = drive.as_recorded(drive.jumps).dead_reckoning()
     status, message = _verdict(solution, decoys)
     odometry = _trajectory(drive, alone)
     trajectory = replace(_trajectory(drive, solution.poses), covariance=solution.pose_covariance)

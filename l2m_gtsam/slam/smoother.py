@@ -39,6 +39,7 @@ from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
     colamd_ordering,
+    jump_covariances,
     levenberg_marquardt,
     odometry_scale,
     pose_covariances,
@@ -207,6 +208,7 @@ class SmoothingProblem:
             scale=odometry_scale(marginals, values),
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
+            step_covariance=jump_covariances(marginals, self._drive),
         )
 
 

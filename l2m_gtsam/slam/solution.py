@@ -47,6 +47,8 @@ class DriveSolution:
         Squared lengths of the scan links' whitened residuals, shape (L,).
     ending
         Why the last optimisation stopped.
+    step_covariance
+        Joint covariance of the poses before and after each of the drive's J jumps, (J, 12, 12).
     """
 
     drive: Drive
@@ -62,6 +64,7 @@ class DriveSolution:
     scale: OdometryScale | None
     link_squared: FloatArray
     ending: Ending
+    step_covariance: FloatArray
 
     @property
     def scale_error(self) -> float:

@@ -32,7 +32,7 @@ from l2m_gtsam.calibration.optimise import TOLERANCE, Ending, LinearSolver, Opti
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.localisation import OdometryScale
-from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
 
 LAST = (ord("T"), ord("D"))
@@ -253,6 +253,13 @@ def pose_covariances_together(marginals: Marginals, count: int) -> FloatArray:
             joint = marginals.joint(keys).reshape(len(keys), POSE, len(keys), POSE)
         blocks.extend(np.einsum("kikj->kij", joint))
     return np.stack(blocks)
+
+
+def jump_covariances(marginals: Marginals, drive: Drive) -> FloatArray:
+    """Return joint covariances of the poses before and after odometry's jumps, (J, 12, 12)."""
+    with reported_ill_conditioning():
+        joint = [marginals.joint([X(each.step), X(each.step + 1)]) for each in drive.jumps]
+    return np.reshape(joint, (-1, 2 * POSE, 2 * POSE))
 
 
 def odometry_scale(marginals: Marginals, values: gtsam.Values) -> OdometryScale | None:

@@ -27,6 +27,7 @@ FIELD_UNITS = {
     "mgauss": Unit.MILLIGAUSS,
     "milligauss": Unit.MILLIGAUSS,
 }
+TESLAS = (Unit.MILLITESLA, Unit.MICROTESLA, Unit.NANOTESLA)
 TIME_UNITS = {
     **{each.value: each for each in TimeUnit if each is not TimeUnit.AUTO},
     "sec": TimeUnit.SECONDS,
@@ -39,7 +40,10 @@ TIME_UNITS = {
     "nsecs": TimeUnit.NANOSECONDS,
 }
 # In order of preference; what ends in one of the first is a message's own stamp.
-STAMPS = ("header.stamp", "header/stamp", "timestamp_sample", "timestamp", "stamp", "__time")
+STAMPS = (
+    *("header.stamp", "header/stamp", "timestamp_sample", "timeintervalsince1970"),
+    *("timestamp", "timestamps", "stamp", "__time"),
+)
 MORE_STAMPS = ("time", "t", "datetime", "seconds_elapsed", "elapsed")
 BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*((?:[^\d\])][^\])]*)?)\s*[\])]\s*$")
 AXIS = re.compile(r"^(.*?)[\s._/\-]*([wxyz])$")
@@ -108,12 +112,15 @@ def column_roles(names: Sequence[str], options: ColumnOptions, stem: str) -> Rol
     parts = [_parts(name) for name in names]
     stamp, unit = _stamp(names, parts, options)
     vectors = _vectors(parts)
+    bare = "mag" in stem.lower() or _states_tesla(parts, vectors.get("", {}))
+    magnetic = {base: axes for base, axes in vectors.items() if _is_magnetic(base, bare)}
+    others = {base: axes for base, axes in vectors.items() if base not in magnetic}
     orientation = _orientation(names, vectors, options)
     return Roles(
         stamp,
         unit if options.time_unit is TimeUnit.AUTO else options.time_unit,
-        _fields(names, parts, vectors, options, stem),
-        _position(names, vectors, options, stem),
+        _fields(names, parts, magnetic, options, stem),
+        _position(names, others, options),
         orientation,
     )
 
@@ -209,19 +216,26 @@ def _fields(
         return given
     found = {}
     for base, axes in vectors.items():
-        if "w" not in axes and _is_magnetic(base, stem):
+        if "w" not in axes:
             columns = (axes["x"], axes["y"], axes["z"])
             label = "_".join(filter(None, WORDS.split(base))) or stem
             found[label] = FieldColumns(columns, _field_unit(parts[columns[0]]))
     return found
 
 
-def _is_magnetic(base: str, stem: str) -> bool:
+def _is_magnetic(base: str, bare: bool) -> bool:
+    """Return whether a name is that of a magnetometer; of columns x, y and z alone it is given."""
     if "cov" in base:
         return False
     if base == "":
-        return "mag" in stem.lower()
+        return bare
     return "mag" in base or _last(base) in FIELDS
+
+
+def _states_tesla(parts: Sequence[Name], axes: Mapping[str, int]) -> bool:
+    """Return whether columns state a unit that nothing but a magnetic field has."""
+    units = [FIELD_UNITS.get(parts[column].unit) for column in axes.values()]
+    return bool(units) and all(unit in TESLAS for unit in units)
 
 
 def _field_unit(name: Name) -> Unit | None:
@@ -235,14 +249,13 @@ def _position(
     names: Sequence[str],
     vectors: Mapping[str, Mapping[str, int]],
     options: ColumnOptions,
-    stem: str,
 ) -> tuple[int, int, int] | None:
     if options.position is not None:
         x, y, z = options.position
         return _place(names, x), _place(names, y), _place(names, z)
     for base, axes in vectors.items():
         likely = _last(base) in POSITIONS or base.startswith("p_")
-        if likely and "w" not in axes and not _is_magnetic(base, stem):
+        if likely and "w" not in axes:
             return axes["x"], axes["y"], axes["z"]
     return None
 

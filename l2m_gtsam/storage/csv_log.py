@@ -4,8 +4,9 @@ import csv
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal, InvalidOperation
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +26,12 @@ NS_PER = {
     TimeUnit.MICROSECONDS: 1000,
     TimeUnit.NANOSECONDS: 1,
 }
-# Times since 1970 of our days are larger than the first of these numbers in each unit.
-DATES = ((1e17, TimeUnit.NANOSECONDS), (1e14, TimeUnit.MICROSECONDS), (1e11, TimeUnit.MILLISECONDS))
-# Of times since a start: a magnetometer reads more often than every 5 s, and not faster than 5 kHz.
-STEPS = ((5.0, TimeUnit.SECONDS), (5e3, TimeUnit.MILLISECONDS), (5e6, TimeUnit.MICROSECONDS))
+# Seconds since 1970 of our days: the years 2000 and 2100.
+OUR_DAYS = (9.46e8, 4.1e9)
+# Of times since a start: a magnetometer reads more often than every 5 s, one whose times are whole
+# milliseconds or microseconds more often than every second, and none faster than 1 MHz.
+STEPS = ((5.0, TimeUnit.SECONDS), (1e3, TimeUnit.MILLISECONDS), (1e6, TimeUnit.MICROSECONDS))
+START = datetime(1970, 1, 1, tzinfo=UTC)
 LATEST_NS = 9_000_000_000_000_000_000
 MAX_COLUMNS = 2000
 POSE_TOPIC = "/pose"
@@ -115,12 +118,36 @@ def read_table(path: Path, options: ColumnOptions) -> NamedColumns:
                 f"{path}: its first line is numbers; write the names of the columns there, as "
                 "stamp,mag_x,mag_y,mag_z"
             )
+        rows: Iterator[list[str]] = csv.reader(lines, delimiter=separator, skipinitialspace=True)
         try:
+            first = next(rows, [])
+            begin = 3 if _are_groups(names, first) else 2
+            if begin == 3:
+                names = _with_groups(names, first)
+            elif first:
+                rows = chain([first], rows)
             roles = column_roles(names, options, path.stem)
+        except csv.Error as error:
+            raise BagError(f"{path}: not a table in CSV: {error}") from error
         except ValueError as error:
             raise BagError(f"{path}: {error}") from error
-        rows = csv.reader(lines, delimiter=separator, skipinitialspace=True)
-        return _read(path, roles, rows)
+        return _read(path, roles, rows, begin)
+
+
+def _are_groups(names: Sequence[str], below: Sequence[str]) -> bool:
+    """Return whether a line stands over names of axes: what columns have in common."""
+    return not any(map(_is_number, below)) and any(
+        not name and axis for name, axis in zip(names, below, strict=False)
+    )
+
+
+def _with_groups(names: Sequence[str], below: Sequence[str]) -> list[str]:
+    """Return names of columns of two lines, of which the upper names several columns at once."""
+    found, group = [], ""
+    for name, axis in zip_longest(names, below, fillvalue=""):
+        group = name or group
+        found.append(f"{group} {axis}".strip())
+    return found
 
 
 def _separator(head: str) -> str:
@@ -135,14 +162,15 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _read(path: Path, roles: Roles, rows: Iterator[list[str]]) -> NamedColumns:
+def _read(path: Path, roles: Roles, rows: Iterator[list[str]], begin: int) -> NamedColumns:
+    """Return the columns that have a meaning, of rows from a line on."""
     fields = [each.columns for each in roles.fields.values()]
     wanted = sorted({*chain(*fields), *(roles.position or ()), *(roles.orientation or ())})
     values = {column: array("d") for column in wanted}
     stamps: list[tuple[str, ...]] = []
     most = max([*wanted, *roles.stamp])
     try:
-        for number, row in enumerate(rows, start=2):
+        for number, row in enumerate(rows, start=begin):
             if len(row) <= most:
                 raise BagError(
                     f"{path}: line {number} has {len(row)} columns, {most + 1} are needed; it may "
@@ -159,19 +187,21 @@ def _read(path: Path, roles: Roles, rows: Iterator[list[str]]) -> NamedColumns:
         raise BagError(f"{path}: not a table in CSV: {error}") from error
     if not stamps:
         raise BagError(f"{path}: no rows below the names of the columns")
-    stamp_ns = _nanoseconds(path, stamps, roles.time_unit)
+    stamp_ns = _nanoseconds(path, stamps, roles.time_unit, begin)
     return NamedColumns(
         roles, stamp_ns, {c: np.array(v, dtype=np.float64) for c, v in values.items()}
     )
 
 
-def _nanoseconds(path: Path, stamps: list[tuple[str, ...]], unit: TimeUnit) -> IntArray:
+def _nanoseconds(path: Path, stamps: list[tuple[str, ...]], unit: TimeUnit, begin: int) -> IntArray:
     """Return times in nanoseconds; in integers, which a double cannot hold."""
+    if len(stamps[0]) == 1 and _date_ns(stamps[0][0]) is not None:
+        return _dates(path, [words[0] for words in stamps], begin)
     if unit is TimeUnit.AUTO:
         unit = _likely_unit(stamps)
     factors = (NS_PER[unit], 1)
     found = array("q")
-    for number, words in enumerate(stamps, start=2):
+    for number, words in enumerate(stamps, start=begin):
         try:
             exact = sum(round(Decimal(w) * f) for w, f in zip(words, factors, strict=False))
         except (InvalidOperation, ValueError, OverflowError):
@@ -185,19 +215,42 @@ def _nanoseconds(path: Path, stamps: list[tuple[str, ...]], unit: TimeUnit) -> I
     return np.array(found, dtype=np.int64)
 
 
+def _dates(path: Path, words: Sequence[str], begin: int) -> IntArray:
+    """Return dates with times of day in nanoseconds since 1970, shape (N,)."""
+    found = array("q")
+    for number, word in enumerate(words, start=begin):
+        nanoseconds = _date_ns(word)
+        if nanoseconds is None:
+            raise BagError(f"{path}: line {number}: {word[:40]!r} is no date and time of day")
+        found.append(nanoseconds)
+    return np.array(found, dtype=np.int64)
+
+
+def _date_ns(word: str) -> int | None:
+    """Return a date with a time of day, UTC where it has no zone; None for a number and others."""
+    if _is_number(word):
+        return None
+    try:
+        date = datetime.fromisoformat(word.strip())
+    except ValueError:
+        return None
+    known = date if date.tzinfo is not None else date.replace(tzinfo=UTC)
+    nanoseconds = 1000 * ((known - START) // timedelta(microseconds=1))
+    return nanoseconds if 0 <= nanoseconds < LATEST_NS else None
+
+
 def _likely_unit(stamps: list[tuple[str, ...]]) -> TimeUnit:
     """Return the unit that makes a date of our days of the times, else a likely rate."""
     try:
         times = np.array([float(words[0]) for words in stamps[:10_000]])
     except ValueError:
         return TimeUnit.SECONDS
-    for least, unit in DATES:
-        if times[0] >= least:
+    first, last = OUR_DAYS
+    for unit, nanoseconds in NS_PER.items():
+        if first <= times[0] * nanoseconds / NS_PER[TimeUnit.SECONDS] < last:
             return unit
     steps = np.diff(np.unique(times))
     typical = float(np.median(steps)) if len(steps) else 0.0
-    if times[0] > 1e9:  # seconds since 1970
-        return TimeUnit.SECONDS
     return next((unit for most, unit in STEPS if typical < most), TimeUnit.NANOSECONDS)
 
 

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, Self
 
 from pydantic import (
     AfterValidator,
@@ -13,6 +13,7 @@ from pydantic import (
     Field,
     TypeAdapter,
     ValidationError,
+    model_validator,
 )
 from pydantic_core import PydanticCustomError
 
@@ -137,8 +138,18 @@ class ManifestEntry(Options):
     """Map file, that of the command line if not given."""
     config: Path | None = None
     """YAML configuration, that of the command line if not given."""
+    poses: Path | None = None
+    """Poses of this drive in a file of their own, as with `l2m calibrate --poses`."""
+    pose_times: Path | None = None
+    """Times of KITTI's poses, a line each, as with `--pose-times`."""
     date: Annotated[datetime, BeforeValidator(_no_number), AfterValidator(_in_utc)] | None = None
     """When the drive was, in UTC if it names no zone, instead of what the bag's stamps say."""
+
+    @model_validator(mode="after")
+    def _times_with_poses(self) -> Self:
+        if self.pose_times is not None and self.poses is None:
+            raise PydanticCustomError("poses", "pose_times goes with poses, a file of KITTI")
+        return self
 
 
 _ADAPTER = TypeAdapter(Annotated[tuple[ManifestEntry, ...], Field(min_length=1, max_length=MOST)])
@@ -175,6 +186,7 @@ def _fault(error: ValidationError) -> str:
 
 
 def _seen_from_here(folder: Path, entry: ManifestEntry) -> ManifestEntry:
-    paths = {"bag": entry.bag, "map": entry.map, "config": entry.config}
+    names = ("bag", "map", "config", "poses", "pose_times")
+    paths = {name: getattr(entry, name) for name in names}
     found = {name: None if path is None else folder / path for name, path in paths.items()}
     return entry.model_copy(update=found)

@@ -1,7 +1,6 @@
 """Say what is in a bag, and what would be used of it and why."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,10 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import BagOptions, Stamps
+from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
 from l2m_gtsam.storage.field_types import (
     FIELD_TYPES,
     VECTOR_TYPE,
-    FieldSource,
     field_source,
     is_field,
 )
@@ -25,112 +24,24 @@ from l2m_gtsam.storage.messages import (
     PATH_TYPE,
     POSE_TYPES,
     TF_TYPES,
-    CovarianceBuffer,
-    FieldBuffer,
-    StampBuffer,
-    frame_of,
-    stamp_of,
 )
-from l2m_gtsam.storage.open_bag import Bag
 from l2m_gtsam.storage.open_log import open_log
-from l2m_gtsam.storage.path_topic import path_trajectory
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
-from l2m_gtsam.storage.pose_check import PoseCheck, needed_frames
+from l2m_gtsam.storage.pose_check import needed_frames
 from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
+from l2m_gtsam.storage.topic_content import TopicContent, collect_paths, collected_topics
 from l2m_gtsam.storage.units import (
     PLAUSIBLE_UT,
     Strength,
     Unit,
-    Units,
     field_fault,
-    is_turning,
     likely_units,
     microtesla_per,
     strength,
 )
 
-POSE_FILE = "file"
 BY_CLOUDS = "a map made with `l2m map build --lidar` gives poses to its point clouds"
-
-
-@dataclass(frozen=True)
-class TopicReport:
-    """What is known of one topic.
-
-    Attributes
-    ----------
-    topic, msgtype
-        Name and type.
-    frames
-        Frames of its headers; empty where messages were not decoded.
-    count
-        Messages.
-    rate_hz
-        One over the median time between header stamps; of topics that are not decoded, messages
-        over the time of the bag.
-    longest_gap_s
-        Longest time between messages.
-    span_s
-        First and last header stamp in seconds.
-    clock_offset_s
-        Median of record time less header stamp in seconds.
-    nan_share
-        Share of readings with a NaN axis; NaN for other types.
-    strength
-        |B| in uT, for magnetic fields in a unit that is known.
-    use
-        What would be used of it, and why, or why not.
-    role
-        `field`, `poses` or empty: what it would be used as.
-    likely_units
-        What its readings are likely in, where they are not in the unit of their type.
-    links
-        Parents and children of its transforms.
-    """
-
-    topic: str
-    msgtype: str
-    frames: tuple[str, ...]
-    count: int
-    rate_hz: float
-    longest_gap_s: float
-    span_s: tuple[float, float]
-    clock_offset_s: float
-    nan_share: float
-    strength: Strength | None
-    use: str
-    role: str = ""
-    likely_units: Units | None = None
-    links: tuple[tuple[str, str], ...] = ()
-
-
-@dataclass(frozen=True)
-class BagReport:
-    """What is in a bag: its topics, what prevents its use, if anything, and what else to know."""
-
-    path: Path
-    topics: tuple[TopicReport, ...]
-    obstacles: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-
-
-@dataclass
-class _TopicBuffers:
-    stamps: StampBuffer = field(default_factory=StampBuffer)
-    frames: set[str] = field(default_factory=set)
-    readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
-    covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
-    poses: PoseCheck = field(default_factory=PoseCheck)
-    fault: str = ""
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether there are readings, and not always the same; a single one may be."""
-        written = self.readings.field()
-        if len(written) == 1:
-            return bool(np.isfinite(written).all())
-        return is_turning(written) or not strength(written).is_constant
 
 
 def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) -> BagReport:
@@ -158,8 +69,8 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
         sources = {c.id: field_source(c) for c in bag.connections if c.msgtype in FIELD_TYPES}
         sources |= {each.connection.id: each for each in fields}
         usable = [c for c in bag.connections if _is_usable(c) or c.id in sources]
-        collected = _collected(bag, usable, sources, progress)
-        if (fault := _collect_paths(bag, poses, collected)) and not no_poses:
+        collected = collected_topics(bag, usable, sources, progress)
+        if (fault := collect_paths(bag, poses, collected)) and not no_poses:
             no_poses = fault
         uses = {each.connection.topic: "magnetic readings" for each in fields}
         uses |= {c.topic: f"poses ({_why_poses(options)})" for c in poses}
@@ -189,38 +100,10 @@ def inspect_bag(path: Path, options: BagOptions, progress: Count | None = None) 
     return BagReport(path, tuple(reports), found, tuple(notes))
 
 
-def _collected(
-    bag: Log, usable: list[Connection], sources: dict[int, FieldSource], progress: Count | None
-) -> dict[str, "_TopicBuffers"]:
-    """Return what the messages on usable topics say."""
-    collected: dict[str, _TopicBuffers] = {}
-    for message in bag.messages(usable, progress):
-        into = collected.setdefault(message.connection.topic, _TopicBuffers())
-        source = sources.get(message.connection.id)
-        _collect(into, message.content, message.connection.msgtype, message.record_ns, source)
-    return collected
-
-
-def _collect_paths(bag: Log, poses: list[Connection], collected: dict[str, "_TopicBuffers"]) -> str:
-    """Add the stamps of poses that come from paths; return what is wrong with them, if anything."""
-    paths = [c for c in poses if c.msgtype == PATH_TYPE]
-    if not paths or not isinstance(bag, Bag):
-        return ""
-    try:
-        found = path_trajectory(bag, paths, None)
-    except (L2MError, ValueError) as error:
-        return str(error)
-    into = collected.setdefault(paths[0].topic, _TopicBuffers())
-    into.frames.add(found.frame)
-    for stamp in found.stamp_ns.tolist():
-        into.stamps.add(stamp, stamp)
-    return ""
-
-
 def _judged_poses(
     reports: list[TopicReport],
     poses: list[Connection],
-    collected: dict[str, "_TopicBuffers"],
+    collected: dict[str, TopicContent],
     options: BagOptions,
 ) -> list[TopicReport]:
     """Return the same; topics whose poses would be used and cannot be are refused."""
@@ -297,38 +180,16 @@ def _by_topic(bag: Log) -> dict[str, list[Connection]]:
     return topics
 
 
-def _collect(
-    into: _TopicBuffers, content: Any, msgtype: str, record_ns: int, source: FieldSource | None
-) -> None:
-    for stamped in _stamped(content, msgtype):
-        into.stamps.add(stamp_of(stamped, record_ns), record_ns)
-        into.frames.add(frame_of(stamped))
-    into.poses.add(content, msgtype, record_ns)
-    if source is not None and not into.fault:
-        into.readings.unit = source.unit
-        try:
-            into.readings.add(record_ns, source.reading(content))
-        except ValueError as error:
-            into.fault = str(error)
-    if msgtype in POSE_TYPES and (pose := POSE_TYPES[msgtype](content)).covariance is not None:
-        into.covariances.add(pose.covariance)
-
-
-def _stamped(content: Any, msgtype: str) -> Sequence[Any]:
-    """Return what has stamps in a message."""
-    return tuple(content.transforms) if msgtype in TF_TYPES else (content,)
-
-
 def _report(
     topic: str,
     connections: list[Connection],
-    found: _TopicBuffers | None,
+    found: TopicContent | None,
     use: str | None,
     duration_s: float,
     options: BagOptions,
 ) -> TopicReport:
     msgtype = connections[0].msgtype
-    found = found or _TopicBuffers()
+    found = found or TopicContent()
     if use and len(found.covariances.row):
         use = f"{use}, {found.covariances.account()}"
     header, record = found.stamps.header(), found.stamps.record()
@@ -354,7 +215,7 @@ def _report(
     )
 
 
-def _strength(found: _TopicBuffers, options: BagOptions) -> Strength | None:
+def _strength(found: TopicContent, options: BagOptions) -> Strength | None:
     """Return the strength of readings in microtesla, if there are any in a unit that is known."""
     written, own = found.readings.field(), found.readings.unit
     if not len(written) or (own is None and options.units is Unit.AUTO):
@@ -375,7 +236,7 @@ def _span(stamps: IntArray) -> tuple[float, float]:
     return (float(stamps.min()) * 1e-9, float(stamps.max()) * 1e-9)
 
 
-def _use(use: str | None, connection: Connection, found: _TopicBuffers, options: BagOptions) -> str:
+def _use(use: str | None, connection: Connection, found: TopicContent, options: BagOptions) -> str:
     """Return what would be used of a topic, and why, or why not."""
     if len(found.readings.stamp_ns) or found.fault:
         return _field_use(use, connection, found, options)
@@ -395,7 +256,7 @@ def _use(use: str | None, connection: Connection, found: _TopicBuffers, options:
 
 
 def _field_use(
-    use: str | None, connection: Connection, found: _TopicBuffers, options: BagOptions
+    use: str | None, connection: Connection, found: TopicContent, options: BagOptions
 ) -> str:
     """Return what would be used of a topic with readings."""
     if use is None and not is_field(connection) and connection.msgtype == VECTOR_TYPE:

@@ -167,6 +167,12 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     }
 
 
+def level_of(path: Path) -> Level | None:
+    """Return the verdict on the sensors of a file, if it has one; errors as of the reader."""
+    found = read_checked(path, _FILE)
+    return None if found.verdict is None else found.verdict.level
+
+
 def read_listed_sensors(path: Path) -> dict[str, ListedSensor]:
     """Return the sensors of a list by name, with how well they are known.
 

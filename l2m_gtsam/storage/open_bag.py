@@ -20,7 +20,6 @@ from rosbags.typesys.store import Typestore
 
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
-from l2m_gtsam.shown import shown
 from l2m_gtsam.storage.bounded import is_there, require_regular
 from l2m_gtsam.storage.log import Message
 from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
@@ -32,6 +31,7 @@ from l2m_gtsam.storage.rosbags_bounds import (
     check_names,
     check_sizes,
 )
+from l2m_gtsam.text.shown import shown
 
 bound_rosbags()
 

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from l2m_gtsam.errors import CalibrationError
@@ -20,6 +21,7 @@ from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.storage.number_ranges import odd_poses
 from l2m_gtsam.storage.result_set import check_set
 
 MAX_BYTES = 100_000_000  # figures of a hundred sensors are some megabytes
@@ -141,7 +143,19 @@ def read_slam(path: Path) -> LocalisationRecord:
     CalibrationError
         The file is missing, damaged or something else.
     """
-    return LocalisationRecord(**_parts(_read(path, _SLAM, "localisation", "`l2m slam` writes it")))
+    found = LocalisationRecord(**_parts(_read(path, _SLAM, "localisation", "`l2m slam` writes it")))
+    if odd := _odd_poses(found):
+        raise CalibrationError(f"{path}: not a localisation file of this program: {odd}")
+    return found
+
+
+def _odd_poses(record: LocalisationRecord) -> str:
+    """Return what is wrong with the poses of a localisation; nothing if all can be."""
+    if not record.poses:
+        return "it has no poses"
+    p = [each.p for part in (record.poses, record.odometry) for each in part]
+    q = [each.quaternion_xyzw for part in (record.poses, record.odometry) for each in part]
+    return odd_poses(np.array(p), np.array(q))
 
 
 def _parts(record: LocalisationRecord) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from l2m_gtsam.data import FloatArray
 
 PLAUSIBLE_UT = (10.0, 200.0)
 EARTH_UT = 50.0
+UNDISTURBED_UT = (20.0, 80.0)  # away from steel
+NORMALISED = (0.7, 1.4)  # lengths of directions before a calibration
 # A strength that is constant to this, relative, over many readings was normalised.
 CONSTANT = 1e-6
 ENOUGH_READINGS = 20
@@ -156,20 +158,33 @@ def likely_units(written: FloatArray, units: Units, own: Unit | None) -> Units |
 
 def suspected_unit(as_written: float) -> Unit | None:
     """Return the unit in which a strength as written is most like the Earth's, if any fits."""
+    return next(iter(_suspects(as_written)), None)
+
+
+def _suspects(as_written: float) -> list[Unit]:
+    """Return the units that a strength as written may be in, the most likely first."""
     low, high = PLAUSIBLE_UT
     fitting = [u for u in (*SUSPECTS, Unit.TESLA) if low <= as_written * MICROTESLA_PER[u] <= high]
-    return min(fitting, key=lambda u: _distance(as_written * MICROTESLA_PER[u]), default=None)
+    return sorted(fitting, key=lambda u: _distance(as_written * MICROTESLA_PER[u]))
 
 
 def _suspicion(as_written: float) -> str:
     """Return the likely unit of a strength as written in the message."""
-    likely = suspected_unit(as_written)
-    if likely is None:
+    suspects = _suspects(as_written)
+    if not suspects:
         return (
             f"{as_written:.4g} fits no unit of field; name it with the option `units:`, or give "
             "the microtesla per unit as a number"
         )
-    return f"it is likely {likely.value}: set the option `units: {likely.value}`"
+    likely = suspects[0]
+    fields = {each: as_written * MICROTESLA_PER[each] for each in suspects}
+    low, high = UNDISTURBED_UT
+    if low <= fields[likely] <= high:
+        return f"it is likely {likely.value}: set the option `units: {likely.value}`"
+    may_be = [f"{unit.value} ({field:.3g} uT)" for unit, field in fields.items()]
+    if NORMALISED[0] <= as_written <= NORMALISED[1]:
+        may_be.append("a direction without a strength, which cannot be calibrated")
+    return f"it may be {' or '.join(may_be)}: set the option `units:`, as `units: {likely.value}`"
 
 
 def _distance(field_ut: float) -> float:

@@ -19,12 +19,22 @@ const WINDOWS = [
 ];
 
 function figures() {
+  // Whether a pointer over the first value of a figure meets that value, and nothing above it.
+  function hovered(svg) {
+    const part = svg.querySelector(".hover title")?.parentElement;
+    if (!part) return null;
+    part.scrollIntoView({ block: "center" });
+    const box = part.getBoundingClientRect();
+    const at = document.elementFromPoint(box.left + box.width / 2, box.top + box.height / 2);
+    return Boolean(at?.closest(".hover")?.querySelector("title"));
+  }
   return [...document.querySelectorAll("figure svg")].map((svg) => {
     const box = svg.getBoundingClientRect();
     const drawn = svg.querySelectorAll("path, image, use").length;
     const visible = svg.checkVisibility({ opacityProperty: true, visibilityProperty: true });
     const inside = box.left >= 0 && box.right <= window.innerWidth + 1;
-    return { alt: svg.getAttribute("aria-label"), width: box.width, height: box.height, drawn, visible, inside };
+    const values = svg.querySelectorAll(".hover title").length;
+    return { alt: svg.getAttribute("aria-label"), width: box.width, height: box.height, drawn, visible, inside, values, hovered: hovered(svg) };
   });
 }
 

@@ -18,6 +18,7 @@ from tests.support.browsing import (
     check_figures,
     check_phone,
     check_silence,
+    check_values,
     look,
     told_by,
 )
@@ -91,6 +92,10 @@ def test_every_trend_is_seen(looked: Looked) -> None:
 
 def test_it_fits_a_phone(looked: Looked) -> None:
     check_phone(looked)
+
+
+def test_every_figure_has_values_under_the_pointer(looked: Looked) -> None:
+    check_values(looked)
 
 
 def test_accessibility_has_no_grave_fault(looked: Looked) -> None:

@@ -15,6 +15,7 @@ from tests.support.browsing import (
     check_figures,
     check_phone,
     check_silence,
+    check_values,
 )
 
 FIGURES = 4 + 3 * 8  # of vehicle and map, and of each sensor
@@ -44,6 +45,10 @@ def test_light_and_dark_differ(looked: Looked) -> None:
     assert np.median(dark) < 60
     for picture in (light, dark):
         assert np.mean(np.abs(picture - np.median(picture)) > 40) > INKED
+
+
+def test_every_figure_has_values_under_the_pointer(looked: Looked) -> None:
+    check_values(looked)
 
 
 def test_accessibility_has_no_grave_fault(looked: Looked) -> None:

@@ -18,6 +18,7 @@ from tests.support.browsing import (
     check_figures,
     check_phone,
     check_silence,
+    check_values,
     look,
 )
 
@@ -57,6 +58,10 @@ def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:
 def test_every_figure_is_seen_on_a_desk_and_on_a_phone(looked: Looked) -> None:
     check_figures(looked, FIGURES)
     check_phone(looked)
+
+
+def test_every_figure_has_values_under_the_pointer(looked: Looked) -> None:
+    check_values(looked)
 
 
 def test_accessibility_has_no_grave_fault(looked: Looked) -> None:

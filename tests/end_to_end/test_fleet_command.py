@@ -33,6 +33,8 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.fleet import DriveOutcome
 from l2m_gtsam.storage.result_set import SET_FILE
+from l2m_gtsam.storage.trajectory_files import write_tum
+from tests.drives.degenerate import eight
 from tests.drives.fleets import Place, make_place, not_a_bag, truncated, vehicle
 from tests.support.command_line import Finished, complaint_here, l2m
 
@@ -305,6 +307,28 @@ def test_what_nobody_expects_is_a_row_too(run: Run, tmp_path: Path) -> None:
     assert not calibrated_drive(blocked, shared).lasting
     bad_map = calibrated_drive(tasks[0], open_map(tmp_path / "absent.npz"))
     assert "absent.npz" in bad_map.error
+
+
+def test_poses_of_a_file_are_those_of_a_drive(run: Run, tmp_path: Path) -> None:
+    """Those of a point 1 cm before the lidar: the sensor is 1 cm less before it."""
+    there = run.copied(tmp_path)
+    way, d = eight(), np.array([0.01, 0.0, 0.0])
+    poses = tmp_path / "poses.tum"
+    write_tum(poses, replace(way, p=way.p + way.R @ d))
+    manifest = tmp_path / "fleet.yaml"
+    manifest.write_text("- {bag: bags/truck_1/day_0.bag, vehicle: v, poses: poses.tum}\n")
+    order = replace(there.order, source=manifest)
+    (task,) = fleet_tasks(fleet_drives(order), there.out)
+    outcome = calibrated_drive(task, open_map(there.place.map))
+    assert outcome.error == ""
+    before = next(row for row in table(there.out) if row["bag"] == "day_0.bag")
+    (found,) = outcome.sensors
+    # A tenth of a millimetre for how both solves end.
+    assert found.t[0] == pytest.approx(float(before["t_x_m"]) - 0.01, abs=1e-4)
+    same = fleet_tasks(fleet_drives(order), there.out)[0]
+    assert same.config_digest == task.config_digest
+    write_tum(poses, way)
+    assert fleet_tasks(fleet_drives(order), there.out)[0].config_digest != task.config_digest
 
 
 @pytest.mark.parametrize("error", [MemoryError("no room"), np.linalg.LinAlgError("Singular")])

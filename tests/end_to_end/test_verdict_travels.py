@@ -1,7 +1,9 @@
 """No path through the commands turns a FAIL into a file without a verdict."""
 
+import csv
 import json
 import shutil
+from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -13,12 +15,15 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from ruamel.yaml import YAML
 
 from l2m_gtsam.batch import reports
+from l2m_gtsam.cli.app import app
+from l2m_gtsam.cli.maps import map_app
 from l2m_gtsam.errors import Notice
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibrated_topics import VERDICT_TOPIC
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from l2m_gtsam.storage.open_bag import open_bag
+from l2m_gtsam.storage.record_files import read_validation
 from tests.drives.yard import CalibratedYard, calibrated_yard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
 
@@ -211,18 +216,113 @@ def test_a_suite_that_failed_is_named(place: CalibratedYard, tmp_path: Path) -> 
         read_known_sensors(tmp_path / "calibration.yaml")
 
 
-def test_strict_ends_with_three(place: CalibratedYard, tmp_path: Path) -> None:
-    """What is written is the same; only the exit code differs."""
-    yard_config = json.loads((place.calibration.parent / "c.yaml").read_text())
-    failing = tmp_path / "failing.yaml"
-    failing.write_text(json.dumps({**yard_config, "qa": THRESHOLDS["fail"]}))
-    common = ("calibrate", place.drive, "--map", place.map, "--config", failing, "--out")
-    assert ended(*common, tmp_path / "one").code == 0
-    run = ended(*common, tmp_path / "two", "--strict")
-    assert run.code == 3
-    assert "verdict: FAIL" in run.out
-    names = ("calibration.yaml", "metrics.json", "report.html")
-    assert all((tmp_path / "two" / name).is_file() for name in names)
-    judged = read_calibration(tmp_path / "two" / "calibration.yaml").judgement
-    assert judged is not None
-    assert judged.level is Level.FAIL
+@dataclass(frozen=True)
+class Failed:
+    """A calibration that was judged FAIL, and configurations that lead to a FAIL everywhere."""
+
+    folder: Path
+    calibration: Path
+    config: Path
+
+
+@pytest.fixture
+def failed(place: CalibratedYard, tmp_path: Path) -> Failed:
+    for name in ("metrics.json", "calibration.yaml"):
+        shutil.copy(place.calibration.parent / name, tmp_path)
+    l2m("report", tmp_path, "--config", config(tmp_path, "fail"))
+    content = json.loads((place.calibration.parent / "c.yaml").read_text())
+    sigmas = {"position_sigma_m": TIGHT, "heading_sigma_deg": TIGHT}
+    content["qa"] = {**THRESHOLDS["fail"], "rejected": TIGHT, "unexplained": TIGHT, "slam": sigmas}
+    content["slam"] = {"key_poses": {"distance_m": 0.5, "angle_deg": 30}}
+    (tmp_path / "failing.yaml").write_text(json.dumps(content))
+    return Failed(tmp_path, tmp_path / "calibration.yaml", tmp_path / "failing.yaml")
+
+
+JUDGING = {"calibrate", "validate", "slam", "batch", "report"}
+USING = {"export", "apply", "validate", "slam", "map build", "map update", "map suite"}
+NEITHER = {
+    *("inspect", "config", "plan", "demo", "simulate", "study"),
+    *("map compare", "map info", "map plot"),
+}
+"""Of the commands: which judge, which make a file of a calibration, and which do neither."""
+
+
+def test_every_command_is_known_here() -> None:
+    """A new one has to say what it does with a FAIL, and then be tried below."""
+    commands = {getattr(each.callback, "__name__", "") for each in app.registered_commands}
+    below = {f"map {each.name}" for each in map_app.registered_commands}
+    assert commands | below == JUDGING | USING | NEITHER
+
+
+def strict_command(place: CalibratedYard, failed: Failed, name: str) -> list[str | Path]:
+    """Return a command that ends with a FAIL."""
+    common: list[str | Path] = ["--map", place.map, "--config", failed.config]
+    other = written(failed.folder, "mcap", "other", seed=8)
+    if name == "calibrate":
+        return ["calibrate", other, *common]
+    if name == "batch":
+        return ["batch", other, *common, "--workers", "1"]
+    return [name, other, "--calibration", failed.calibration, *common]
+
+
+@pytest.mark.parametrize("name", ["batch", "calibrate", "validate"])
+def test_strict_ends_with_three(place: CalibratedYard, failed: Failed, name: str) -> None:
+    """Everything is written; only the exit code differs. `slam` is tried below."""
+    command, out = strict_command(place, failed, name), failed.folder / "out"
+    run = ended(*command, "--out", out, "--strict")
+    assert run.code == 3, run.err
+    assert "verdict: FAIL" in run.out or "1 fail" in run.out
+    written_file = {"calibrate": "report.html", "batch": "index.html"}
+    assert (out / written_file.get(name, "validation.json")).is_file()
+    if name in ("batch", "validate"):  # quick the second time
+        assert ended(*command, "--out", out).code == 0
+    if name in ("calibrate", "batch"):
+        for path in failed.folder.rglob("out/**/calibration.yaml"):
+            judged = read_calibration(path).judgement
+            assert judged is not None
+            assert judged.level is Level.FAIL
+    if name == "batch":
+        with (out / "fleet.csv").open(encoding="utf-8", newline="") as file:
+            assert {row["verdict"] for row in csv.DictReader(file)} == {"fail"}
+
+
+def test_a_passed_strict_run_ends_with_nought(place: CalibratedYard, tmp_path: Path) -> None:
+    lax = config(tmp_path, "warn")
+    common = ("--calibration", place.calibration, "--compare", place.calibration)
+    assert ended("validate", *common, "--config", lax, "--strict").code == 0
+
+
+def test_what_a_failed_calibration_was_used_for_says_so(
+    place: CalibratedYard, failed: Failed
+) -> None:
+    """Validations, localisations, maps, suites, and what is calibrated on such a map."""
+    folder, quick = failed.folder, place.yard.config
+    files = ("--calibration", failed.calibration, "--map", place.map)
+    drive = written(folder, "mcap", "other", seed=8)
+    l2m("validate", drive, *files, "--out", folder / "valid")
+    l2m("validate", *files[:2], "--compare", place.calibration, "--out", folder / "compared")
+    for name in ("valid", "compared"):
+        verdict = read_validation(folder / name / "validation.json").verdict
+        assert any("judged FAIL" in each.text for each in verdict.reasons)
+        assert verdict.level is not Level.PASS
+    common = ("--config", failed.config, "--out", folder / "path")
+    assert ended("slam", drive, *files, *common, "--strict").code == 3
+    assert "is FAIL" in " ".join(json.loads((folder / "path" / "slam.json").read_text())["notes"])
+    suite, field_map, more = ("--suite", failed.calibration), folder / "m.npz", folder / "more.npz"
+    quickly = ("--config", quick, "--no-tiles")
+    l2m("map", "build", drive, *suite, *quickly, "--out", field_map)
+    l2m("map", "update", place.map, drive, *suite, *quickly, "--out", more)
+    for made in (field_map, more):
+        assert "whose verdict is FAIL" in l2m("map", "info", made).err
+    once = folder / "once.yaml"  # enough rounds for what is looked at here
+    once.write_text(
+        json.dumps({**json.loads(quick.read_text()), "mapping": {"suite": {"rounds": 1}}})
+    )
+    l2m("map", "suite", drive, *suite, "--config", once, "--out", folder / "suite.yaml")
+    assert "whose verdict is FAIL" in " ".join(read_calibration(folder / "suite.yaml").doubts)
+    start = ("--config", place.calibration.parent / "c.yaml")
+    l2m("calibrate", place.drive, "--map", field_map, *start, "--out", folder / "on_it")
+    on_it = read_calibration(folder / "on_it" / "calibration.yaml")
+    assert any("whose verdict is FAIL" in each for each in on_it.doubts)
+    assert on_it.judgement is not None
+    assert on_it.judgement.level is not Level.PASS

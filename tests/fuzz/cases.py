@@ -3,15 +3,16 @@
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 
-from tests.fuzz.corpus import CASE, OUT, Sound
 from tests.fuzz.runner import BAD, GOOD, MORE_CPU_S, MOST_CPU_S, Ended, run_case
+from tests.fuzz.sound import CASE, OUT, Sound
 
 OUT_NAME = "out"
+QUICK_TURNS = 5  # of files that are read in a moment, for one of a file that takes seconds
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,9 @@ class Case:
 def case_of(corpus: Sequence[Sound], number: int) -> Case:
     """Return a case; kinds take turns."""
     random = Random(number)  # noqa: S311 - repeatable, not secret
-    sound = corpus[number % len(corpus)]
+    quick = [each for each in corpus if not each.computes]
+    turns = [*(quick * QUICK_TURNS), *(each for each in corpus if each.computes)]
+    sound = turns[number % len(turns)]
     name = random.choice(list(sound.changes))
     words = random.choice(sound.commands)
     try:
@@ -83,15 +86,6 @@ def ended(case: Case, keep: Path | None = None) -> Ended:
             (kept / path.name).write_bytes(case.data)
             (kept / "said.txt").write_text(f"{case.name}\n{found}\n{found.said}")
         return found
-
-
-def run_cases(
-    corpus: Sequence[Sound], numbers: range, keep: Path | None = None
-) -> Iterator[tuple[Case, Ended]]:
-    """Yield cases with their ends."""
-    for number in numbers:
-        case = case_of(corpus, number)
-        yield case, ended(case, keep)
 
 
 def table(ends: Counter[tuple[str, str]]) -> str:

@@ -1,64 +1,36 @@
 """Sound files of every kind that is read, and the commands that read them."""
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from random import Random
 
 import numpy as np
 from ruamel.yaml import YAML
 
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.storage.cloud import write_cloud
 from tests.drives.bags import Entry, ros, write
-from tests.fuzz.changes import changed_bytes, changed_json, changed_words, changed_yaml
-from tests.fuzz.structures import (
-    changed_archive,
-    changed_cloud,
-    changed_db3,
-    changed_map,
-    changed_mcap,
-    changed_ros1,
+from tests.fuzz.further import further_corpus
+from tests.fuzz.sound import (
+    BAGS,
+    BYTES,
+    CASE,
+    MAPS,
+    OUT,
+    PLAIN_JSON,
+    PLAIN_YAML,
+    READ,
+    WORDS,
+    Sound,
 )
+from tests.fuzz.structures import changed_archive, changed_cloud
 from tests.support.command_line import l2m_process
 from tests.support.ulog import write_ulog
 from tests.worlds.halls import SMALL_HALL
 
-Change = Callable[[bytes, Random], bytes]
 START = 1_700_000_000_000_000_000
-READ, CASE, OUT = "read", "CASE", "OUT"
 EXPORTS = ("json", "ros2-launch", "urdf", "kalibr", "px4", "ardupilot")
-
-
-@dataclass(frozen=True)
-class Sound:
-    """A sound file, how it may be changed, and what is done with it then.
-
-    Attributes
-    ----------
-    kind
-        What it is called in tables.
-    path
-        The file.
-    changes
-        By name.
-    commands
-        Words of each command; `CASE` stands for the changed file and `OUT` for what is written.
-        The first word `read` stands for a function of `tests.fuzz.readers`.
-    beside
-        Files that are laid beside it.
-    computes
-        Whether commands take seconds also with the sound file.
-    """
-
-    kind: str
-    path: Path
-    changes: dict[str, Change]
-    commands: tuple[tuple[str, ...], ...]
-    beside: tuple[Path, ...] = ()
-    computes: bool = False
-
-
 PCD = """VERSION 0.7
 FIELDS x y z
 SIZE 4 4 4
@@ -69,16 +41,6 @@ HEIGHT 1
 POINTS 300
 DATA ascii
 """
-BYTES: dict[str, Change] = {"bytes": changed_bytes}
-WORDS: dict[str, Change] = {"bytes": changed_bytes, "words": changed_words}
-PLAIN_YAML: dict[str, Change] = {**WORDS, "values": changed_yaml}
-PLAIN_JSON: dict[str, Change] = {"bytes": changed_bytes, "values": changed_json}
-MAPS: dict[str, Change] = {**BYTES, "arrays": changed_map, "members": changed_archive}
-BAGS: dict[str, dict[str, Change]] = {
-    ".bag": {**BYTES, "records": changed_ros1},
-    ".mcap": {**BYTES, "records": changed_mcap},
-    ".db3": {**BYTES, "cells": changed_db3},
-}
 
 
 def drive(folder: Path, kind: str, frames: Sequence[str] = ("mag_00",)) -> Path:
@@ -113,7 +75,7 @@ def quick_corpus(folder: Path, files: Path) -> list[Sound]:
     """
     calibration, metrics = files / "calibration.yaml", files / "metrics.json"
     bags = [drive(folder, kind) for kind in ("ros1", "sqlite3", "mcap")]
-    sounds = [Sound(f"bag {each.suffix}", each, BAGS[each.suffix], INSPECT) for each in bags]
+    sounds = [Sound(f"bag {each.suffix}", each, BAGS[each.suffix], LOOK) for each in bags]
     exports = [("export", CASE, "--format", each, "--out", OUT) for each in EXPORTS]
     validate = ("validate", "--calibration", CASE, "--compare", str(calibration))
     despite = tuple((*each, "--despite-verdict") for each in exports)
@@ -124,10 +86,12 @@ def quick_corpus(folder: Path, files: Path) -> list[Sound]:
         Sound("metrics", metrics, PLAIN_JSON, (("report", "."),), (calibration,)),
         Sound("slam.json", files / "slam.json", PLAIN_JSON, (("report", "."),)),
     ]  # fmt: skip
-    return [*sounds, *_texts(folder, files, bags[-1]), *_clouds(folder), *_logs(folder)]
+    sounds += [*_texts(folder, files, bags[-1]), *_clouds(folder), *_logs(folder)]
+    return [*sounds, *further_corpus(folder, files, bags[-1])]
 
 
 INSPECT = (("inspect", CASE),)
+LOOK = (*INSPECT, ("config", "--for", CASE))
 
 
 def _texts(folder: Path, files: Path, bag: Path) -> list[Sound]:
@@ -208,7 +172,20 @@ def _clouds(folder: Path) -> list[Sound]:
         las.write(str(folder / f"cloud{suffix}"))
         path = folder / f"cloud{suffix}"
         sounds.append(Sound(f"cloud {suffix}", path, BYTES, ((READ, "cloud", CASE),)))
-    return sounds
+    return [*sounds, *_e57(folder, points)]
+
+
+def _e57(folder: Path, points: FloatArray) -> list[Sound]:
+    try:
+        import pye57
+    except ImportError:
+        return []
+    path = folder / "cloud.e57"
+    with pye57.E57(str(path), mode="w") as file:
+        axes = ("cartesianX", "cartesianY", "cartesianZ")
+        columns = dict(zip(axes, points.T, strict=True))
+        file.write_scan_raw(columns, rotation=np.array([1.0, 0, 0, 0]), translation=np.zeros(3))
+    return [Sound("cloud .e57", path, BYTES, ((READ, "cloud", CASE),))]
 
 
 def _logs(folder: Path) -> list[Sound]:
@@ -253,6 +230,8 @@ def whole_corpus(folder: Path, files: Path, demo: Path) -> list[Sound]:
     truth, config = demo / "slam" / "trajectory.tum", folder / "drive.yaml"
     options = {"slam": {"drift": {"scale": 0.0}}, "bag": {"units": "auto"}}
     config.write_text(json.dumps(options))
+    fleet = folder / "fleet.yaml"
+    fleet.write_text(json.dumps([{"bag": str(bag), "vehicle": "v"}]))
     known = ("--calibration", str(result))
     on_map = ("--map", str(field_map))
     use = ("--calibration", CASE, "--out", OUT, "--despite-verdict")
@@ -269,6 +248,7 @@ def whole_corpus(folder: Path, files: Path, demo: Path) -> list[Sound]:
         Sound("survey", mapping, BAGS[".mcap"], (
             ("map", "update", str(field_map), CASE, "--suite", str(suite), "--out", f"{OUT}.npz"),
             ("map", "suite", CASE, "--out", f"{OUT}.yaml"),
+            ("map", "build", CASE, "--suite", str(suite), "--out", f"{OUT}.npz"),
         )),
         Sound("map of a drive", field_map, MAPS, (
             ("calibrate", str(bag), "--map", CASE, "--out", OUT),
@@ -287,6 +267,9 @@ def whole_corpus(folder: Path, files: Path, demo: Path) -> list[Sound]:
         Sound("configuration of a drive", config, PLAIN_YAML, (
             ("calibrate", str(bag), *on_map, "--config", CASE, "--out", OUT),
             ("slam", str(bag), *on_map, *known, "--config", CASE, "--out", OUT),
+        )),
+        Sound("fleet", fleet, PLAIN_YAML, (
+            ("batch", CASE, *on_map, "--out", OUT, "--workers", "1"),
         )),
         Sound("truth", truth, WORDS, (
             ("slam", str(bag), *on_map, *known, "--truth", CASE, "--out", OUT),

@@ -1,16 +1,31 @@
 """Run many cases and print the table: ``python -m tests.fuzz.run --cases 10000 --out folder``."""
 
 import argparse
+import json
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from shutil import rmtree
 
-from tests.fuzz.cases import run_cases, table
-from tests.fuzz.corpus import Sound, make_demo, quick_corpus, whole_corpus
+from tests.fuzz.cases import case_of, ended, table
+from tests.fuzz.corpus import make_demo, quick_corpus, whole_corpus
 from tests.fuzz.runner import BAD, import_commands
+from tests.fuzz.sound import Sound
 
 FILES = Path(__file__).parents[1] / "files"
-EVERY = 100  # cases between two tables
+JOURNAL = "ends.jsonl"
+
+
+@dataclass(frozen=True)
+class Line:
+    """How a case ended, as it is kept."""
+
+    number: int
+    kind: str
+    how: str
+    cpu_s: float
+    peak_bytes: int
 
 
 def main() -> None:
@@ -23,7 +38,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
     corpus_folder = (asked.out / "corpus").resolve()
-    corpus_folder.mkdir(parents=True, exist_ok=True)
+    rmtree(corpus_folder, ignore_errors=True)
+    corpus_folder.mkdir(parents=True)
     files = FILES.resolve()
     if asked.demo is None:
         corpus = quick_corpus(corpus_folder, files)
@@ -35,19 +51,42 @@ def main() -> None:
     run(range(asked.first, asked.first + asked.cases), corpus, asked.out)
 
 
-def run(numbers: range, corpus: Sequence[Sound], out: Path) -> Counter[tuple[str, str]]:
-    """Run cases; write table and failures as they come."""
-    ends: Counter[tuple[str, str]] = Counter()
-    peak, slowest = 0, 0.0
-    for case, ended in run_cases(corpus, numbers, out / "failed"):
-        ends[case.sound.kind, ended.how] += 1
-        peak, slowest = max(peak, ended.peak_bytes), max(slowest, ended.cpu_s)
-        if ended.how in BAD:
-            print(f"{ended.how}: {case.name}: {ended.said.strip()[-200:]!r}", flush=True)
-        if (case.number + 1 - numbers.start) % EVERY == 0 or case.number + 1 == numbers.stop:
-            line = f"peak {peak / 2**20:.0f} MiB, slowest {slowest:.1f} s of a core\n"
-            (out / "table.md").write_text(f"{table(ends)}\n{line}")
-    return ends
+def run(numbers: range, corpus: Sequence[Sound], out: Path) -> tuple[Counter[tuple[str, str]], str]:
+    """Run the cases that a folder does not hold yet; return counts, and what they took at most.
+
+    Ends are written as they come, so that a run that was stopped goes on. What fails is kept.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    journal = out / JOURNAL
+    ends = {each.number: each for each in _read(journal)}
+    with journal.open("a") as file:
+        for number in numbers:
+            if number in ends:
+                continue
+            case = case_of(corpus, number)
+            found = ended(case, out / "failed")
+            ends[number] = Line(
+                number, case.sound.kind, found.how, round(found.cpu_s, 3), found.peak_bytes
+            )
+            file.write(json.dumps(asdict(ends[number])) + "\n")
+            file.flush()
+            if found.how in BAD:
+                print(f"{found.how}: {case.name}: {found.said.strip()[-200:]!r}", flush=True)
+    done = [ends[number] for number in numbers]
+    peak = max(each.peak_bytes for each in done) / 2**20
+    slowest = max(each.cpu_s for each in done)
+    took = f"{len(done):,} cases, peak {peak:.0f} MiB, slowest {slowest:.1f} s of a core"
+    counts = Counter((each.kind, each.how) for each in done)
+    (out / "table.md").write_text(f"{took}\n\n{table(counts)}")
+    return counts, took
+
+
+def _read(journal: Path) -> list[Line]:
+    if not journal.exists():
+        return []
+    # The last line may be cut.
+    whole = journal.read_text().split("\n")[:-1]
+    return [Line(**json.loads(each)) for each in whole]
 
 
 if __name__ == "__main__":

@@ -58,9 +58,7 @@ def run_case(words: Sequence[str], folder: Path, out: Path, most_s: int = MOST_C
         Seconds of a core that it may take.
     """
     log = folder / "said.log"
-    number = os.fork()
-    if number == 0:
-        _child(words, folder, log, most_s)
+    number = start_command(words, folder, log, most_s)
     status, usage, late = _awaited(number)
     said = log.read_text(encoding="utf-8", errors="replace")
     log.unlink()
@@ -69,6 +67,14 @@ def run_case(words: Sequence[str], folder: Path, out: Path, most_s: int = MOST_C
     if how in GOOD.values() and (left := _left_over(folder, out, status)):
         how, said = "left over", f"{left}\n{said}"
     return Ended(how, said, cpu_s, peak)
+
+
+def start_command(words: Sequence[str], folder: Path, log: Path, most_s: int) -> int:
+    """Start a command as ``run_case`` does, and return the number of its process."""
+    number = os.fork()
+    if number == 0:
+        _child(words, folder, log, most_s)
+    return number
 
 
 def _child(words: Sequence[str], folder: Path, log: Path, most_s: int) -> None:

@@ -86,6 +86,13 @@ def check_figures(looked: Looked, count: int) -> None:
             assert figure["inside"]
             assert figure["drawn"] > 5
             assert min(figure["width"], figure["height"]) > 100
+            assert figure["hovered"] is not False
+
+
+def check_values(looked: Looked) -> None:
+    """Every figure shows values where the pointer is."""
+    for each in looked.looks:
+        assert [figure["alt"] for figure in each["figures"] if not figure["values"]] == []
 
 
 def check_phone(looked: Looked) -> None:

@@ -7,7 +7,7 @@ from rich.table import Table
 from l2m_gtsam.cli.tables import add_numbers, add_text, new_table, plain_table
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.plan import DrivePlan, SensorPlan, Worst
-from l2m_gtsam.storage.inspect import BagReport, TopicReport
+from l2m_gtsam.storage.bag_report import BagReport, TopicReport
 
 HEADINGS = ("± t (mm)", "± H (uT)", "± rotation (deg)", "± clock (ms)")
 OTHERS = ("± C by column", "assumed t (m)", "readings", "outside map")

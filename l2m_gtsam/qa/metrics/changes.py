@@ -20,6 +20,7 @@ from l2m_gtsam.records.validation import (
     ComparedSensor,
     NotValidated,
 )
+from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.solve.chi_square import chance_beyond
 
 TINY = 1e-12  # of the largest variance, in units of sigmas: a direction that both share exactly
@@ -110,7 +111,11 @@ def compare_calibrations(
     assumption = INDEPENDENT + (SHARED_BAG if same_bag else "")
     if same_content(new.map, old.map) and not same_bag:
         assumption += SHARED_MAP
-    return CalibrationComparison(tuple(sensors), tuple(missing), assumption, same_bag)
+    both = {"new": new.judgement, "old": old.judgement}
+    failed = [name for name, each in both.items() if each is not None and each.level is Level.FAIL]
+    return CalibrationComparison(
+        tuple(sensors), tuple(missing), assumption, same_bag, tuple(failed)
+    )
 
 
 def _why_not(new: SensorCalibration, old: SensorCalibration | None) -> str:

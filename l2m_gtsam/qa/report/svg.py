@@ -37,6 +37,10 @@ AXES = (X, Y, Z)
 DASHES = ("-", "--", "-.")  # lines of x, y, z differ without their colours, too
 MARKERS = ("o", "s", "^")
 
+HOVER = (
+    "hover-"  # before words, in hexadecimal, that name a part of a figure: they become its title
+)
+
 SMALL = 9.3  # points; a figure is drawn at about its own size on a phone
 
 SETTINGS: Any = {
@@ -113,6 +117,7 @@ def _(figure: Figure, name: str, alt: str) -> Markup:
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(rf'<g id="{HOVER}([0-9a-f]*)">', _title, text)
     text = _renamed(text, name)
     text = re.sub(r' d="([^"]*)"', lambda found: f' d="{_short(found.group(1))}"', text)
     for colour, variable in VARIABLES.items():
@@ -166,6 +171,16 @@ def save_figure(figure: Figure, path: Path) -> None:
 def short_name(name: str) -> str:
     """Return a name that fits into a figure."""
     return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
+
+
+def hover_name(words: str) -> str:
+    """Return the name of a part of matplotlib's whose title these words shall be."""
+    return HOVER + words.encode(errors="replace").hex()
+
+
+def _title(found: re.Match[str]) -> str:
+    words = bytes.fromhex(found[1]).decode()
+    return f'<g class="hover"><title>{escape(words)}</title>'
 
 
 def _short(path: str) -> str:

@@ -36,6 +36,7 @@ from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
+    jump_covariances,
     levenberg_marquardt,
     odometry_scale,
     pose_covariances_together,
@@ -238,6 +239,7 @@ class TiledProblem:
             scale=odometry_scale(marginals, solved.values),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
+            step_covariance=jump_covariances(marginals, drive),
         )
         path = drive.steps.path
         returns = tiled.anchoring.returns(path, AWAY_M)

@@ -91,8 +91,8 @@ def test_jumps_of_odometry_do_no_harm(
     assert pose_nees(drive.truth, result.trajectory).mean() < 12
     assert result.notes[0].startswith("odometry jumps by 0.50 m and 0.0 deg 5.1 s after")
     assert result.notes[3] == "odometry jumps 1 more times"
-    # What is told of odometry is that without its jumps, too.
-    assert result.drift.end_m < 0.5
+    # What is removed is compared with odometry as it was recorded, with the origin set anew.
+    assert result.drift.end_m > 20
 
 
 def test_jumps_that_are_believed_do_harm(

@@ -22,6 +22,7 @@ from tests.support.ulog import write_ulog
 START_NS = 1_700_000_000_000_000_000
 STEP_NS = 20_000_000
 COUNT = 60
+UPTIME_NS = 341_986_128_864_000  # four days: in milliseconds a date no sooner than 12,800
 EARTH = np.array([20.0, 5.0, -40.0])
 
 
@@ -99,12 +100,41 @@ TABLES: dict[str, tuple[str, Callable[[int, list[float]], list[object]]]] = {
         "time,seconds_elapsed,z,y,x",
         lambda k, b: [START_NS + k * STEP_NS, 0.02 * k, b[2], b[1], b[0]],
     ),
+    # What else such programs write: an axis and its unit alone, dates, times since the last start.
+    "Raw Data.csv": (
+        '"Time (s)","X (µT)","Y (µT)","Z (µT)"',
+        lambda k, b: [f"{0.02 * k:.2f}", *b],
+    ),
+    "SensorLog.csv": (
+        "Timestamp,timeIntervalSince1970,GyroX,GyroY,GyroZ,MagX,MagY,MagZ",
+        lambda k, b: [f"today {k}", f"{1_700_000_000 + 0.02 * k:.2f}", 1, 2, 3, *b],
+    ),
+    "dates.csv": (
+        "Time,Timestamp,mag_x,mag_y,mag_z",
+        lambda k, b: [k, f"2023-11-14 22:13:{20 + 0.02 * k:06.3f}", *b],
+    ),
+    "zones.csv": (
+        "timestamps,mag_x,mag_y,mag_z",
+        lambda k, b: [f"2023-11-15T00:13:{20 + 0.02 * k:06.3f}+02:00", *b],
+    ),
+    "uptime.csv": (
+        ",time,gyro_x,gyro_y,gyro_z,magnet_x,magnet_y,magnet_z",
+        lambda k, b: [k, f"{UPTIME_NS + k * STEP_NS}.0", 1, 2, 3, *b],
+    ),
+    "groups.csv": (
+        "Time (s),IMU Gyroscope,,,IMU Magnetometer,,\n,X,Y,Z,X,Y,Z",
+        lambda k, b: [f"{0.02 * k:.2f}", 1, 2, 3, *b],
+    ),
     "vehicle_magnetometer_0.csv": (
         "timestamp,magnetometer_ga[0],magnetometer_ga[1],magnetometer_ga[2]",
         lambda k, b: [20_000 * k, *b],
     ),
 }
-FROM_START = ("phyphox.csv", "vehicle_magnetometer_0.csv")
+BEGIN = {
+    **dict.fromkeys(("phyphox.csv", "Raw Data.csv", "groups.csv", "vehicle_magnetometer_0.csv"), 0),
+    "uptime.csv": UPTIME_NS,
+}
+STATED = ("phyphox.csv", "Raw Data.csv", "vehicle_magnetometer_0.csv")
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -113,8 +143,7 @@ def test_tables_of_other_programs(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     lines = [head, *(",".join(map(str, row(k, b))) for k, b in enumerate(readings().tolist()))]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    stated = name in ("phyphox.csv", "vehicle_magnetometer_0.csv")
-    if not stated:
+    if name not in STATED:
         with pytest.raises(UnitsError, match=r"in a unit that the log does not state.*microtesla"):
             read_fields(path, BagOptions())
     if name == "vehicle_magnetometer_0.csv":  # 45 gauss is no field on Earth
@@ -122,8 +151,15 @@ def test_tables_of_other_programs(tmp_path: Path, name: str) -> None:
             read_fields(path, BagOptions())
     (found,) = read_fields(path, BagOptions(units=Unit.MICROTESLA))
     np.testing.assert_allclose(found.field, readings(), rtol=1e-12)
-    begin = 0 if name in FROM_START else START_NS
+    begin = BEGIN.get(name, START_NS)
     np.testing.assert_array_equal(found.stamp_ns, begin + STEP_NS * np.arange(COUNT))
+
+
+def test_a_table_without_its_name(tmp_path: Path) -> None:
+    path = tmp_path / "log.txt"
+    path.write_text("stamp,mag_x,mag_y,mag_z\n1,2,3,4\n")
+    with pytest.raises(BagError, match=r"call a table \.csv"):
+        read_fields(path, BagOptions())
 
 
 def test_named_columns_and_raw_counts(tmp_path: Path) -> None:
@@ -152,6 +188,7 @@ def test_named_columns_and_raw_counts(tmp_path: Path) -> None:
         ("stamp,mag_x,mag_y,mag_z\n1,2,3\n", "line 2 has 3 columns, 4 are needed"),
         ("stamp,mag_x,mag_y,mag_z\n1,2,3,north\n", "line 2: 'north' is no number"),
         ("stamp,mag_x,mag_y,mag_z\nnow,2,3,4\n", "line 2: 'now' is no time"),
+        ("stamp,mag_x,mag_y,mag_z\n2024-01-01,2,3,4\nx,2,3,4\n", "line 3: 'x' is no date"),
         ("stamp,speed\n1,2\n", "no columns of a magnetometer"),
         ("stamp,mag_x,mag_y,mag_z\n" + "1,2,3,4\n" * 30, "in a unit that the log|no poses"),
     ],

@@ -218,6 +218,19 @@ def test_a_manifest(tmp_path: Path) -> None:
     assert [each.folder for each in (one, two, three)] == ["7/a", "van/b", "van/c"]
 
 
+def test_poses_in_files_of_their_own(tmp_path: Path) -> None:
+    """One log with the poses of two SLAMs is two drives."""
+    manifest = tmp_path / "fleet.yaml"
+    manifest.write_text(
+        "- {bag: a.csv, vehicle: van, poses: a.tum}\n"
+        "- {bag: a.csv, vehicle: van, poses: kitti.txt, pose_times: times.txt}\n"
+    )
+    one, two = listed(tmp_path, manifest)
+    assert (one.poses, one.pose_times) == (tmp_path / "a.tum", None)
+    assert (two.poses, two.pose_times) == (tmp_path / "kitti.txt", tmp_path / "times.txt")
+    assert one.folder != two.folder
+
+
 @given(st.datetimes(timezones=st.none() | st.timezones()))
 def test_every_date_is_read_back_or_refused(date: datetime) -> None:
     """What is read can be written as text of a table, and read from it."""
@@ -241,6 +254,7 @@ def test_every_date_is_read_back_or_refused(date: datetime) -> None:
         ("- {bag: a.bag, vehicle: ''}", "drive 1: vehicle: String should have at least 1"),
         ("- {bag: a.bag, vehicle: v}\n- {bag: a.bag, vehicel: v}", "drive 2: vehicle: Field"),
         ("- {bag: a.bag, vehicle: v, colour: red}", "drive 1: colour: unknown key; accepted here"),
+        ("- {bag: a.bag, vehicle: v, pose_times: t.txt}", "drive 1: pose_times goes with poses"),
         ("- {bag: a.bag, vehicle: v, date: soon}", "drive 1: date: Input should be a valid date"),
         (
             "- {bag: a.bag, vehicle: v, date: 20260502}",

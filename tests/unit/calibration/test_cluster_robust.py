@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from l2m_gtsam.calibration.cluster_robust import BLOCKS, Excess, gathered, halved, unmodelled
-from l2m_gtsam.calibration.joint_information import Rows
+from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.calibration import EXPLAINED, Unmodelled
@@ -28,8 +28,12 @@ class Fitted:
     covariance: FloatArray
     error: FloatArray
 
+    @property
+    def half(self) -> HalfCovariance:
+        return HalfCovariance.of(self.covariance)
+
     def unmodelled(self) -> Excess:
-        return unmodelled(self.readings, self.rows, OWN, self.covariance, 1)
+        return unmodelled(self.readings, self.rows, OWN, self.half, 1)
 
 
 def fitted(rng: np.random.Generator, lasting: float = 0.0) -> Fitted:
@@ -73,7 +77,7 @@ def test_expected_scores_are_those_of_many_fits() -> None:
     rng = np.random.default_rng(1)
     one = fitted(rng)
     labels = halved(one.readings.stamp_ns[:, None].astype(np.float64), 4)
-    scores = gathered(one.rows, labels, OWN, one.covariance).scores(one.covariance)
+    scores = gathered(one.rows, labels, OWN, one.half).scores(one.half)
     X = np.vstack([each.jacobian for each in one.rows])
     # e = (I - X P X^T) noise + prior's share; its covariance is I - X P X^T.
     left = np.eye(len(X)) - X @ one.covariance @ X.T
@@ -86,7 +90,7 @@ def test_expected_scores_are_those_of_many_fits() -> None:
 def test_scores_add_up_to_the_pull_of_the_priors() -> None:
     one = fitted(np.random.default_rng(2))
     labels = halved(one.readings.p_map_lidar, 4)
-    sums = gathered(one.rows, labels, OWN, one.covariance)
+    sums = gathered(one.rows, labels, OWN, one.half)
     size = np.abs(sums.found).sum(axis=0)
     # The shared errors are known to be zero, with unit variance.
     pull = -one.covariance[OWN, :SHARED] @ one.x[:SHARED]
@@ -127,7 +131,7 @@ def test_an_error_that_lasts_is_found_and_counted() -> None:
 def test_few_readings_tell_nothing() -> None:
     one = fitted(np.random.default_rng(5), lasting=5.0)
     few = [Rows(0, r.columns, r.jacobian[:3], r.residual[:3], r.readings[:1]) for r in one.rows]
-    assert unmodelled(one.readings, few, OWN, one.covariance, 1).factors == EXPLAINED
+    assert unmodelled(one.readings, few, OWN, one.half, 1).factors == EXPLAINED
 
 
 @given(

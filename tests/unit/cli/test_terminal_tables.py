@@ -72,3 +72,15 @@ def test_levels_are_coloured_and_names_are_text(
     out = capsys.readouterr().out
     assert out.count("\x1b[1;33mWARN\x1b[0m") == 2
     assert Text.from_ansi(out).plain.splitlines()[1] == f"  WARN {name}: It is PASS."
+
+
+def test_control_characters_of_names_are_text(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = "/mag\x1b]0;title\x07\u202e\n"
+    table = new_table(name, "topic", ["count"], name)
+    add_text(table, "use")
+    table.add_row(name, "12", name)
+    out = "\n".join(lines_of(table, 200, monkeypatch, capsys))
+    assert out.count("/mag\\x1b]0;title\\x07\\u202e\\n") == 4
+    assert not {"\x1b", "\x07", "\u202e"} & set(out)

@@ -10,7 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, difference, moved
-from l2m_gtsam.recording.odometry_jumps import JumpOptions, RepairedOdometry, without_jumps
+from l2m_gtsam.recording.odometry_jumps import (
+    JumpOptions,
+    RepairedOdometry,
+    jump_notes,
+    without_jumps,
+)
 from l2m_gtsam.slam.odometry import drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 from tests.drives.faults import jumped, shift
@@ -52,7 +57,7 @@ def test_smooth_drives_have_no_jumps(faster: float, every: int) -> None:
     assert repaired.left_out == 0
     assert repaired.trajectory is not None
     np.testing.assert_array_equal(repaired.trajectory.p, drive.p)
-    assert repaired.notes() == ()
+    assert jump_notes(repaired.jumps) == repaired.notes() == ()
 
 
 @given(st.integers(0, 1000), st.floats(0.0, 0.01), st.floats(0.0, 1.0))
@@ -109,7 +114,7 @@ def test_a_jump_anywhere_is_found_and_taken_out(
     # Chi squared of 6 degrees of freedom passes 22.5 once in 1,000; there are 600 places.
     assert step_nees(DRIVE, repaired) < 22.5
     np.testing.assert_array_equal(repaired.rows, [row, row + 1])
-    (note,) = repaired.notes()
+    (note,) = jump_notes(repaired.jumps)
     assert f"odometry jumps by {jump.distance_m:.2f} m and {jump.angle_deg:.1f} deg" in note
 
 
@@ -126,7 +131,7 @@ def test_several_jumps_are_taken_out(places: set[int], seed: int) -> None:
     # 6 in the mean for each, and once in 1,000 as much as this for one of them.
     assert step_nees(DRIVE, repaired) < 22.5 + 6 * (len(shifts) - 1) * 2
     if len(shifts) > 3:
-        assert repaired.notes()[-1] == f"odometry jumps {len(shifts) - 3} more times"
+        assert jump_notes(repaired.jumps)[-1] == f"odometry jumps {len(shifts) - 3} more times"
 
 
 def test_a_rotation_alone_is_a_jump() -> None:

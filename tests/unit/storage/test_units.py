@@ -74,3 +74,17 @@ def test_half_missing_readings_do_not_count() -> None:
     holes = field.copy()
     holes[::2, 1] = np.nan
     assert strength(holes) == strength(field[1::2])
+
+
+@pytest.mark.parametrize(
+    ("written", "told"),
+    [
+        (178.0, "may be milligauss (17.8 uT) or microtesla (178 uT)"),
+        (1.05, "may be gauss (105 uT) or a direction without a strength"),
+        (0.45, "likely gauss: set the option `units: gauss`"),
+    ],
+)
+def test_what_may_be_several_units_is_not_called_one(written: float, told: str) -> None:
+    sentence = field_fault(turning_field(written, 1e-2), Unit.AUTO, None)
+    assert sentence is not None
+    assert told in sentence

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.report.hover import axes_places, axes_strips
 from l2m_gtsam.qa.report.svg import (
     BAD,
     GOOD,
@@ -49,6 +50,19 @@ def drives_figure(sensor: SensorCalibration, found: Repeatability) -> Figure:
     for axes in parts[-1]:
         axes.set_xticks(numbers, [str(k + 1) for k in numbers], fontsize=SMALL)
         axes.set_xlim(-0.6, len(found.drives) - 0.4)
+    for axes, at, factor, unit in zip(
+        parts.ravel(),
+        (0, 1, 2, 12, 13, 14),
+        3 * (1e3,) + 3 * (1.0,),
+        3 * ("mm",) + 3 * ("µT",),
+        strict=True,
+    ):
+        words = [
+            f"drive {k + 1}, {each.bag}: {factor * (each.estimate[at] - whole[at]):+.2f} ± "
+            f"{factor * each.sigma[at]:.2f} {unit}"
+            for k, each in enumerate(found.drives)
+        ]
+        axes_strips(axes, np.arange(float(len(found.drives))), words)
     parts[-1][1].set_xlabel("drive")
     return figure
 
@@ -93,6 +107,12 @@ def field_errors_figure(sensors: Sequence[ValidatedSensor]) -> Figure:
         color=Y,
         label="after, ± 1 std",
     )
+    words = [
+        f"{s.sensor}: before {s.before.mean:.2f}, after {s.after.mean:.2f} ± {s.after.std:.2f} µT"
+        for s in sensors
+    ]
+    for at in ([s.before.mean for s in sensors], [s.after.mean for s in sensors]):
+        axes_places(axes, np.column_stack([at, rows]), words)
     _logarithmic(axes)
     axes.set(xlabel="distance to the map's field (µT)")
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
@@ -109,6 +129,12 @@ def nis_figure(sensors: Sequence[ValidatedSensor]) -> Figure:
         axes.plot(nis.ratio, k, "o" if good else "X", color=GOOD if good else BAD, markersize=6)
     axes.axvline(1, color=MUTED, linewidth=0.8)
     values = [each.nis.ratio for each in sensors]
+    words = [
+        f"{s.sensor}: {s.nis.ratio:.2f}; 95 % of cases: {s.nis.low / s.nis.freedom:.2f} to "
+        f"{s.nis.high / s.nis.freedom:.2f}"
+        for s in sensors
+    ]
+    axes_places(axes, np.column_stack([values, np.arange(len(sensors))]), words)
     if max(values) > 3:
         _logarithmic(axes)
     axes.plot([], [], "-", color=GRID, linewidth=6, label="95 % of all cases")

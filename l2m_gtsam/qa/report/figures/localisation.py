@@ -8,10 +8,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.metrics.trajectory import HEADING, LocalisedTrajectory
 from l2m_gtsam.qa.report.figures.map import mark, strength_background, wide
+from l2m_gtsam.qa.report.figures.readings import residual_words
+from l2m_gtsam.qa.report.hover import axes_box, axes_places, axes_strips, some
 from l2m_gtsam.qa.report.svg import (
     AXES,
     BAD,
@@ -67,8 +69,20 @@ def path_figure(path: LocalisedTrajectory, picture: MapPicture, truth: Rows | No
         shape.set(facecolor="#ffffff66", edgecolor="black")
         axes.add_patch(shape)
     _mark_ends(axes, path.p[0, :2], path.p[-1, :2], picture)
+    rows = some(len(path.p))
+    axes_places(axes, path.p[rows, :2], _pose_words(path, rows))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     return figure
+
+
+def _pose_words(path: LocalisedTrajectory, rows: IntArray) -> list[str]:
+    """Return time, place and standard deviations of some poses, a line each."""
+    return [
+        f"{path.seconds[k]:.1f} s, {path.distance[k]:.1f} m along the path: "
+        f"x {path.p[k, 0]:.2f}, y {path.p[k, 1]:.2f} m; sigma {path.position_sigma[k]:.3f} m, "
+        f"heading {path.heading_sigma[k]:.2f}°"
+        for k in rows
+    ]
 
 
 def _mark_ends(axes: Axes, start: FloatArray, end: FloatArray, picture: MapPicture) -> None:
@@ -91,6 +105,12 @@ def drift_figure(path: LocalisedTrajectory) -> Figure:
     below.plot(path.distance[keep], path.turned[keep], "-", color=Y)
     above.set(ylabel="distance (m)", ylim=(0, None))
     below.set(ylabel="angle (°)", ylim=(0, None), xlabel="localised path (m)")
+    rows = some(len(path.distance))
+    words = [
+        f"{path.distance[k]:.1f} m: {path.apart[k]:.3f} m, {path.turned[k]:.2f}°" for k in rows
+    ]
+    for axes in (above, below):
+        axes_strips(axes, path.distance[rows], words)
     return figure
 
 
@@ -108,8 +128,11 @@ def sigma_figure(path: LocalisedTrajectory) -> Figure:
     below.plot(at, alone[:, HEADING], ":", color=MUTED, linewidth=1.6)
     above.set_ylabel("position (m)")
     below.set(ylabel="heading (°)", xlabel="time (s)")
+    rows = some(len(path.seconds))
+    words = _pose_words(path, rows)
     for axes in (above, below):
         _decades(axes)
+        axes_strips(axes, path.seconds[rows], words)
     figure.legend(*above.get_legend_handles_labels(), loc="upper center", ncols=4)
     return figure
 
@@ -128,6 +151,14 @@ def truth_figure(path: LocalisedTrajectory, truth: TruthRecord) -> Figure:
     below.axhspan(0, BAND_95, color=GRID, label="95 % if consistent")
     dots(below, distance, np.array(truth.squared)[keep], 2.2, color=X)
     below.set(ylabel="NEES", ylim=(0, None), xlabel="localised path (m)")
+    rows = some(len(path.distance))
+    words = [
+        f"{path.distance[k]:.1f} m: {truth.localised_m[k]:.3f} m, odometry "
+        f"{truth.odometry_m[k]:.3f} m; NEES {truth.squared[k]:.1f}"
+        for k in rows
+    ]
+    for axes in (above, below):
+        axes_strips(axes, path.distance[rows], words)
     below.legend(loc="best")
     figure.legend(*above.get_legend_handles_labels(), loc="upper center", ncols=3)
     return figure
@@ -146,6 +177,12 @@ def counted_figure(sensors: Sequence[SensorRecord]) -> Figure:
         _bars(axes, line.edges, foot, used, color=GOOD, alpha=0.35)
         _bars(axes, line.edges, foot - used, wrong, color=BAD)
         _bars(axes, line.edges, foot - used - wrong, lost, color=MUTED, alpha=0.6)
+        for start, end, each in zip(line.edges[:-1], line.edges[1:], counts.T, strict=True):
+            words = (
+                f"{sensor.use.sensor}, {start:.1f} to {end:.1f} s: {each[0]:.0f} count, "
+                f"{each[1]:.0f} rejected, {each[2]:.0f} outside the map"
+            )
+            axes_box(axes, (start, foot - 0.8), (end - start, 0.8), words, axes.transData)
     for colour, alpha, label in (
         (GOOD, 0.35, "count"),
         (BAD, 1, "rejected"),
@@ -169,6 +206,9 @@ def rejected_figure(path: LocalisedTrajectory, sensors: Sequence[SensorRecord]) 
             wrong = np.array(sensor.series.rejected)
             place = np.array(sensor.series.place)[wrong]
             axes.plot(*place.reshape(-1, 3)[:, :2].T, "x", color=BAD, markersize=4)
+            rows = np.flatnonzero(wrong)[some(len(place))]
+            seen = np.array(sensor.series.place)[rows, :2].reshape(-1, 2)
+            axes_places(axes, seen, residual_words(sensor.series, rows))
     axes.plot([], [], "x", color=BAD, markersize=4, label="rejected readings")
     axes.plot(*path.p[0, :2], "o", color=INK, markersize=5)
     axes.annotate(

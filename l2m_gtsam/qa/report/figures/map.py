@@ -29,6 +29,7 @@ from l2m_gtsam.qa.report.drawing import (
     shades,
     spread,
 )
+from l2m_gtsam.qa.report.hover import axes_image, places, some_and_marked
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.records.calibration import Disagreement
 from l2m_gtsam.records.metrics import MapPicture, Metrics, Row, Rows, Series
@@ -84,7 +85,14 @@ def residual_figure(series: Series) -> Drawing:
     if wrong.any():
         legend(panel, [LegendEntry("× rejected", Stroke(BAD, 0))])
     bar = _bar(Rectangle(90, POINTS * height - 40, PAGE - 180, 6), high)
-    return Drawing(height, (panel, bar))
+    figure, rows = Drawing(height, (panel, bar)), some_and_marked(wrong)
+    words = [
+        f"{series.seconds[k]:.1f} s, x {place[k, 0]:.2f} m, y {place[k, 1]:.2f} m: {size[k]:.2f} µT"
+        f"{', rejected' if wrong[k] else ''}"
+        for k in rows
+    ]
+    places(figure, panel, place[rows, :2], words)
+    return figure
 
 
 def _equal(room: Rectangle, places: FloatArray) -> Panel:
@@ -134,6 +142,7 @@ def _map(picture: MapPicture, values: Rows, label: str, colours: str) -> tuple[F
     draw_map(figure, axes, np.array(values), picture.extent, label, colours, **BELOW)
     axes.set_title(f"at z = {picture.height:.2f} m; blank: no data")
     axes.grid(visible=False)
+    axes_image(axes, np.array(values), picture.extent, "µT")
     return figure, axes
 
 

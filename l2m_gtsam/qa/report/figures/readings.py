@@ -17,6 +17,7 @@ from l2m_gtsam.qa.report.drawing import (
     spread,
     stacked,
 )
+from l2m_gtsam.qa.report.hover import places, some, some_and_marked, strips
 from l2m_gtsam.qa.report.svg import AXES, BAD, GRID, INK, MUTED, SMALL, X, Y
 from l2m_gtsam.records.metrics import SensorMetrics, Series
 
@@ -49,7 +50,19 @@ def residuals_figure(series: Series) -> Drawing:
         shown = np.clip(residual[wrong, k], -limit, limit)
         panel.crosses(seconds[wrong], shown, 4, BAD)
         panel.frame()
-    return Drawing(height, tuple(panels))
+    figure, rows = Drawing(height, tuple(panels)), some_and_marked(wrong)
+    strips(figure, seconds[rows], residual_words(series, rows))
+    return figure
+
+
+def residual_words(series: Series, rows: IntArray) -> list[str]:
+    """Return what the residuals of some readings are, a line each."""
+    residual = np.array(series.residual)[rows]
+    return [
+        f"{series.seconds[k]:.1f} s: x {x:+.2f}, y {y:+.2f}, z {z:+.2f} µT"
+        f"{', rejected' if series.rejected[k] else ''}"
+        for k, (x, y, z) in zip(rows, residual, strict=True)
+    ]
 
 
 def curves_figure(series: Series) -> Drawing:
@@ -76,7 +89,24 @@ def curves_figure(series: Series) -> Drawing:
     figure.legend_above(
         [LegendEntry(*each) for each in zip(names, (BEFORE, MAP, AFTER), strict=True)]
     )
+    rows = some(len(times))
+    strips(figure, times[rows], _curve_words(series, rows))
     return figure
+
+
+def _curve_words(series: Series, rows: IntArray) -> list[str]:
+    """Return what some readings are before and after, and what the map has there."""
+    before, after, there = (
+        _vectors(np.array(each)[rows]) for each in (series.before, series.after, series.map)
+    )
+    return [
+        f"{series.seconds[k]:.1f} s: before {b}, after {a}, map {m} µT"
+        for k, b, a, m in zip(rows, before, after, there, strict=True)
+    ]
+
+
+def _vectors(values: FloatArray) -> list[str]:
+    return [f"({x:.1f}, {y:.1f}, {z:.1f})" for x, y, z in values]
 
 
 def along(series: Series) -> FloatArray:
@@ -149,7 +179,24 @@ def directions_figure(sensor: SensorMetrics) -> Drawing:
         panel.text(float(panel.across(1.02)), float(panel.down(0)) + 3, "x", AXIS)
         panel.text(middle, top - 2, "y", letters("middle", colour=MUTED))
         panels.append(panel)
-    return Drawing(DISKS, tuple(panels))
+    figure = Drawing(DISKS, tuple(panels))
+    for panel, side in zip(panels, (1, -1), strict=True):
+        own = b[np.sign(b[:, 2]) == side]
+        own = own[some(len(own))]
+        unit = own / np.linalg.norm(own, axis=1, keepdims=True)
+        places(figure, panel, equal_area(unit), _direction_words(own))
+    return figure
+
+
+def _direction_words(b: FloatArray) -> list[str]:
+    """Return azimuth, elevation and strength of fields in the lidar frame, shape (N, 3)."""
+    azimuth = np.rad2deg(np.arctan2(b[:, 1], b[:, 0]))
+    strength = np.linalg.norm(b, axis=1)
+    elevation = np.rad2deg(np.arcsin(b[:, 2] / strength))
+    return [
+        f"azimuth {a:.0f}°, elevation {e:.0f}°: {s:.1f} µT"
+        for a, e, s in zip(azimuth, elevation, strength, strict=True)
+    ]
 
 
 def equal_area(unit: FloatArray) -> FloatArray:

@@ -18,6 +18,7 @@ from l2m_gtsam.qa.report.drawing import (
     shades,
     usual,
 )
+from l2m_gtsam.qa.report.hover import cells, strips
 from l2m_gtsam.qa.report.svg import BAD, GRID, INK, MUTED, PAPER, SMALL, X, Y
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import Normalised, Row, SensorMetrics
@@ -60,7 +61,13 @@ def chi_square_figure(found: Normalised) -> Drawing:
         LegendEntry("expected: chi-square of 3", EXPECTED),
     ]
     legend(panel, samples)
-    return Drawing(HEIGHT, (panel,))
+    figure = Drawing(HEIGHT, (panel,))
+    words = [
+        f"{a:.1f} to {b:.1f}: {number} readings, density {high:.3f}"
+        for (a, b), number, high in zip(sides, found.counts, read, strict=True)
+    ]
+    strips(figure, sides.mean(axis=1), words)
+    return figure
 
 
 def autocorrelation_figure(sensor: SensorMetrics) -> Drawing:
@@ -83,7 +90,10 @@ def autocorrelation_figure(sensor: SensorMetrics) -> Drawing:
     panel.level(0, ZERO)
     panel.frame()
     legend(panel, [LegendEntry("chance (95 %)", BAND)])
-    return Drawing(HEIGHT, (panel,))
+    figure = Drawing(HEIGHT, (panel,))
+    words = [f"{lag:.0f} apart: {rho:+.2f}" for lag, rho in zip(lags, correlation, strict=True)]
+    strips(figure, lags, words)
+    return figure
 
 
 def halves_figure(sensor: SensorMetrics) -> Drawing:
@@ -112,7 +122,17 @@ def sigmas_figure(difference: Row, sigma_of: Row, label: str) -> Drawing:
         panel.parts.append(f'<text transform="{at}" style="{letters("end", SMALL)}">{name}</text>')
     panel.frame()
     legend(panel, [LegendEntry(f"± {ALIKE:g} sigmas", BAND)])
-    return Drawing(HEIGHT, (panel,))
+    figure = Drawing(HEIGHT, (panel,))
+    strips(figure, place, list(map(_difference_words, NAMES, d, sigma, known)))
+    return figure
+
+
+def _difference_words(name: str, difference: float, sigma: float, known: bool) -> str:
+    """Return a parameter's difference in its unit with its sigma."""
+    unit = {"t": " m", "C": "", "H": " µT"}[name[0]]
+    if not known:
+        return f"{name}: not determined"
+    return f"{name}: {difference:+.3g} ± {sigma:.2g}{unit}, {difference / sigma:+.1f} sigmas"
 
 
 def correlations(sensor: SensorCalibration) -> FloatArray:
@@ -152,7 +172,11 @@ def correlation_figure(sensor: SensorCalibration) -> Drawing:
     for value in (-1, -0.5, 0, 0.5, 1):
         words = f"{value:.1f}".replace("-", "−")
         bar.text(SCALE.right + 5, float(bar.down(value)) + 3.5, words, letters("start"))
-    return Drawing(HEIGHT_OF_MATRIX, (matrix, bar))
+    figure = Drawing(HEIGHT_OF_MATRIX, (matrix, bar))
+    below = np.nonzero(np.tril(np.isfinite(rho)))  # the same as above the diagonal
+    told = [f"{NAMES[j]} and {NAMES[i]}: {rho[i, j]:+.2f}" for i, j in zip(*below, strict=True)]
+    cells(figure, matrix, np.column_stack([below[1], 14 - below[0]]).astype(float), told)
+    return figure
 
 
 def _names(matrix: Panel) -> None:

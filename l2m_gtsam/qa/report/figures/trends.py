@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num, num2date
 from matplotlib.figure import Figure
 
 from l2m_gtsam.data import BoolArray, FloatArray
 from l2m_gtsam.qa.fleet import by_sensor
+from l2m_gtsam.qa.report.hover import axes_strips
 from l2m_gtsam.qa.report.svg import AXES, BAD, INK, MUTED, dots, plain_figure
 from l2m_gtsam.records.fleet import DATE, FleetRow
 
@@ -93,7 +94,25 @@ def trend_figure(trend: Trend) -> Figure:
     low, high = trend.days.min(), trend.days.max()
     margin = max(0.04 * (high - low), LEAST_DAYS / 2)
     parts[-1].set_xlim(low - margin, high + margin)
+    top, bottom = parts[0].get_position(), parts[-1].get_position()
+    height = (top.y1 - bottom.y0) / bottom.height
+    axes_strips(parts[-1], trend.days, _words(trend, labels), height)
     return figure
+
+
+def _words(trend: Trend, labels: Sequence[str]) -> list[str]:
+    """Return date, values and sigmas of each drive."""
+    lines = [
+        "; ".join(
+            f"{label} {value:.1f} ± {sigma:.1f}{', outlier' if outlying else ''}"
+            for label, value, sigma, outlying in zip(labels, *each, strict=True)
+        )
+        for each in zip(trend.values, trend.sigmas, trend.outlying, strict=True)
+    ]
+    return [
+        f"{num2date(day):%Y-%m-%d %H:%M}: {line}"
+        for day, line in zip(trend.days, lines, strict=True)
+    ]
 
 
 def _trend(vehicle: str, sensor: str, rows: Sequence[FleetRow]) -> Trend:

@@ -10,6 +10,7 @@ from matplotlib.patches import Ellipse
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.qa.report.figures.map import draw_map
+from l2m_gtsam.qa.report.hover import axes_places
 from l2m_gtsam.qa.report.svg import (
     BAD,
     FAIR,
@@ -64,7 +65,21 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: Viewpoint)
     axes.locator_params(nbins=6)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.18)
+    for sensor in found:
+        at = sensor.t_lidar_mag[list(view.axes)]
+        axes_places(axes, at[None], [place_words(sensor, verdict)])
     return figure
+
+
+def place_words(sensor: SensorCalibration, verdict: Verdict) -> str:
+    """Return a sensor's name, verdict and place with standard deviations."""
+    parts = [
+        f"{axis} {1e3 * value:.1f} ± {1e3 * sigma:.1f} mm"
+        if np.isfinite(sigma)
+        else f"{axis} not determined"
+        for axis, value, sigma in zip("xyz", sensor.t_lidar_mag, sensor.t_sigma, strict=True)
+    ]
+    return f"{sensor.sensor}, {verdict[sensor.sensor].level.upper()}: {', '.join(parts)}"
 
 
 def enlargement(found: list[SensorCalibration], view: Viewpoint) -> int:

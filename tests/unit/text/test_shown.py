@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_gtsam.shown import LONGEST_LINE, LONGEST_VALUE, shown, shown_value
+from l2m_gtsam.text.shown import LONGEST_LINE, LONGEST_VALUE, shown, shown_value
 
 
 @given(st.text(max_size=200))

@@ -1,0 +1,107 @@
+"""What the messages on a topic say, as far as it is needed to judge the topic."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Connection
+
+from l2m_gtsam.errors import L2MError
+from l2m_gtsam.progress import Count
+from l2m_gtsam.storage.field_types import FieldSource
+from l2m_gtsam.storage.log import Log
+from l2m_gtsam.storage.messages import (
+    PATH_TYPE,
+    POSE_TYPES,
+    TF_TYPES,
+    CovarianceBuffer,
+    FieldBuffer,
+    StampBuffer,
+    frame_of,
+    stamp_of,
+)
+from l2m_gtsam.storage.open_bag import Bag
+from l2m_gtsam.storage.path_topic import path_trajectory
+from l2m_gtsam.storage.pose_check import PoseCheck
+from l2m_gtsam.storage.units import is_turning, strength
+
+
+@dataclass
+class TopicContent:
+    """What was collected of a topic.
+
+    Attributes
+    ----------
+    stamps, frames
+        Of the headers.
+    readings, covariances, poses
+        Of the messages that have them.
+    fault
+        Why readings cannot be had; empty if they can.
+    """
+
+    stamps: StampBuffer = field(default_factory=StampBuffer)
+    frames: set[str] = field(default_factory=set)
+    readings: FieldBuffer = field(default_factory=lambda: FieldBuffer("", ""))
+    covariances: CovarianceBuffer = field(default_factory=CovarianceBuffer)
+    poses: PoseCheck = field(default_factory=PoseCheck)
+    fault: str = ""
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether there are readings, and not always the same; a single one may be."""
+        written = self.readings.field()
+        if len(written) == 1:
+            return bool(np.isfinite(written).all())
+        return is_turning(written) or not strength(written).is_constant
+
+
+def collected_topics(
+    bag: Log, usable: list[Connection], sources: dict[int, FieldSource], progress: Count | None
+) -> dict[str, TopicContent]:
+    """Return what the messages on usable topics say."""
+    collected: dict[str, TopicContent] = {}
+    for message in bag.messages(usable, progress):
+        into = collected.setdefault(message.connection.topic, TopicContent())
+        source = sources.get(message.connection.id)
+        _collect(into, message.content, message.connection.msgtype, message.record_ns, source)
+    return collected
+
+
+def collect_paths(bag: Log, poses: list[Connection], collected: dict[str, TopicContent]) -> str:
+    """Add the stamps of poses that come from paths; return what is wrong with them, if anything."""
+    paths = [c for c in poses if c.msgtype == PATH_TYPE]
+    if not paths or not isinstance(bag, Bag):
+        return ""
+    try:
+        found = path_trajectory(bag, paths, None)
+    except (L2MError, ValueError) as error:
+        return str(error)
+    into = collected.setdefault(paths[0].topic, TopicContent())
+    into.frames.add(found.frame)
+    for stamp in found.stamp_ns.tolist():
+        into.stamps.add(stamp, stamp)
+    return ""
+
+
+def _collect(
+    into: TopicContent, content: Any, msgtype: str, record_ns: int, source: FieldSource | None
+) -> None:
+    for stamped in _stamped(content, msgtype):
+        into.stamps.add(stamp_of(stamped, record_ns), record_ns)
+        into.frames.add(frame_of(stamped))
+    into.poses.add(content, msgtype, record_ns)
+    if source is not None and not into.fault:
+        into.readings.unit = source.unit
+        try:
+            into.readings.add(record_ns, source.reading(content))
+        except ValueError as error:
+            into.fault = str(error)
+    if msgtype in POSE_TYPES and (pose := POSE_TYPES[msgtype](content)).covariance is not None:
+        into.covariances.add(pose.covariance)
+
+
+def _stamped(content: Any, msgtype: str) -> Sequence[Any]:
+    """Return what has stamps in a message."""
+    return tuple(content.transforms) if msgtype in TF_TYPES else (content,)

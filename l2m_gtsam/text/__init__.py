@@ -1,0 +1,1 @@
+"""Text that strangers wrote, on its way to screens and pictures."""

@@ -1,0 +1,38 @@
+"""Commands that are killed: the results are those of before or of after, and the next run is well.
+
+A few kills of a quick command in the gate; hundreds of all in the studies.
+"""
+
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tests.fuzz.corpus import make_demo
+from tests.fuzz.kills import kill_all, killed
+from tests.fuzz.runner import import_commands
+from tests.fuzz.trials import BAD, Command, commands, prepared, table
+
+FILES = Path(__file__).parents[1] / "files"
+KILLS = 6  # of a command that takes half a second
+ALL = 200  # in the studies
+
+
+def test_a_killed_comparison_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
+    import_commands()
+    names = ("calibration.yaml", "metrics.json")
+    other = ("validate", "--calibration", "HERE/calibration.yaml")
+    compared = (*other, "--compare", "HERE/calibration.yaml", "--out", "OUT")
+    command = Command("validate", compared, compared, tuple(FILES / each for each in names))
+    trial = prepared(command, tmp_path / "validate")
+    left = [killed(trial, Random(seed)) for seed in range(KILLS)]  # noqa: S311 - repeatable
+    assert not [each for each in left if each[0] in BAD]
+
+
+@pytest.mark.study
+def test_kills_at_random_moments(tmp_path: Path) -> None:
+    make_demo(tmp_path / "demo")
+    import_commands()
+    found = kill_all(commands(tmp_path, tmp_path / "demo"), ALL, tmp_path, seed=0)
+    print(table(found))
+    assert not {left for _, left in found} & set(BAD)

@@ -1,0 +1,135 @@
+"""Disks that are full in the middle of a command: what is left, and what the next run makes of it.
+
+``python -m tests.fuzz.full_disks --disks 20 --demo DEMO --out FOLDER``, as whoever may mount.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from random import Random
+
+from tests.fuzz.corpus import make_demo
+from tests.fuzz.runner import import_commands
+from tests.fuzz.trials import (
+    BAD,
+    NEW,
+    OLD,
+    Command,
+    Prepared,
+    commands,
+    hidden,
+    next_run,
+    prepared,
+    start,
+    state,
+    table,
+)
+
+PAGE = 4096  # that a small file takes
+ENOUGH = 1 << 29
+MENDABLE = 2
+
+
+def may_mount(folder: Path) -> bool:
+    """Return whether a small file system can be laid over a folder."""
+    try:
+        with small_disk(folder, 1 << 16):
+            return True
+    except (OSError, subprocess.CalledProcessError):
+        return False
+
+
+@contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[None]:
+    """Lay an empty file system of so many bytes over a folder; it is in memory."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _run("mount", "-t", "tmpfs", "-o", f"size={size}", "l2m", str(folder))
+    try:
+        yield
+    finally:
+        _run("umount", str(folder))
+
+
+def _run(*words: str) -> None:
+    subprocess.run([str(shutil.which(words[0])), *words[1:]], check=True, capture_output=True)
+
+
+def filled(trial: Prepared, random: Random) -> tuple[str, str]:
+    """Let the disk get full once; return what was left, and what is wrong with it."""
+    there, before = trial.there, trial.folder / "before"
+    shutil.rmtree(there, ignore_errors=True)
+    at_first, more = _taken(before), _taken(trial.folder / "after") - _taken(before)
+    # Half of the time what is written last, the results, is what finds no room.
+    last = min(more, _taken(trial.folder / "after" / "out"))
+    room = random.randrange(more) if random.random() < 0.5 else more - random.randrange(last)
+    with small_disk(there, at_first + room + PAGE):
+        shutil.copytree(before, there, dirs_exist_ok=True)
+        number = start(trial.command.words, there)
+        ended = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+        said = there.with_name("said.log").read_text(errors="replace").strip()
+        last_line = said.splitlines()[-1] if said else ""
+        if ended == MENDABLE and "No space left" not in last_line:
+            return "ends otherwise", last_line
+        if ended not in (0, 1, MENDABLE) or "Traceback" in said:
+            return "ends otherwise", f"{ended}: {said[-400:]}"
+        if stay := hidden(there):
+            return "hidden", ", ".join(stay)
+        left = state(trial)
+        if left not in (OLD, NEW):
+            return "mixture", f"{ended}: {left}"
+        _run("mount", "-o", f"remount,size={ENOUGH}", str(there))
+        wrong, why = next_run(trial)
+    return (wrong, why) if wrong else (f"{left}, exit code {ended}", "")
+
+
+def _taken(folder: Path) -> int:
+    """Return the bytes that a folder takes on a disk of pages."""
+    sizes = [each.stat().st_size if each.is_file() else PAGE for each in folder.rglob("*")]
+    return sum(-(-size // PAGE) * PAGE for size in sizes)
+
+
+def fill_all(
+    chosen: Sequence[Command], disks: int, folder: Path, seed: int
+) -> Counter[tuple[str, str]]:
+    """Fill disks under commands by their shares; return how often each left what."""
+    found: Counter[tuple[str, str]] = Counter()
+    whole = sum(each.share for each in chosen)
+    for command in chosen:
+        trial = prepared(command, folder / command.name.replace(" ", "_"))
+        shutil.copytree(trial.there, trial.folder / "after")
+        for number in range(max(1, round(disks * command.share / whole))):
+            left, wrong = filled(trial, Random(f"{seed} {command.name} {number}"))  # noqa: S311 - repeatable
+            found[command.name, left] += 1
+            print(f"{number}: {command.name}: {left} {wrong}", flush=True)
+        (folder / "table.md").write_text(table(found))
+    return found
+
+
+def main() -> None:
+    """Fill as the command line asks."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--disks", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", action="append", help="name of a command")
+    parser.add_argument("--demo", type=Path, required=True, help="folder of `l2m demo`")
+    parser.add_argument("--out", type=Path, required=True)
+    asked = parser.parse_args()
+    make_demo(asked.demo.resolve())
+    shutil.rmtree(asked.out, ignore_errors=True)
+    asked.out.mkdir(parents=True)
+    import_commands()
+    chosen = commands(asked.out.resolve(), asked.demo.resolve())
+    wanted = [each for each in chosen if not asked.only or each.name in asked.only]
+    found = fill_all(wanted, asked.disks, asked.out.resolve(), asked.seed)
+    print(table(found))
+    sys.exit(int(any(left in BAD for _, left in found)))
+
+
+if __name__ == "__main__":
+    main()
