@@ -1,6 +1,11 @@
 """The base of every options model: frozen, documented field by field, unknown keys refused."""
 
-from collections.abc import Collection
+import ast
+import inspect
+from collections.abc import Collection, Mapping
+from functools import cache
+from itertools import pairwise
+from textwrap import dedent
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -8,9 +13,36 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 class Options(BaseModel):
     """Options that stand beside their algorithm; ``config.py`` only composes them."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+@cache
+def meanings(model: type[BaseModel]) -> Mapping[str, str]:
+    """Return the docstring of each option of a model, those of its bases included.
+
+    Read from the source when they are asked for: for all models together that takes a tenth of a
+    second, at every start of a program that seldom asks.
+    """
+    found: dict[str, str] = {}
+    for each in reversed(model.__mro__):
+        if issubclass(each, BaseModel) and each.__module__ != BaseModel.__module__:
+            found |= _docstrings(each)
+    return found
+
+
+def _docstrings(model: type[BaseModel]) -> dict[str, str]:
+    """Return the strings that stand below the fields of a class."""
+    (body,) = ast.parse(dedent(inspect.getsource(model))).body
+    lines = body.body if isinstance(body, ast.ClassDef) else []
+    return {
+        field.target.id: inspect.cleandoc(text)
+        for field, below in pairwise(lines)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(below, ast.Expr)
+        and isinstance(below.value, ast.Constant)
+        and isinstance(text := below.value.value, str)
+    }
 
 
 def first_fault(error: ValidationError, *above: str, hidden: Collection[str] = ()) -> str:

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from l2m_gtsam.config import Config
-from l2m_gtsam.options import Options
+from l2m_gtsam.options import Options, meanings
 from l2m_gtsam.simulate.scenario import ScenarioOptions
 
 CONFIGURATION = """# Configuration
@@ -61,7 +61,7 @@ def _sections(model: type[BaseModel], prefix: str, values: BaseModel | None) -> 
     yield "\n"
     for name, inside in below.items():
         key = f"{prefix}.{name}{inside.through}".lstrip(".")
-        yield f"- [`{key}`](#{key}): {_text(model.model_fields[name].description or '')}\n"
+        yield f"- [`{key}`](#{key}): {_text(meanings(model).get(name, ''))}\n"
     for name, inside in below.items():
         key = f"{prefix}.{name}{inside.through}".lstrip(".")
         value = getattr(values, name, None)
@@ -72,7 +72,8 @@ def _row(model: type[BaseModel], name: str, values: BaseModel | None) -> str:
     field = model.model_fields[name]
     kind = _cell(kind_of(field.annotation) + limits_of(field))
     default = "required" if field.is_required() else f"`{_cell(_default(field, name, values))}`"
-    return f"| `{field.alias or name}` | {kind} | {default} | {_text(field.description or '')} |\n"
+    meaning = _text(meanings(model).get(name, ""))
+    return f"| `{field.alias or name}` | {kind} | {default} | {meaning} |\n"
 
 
 @dataclass(frozen=True)

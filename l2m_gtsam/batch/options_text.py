@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 from l2m_gtsam.batch.options_reference import inside_of, kind_of, limits_of
 from l2m_gtsam.config import Config
 from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.options import meanings
 
 WIDTH = 96
 HEAD = (
@@ -40,22 +41,32 @@ def _entries(
     fields = {field.alias or name: field for name, field in model.model_fields.items()}
     if wanted and wanted[0] not in fields:
         raise ConfigError(f"no option {wanted[0]!r}; there are: {', '.join(fields)}")
+    texts = {
+        field.alias or name: meanings(model)[name] for name, field in model.model_fields.items()
+    }
     for name, field in fields.items():
         if wanted and name != wanted[0]:
             continue
-        value = None if values is None else values[name]
-        yield from _entry(name, field, value, wanted[1:], indent, given=values is not None)
+        value, given = None if values is None else values[name], values is not None
+        yield from _entry(name, field, value, wanted[1:], indent, texts[name], given=given)
 
 
 def _entry(
-    name: str, field: FieldInfo, value: Any, wanted: list[str], indent: str, *, given: bool
+    name: str,
+    field: FieldInfo,
+    value: Any,
+    wanted: list[str],
+    indent: str,
+    meaning: str,
+    *,
+    given: bool,
 ) -> Iterator[str]:
     """Yield the lines of one option and, where it holds a model, of those inside."""
     inner = inside_of(field)
     kind = "" if inner else f" ({kind_of(field.annotation)}{limits_of(field)})"
     if not wanted:
         # A line without end would be no line: words of a name that has to stay whole.
-        text = " ".join((field.description or "").split()) + kind.replace("`", "")
+        text = " ".join(meaning.split()) + kind.replace("`", "")
         yield from (f"{indent}# {line}" for line in wrap(text, WIDTH - len(indent)))
     if inner is not None and not inner.through and isinstance(value, dict):
         yield f"{indent}{name}:"

@@ -8,7 +8,7 @@ count: the last answer is remembered, too.
 """
 
 from dataclasses import dataclass
-from threading import Lock
+from threading import Lock, local
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,9 @@ class LastFields:
     gradient: FloatArray
 
 
+NOTHING = LastFields(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
+
+
 class RememberedMap:
     """A map with a memory of the places that it was asked for; in all else the map itself.
 
@@ -44,7 +47,7 @@ class RememberedMap:
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
-        self._last = LastFields(np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
+        self._own = local()  # what a thread asked last is no use to another, which would forget it
 
     def __getattr__(self, name: str) -> Any:
         if name == "_map":  # before there is one, as when another process unpacks it
@@ -57,8 +60,7 @@ class RememberedMap:
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient; those of the last question or query are remembered."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        with self._lock:
-            last = self._last
+        last: LastFields = getattr(self._own, "last", NOTHING)
         at = rows_among(last.points, points)
         known = at >= 0
         if known.all():
@@ -66,8 +68,7 @@ class RememberedMap:
         field, gradient = np.empty((len(points), 3)), np.empty((len(points), 3, 3))
         field[known], gradient[known] = last.field[at[known]], last.gradient[at[known]]
         field[~known], gradient[~known] = self._map.field_and_gradient(points[~known])
-        with self._lock:
-            self._last = LastFields(points.copy(), field.copy(), gradient.copy())
+        self._own.last = LastFields(points.copy(), field.copy(), gradient.copy())
         return field, gradient
 
     def query(self, points: FloatArray, /) -> FieldSample:
@@ -75,8 +76,8 @@ class RememberedMap:
         points = np.ascontiguousarray(points, dtype=np.float64)
         with self._lock:
             sample = self._recalled(points)
-            inside = sample.inside
-            self._last = LastFields(points[inside], sample.field[inside], sample.gradient[inside])
+        inside = sample.inside
+        self._own.last = LastFields(points[inside], sample.field[inside], sample.gradient[inside])
         return sample
 
     def remember(self, points: FloatArray, sample: FieldSample) -> None:

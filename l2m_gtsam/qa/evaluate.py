@@ -14,9 +14,9 @@ from l2m_gtsam.calibration.one_key import solve_part
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.parallel.threads import in_threads, one_blas_thread, side_by_side
 from l2m_gtsam.progress import Progress, silent
-from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, metrics_of
+from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, SeenSensors, map_picture, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
 from l2m_gtsam.qa.metrics.repeatability import (
     PartialEstimate,
@@ -56,21 +56,38 @@ def evaluate(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    halves: dict[str, Halves] = {}
-    drives: dict[str, Repeatability] = {}
-    if qa.halves:
-        stage = "drives by themselves" if recording.drives else "halves of the drive"
-        progress(stage, 0.0)
-        if recording.drives:
-            drives = compared_drives(calibrated, recording, options, qa.half_readings)
-        else:
-            halves = compared_halves(calibrated, options, qa.half_readings)
-        progress(stage, 1.0)
-    progress(FIGURES, 0.0)
     evidence, maps = evidence_of(calibrated), maps_of(calibrated)
-    metrics = metrics_of(calibrated.result, evidence, recording, maps, Repeats(halves, drives))
+    seen = SeenSensors.of(calibrated.result, evidence, maps.along_drive)
+    # Parts are GTSAM's, who holds Python; the map leaves it alone.
+    repeats, picture = side_by_side(
+        lambda: repeats_of(recording, calibrated, options, qa, progress),
+        lambda: map_picture(maps.anywhere, seen.places),
+    )
+    progress(FIGURES, 0.0)
+    metrics = metrics_of(calibrated.result, seen, recording, picture, repeats)
     progress(FIGURES, 0.5)
     return metrics
+
+
+def repeats_of(
+    recording: Recording,
+    calibrated: Calibrated,
+    options: CalibrationOptions,
+    qa: QaOptions,
+    progress: Progress,
+) -> Repeats:
+    """Return what parts of a drive, or drives, say by themselves; parameters as ``evaluate``."""
+    if not qa.halves:
+        return Repeats({}, {})
+    stage = "drives by themselves" if recording.drives else "halves of the drive"
+    progress(stage, 0.0)
+    if recording.drives:
+        drives = compared_drives(calibrated, recording, options, qa.half_readings)
+        repeats = Repeats({}, drives)
+    else:
+        repeats = Repeats(compared_halves(calibrated, options, qa.half_readings), {})
+    progress(stage, 1.0)
+    return repeats
 
 
 def evidence_of(calibrated: Calibrated) -> DriveEvidence:
@@ -108,8 +125,8 @@ def compared_halves(
     middle = np.median(readings.stamp_ns)
     parts = (readings.stamp_ns < middle, readings.stamp_ns >= middle)
     try:
-        first, second = (
-            _parts(calibrated, readings.select(part), t, options, each_half) for part in parts
+        first, second = in_threads(
+            lambda part: _parts(calibrated, readings.select(part), t, options, each_half), parts
         )
     except (CalibrationError, np.linalg.LinAlgError) as error:
         # The whole is calibrated: that a half is not is no reason to lose it.

@@ -5,7 +5,7 @@ from typing import Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from l2m_gtsam.options import Options
+from l2m_gtsam.options import Options, meanings
 from l2m_gtsam.records.verdict import Level, Reason, Threshold
 
 UNIT = 1e-3  # a quaternion given to three digits is as long as this
@@ -42,10 +42,10 @@ def thresholds(
     options: Options, names: Iterable[str] | None = None, prefix: str = ""
 ) -> tuple[Threshold, ...]:
     """Return the limits among some options, all if none are named."""
-    fields = type(options).model_fields
+    model = type(options)
     return tuple(
-        Threshold(prefix + name, limit.warn, limit.fail, fields[name].description or "")
-        for name in names or fields
+        Threshold(prefix + name, limit.warn, limit.fail, meanings(model).get(name, ""))
+        for name in names or model.model_fields
         if isinstance(limit := getattr(options, name), Limit)
     )
 

@@ -10,6 +10,7 @@ from ruamel.yaml import YAML
 from l2m_gtsam.batch.options_reference import inside_of, pages
 from l2m_gtsam.batch.options_text import options_text
 from l2m_gtsam.config import Config, load_config
+from l2m_gtsam.options import meanings
 from l2m_gtsam.storage.inspect import inspect_bag
 from tests.drives.bags import Entry, ros, write
 from tests.support.command_line import complaint_here, ended, l2m
@@ -33,8 +34,8 @@ def test_all_options_are_a_configuration_of_defaults(tmp_path: Path) -> None:
 def described(model: type[BaseModel]) -> list[str]:
     """The first words of the sentence of every option."""
     found = []
-    for field in model.model_fields.values():
-        found.append(" ".join((field.description or "").split()[:3]))
+    for name, field in model.model_fields.items():
+        found.append(" ".join(meanings(model)[name].split()[:3]))
         if inner := inside_of(field):
             found += described(inner.model)
     return found

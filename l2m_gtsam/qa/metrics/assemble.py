@@ -44,11 +44,45 @@ class Repeats:
     drives: Mapping[str, Repeatability]
 
 
+@dataclass(frozen=True)
+class SeenSensors:
+    """What the map and a calibration make of a drive's readings.
+
+    Attributes
+    ----------
+    drive
+        All readings.
+    sensors
+        Of each sensor that was solved.
+    """
+
+    drive: DriveEvidence
+    sensors: dict[str, SensorEvidence]
+
+    @classmethod
+    def of(
+        cls, result: CalibrationResult, drive: DriveEvidence, field_map: Queryable
+    ) -> "SeenSensors":
+        """Return this of the sensors that were solved."""
+        solved = solved_sensors(result)
+        return cls(drive, {each.sensor: sensor_evidence(drive, each, field_map) for each in solved})
+
+    @property
+    def places(self) -> FloatArray:
+        """Where all of them were, metres, shape (N, 3)."""
+        return np.concatenate([each.place for each in self.sensors.values()])
+
+
+def solved_sensors(result: CalibrationResult) -> list[SensorCalibration]:
+    """Return the sensors of a calibration that were solved."""
+    return [each for each in result.sensors if each.residuals is not None]
+
+
 def metrics_of(
     result: CalibrationResult,
-    evidence: DriveEvidence,
+    seen: SeenSensors,
     recording: Recording,
-    maps: MapForms,
+    picture: MapPicture,
     repeats: Repeats,
 ) -> Metrics:
     """Return the figures of all sensors that were solved, and of the drive.
@@ -57,22 +91,21 @@ def metrics_of(
     ----------
     result
         The calibration.
-    evidence
+    seen
         Its readings.
     recording
         What was calibrated.
-    maps
-        The map.
+    picture
+        The map around them.
     repeats
         Comparisons of parts, as far as there are some.
     """
-    solved = [each for each in result.sensors if each.residuals is not None]
+    solved = solved_sensors(result)
     most = int(np.clip(DRAWN // max(len(solved), 1), FEWEST, MOST))
-    start_ns = starts_of(evidence)
-    seen = {each.sensor: sensor_evidence(evidence, each, maps.along_drive) for each in solved}
-    sensors = tuple(_sensor(each, seen[each.sensor], repeats, start_ns, most) for each in solved)
-    places = np.concatenate([each.place for each in seen.values()])
-    picture = map_picture(maps.anywhere, places)
+    start_ns = starts_of(seen.drive)
+    sensors = tuple(
+        _sensor(each, seen.sensors[each.sensor], repeats, start_ns, most) for each in solved
+    )
     bags = tuple(each.source.path for each in recording.drives) or None
     return Metrics(sensors, drive_metrics(recording), picture, bags)
 
