@@ -1,0 +1,1 @@
+"""Verdicts and sigmas where a drive or its survey is not as assumed."""

@@ -1,0 +1,100 @@
+"""Drives through a hall on which one thing, or everything, is not as assumed."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.simulate.hall_drives import calibration_drive
+from l2m_gtsam.studies.honesty.drives import drive_seed, driven, lasting
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
+from l2m_gtsam.studies.troubles.surveys import TroubledHall
+
+SENSORS = 2
+STRONG_UT = 50.0  # field of the Earth, at which a scale that is not linear is stated
+
+
+def troubled_drive(
+    options: TroublesOptions, place: TroubledHall, trouble: Trouble, number: int
+) -> tuple[Recording, tuple[KnownSensor, ...]]:
+    """Return a drive by its number as it was recorded, and the truth about its sensors.
+
+    All conditions have the same path, sensors and white noise.
+    """
+    seed = drive_seed(place.seed, number)
+    span = (min(options.heights), max(options.heights))
+    drive = driven(
+        calibration_drive(place.hall, seed, span, options.noise, SENSORS, options.readings)
+    )
+    rng, readings = np.random.default_rng([seed, 12]), drive.readings
+    change = np.zeros_like(readings.field)
+    for index in range(SENSORS):
+        rows = readings.rows_of(index)
+        seconds = 1e-9 * (readings.stamp_ns[rows] - readings.stamp_ns[rows.start])
+        change[rows] = disturbance(options, trouble, readings.field[rows], seconds, rng)
+    trajectory = drive.trajectory
+    if trouble.has(Trouble.WARP):
+        trajectory = bent(trajectory, options, rng)
+    if trouble.has(Trouble.POSES) or trouble is Trouble.POSES_STATED:
+        trajectory = misplaced(trajectory, options, rng)
+    series = tuple(
+        FieldSeries(
+            sensor.sensor,
+            f"/{sensor.sensor}",
+            sensor.sensor,
+            readings.stamp_ns[readings.rows_of(index)],
+            (readings.field + change)[readings.rows_of(index)],
+        )
+        for index, sensor in enumerate(drive.sensors)
+    )
+    source = SourceFile(f"hall-{place.seed}-drive-{number}", "")
+    return Recording(trajectory, series, source), drive.sensors
+
+
+def disturbance(
+    options: TroublesOptions,
+    trouble: Trouble,
+    field: FloatArray,
+    seconds: FloatArray,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Return what is added to a sensor's readings in uT, shape (N, 3)."""
+    change = np.zeros_like(field)
+    if trouble.has(Trouble.DRIFT):
+        step = np.sqrt(np.diff(seconds, prepend=0.0) / seconds[-1])[:, None]
+        change += options.drift_ut * np.cumsum(step * rng.standard_normal(field.shape), axis=0)
+    if trouble.has(Trouble.PINK):
+        change += options.pink_ut * pink(len(field), rng)
+    if trouble.has(Trouble.NONLINEAR):
+        sign = rng.choice([-1.0, 1.0], 3)
+        change += sign * options.nonlinear * field * np.abs(field) / STRONG_UT
+    return change
+
+
+def pink(count: int, rng: np.random.Generator) -> FloatArray:
+    """Return noise of a power that falls with frequency, of unit variance, shape (N, 3)."""
+    spectrum = np.fft.rfft(rng.standard_normal((count, 3)), axis=0)
+    frequency = np.fft.rfftfreq(count)
+    spectrum[1:] /= np.sqrt(frequency[1:, None])
+    spectrum[0] = 0.0
+    noise = np.fft.irfft(spectrum, count, axis=0)
+    return np.asarray(noise / noise.std(axis=0))
+
+
+def bent(true: Trajectory, options: TroublesOptions, rng: np.random.Generator) -> Trajectory:
+    """Return poses in a frame that is bent: a slow wave along x and along y."""
+    wave = 2 * np.pi / options.warp_length_m
+    phase = rng.uniform(-np.pi, np.pi, (2, 2))
+    along = np.sin(wave * true.p[:, None, :2] + phase).mean(axis=2)
+    shift = np.column_stack([options.warp_m * along, np.zeros(len(along))])
+    return replace(true, p=true.p + shift)
+
+
+def misplaced(true: Trajectory, options: TroublesOptions, rng: np.random.Generator) -> Trajectory:
+    """Return poses that are wrong by errors that last: true = measured Exp(error)."""
+    seconds: FloatArray = 1e-9 * (true.stamp_ns - true.stamp_ns[0]).astype(np.float64)
+    sigmas = np.repeat([np.deg2rad(options.pose_deg), options.pose_m], 3)
+    turn, shift = np.split(lasting(seconds, options.pose_s, rng) * sigmas, 2, axis=1)
+    R = true.R @ Rotation.from_rotvec(-turn).as_matrix()
+    return replace(true, R=R, p=true.p - np.einsum("nij,nj->ni", R, shift))

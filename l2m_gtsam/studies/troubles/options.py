@@ -1,0 +1,92 @@
+"""Size of the troubles study, and what goes wrong in it."""
+
+from enum import StrEnum
+
+import numpy as np
+from pydantic import Field
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.build import MapOptions
+from l2m_gtsam.options import Options
+
+
+class Trouble(StrEnum):
+    """What is not as assumed on a drive or its survey."""
+
+    CLEAN = "clean"
+    """Nothing."""
+    SUITE = "suite"
+    """The survey's sensors are off, and count as exact."""
+    SUITE_STATED = "suite-stated"
+    """The same, and their sigmas are stated."""
+    POSES = "poses"
+    """Poses of the drive are wrong by errors that last, and count as exact."""
+    POSES_STATED = "poses-stated"
+    """The same, and their sigmas are stated."""
+    WARP = "warp"
+    """The map's frame is bent between survey and drive."""
+    DRIFT = "drift"
+    """H wanders on the drive."""
+    PINK = "pink"
+    """Noise of the sensors that lasts, beside the white one."""
+    NONLINEAR = "nonlinear"
+    """Readings are off by a share of themselves that grows with them."""
+    ALL = "all"
+    """All that is not stated, together."""
+
+    @property
+    def wrong_suite(self) -> bool:
+        """Whether the survey's sensors are off."""
+        return self in (Trouble.SUITE, Trouble.SUITE_STATED, Trouble.ALL)
+
+    def has(self, other: "Trouble") -> bool:
+        """Whether a drive has another trouble, too."""
+        return self in (other, Trouble.ALL)
+
+
+class TroublesOptions(Options):
+    """Size and conditions of the study."""
+
+    seed: int = Field(default=700, ge=0)
+    """Of the first hall; the others follow it one by one."""
+    surveys: int = Field(default=10, ge=2)
+    """Halls, each with its surveys and maps: what is independent."""
+    drives: int = Field(default=4, ge=1)
+    """On each map, each with two sensors of random place and distortion."""
+    noise: float = Field(default=0.2, gt=0)
+    """Of survey and drives alike in uT."""
+    readings: int = Field(default=600, ge=100)
+    """Of each sensor of a drive."""
+    heights: tuple[float, ...] = Field(default=(0.4, 0.7, 1.0), min_length=1)
+    """Of the suite's sensors over the floor in metres; those of a drive sit between them."""
+    survey_readings: int = Field(default=1500, ge=30)
+    """Of a survey."""
+    suite_t_m: float = Field(default=0.003, gt=0)
+    """Standard deviation of the suite's places in metres, each coordinate."""
+    suite_C: float = Field(default=0.005, gt=0)
+    """Of each entry of its C: scale and 0.3 degrees."""
+    suite_H_ut: float = Field(default=0.3, gt=0)
+    """Of its H in uT."""
+    pose_m: float = Field(default=0.007, gt=0)
+    """Standard deviation of a drive's positions in metres, each coordinate."""
+    pose_deg: float = Field(default=0.15, gt=0)
+    """Of its rotations in degrees, about each axis."""
+    pose_s: float = Field(default=2.0, gt=0)
+    """How long these errors last, seconds."""
+    warp_m: float = Field(default=0.02, gt=0)
+    """Amplitude of the warp in metres, along x and y."""
+    warp_length_m: float = Field(default=20.0, gt=0)
+    """Length of its wave in metres."""
+    drift_ut: float = Field(default=0.3, gt=0)
+    """By how much H has wandered at the end of a drive, uT, standard deviation of each axis."""
+    pink_ut: float = Field(default=0.2, gt=0)
+    """Standard deviation of pink noise in uT."""
+    nonlinear: float = Field(default=0.002, gt=0)
+    """Share by which a reading of 50 uT is off, along each axis."""
+    map: MapOptions = MapOptions()
+    """How the map is made of the survey, and of the structure that the LiDAR saw."""
+
+    @property
+    def suite_sigmas(self) -> FloatArray:
+        """Of (t, C row by row, H, time offset), shape (16,)."""
+        return np.repeat([self.suite_t_m, self.suite_C, self.suite_H_ut, 0.0], [3, 9, 3, 1])
