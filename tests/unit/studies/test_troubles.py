@@ -1,0 +1,109 @@
+"""What is wrong on the drives of the troubles study, and what its summary counts."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import Trajectory
+from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.simulate.steel_hall import steel_hall
+from l2m_gtsam.studies.troubles.cells import Judged, TroublesCell
+from l2m_gtsam.studies.troubles.drives import bent, disturbance, pink
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
+from l2m_gtsam.studies.troubles.study import TROUBLES, kind, split
+from l2m_gtsam.studies.troubles.surveys import known_suite, survey_of
+
+OPTIONS = TroublesOptions(surveys=2, drives=1)
+
+
+def test_pink_noise_falls_with_frequency() -> None:
+    noise = pink(4096, np.random.default_rng(0))
+    np.testing.assert_allclose(noise.std(axis=0), 1.0)
+    power = (np.abs(np.fft.rfft(noise, axis=0)) ** 2).mean(axis=1)
+    slow, fast = power[8:32].mean(), power[512:2048].mean()
+    # One over frequency: 18 against 1,180 on average, by 90 draws of exponentials and more.
+    assert slow / fast == pytest.approx(65, rel=0.35)
+
+
+def test_each_trouble_is_of_the_size_that_is_told() -> None:
+    rng, count = np.random.default_rng(1), 400
+    field, seconds = rng.normal(0, 30, (count, 3)), np.linspace(0, 60, count)
+    size = {
+        trouble: np.concatenate(
+            [disturbance(OPTIONS, trouble, field, seconds, rng) for _ in range(40)], axis=1
+        )
+        for trouble in Trouble
+    }
+    for trouble in (Trouble.CLEAN, Trouble.SUITE, Trouble.POSES, Trouble.WARP):
+        assert not size[trouble].any()
+    # 120 draws of a normal number.
+    assert size[Trouble.DRIFT][-1].std() == pytest.approx(OPTIONS.drift_ut, rel=0.25)
+    assert size[Trouble.PINK].std() == pytest.approx(OPTIONS.pink_ut, rel=0.01)
+    expected = OPTIONS.nonlinear * np.abs(field) * np.abs(field) / 50
+    np.testing.assert_allclose(np.abs(size[Trouble.NONLINEAR][:, :3]), expected)
+    assert (size[Trouble.ALL].std(axis=0) > size[Trouble.PINK].std(axis=0).min()).mean() > 0.8
+
+
+def test_a_bent_frame_moves_places_and_turns_nothing() -> None:
+    at = np.linspace(0, 50, 200)
+    R = np.broadcast_to(np.eye(3), (200, 3, 3))
+    p = np.column_stack([5 * np.cos(at), 3 * np.sin(at), 0 * at])
+    true = Trajectory((1e9 * at).astype(np.int64), R, p, "map", "lidar")
+    moved = bent(true, OPTIONS, np.random.default_rng(2))
+    np.testing.assert_array_equal(moved.R, true.R)
+    shift = moved.p - true.p
+    assert not shift[:, 2].any()
+    assert 0 < np.abs(shift).max() <= OPTIONS.warp_m
+
+
+def test_a_survey_reads_where_its_suite_is() -> None:
+    hall = steel_hall(OPTIONS.seed)
+    survey, suite = survey_of(hall, OPTIONS.seed, OPTIONS), known_suite(OPTIONS)
+    points, field = survey.given(suite, hall, OPTIONS, off=False)
+    expected = hall.world.field(points)
+    read = np.einsum("nij,nj->ni", survey.R, field)
+    # Readings of 0.2 uT of noise and no other error.
+    assert (read - expected).std() == pytest.approx(OPTIONS.noise, rel=0.05)
+    _, wrong = survey.given(suite, hall, OPTIONS, off=True)
+    # 0.3 uT of H and half a per cent of 50 uT, nine at a time, of three sensors.
+    assert 0.2 < (wrong - field).std() < 1.0
+
+
+def judged(level: Level, distance: float | None) -> Judged:
+    known = None if distance is None else 0.01
+    return Judged(level.value, distance, distance, known, known, 1.0)
+
+
+def test_conditions_are_counted() -> None:
+    cells = {
+        key: TroublesCell(
+            split(key)[1],
+            split(key)[0],
+            (judged(Level.PASS, 10.0), judged(Level.WARN, 1000.0), judged(Level.FAIL, None)),
+        )
+        for key in TROUBLES.keys(OPTIONS)
+    }
+    summary = TROUBLES.summarise(OPTIONS, cells)
+    assert [row.trouble for row in summary.rows] == list(Trouble)
+    for row in summary.rows:
+        assert row.levels == (2, 2, 2)
+        assert row.determined == 4
+        assert row.nees == 505.0
+        assert row.passed is not None
+        assert row.passed.rate == 1.0
+        assert row.passed_t is not None
+        assert row.passed_t.rate == 0.0  # 10 is beyond 7.8
+        assert row.held is not None
+        assert row.held.rate == 0.5
+    page = TROUBLES.page(summary)
+    assert "| suite-stated | 2, 2, 2 |" in page
+    assert set(TROUBLES.figures(summary)) == {"troubles"}
+
+
+def test_conditions_of_one_map_follow_each_other() -> None:
+    """The map of a survey is made once."""
+    sites = [TROUBLES.site(OPTIONS, key) for key in TROUBLES.keys(OPTIONS)]
+    changes = sum(a != b for a, b in pairwise(sites))
+    assert changes == len(set(sites)) - 1
+    assert kind(Trouble.ALL) is Trouble.SUITE
