@@ -168,5 +168,8 @@ def key_pose_residuals(
     R_lidar_key = R.transpose(0, 2, 1)
     t_key_mag = np.einsum("nij,nj->ni", R, t) + p
     by_shift = seen.de_dt @ R_lidar_key
+    # x = R_map_key t_key_mag + p_map_key. A right perturbation w of the key pose turns the field
+    # seen by -w, so that b gains [b]_x w, and carries the sensor by -[t_key_mag]_x w; the map's
+    # slope turns that into field.
     by_turn = C @ skew(seen.b_lidar) @ R_lidar_key - by_shift @ skew(t_key_mag)
     return KeyPoseResiduals(seen, np.concatenate([by_turn, by_shift], axis=2))

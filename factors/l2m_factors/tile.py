@@ -118,6 +118,8 @@ class TileBatch(KeyPoseBatch):
         if key_pose == self._anchor:
             return blocks
         by_key = residuals.de_dX[rows]
+        # With A the anchor, (A exp(a))^-1 X = A^-1 X exp(-Ad(X^-1 A) a): Sola, Deray, Atchuthan, "A
+        # micro Lie theory for state estimation in robotics", 2018, on the adjoint.
         return [by_key, -by_key @ relative.inverse().AdjointMap(), *blocks]
 
     def places(self, values: gtsam.Values, key_pose: int) -> TilePlaces:
@@ -141,6 +143,7 @@ class TileBatch(KeyPoseBatch):
         blocks = self._variables.place_jacobians(R @ where.R_key_lidar, self._rows[key_pose])
         if key_pose == self._anchor:
             return blocks
+        # R exp(w) t = R t - R [t]_x w; a right shift goes along the axes of the key pose.
         by_key = np.concatenate([-R @ skew(where.t_key), np.tile(R, (n, 1, 1))], axis=2)
         return [by_key, -by_key @ where.T_anchor_key.inverse().AdjointMap(), *blocks]
 

@@ -8,16 +8,15 @@ import numpy as np
 from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem, solve_moving
-from l2m_gtsam.calibration.named_priors import priors_of
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
+from l2m_gtsam.calibration.prior_options import priors_of
 from l2m_gtsam.calibration.priors import Priors
-from l2m_gtsam.calibration.remembered_map import RememberedMap
 from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
 from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
@@ -33,8 +32,8 @@ from l2m_gtsam.records.calibration import (
     SensorCalibration,
     SensorStatus,
 )
-from l2m_gtsam.solve.disagreement import disagreements
 from l2m_gtsam.solve.explain import movement
+from l2m_gtsam.solve.robust import disagreements
 
 VERSIONED = ("l2m-gtsam", "gtsam", "numpy", "scipy", "rosbags")
 

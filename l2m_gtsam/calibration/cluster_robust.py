@@ -99,6 +99,7 @@ class Scores:
         """
         sigma = np.sqrt(np.diag(covariance)[block])
         correlation = covariance[block, block] / np.outer(sigma, sigma)
+        # Sum of squares in the metric of P: which axes the block is written in does not matter.
         lower = cholesky(correlation, lower=True)
         white = solve_triangular(lower, np.diag(1 / sigma), lower=True)
         found = float(((self.found[:, block] @ white.T) ** 2).sum())

@@ -236,6 +236,7 @@ def cover(view: View, errors: UncertainMap, estimate: Estimate, correlation_s: f
     tiles = list(map_errors.sizes())
     for tile, (rows, features, common) in zip(tiles, in_threads(asked, tiles), strict=True):
         shared = np.einsum("nir,nir->ni", features, features)
+        # beta has unit variance in each tile: A A^T is what it explains, the rest is noise.
         rest[rows] = np.maximum(view.map_variance[rows] - shared, 0.0)
         for own in together(readings, segment, rows, whole=knots is None):
             first = rows[own[0]]

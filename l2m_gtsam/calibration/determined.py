@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag, solve_triangular
 
-from l2m_gtsam.calibration.marginals import clusters_of
+from l2m_gtsam.calibration.optimise import clusters_of
 from l2m_gtsam.calibration.priors import HOLD_S, Prior, Priors, prior_rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_among, rows_in
 from l2m_gtsam.data import FloatArray

@@ -169,6 +169,7 @@ def pose_share(
 
 def _inverse_root(covariance: FloatArray) -> FloatArray:
     """Return the lower triangular W with ``W S W^T = I``."""
+    # S = K K^T, hence W = K^-1: rows that stay in order of time, each less what those before say.
     inverse, _ = dtrtri(np.linalg.cholesky(covariance), lower=1)
     return np.ascontiguousarray(inverse)
 

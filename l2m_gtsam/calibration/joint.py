@@ -9,7 +9,6 @@ import numpy as np
 from l2m_factors import BatchedReadings
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.cluster_robust import Excess, unmodelled
-from l2m_gtsam.calibration.contradictions import Contradiction, contradictions
 from l2m_gtsam.calibration.determined import determinacies
 from l2m_gtsam.calibration.factor_graph import (
     Estimate,
@@ -19,20 +18,26 @@ from l2m_gtsam.calibration.factor_graph import (
     whitened_jacobian,
 )
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
-from l2m_gtsam.calibration.marginals import covariance_by_qr, joint_covariance
 from l2m_gtsam.calibration.moving_fields import Correction
-from l2m_gtsam.calibration.optimise import Ending, optimise, polish
+from l2m_gtsam.calibration.optimise import (
+    Ending,
+    covariance_by_qr,
+    joint_covariance,
+    optimise,
+    polish,
+)
 from l2m_gtsam.calibration.pose_errors import error_of_poses
+from l2m_gtsam.calibration.priors import Contradiction, contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.calibration import EXPLAINED, ResidualFigures, Unmodelled
-from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.noise import (
     HALF,
     estimate_noise,
     map_covariance,
     reading_covariance,
+    residual_figures,
     whitening,
 )
 from l2m_gtsam.solve.rank import Determinacy

@@ -30,10 +30,16 @@ from l2m_gtsam.calibration.joint import (
 )
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.remembered_map import RememberedMap, remembered
 from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
-from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
+from l2m_gtsam.calibration.view import (
+    QueryableMap,
+    RememberedMap,
+    View,
+    observe,
+    places_of,
+    remembered,
+)
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings, Trajectory
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent

@@ -98,6 +98,9 @@ class PoseKnots:
         return np.clip(seconds - self.seconds[segment], 0.0, spacing), spacing
 
     def _weights(self, after: FloatArray, spacing: FloatArray) -> FloatArray:
+        # An Ornstein-Uhlenbeck process is Markov: between two knots it depends on these alone.
+        # With q = exp(-gap / tau) the weights are [q_a, q_b] times the inverse of [[1, q], [q, 1]];
+        # expm1 keeps the digits of 1 - q^2 where knots are close.
         whole = -np.expm1(-2 * spacing / self.correlation_s)
         return np.column_stack(
             [
@@ -141,6 +144,7 @@ def pose_features(
     t
         Position of the sensor in the lidar frame in metres, shape (N, 3).
     """
+    # b = R^T B(R t + p) under a right perturbation of the pose; see ``key_pose_residuals``.
     turn = skew(b_lidar) - slope @ skew(t)
     return np.asarray(np.concatenate([turn, slope], axis=2) @ pose_root)
 

@@ -12,9 +12,16 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.view import QueryableMap, View, places_of
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
-from l2m_gtsam.solve.disagreement import Judged
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
-from l2m_gtsam.solve.robust import WEIGHTS, Loss, RobustOptions, consistent, grown, median_noise
+from l2m_gtsam.solve.robust import (
+    WEIGHTS,
+    Judged,
+    Loss,
+    RobustOptions,
+    consistent,
+    grown,
+    median_noise,
+)
 
 # Stages of the graduation; what is wrong by far is left out before, so that few are enough.
 GRADUATION = (1.0, 10.0, float("inf"))

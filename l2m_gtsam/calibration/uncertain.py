@@ -21,7 +21,6 @@ import numpy as np
 from l2m_factors import D, Q, U, UncertainReadings, uncertain_block_factor, uncertain_reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.cluster_robust import unmodelled
-from l2m_gtsam.calibration.contradictions import contradictions
 from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
@@ -33,22 +32,22 @@ from l2m_gtsam.calibration.joint_information import (
     joint_information,
     rows_of_factors,
 )
-from l2m_gtsam.calibration.marginals import joint_covariance
 from l2m_gtsam.calibration.moving_fields import Correction, moving_fields
 from l2m_gtsam.calibration.optimise import (
     TOLERANCE,
     Ending,
     LinearSolver,
     Optimised,
+    joint_covariance,
     optimise,
     polish,
 )
+from l2m_gtsam.calibration.priors import contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_of, keys_of
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.solve.figures import residual_figures
 from l2m_gtsam.solve.linear_algebra import covariance_root
-from l2m_gtsam.solve.noise import HALF, estimate_noise
+from l2m_gtsam.solve.noise import HALF, estimate_noise, residual_figures
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6

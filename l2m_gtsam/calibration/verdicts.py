@@ -6,11 +6,11 @@ import numpy as np
 from scipy.special import chdtri
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.contradictions import Contradiction
 from l2m_gtsam.calibration.explanation import Explained
 from l2m_gtsam.calibration.moving_solve import MovingSolution
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.calibration.priors import Contradiction
 from l2m_gtsam.data import Distortion, Readings, SyncCounts, Synchronised
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import FoundStart, SensorCalibration, SensorStatus, TimeOffset

@@ -21,7 +21,7 @@ from l2m_gtsam.records.calibration import (
     TimeOffset,
     Uncertainty,
 )
-from l2m_gtsam.solve.figures import residual_figures
+from l2m_gtsam.solve.noise import residual_figures
 from l2m_gtsam.solve.rotation import polar_rotation
 
 REACH = 5.0  # standard deviations of a clock for which readings need poses around them

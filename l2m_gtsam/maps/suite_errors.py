@@ -110,6 +110,7 @@ class SuiteErrors:
         at = np.searchsorted(rows, self.reading)
         known = np.flatnonzero(rows[np.minimum(at, len(rows) - 1)] == self.reading)
         n, at = len(rows), at[known]
+        # A reading that was taken elsewhere stands for the field here less what lies between: G dx.
         change = self.shift[known, 3:] - gradient[at] @ self.shift[known, :3]
         effect = np.zeros((n, len(self.sensors), 3, SIZE))
         effect[at, self.sensor[known]] = change  # each pair is there once

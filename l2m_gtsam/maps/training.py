@@ -194,6 +194,8 @@ def merged(readings: TrainingSet, edge: float, independent: int) -> TrainingSet:
         The most that the readings of one cube are worth.
     """
     owner = cubes_of(readings.points, edge)
+    # Weighted means are what all readings of a cube are worth together where the field is linear
+    # in it; beyond ``independent`` they share errors that no average removes.
     worth = np.bincount(owner, readings.weight)
     columns = (np.hstack([readings.points, readings.field]) * readings.weight[:, None]).T
     means = np.column_stack([np.bincount(owner, column) for column in columns]) / worth[:, None]

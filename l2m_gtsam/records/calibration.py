@@ -14,9 +14,26 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
-from l2m_gtsam.records.drive_trace import DriveTrace
+from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
+
+
+@dataclass(frozen=True)
+class DriveTrace(Record):
+    """Some poses of a drive, spread evenly over it.
+
+    Attributes
+    ----------
+    stamp_ns
+        Times in nanoseconds, strictly increasing, shape (N,).
+    p
+        Positions of the lidar in the map in metres, shape (N, 3).
+    """
+
+    stamp_ns: tuple[int, ...]
+    p: tuple[tuple[float, ...], ...]
+
 
 Row15 = Annotated[list[float], Field(min_length=15, max_length=15)]
 Rows16 = Annotated[list[list[float]], Field(min_length=16, max_length=16)]

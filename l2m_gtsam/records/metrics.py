@@ -14,6 +14,9 @@ Row = tuple[float, ...]
 Rows = tuple[Row, ...]
 
 
+FAR = 1e8  # metres: further than any place of the Earth from another
+
+
 @dataclass(frozen=True)
 class Halves(Record):
     """One sensor calibrated on two parts: halves of a drive, or the other drives and one drive.
@@ -415,6 +418,13 @@ class MapPicture(Record):
     height: float
     strength: Rows
     sigma: Rows
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError for a place that cannot be drawn."""
+        super().__post_init__()
+        left, right, bottom, top = self.extent
+        if not (-FAR <= left <= right <= FAR and -FAR <= bottom <= top <= FAR):
+            raise ValueError(f"extent is {self.extent}, no place of at most {FAR:g} m")
 
 
 @dataclass(frozen=True)

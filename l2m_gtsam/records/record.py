@@ -1,10 +1,15 @@
 """What all records that are files have in common: numbers as JSON has them, arrays that fit."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from pydantic import ConfigDict
+
+# Squares and sums of such numbers are finite; no quantity is nearly as large in any unit.
+LARGEST = 1e30
+HUGE = 10**300  # that integers are taken for which are no floats
 
 
 def _fits(value: Sequence[Any], shape: Sequence[str], lengths: dict[str, int]) -> bool:
@@ -19,6 +24,15 @@ def _fits(value: Sequence[Any], shape: Sequence[str], lengths: dict[str, int]) -
     return len(shape) == 1 or all(_fits(row, shape[1:], lengths) for row in value)
 
 
+def _largest(value: Any) -> float:
+    """Return the largest finite number in rows of rows."""
+    if isinstance(value, tuple | list):
+        return max(map(_largest, value), default=0.0)
+    if isinstance(value, int):
+        return float(min(abs(value), HUGE))
+    return abs(value) if isinstance(value, float) and math.isfinite(value) else 0.0
+
+
 @dataclass(frozen=True)
 class Record:
     """A part of a file in JSON; numbers that are not finite are text there."""
@@ -31,7 +45,7 @@ class Record:
     """
 
     def __post_init__(self) -> None:
-        """Raise a ValueError for arrays whose shapes do not fit together."""
+        """Raise a ValueError for arrays whose shapes do not fit together, or with odd numbers."""
         lengths: dict[str, int] = {}
         for name, shape in self.SHAPES.items():
             value = self._array(name)
@@ -39,6 +53,8 @@ class Record:
                 known = ", ".join(f"{letter} = {length}" for letter, length in lengths.items())
                 where = f" with {known}" if known else ""
                 raise ValueError(f"{name} must have the shape ({shape}){where}")
+            if (largest := _largest(value)) > LARGEST:
+                raise ValueError(f"{name} has {largest:.3g}, at most {LARGEST:g} can be")
 
     def _array(self, name: str) -> Any:
         """Return a field, or one of a record in this one; None if either is absent."""

@@ -183,6 +183,7 @@ def predict(field_map: QueryableMap, where: PlacedReadings, sensors: KnownSensor
     b = np.einsum("nij,nj->ni", R_back, sample.field)
     predicted = np.einsum("nij,nj->ni", where.C, b) + sensors.distortion[at.sensor, 9:]
     by_shift = R_back @ sample.gradient @ at.R_map_lidar
+    # As of a key pose (``key_pose_residuals``), here by a right perturbation of the lidar itself.
     by_turn = skew(b) - by_shift @ skew(sensors.t[at.sensor])
     by_lidar = where.C @ np.concatenate([by_turn, by_shift], axis=2)
     by_lidar[~sample.inside] = 0.0
@@ -246,6 +247,8 @@ class SharedMapErrors:
             own = np.flatnonzero(owner[rows] == tile)
             A = found.features(x[own], tile)
             held = np.einsum("nir,nir->ni", A, A)
+            # The weights carry A A^T of the variance; what they leave is noise of each reading:
+            # nothing counts twice.
             rest[rows[own]] = np.maximum(rest[rows[own]] - held, 0.0)
             features[tile] = R[own].transpose(0, 2, 1) @ A
         lower = np.linalg.cholesky(found.covariance)

@@ -170,6 +170,8 @@ def solve_pose_graph(drive: Drive, confidence: float) -> PoseGraph:
 def _params(sure: int) -> gtsam.GncLMParams:
     """Return settings with which so many first factors are taken for true."""
     params = gtsam.GncLMParams()
+    # Truncated least squares: beyond its threshold a wrong link pulls no more (Yang, Antonante,
+    # Tzoumas, Carlone, "Graduated non-convexity for robust spatial perception", 2020).
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers(list(range(sure)))
     return params

@@ -1,10 +1,11 @@
-"""The noise of readings: what the map and the sensor contribute, and how large the sensor's is."""
+"""The noise of readings: what map and sensor contribute, how large it is, and what a fit leaves."""
 
 import numpy as np
 from numba import njit
 from scipy.optimize import brentq
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.records.calibration import ResidualFigures
 
 # Search range for a sensor's noise in uT: from below the resolution of any vehicle's magnetometer
 # to above the Earth's field.
@@ -121,3 +122,29 @@ def estimate_noise(residual: FloatArray, map_variance: FloatArray, taken: float)
     if score(high) <= 0:
         return NOISE_RANGE[1]
     return float(np.exp(brentq(score, low, high, xtol=1e-6)))
+
+
+def residual_figures(residual: FloatArray, whitening: FloatArray, taken: float) -> ResidualFigures:
+    """Summarise the residuals of one sensor.
+
+    Parameters
+    ----------
+    residual
+        ``C b + H - z`` in uT, shape (N, 3).
+    whitening
+        Matrices that make them white, shape (N, 3, 3).
+    taken
+        Degrees of freedom that the fit took; see ``estimate_noise``.
+    """
+    norm = np.linalg.norm(residual, axis=1)
+    white = np.einsum("nij,nj->ni", whitening, residual)
+    freedom = max(residual.size - taken, 1)
+    return ResidualFigures(
+        readings=len(residual),
+        rms_axes=np.sqrt(np.mean(residual**2, axis=0)),
+        rms=float(np.sqrt(np.mean(norm**2))),
+        median_norm=float(np.median(norm)),
+        p95_norm=float(np.quantile(norm, 0.95)),
+        max_norm=float(norm.max()),
+        chi2_per_dof=float(np.sum(white**2) / freedom),
+    )

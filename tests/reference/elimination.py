@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-from l2m_gtsam.calibration.marginals import clusters_of
+from l2m_gtsam.calibration.optimise import clusters_of
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_among, columns_of, rows_in
 from l2m_gtsam.data import FloatArray, IntArray
 

@@ -13,13 +13,12 @@ from pydantic import Field
 from scipy.ndimage import minimum_filter
 
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.start.candidates import Candidates
+from l2m_gtsam.calibration.start.candidates import Candidates, NearestReadings
 from l2m_gtsam.calibration.start.descent import Basin, StartProblem, descend
 from l2m_gtsam.calibration.start.rigid_groups import Bounds, Rigid, bounded, pooled, rigid_groups
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.maps.field_map import Surveyed
-from l2m_gtsam.maps.nearest import NearestReadings
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.records.calibration import FoundStart

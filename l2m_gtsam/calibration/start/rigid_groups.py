@@ -135,6 +135,7 @@ def pooled(left: FloatArray, groups: Sequence[Rigid], step: float) -> FloatArray
             if np.isfinite(left[..., sensor]).any()
         ]
         if parts:
+            # Profile likelihoods multiply; of n readings each goes as rms^-3n, any noise.
             mean = np.exp(np.mean(parts, axis=0))
             for sensor, shift in zip(group.sensors, shifts, strict=True):
                 left[..., sensor] = moved(mean, -shift)

@@ -147,6 +147,8 @@ class BilinearMap:
         old = self.readings
         cells = averaged(joined(old, new), self.options)
         lattice = lattice_over(cells, self.options)
+        # About its cell's mean a reading scatters as much as ever; by Steiner's theorem the squares
+        # about two interpolants differ by those of the means alone.
         squares = 3 * float(old.weight.sum()) * self.spread
         squares += squares_about(lattice, old) - squares_about(self.lattice, old)
         squares = max(squares, 0.0) + squares_about(lattice, new)

@@ -172,6 +172,8 @@ def count_boxes(first: IntArray, last: IntArray, counts: IntArray) -> None:
     for n in range(len(first)):
         i, j, k = first[n]
         u, v, w = last[n] + 1
+        # Signs at the corners by inclusion and exclusion: running sums along the axes, below, then
+        # count one inside of the box and none outside (summed-area tables, Crow 1984).
         counts[i, j, k] += 1
         counts[u, v, k] += 1
         counts[u, j, w] += 1

@@ -99,6 +99,7 @@ def write_shares(
                 total += product
                 count += 1
         for each in range(first, count):
+            # At the rim of the map some of the four neighbours are missing.
             share[each] /= total
         if count == first:
             rows[count], tiles[count], share[count] = n, -1, 1.0
@@ -109,6 +110,8 @@ def write_shares(
 @njit(cache=True, nogil=True)
 def ramp(within: float) -> float:
     """Return a share along one axis, twice differentiable, at a fraction of the band's width."""
+    # The shortest polynomial from 0 to 1 whose first and second derivatives vanish at both ends:
+    # a blended gradient has no kink that a solver's steps could catch on.
     r = min(max(within, 0.0), 1.0)
     return float(r * r * r * (10 + r * (6 * r - 15)))
 

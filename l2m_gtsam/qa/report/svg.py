@@ -111,6 +111,7 @@ def as_svg(figure: Any, name: str, alt: str) -> Markup:
 @as_svg.register
 def _(figure: Figure, name: str, alt: str) -> Markup:
     stream = StringIO()
+    lay_out(figure)
     figure.savefig(
         stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
     )
@@ -164,8 +165,20 @@ def plain_decades(axis: Axis, wide: bool) -> None:
 
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, whole or not at all."""
+    lay_out(figure)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png")
+
+
+def lay_out(figure: Figure) -> None:
+    """Place the axes of a figure for good.
+
+    Saved with an engine that would place them, it is drawn once more for nothing.
+    """
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        engine.execute(figure)
+        figure.set_layout_engine(None)
 
 
 def short_name(name: str) -> str:

@@ -246,6 +246,8 @@ def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> floa
                 r2 += r[axis] ** 2
             slope = nodes.slope[row]
             tolerance = slope * pattern.moved[n] + pattern.turned[n] + nodes.curvature[row]
+            # What the cell and the step of heading may hide counts as noise: no true place is
+            # lost to the coarseness of the search.
             s2 = pattern.variance[n] + nodes.variance[row] + slope**2 * pattern.drift2[n]
             s2 += tolerance**2
             x, y, z = pattern.field[n, 0], pattern.field[n, 1], pattern.field[n, 2]
@@ -259,6 +261,8 @@ def score_at(at: IntArray, nodes: Nodes, pattern: Heading, rules: Rules) -> floa
                 c += (z * z + x * x) / s2
                 g += (y * r[2] - z * r[1]) / s2
                 h += (z * r[0] - x * r[2]) / s2
+        # Both unknowns are linear: eliminated, they lower the squares by g^T A^-1 g, written out.
+        # Terms still to come only add, so that a hypothesis beyond the limit can be left here.
         by_tilt = (c * g * g - 2 * b * g * h + a * h * h) / (a * c - b * b)
         if total - by_tilt > rules.limit or unknown > rules.most_unknown:
             return np.inf

@@ -11,9 +11,15 @@ from l2m_gtsam.calibration import uncertain
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import FactorForm
 from l2m_gtsam.calibration.forecast import stated_at
-from l2m_gtsam.calibration.marginals import joint_covariance
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.calibration.optimise import Ending, LinearSolver, Optimised, Optimizer, polish
+from l2m_gtsam.calibration.optimise import (
+    Ending,
+    LinearSolver,
+    Optimised,
+    Optimizer,
+    joint_covariance,
+    polish,
+)
 from l2m_gtsam.calibration.uncertain import UncertainDrive, UncertainProblem, starting_values
 from l2m_gtsam.calibration.view import View, observe
 from l2m_gtsam.data import FloatArray, Readings

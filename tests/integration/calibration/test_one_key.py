@@ -10,9 +10,8 @@ from l2m_gtsam.calibration import one_key
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import FactorForm
 from l2m_gtsam.calibration.joint import joint_problem
-from l2m_gtsam.calibration.marginals import covariance_by_qr, joint_covariance
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
-from l2m_gtsam.calibration.optimise import Optimizer
+from l2m_gtsam.calibration.optimise import Optimizer, covariance_by_qr, joint_covariance
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FieldSample, FloatArray, KnownSensor
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method

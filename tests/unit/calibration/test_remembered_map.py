@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2m_gtsam.calibration import remembered_map
+from l2m_gtsam.calibration import view
 from l2m_gtsam.calibration.coverage import UncertainMap
-from l2m_gtsam.calibration.remembered_map import RememberedMap
+from l2m_gtsam.calibration.view import RememberedMap
 from l2m_gtsam.data import FieldSample, FloatArray
 from tests.worlds.exact import dipole_world
 
@@ -99,7 +99,7 @@ def test_fields_of_a_query_are_those_inside() -> None:
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond it all is forgotten, and answers stay right."""
-    monkeypatch.setattr(remembered_map, "MOST", 10)
+    monkeypatch.setattr(view, "MOST", 10)
     counting = Counting()
     remembered = RememberedMap(counting)
     places = np.random.default_rng(0).normal(size=(12, 3))

@@ -27,9 +27,9 @@ from l2m_gtsam.qa.metrics.fit import correlation
 from l2m_gtsam.recording.joining import drive_at, joined, own_ns
 from l2m_gtsam.recording.sync import stuck_readings, with_offsets
 from l2m_gtsam.records.sensor_models import Samples
-from l2m_gtsam.solve.disagreement import LATER_S
 from l2m_gtsam.solve.model_comparison import correlation_of, segments_of
 from l2m_gtsam.solve.profile import interpolated
+from l2m_gtsam.solve.robust import LATER_S
 
 STEP_NS = 50_000_000
 GPS = 1_700_000_000_000_000_000

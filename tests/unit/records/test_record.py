@@ -1,6 +1,7 @@
 """Arrays of records: those of one record have shapes that fit together."""
 
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from typing import Any, ClassVar
 import pytest
 
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.records.metrics import MapPicture
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.storage.record_files import read_metrics, read_slam
 
@@ -30,6 +32,7 @@ def test_shapes_that_fit() -> None:
     row = (1.0, 2.0, 3.0)
     _Example((row, row), (0.0, 0.0), (0.0, 0.0, 0.0), ((1.0, 2.0), (3.0, 4.0)))
     _Example((), (), (0.0,), ())
+    _Example((row,), (math.inf,), (math.nan, 1e29))
 
 
 @pytest.mark.parametrize(
@@ -38,10 +41,13 @@ def test_shapes_that_fit() -> None:
         ({"a": ((1.0, 2.0),)}, r"a must have the shape \(N 3\) with N = 1"),
         ({"b": ()}, r"b must have the shape \(N\) with N = 1"),
         ({"c": (0.0,)}, r"c must have the shape \(N\+1\) with N = 1"),
+        ({"b": (-1e300,)}, r"b has 1e\+300, at most 1e\+30 can be"),
+        ({"b": (10**400,)}, r"b has 1e\+300"),
+        ({"a": ((1.0, 2.0, 1e31),)}, r"a has 1e\+31"),
         ({"d": ((1.0, 2.0),)}, r"d must have the shape \(M M\)"),
     ],
 )
-def test_shapes_that_do_not(changes: dict[str, Any], told: str) -> None:
+def test_arrays_that_are_wrong(changes: dict[str, Any], told: str) -> None:
     sound = {"a": ((1.0, 2.0, 3.0),), "b": (0.0,), "c": (0.0, 0.0)}
     _Example(**sound)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=told):
@@ -68,6 +74,15 @@ def _shortened(tree: Any) -> Iterator[Any]:
             node = node[key]
         node.pop()
         yield at, made
+
+
+@pytest.mark.parametrize(
+    "extent",
+    [(0, 3e8, 0, 1), (1, 0, 0, 1), (0, 1, 1, 0), (0, math.nan, 0, 1), (-math.inf, 0, 0, 1)],
+)
+def test_places_that_cannot_be_drawn(extent: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match="extent is"):
+        MapPicture(extent, 0.0, ((1.0,),), ((1.0,),))
 
 
 # Lists that may have any length: paths of a drive, options, angles that are drawn.

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from l2m_gtsam.solve.figures import residual_figures
-from l2m_gtsam.solve.noise import estimate_noise, map_covariance, reading_covariance, whitening
+from l2m_gtsam.solve.noise import (
+    estimate_noise,
+    map_covariance,
+    reading_covariance,
+    residual_figures,
+    whitening,
+)
 
 
 def test_whitening_makes_unit_covariance() -> None:

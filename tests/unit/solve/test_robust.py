@@ -10,12 +10,13 @@ from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.calibration import Return
-from l2m_gtsam.solve.disagreement import Judged, disagreements
 from l2m_gtsam.solve.robust import (
     WEIGHTS,
+    Judged,
     Loss,
     RobustOptions,
     consistent,
+    disagreements,
     grown,
     median_noise,
     truncated_weights,
