@@ -54,6 +54,7 @@ NAMES = (
     "n" * 400,
 )
 DANGEROUS = {"script", "img", "iframe", "object", "embed", "base", "form", "meta-refresh"}
+OTHERS = ("kalibr", "bias-scale", "px4", "ardupilot")  # seconds each, and of the same parts
 START = 1_700_000_000_000_000_000
 
 
@@ -133,7 +134,11 @@ def test_reports(folder: Path, repository: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind", ["json", "ros2-launch", "urdf", "kalibr", "bias-scale", "px4", "ardupilot"]
+    "kind",
+    [
+        *("json", "ros2-launch", "urdf"),
+        *(pytest.param(each, marks=pytest.mark.study) for each in OTHERS),
+    ],
 )
 def test_exports(folder: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "made"
@@ -177,6 +182,7 @@ def _strings(tree: object) -> list[str]:
     return [text for each in tree for text in _strings(each)] if isinstance(tree, list) else []
 
 
+@pytest.mark.study
 def test_a_comparison(folder: Path, tmp_path: Path) -> None:
     known = folder / "calibration.yaml"
     words = ("validate", "--calibration", known, "--compare", known, "--out", tmp_path / "out")
