@@ -5,9 +5,32 @@ import inspect
 from collections.abc import Collection, Mapping
 from functools import cache
 from itertools import pairwise
+from math import hypot
 from textwrap import dedent
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+
+UNIT = 1e-3  # a quaternion given to three digits is as long as this
+Components = tuple[float, float, float, float]
+
+
+def _of_unit_length(quaternion: Components) -> Components:
+    if abs(hypot(*quaternion) - 1) > UNIT:
+        raise ValueError(f"must have length 1, this one has {hypot(*quaternion):.4g}")
+    return quaternion
+
+
+def _not_zero(quaternion: Components) -> Components:
+    if not any(quaternion):
+        raise ValueError("is all zero, it must be a rotation")
+    return quaternion
+
+
+UnitQuaternion = Annotated[Components, AfterValidator(_of_unit_length)]
+"""A rotation as x, y, z, w."""
+AnyQuaternion = Annotated[Components, AfterValidator(_not_zero)]
+"""The same, of any length but zero."""
 
 
 class Options(BaseModel):

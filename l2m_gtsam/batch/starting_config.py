@@ -15,6 +15,7 @@ from l2m_gtsam.storage.bag_report import POSE_FILE, BagReport, TopicReport
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.messages import ALL_POSE_TYPES, TF_TYPES
 from l2m_gtsam.storage.units import EARTH_UT, Unit
+from l2m_gtsam.text.shown import shown
 
 TRACKED = ("base_link", "lidar", "velodyne", "os_sensor", "base_footprint", "imu_link", "body")
 
@@ -42,12 +43,14 @@ def starting_config(path: Path, given: BagOptions, progress: Count | None = None
     lines += [*_stamps(report)]
     if lines[-1] == "bag:":
         lines[-1] = "bag: {}"
+    # Names in comments are those of others: none ends its line.
+    lines = [shown(each, None) for each in lines]
     chosen = _read("\n".join(lines))
     again = inspect_bag(path, chosen.bag)
     lines += _starts(again)
     lines += [f"# Cannot be calibrated as it is: {_one_line(each)}" for each in again.obstacles]
     lines += [f"# {_one_line(each)}" for each in again.notes]
-    return "\n".join(lines) + "\n"
+    return "\n".join(shown(each, None) for each in lines) + "\n"
 
 
 def _read(text: str) -> Config:
@@ -124,8 +127,8 @@ def _chain(topics: Sequence[TopicReport]) -> Iterator[str]:
     while root in parents:
         root = parents.pop(root)
     yield f"  tf: {{frame: {json.dumps(root)}, child_frame: {json.dumps(tracked)}}}"
-    shown = ", ".join(f"{parent} > {child}" for parent, child in links[:20])
-    yield f"  # of the transforms {_one_line(shown)}"
+    some = ", ".join(f"{parent} > {child}" for parent, child in links[:20])
+    yield f"  # of the transforms {_one_line(some)}"
 
 
 def _stamps(report: BagReport) -> Iterator[str]:

@@ -19,9 +19,7 @@ from l2m_gtsam.calibration.priors import (
     Priors,
 )
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.options import Options
-
-UNIT = 1e-3  # a quaternion given to three digits is as long as this
+from l2m_gtsam.options import Options, UnitQuaternion
 
 
 class PlanarMount(Options):
@@ -36,20 +34,12 @@ class PlanarMount(Options):
 class NominalRotation(Options):
     """How a sensor was meant to be turned."""
 
-    quaternion_xyzw: tuple[float, float, float, float]
+    quaternion_xyzw: UnitQuaternion
     """R_lidar_mag, from the sensor's axes to the lidar's."""
     sigma_deg: float = Field(default=2.0, gt=0)
     """How far it may be turned otherwise about each axis, degrees."""
     scale_sigma: float = Field(default=0.05, gt=0)
     """Spread of what scales and soft iron add to each entry of C beside the rotation."""
-
-    @model_validator(mode="after")
-    def _is_a_rotation(self) -> Self:
-        length = float(np.linalg.norm(self.quaternion_xyzw))
-        if abs(length - 1) > UNIT:
-            msg = f"quaternion_xyzw must have length 1, this one has {length:.4g}"
-            raise ValueError(msg)
-        return self
 
 
 class Baseline(Options):

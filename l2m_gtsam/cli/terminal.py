@@ -157,6 +157,7 @@ def print_table(table: "Table", wide: bool = False) -> None:
     left_out: list[str] = []
     while len(table.columns) > FEWEST_COLUMNS and _needed(console, table) > width:
         left_out.insert(0, str(table.columns.pop().header))
+    _widen(console, table, width - _needed(console, table))
     Console(width=width).print(table)
     if left_out:
         Console(width=width, highlight=False).print(f"--wide shows also: {', '.join(left_out)}")
@@ -207,6 +208,23 @@ def _show_control_characters(table: "Table") -> None:
             setattr(table, name, shown(text))
     for column in table.columns:
         column._cells = [shown(cell) if isinstance(cell, str) else cell for cell in column.cells]
+
+
+def _widen(console: "Console", table: "Table", spare: int) -> None:
+    """Give room that is left to columns of text, the first ones first.
+
+    Left to itself rich takes it from all of them alike, and may cut off the last column.
+    """
+    from rich.measure import Measurement
+
+    options = console.options.update(width=1000)
+    for column in table.columns:
+        if column.min_width is not None:
+            cells = (column.header, *column.cells)
+            longest = max(Measurement.get(console, options, cell).maximum for cell in cells)
+            extra = max(0, min(spare, longest - column.min_width))
+            column.width = column.min_width + extra
+            spare -= extra
 
 
 def _needed(console: "Console", table: "Table") -> int:

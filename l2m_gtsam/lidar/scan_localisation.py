@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, LidarMap, RigidTransform, Trajectory
@@ -22,7 +22,7 @@ from l2m_gtsam.lidar.registration import (
     register,
 )
 from l2m_gtsam.lidar.surface import Surface
-from l2m_gtsam.options import Options
+from l2m_gtsam.options import AnyQuaternion, Options
 from l2m_gtsam.records.scans import PoseFix
 
 # Points of the scan that rank the candidates.
@@ -34,14 +34,8 @@ class ScanStartOptions(Options):
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """In the map in metres; within `localisation.registration.reach_m` of the truth."""
-    quaternion_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    quaternion_xyzw: AnyQuaternion = (0.0, 0.0, 0.0, 1.0)
     """Rotation from lidar to map, of any length but zero; within about 15 degrees."""
-
-    @model_validator(mode="after")
-    def _a_rotation(self) -> "ScanStartOptions":
-        if not any(self.quaternion_xyzw):
-            raise ValueError("`quaternion_xyzw` is all zero, it must be a rotation")
-        return self
 
     def rigid(self) -> RigidTransform:
         """Return the pose."""

@@ -5,10 +5,8 @@ from typing import Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
-from l2m_gtsam.options import Options, meanings
+from l2m_gtsam.options import Options, UnitQuaternion, meanings
 from l2m_gtsam.records.verdict import Level, Reason, Threshold
-
-UNIT = 1e-3  # a quaternion given to three digits is as long as this
 
 
 class Limit(Options):
@@ -55,16 +53,8 @@ class Nominal(Options):
 
     t_lidar_mag: tuple[float, float, float] | None = None
     """Its place in the lidar frame, metres."""
-    quaternion_xyzw: tuple[float, float, float, float] | None = None
+    quaternion_xyzw: UnitQuaternion | None = None
     """R_lidar_mag, from the sensor's axes to the lidar's."""
-
-    @model_validator(mode="after")
-    def _is_a_rotation(self) -> Self:
-        length = sum(part**2 for part in self.quaternion_xyzw or (1.0,)) ** 0.5
-        if abs(length - 1) > UNIT:
-            msg = f"quaternion_xyzw must have length 1, this one has {length:.4g}"
-            raise ValueError(msg)
-        return self
 
 
 class ValidationOptions(Options):

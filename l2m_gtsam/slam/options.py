@@ -5,7 +5,7 @@ from enum import StrEnum
 from pydantic import Field, model_validator
 
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.options import Options
+from l2m_gtsam.options import AnyQuaternion, Options
 from l2m_gtsam.recording.odometry_jumps import JumpOptions
 from l2m_gtsam.solve.robust import RobustOptions
 
@@ -163,7 +163,7 @@ class StartPoseOptions(Options):
 
     position: tuple[float, float, float] | None = None
     """Position of the lidar in the map in metres; that of the first recorded pose if not given."""
-    quaternion_xyzw: tuple[float, float, float, float] | None = None
+    quaternion_xyzw: AnyQuaternion | None = None
     """Rotation from lidar to map, of any length but zero; that of the first recorded pose if not
     given."""
     position_m: float = Field(default=0.1, gt=0)
@@ -180,12 +180,6 @@ class StartPoseOptions(Options):
     def _known_or_not(self) -> "StartPoseOptions":
         if self.anywhere and (self.position is not None or self.quaternion_xyzw is not None):
             raise ValueError("`anywhere` and a `position` or `quaternion_xyzw`: give one of them")
-        return self
-
-    @model_validator(mode="after")
-    def _a_rotation(self) -> "StartPoseOptions":
-        if self.quaternion_xyzw is not None and not any(self.quaternion_xyzw):
-            raise ValueError("`quaternion_xyzw` is all zero, it must be a rotation")
         return self
 
 

@@ -32,6 +32,11 @@ def shown(text: str, longest: int | None = LONGEST_LINE) -> str:
     return "".join(_in_words(each) if _is_hidden(each) else each for each in text)
 
 
+def shown_lines(text: str) -> str:
+    """Return text whose lines are as ``shown`` has them, in full."""
+    return text if text.isprintable() else "\n".join(shown(line, None) for line in text.split("\n"))
+
+
 def shown_value(value: Any) -> str:
     """Return a value as Python writes it, within ``LONGEST_VALUE`` letters and with few steps.
 

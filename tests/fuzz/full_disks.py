@@ -64,10 +64,12 @@ def filled(trial: Prepared, random: Random) -> tuple[str, str]:
     """Let the disk get full once; return what was left, and what is wrong with it."""
     there, before = trial.there, trial.folder / "before"
     shutil.rmtree(there, ignore_errors=True)
-    at_first, more = _taken(before), _taken(trial.folder / "after") - _taken(before)
+    at_first = _taken(before)
+    # New results are written beside old ones, which then go.
+    results = _taken(trial.folder / "after" / "out")
+    more = max(_taken(trial.folder / "after") - at_first, results)
     # Half of the time what is written last, the results, is what finds no room.
-    last = min(more, _taken(trial.folder / "after" / "out"))
-    room = random.randrange(more) if random.random() < 0.5 else more - random.randrange(last)
+    room = random.randrange(more) if random.random() < 0.5 else more - random.randrange(results)
     with small_disk(there, at_first + room + PAGE):
         shutil.copytree(before, there, dirs_exist_ok=True)
         number = start(trial.command.words, there)

@@ -1,5 +1,7 @@
 """Drives in the terminal: what a bag holds, and what a drive will determine."""
 
+from dataclasses import replace
+
 import numpy as np
 from rich.markup import escape
 from rich.table import Table
@@ -106,7 +108,8 @@ def bag_table(report: BagReport) -> Table:
     add_text(table, "frame", 10)
     add_numbers(table, ("gap (s)", "clock (s)", "NaN"))
     for topic in report.topics:
-        table.add_row(*_topic_row(topic))
+        below = f"{topic.topic}: {topic.use}" in report.obstacles
+        table.add_row(*_topic_row(replace(topic, use="refused: see below") if below else topic))
     return table
 
 

@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.qa.report.svg import GRID, INK, MUTED, SMALL, VARIABLES, WIDTH, as_svg
+from l2m_gtsam.text.shown import shown_lines
 
 STEPS = [1, 2, 2.5, 5, 10]
 TICK = 3.5  # points
@@ -144,7 +145,9 @@ class Panel:
 
     def text(self, x: float, y: float, words: str, style: str = "") -> None:
         """Write words at a place of the figure in points."""
-        self.parts.append(f'<text x="{x:.1f}" y="{y:.1f}" style="{style}">{escape(words)}</text>')
+        self.parts.append(
+            f'<text x="{x:.1f}" y="{y:.1f}" style="{style}">{escape(shown_lines(words))}</text>'
+        )
 
     def path(self, d: str, style: str) -> None:
         """Draw a path in points, if there is any of it."""
@@ -169,7 +172,7 @@ class Panel:
         if label:
             self.parts.append(
                 f'<text transform="translate(10 {middle:.1f}) rotate(-90)" '
-                f'style="{letters("middle")}">{escape(label)}</text>'
+                f'style="{letters("middle")}">{escape(shown_lines(label))}</text>'
             )
 
     def x_axis(self, label: str = "", *, most: int = 8) -> None:
@@ -256,7 +259,7 @@ def _(figure: Drawing, name: str, alt: str) -> Markup:
     box = f'viewBox="0 0 {PAGE:.1f} {POINTS * figure.height:.1f}"'
     inside = "\n".join([*(part for each in figure.panels for part in each.parts), *figure.parts])
     # words are escaped where they are written
-    return Markup(f'<svg {box} role="img" aria-label="{escape(alt)}">{inside}</svg>')  # noqa: S704
+    return Markup(f'<svg {box} role="img" aria-label="{escape(shown_lines(alt))}">{inside}</svg>')  # noqa: S704
 
 
 def colours(name: str) -> list[str]:

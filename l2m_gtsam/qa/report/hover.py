@@ -15,6 +15,7 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.report.drawing import Drawing, Panel
 from l2m_gtsam.qa.report.svg import hover_name
+from l2m_gtsam.text.shown import shown_lines
 
 MOST = 64  # parts of a figure: about two millimetres of its width each
 REACH = 4.5  # points around a place
@@ -54,7 +55,8 @@ def strips(figure: Drawing, x: FloatArray, words: Sequence[str]) -> None:
 def places(figure: Drawing, panel: Panel, at: FloatArray, words: Sequence[str]) -> None:
     """Show words around places of a panel, shape (N, 2)."""
     parts = [
-        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="{REACH}"><title>{escape(text)}</title></circle>'
+        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="{REACH}">'
+        f"<title>{escape(shown_lines(text))}</title></circle>"
         for a, b, text in zip(panel.across(at[:, 0]), panel.down(at[:, 1]), words, strict=True)
     ]
     _add(figure, parts)
@@ -131,7 +133,7 @@ def axes_box(
 def _rectangle(x: float, y: float, width: float, height: float, words: str) -> str:
     return (
         f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}">'
-        f"<title>{escape(words)}</title></rect>"
+        f"<title>{escape(shown_lines(words))}</title></rect>"
     )
 
 

@@ -16,6 +16,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.svg import as_svg
 from l2m_gtsam.records.metrics import Row
+from l2m_gtsam.text.shown import shown_lines
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,7 @@ def vector(values: FloatArray, digits: int) -> str:
 
 def code(text: str) -> Markup:
     """Return a sentence in which what stands in backticks is code; all of it is text."""
+    text = shown_lines(text)
     parts = str(escape(text)).split("`")
     if len(parts) % 2 == 0:  # a name has one of its own
         return escape(text)
@@ -92,11 +94,18 @@ def own_file(name: str) -> Markup:
     return Markup(text)  # noqa: S704 - our own file
 
 
+def _visible(value: Any) -> Any:
+    """Return what a template writes, text of others without control characters."""
+    is_text = isinstance(value, str) and not isinstance(value, Markup)
+    return shown_lines(value) if is_text else value
+
+
 @cache
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("l2m_gtsam.qa.report"),
         autoescape=True,
+        finalize=_visible,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -1,6 +1,9 @@
 """Matplotlib figures: new ones, their parts, and as SVG in the colours and fonts of a page."""
 
 import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import singledispatch
 from io import StringIO
 from pathlib import Path
@@ -12,10 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.storage.files import atomic_path
+from l2m_gtsam.text.shown import shown, shown_lines
 
 # Placeholders for variables of the page's style, so that a figure follows light and dark.
 INK, MUTED, GRID, PAPER = "#010203", "#040506", "#070809", "#0a0b0c"
@@ -40,6 +45,8 @@ MARKERS = ("o", "s", "^")
 HOVER = (
     "hover-"  # before words, in hexadecimal, that name a part of a figure: they become its title
 )
+
+UNSAID = ("Date", "Creator", "Format", "Type")  # facts that would differ from run to run
 
 SMALL = 9.3  # points; a figure is drawn at about its own size on a phone
 
@@ -112,9 +119,8 @@ def as_svg(figure: Any, name: str, alt: str) -> Markup:
 def _(figure: Figure, name: str, alt: str) -> Markup:
     stream = StringIO()
     lay_out(figure)
-    figure.savefig(
-        stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None}
-    )
+    with _names_shown(figure):
+        figure.savefig(stream, format="svg", metadata=dict.fromkeys(UNSAID))
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
@@ -126,7 +132,7 @@ def _(figure: Figure, name: str, alt: str) -> Markup:
     head, rest = text.split(">", 1)
     box = re.search(r'viewBox="[^"]*"', head)
     shape = box.group() if box else ""
-    label = f'role="img" aria-label="{escape(alt)}"'
+    label = f'role="img" aria-label="{escape(shown_lines(alt))}"'
     # what is inside comes from matplotlib, which escapes its text
     return Markup(f'<svg xmlns:xlink="http://www.w3.org/1999/xlink" {shape} {label}>{rest}')  # noqa: S704
 
@@ -166,8 +172,26 @@ def plain_decades(axis: Axis, wide: bool) -> None:
 def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, whole or not at all."""
     lay_out(figure)
-    with atomic_path(path) as temporary:
+    with atomic_path(path) as temporary, _names_shown(figure):
         figure.savefig(temporary, format="png")
+
+
+@contextmanager
+def _names_shown(figure: Figure) -> Iterator[None]:
+    """Have names in a figure as text: control characters, mathematics, letters of no font."""
+    ticks = {
+        label
+        for axes in figure.axes
+        for axis in (axes.xaxis, axes.yaxis)
+        for label in (*axis.get_ticklabels(), *axis.get_ticklabels(minor=True))
+    }
+    for words in figure.findobj(Text):
+        if isinstance(words, Text) and words not in ticks:
+            words.set_text(shown_lines(words.get_text()))
+            words.set_parse_math(False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=r"Glyph \d+ .* missing from font")
+        yield
 
 
 def lay_out(figure: Figure) -> None:
@@ -183,6 +207,7 @@ def lay_out(figure: Figure) -> None:
 
 def short_name(name: str) -> str:
     """Return a name that fits into a figure."""
+    name = shown(name, None)
     return name if len(name) <= LONGEST else f"{name[: LONGEST - 1]}…"
 
 
@@ -193,7 +218,7 @@ def hover_name(words: str) -> str:
 
 def _title(found: re.Match[str]) -> str:
     words = bytes.fromhex(found[1]).decode()
-    return f'<g class="hover"><title>{escape(words)}</title>'
+    return f'<g class="hover"><title>{escape(shown_lines(words))}</title>'
 
 
 def _short(path: str) -> str:

@@ -1,6 +1,7 @@
 """The scatter of parts of a drive against what a linear model expects of it, in closed form."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -155,3 +156,21 @@ def test_covariances_grow_where_something_is_unmodelled(block: str) -> None:
     at = BLOCKS[block]
     np.testing.assert_array_equal(excess.scale[at], 2.0)
     assert excess.scale.sum() == SENSOR + (at.stop - at.start)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(2, 30), st.integers(0, 10**6))
+def test_half_of_a_covariance_says_what_the_whole_does(size: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.standard_normal((size, size)) + 3 * np.eye(size)
+    information, scale = root @ root.T + np.eye(size), rng.uniform(0.1, 10, size)
+    whole = np.linalg.inv(information) * np.outer(scale, scale)
+    lower = np.asfortranarray(np.linalg.cholesky(information))
+    at = rng.permutation(size)[: size // 2 + 1]
+    A = rng.standard_normal((len(at), 3))
+    for half in (HalfCovariance.from_factor(lower, scale), HalfCovariance.of(whole)):
+        # Rounding, times the condition of a matrix whose diagonal stands out.
+        alike = partial(np.testing.assert_allclose, rtol=1e-7, atol=1e-9 * np.abs(whole).max())
+        alike(half.among(at), whole[np.ix_(at, at)])
+        alike(half.across(at, A), A.T @ whole[np.ix_(at, at)] @ A)
+        alike(half.trace(at, A.T), np.trace(A.T @ whole[np.ix_(at, at)] @ A))

@@ -10,7 +10,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from l2m_gtsam.calibration import calibrate
 from l2m_gtsam.mapping import map_building, suite_calibration
-from l2m_gtsam.parallel.threads import in_threads, one_blas_thread
+from l2m_gtsam.parallel.threads import in_threads, one_blas_thread, side_by_side
 from l2m_gtsam.planning import plan
 from l2m_gtsam.qa import evaluate, scene
 from l2m_gtsam.slam import exploration, localisation, record
@@ -126,3 +126,24 @@ def test_public_functions_compute_with_one_thread(entry: Callable[..., Any]) -> 
         entry(*[Watched() for _ in range(count)])
     assert seen == [{1}]
     assert blas_threads() == {GIVEN}
+
+
+def test_two_pieces_of_work_run_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("L2M_THREADS", "2")
+    both = Barrier(2, timeout=10)  # each waits for the other
+
+    def worded() -> str:
+        both.wait()
+        return "first"
+
+    def counted() -> int:
+        both.wait()
+        return 2
+
+    assert side_by_side(worded, counted) == ("first", 2)
+
+    def failing() -> int:
+        raise ValueError("second")
+
+    with pytest.raises(ValueError, match="second"):
+        side_by_side(lambda: 1, failing)
