@@ -12,7 +12,6 @@ from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import compare_recordings, map_recordings, update_map
-from l2m_gtsam.mapping.suite_calibration import suite_doubts
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
 from l2m_gtsam.maps.field_map import FieldMap, MapSummary
@@ -79,11 +78,9 @@ def build_map_file(
     scanned = scanned_place(bags, survey.recordings, config, progress) if lidar else None
     progress("building the map", 0.0)
     field_map = map_recordings(survey.recordings, survey.suite, config.mapping, survey.cloud)
-    doubts = suite_doubts(survey.recordings, survey.suite, config.mapping.suite)
     progress("building the map", 1.0)
     provenance = {
         "bags": [vars(recording.source) for recording in survey.recordings],
-        "suite_doubts": list(doubts),
         "suite": None if suite is None else used_file(suite, survey.suite_level),
         "structure": None if survey.structure is None else survey.structure.provenance,
         "lidar": None if scanned is None else scanned.provenance,

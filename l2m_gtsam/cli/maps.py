@@ -116,7 +116,7 @@ def map_build(
         if tiles:
             make_tiles(built.field_map, out, progress)
     print_table(map_table(built.description))
-    warn([*built.description.summary.doubts, *built.description.provenance["suite_doubts"]])
+    warn(built.description.summary.doubts)
     say(f"written: {out}")
 
 

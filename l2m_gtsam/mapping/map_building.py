@@ -8,6 +8,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.mapping.suite_calibration import suite_doubts
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_shifts import suite_errors
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
@@ -95,7 +96,11 @@ def map_recordings(
         Readings and poses of a recording do not overlap.
     """
     read = suite_readings(recordings, suite, options.sync)
-    return build_map(read.points, read.field, options.model, cloud, read.suite)
+    field_map = build_map(read.points, read.field, options.model, cloud, read.suite)
+    # Stated errors are counted; sensors that count as exact have to look like it.
+    if read.suite is None and isinstance(field_map, HarmonicMap):
+        return field_map.doubted(suite_doubts(recordings, suite, options.suite))
+    return field_map
 
 
 @one_blas_thread()

@@ -157,6 +157,12 @@ class HarmonicMap:
         learnt, options = learnt_from_state(state)
         return cls.condition(learnt, options)
 
+    def doubted(self, doubts: tuple[str, ...]) -> "HarmonicMap":
+        """Return the map with more that speaks against its survey, a sentence each."""
+        origin = self.learnt.origin
+        learnt = replace(self.learnt, origin=replace(origin, survey=(*origin.survey, *doubts)))
+        return replace(self, learnt=learnt)
+
     def with_store(self, store: TileStore) -> "HarmonicMap":
         """Return the map that keeps its tiles in a store, and takes from it those that it has."""
         return replace(self, tiles=Tiles(self.learnt, self.tiles.solved, store))

@@ -6,10 +6,17 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.data import Distortion, FloatArray, IntArray, KnownSensor, LidarMotion, Readings
-from l2m_gtsam.mapping.map_building import map_fields, sensor_positions
-from l2m_gtsam.mapping.suite_shifts import suite_errors
-from l2m_gtsam.maps.build import build_map
+from l2m_gtsam.data import (
+    Distortion,
+    FieldSeries,
+    FloatArray,
+    IntArray,
+    KnownSensor,
+    Recording,
+    SourceFile,
+    Trajectory,
+)
+from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
 from l2m_gtsam.simulate.hall_drives import LIDAR_M, STEP_NS, survey
 from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
@@ -32,11 +39,11 @@ def troubled_hall(options: TroublesOptions, trouble: Trouble, number: int) -> Tr
     hall = steel_hall(seed)
     read = survey_of(hall, seed, options)
     suite = known_suite(options)
-    points, field = read.given(suite, hall, options, off=trouble.wrong_suite)
-    stated = suite_errors(read.readings(field), suite) if trouble is Trouble.SUITE_STATED else None
-    mapped = map_fields(read.readings(field), suite)
+    recording = read.recorded(suite, hall, options, off=trouble.wrong_suite)
+    if trouble is not Trouble.SUITE_STATED:
+        suite = {name: replace(each, covariance=None) for name, each in suite.items()}
     cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
-    learnt = build_map(points, mapped, options.map, cloud, stated)
+    learnt = map_recordings([recording], suite, MappingOptions(model=options.map), cloud)
     compiled = learnt.compile() if isinstance(learnt, Compilable) else learnt
     return TroubledHall(hall, seed, compiled)
 
@@ -63,32 +70,25 @@ class SurveyDrive:
     p: FloatArray
     noise: float
 
-    def given(
-        self, suite: list[KnownSensor], hall: SteelHall, options: TroublesOptions, *, off: bool
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return where a suite is thought to read, and what it reads, shapes (N, 3).
+    def recorded(
+        self, suite: dict[str, KnownSensor], hall: SteelHall, options: TroublesOptions, *, off: bool
+    ) -> Recording:
+        """Return what a suite reads; the vehicle's clocks are right.
 
         ``off`` is whether its sensors are not as known, by draws of the options' sigmas.
         """
-        rng = np.random.default_rng([self.seed, 11])
+        rng, count = np.random.default_rng([self.seed, 11]), len(self.p)
         draws = rng.standard_normal((len(suite), 16)) * options.suite_sigmas
-        noise = self.noise * rng.standard_normal(self.p.shape)
-        truth = [_off(s, draw) if off else s for s, draw in zip(suite, draws, strict=True)]
-        field = np.empty_like(self.p)
-        for index, sensor in enumerate(truth):
-            own = self.sensor == index
-            B = hall.world.field(self.R[own] @ sensor.t_lidar_mag + self.p[own])
-            field[own] = sensor.distortion.apply(np.einsum("nji,nj->ni", self.R[own], B))
-        readings = self.readings(field)
-        return sensor_positions(readings, suite), field + noise
-
-    def readings(self, field: FloatArray) -> Readings:
-        """Return what was read, with poses; the vehicle's clocks are right."""
-        count = len(self.p)
-        still = LidarMotion(np.zeros((count, 6)), np.zeros(count))
-        names = tuple(f"suite_{index}" for index in range(int(self.sensor.max()) + 1))
-        stamps = np.arange(count) * STEP_NS
-        return Readings(names, self.sensor, stamps, self.R, self.p, field, motion=still)
+        noise, stamps = self.noise * rng.standard_normal((count, 3)), np.arange(count) * STEP_NS
+        series = []
+        for index, (known, draw) in enumerate(zip(suite.values(), draws, strict=True)):
+            true, own = _off(known, draw) if off else known, self.sensor == index
+            B = hall.world.field(self.R[own] @ true.t_lidar_mag + self.p[own])
+            field = true.distortion.apply(np.einsum("nji,nj->ni", self.R[own], B)) + noise[own]
+            name = known.sensor
+            series.append(FieldSeries(name, f"/{name}", name, stamps[own], field))
+        trajectory = Trajectory(stamps, self.R, self.p, "map", "lidar")
+        return Recording(trajectory, tuple(series), SourceFile(f"survey-{self.seed}", ""))
 
 
 def survey_of(hall: SteelHall, seed: int, options: TroublesOptions) -> SurveyDrive:
@@ -101,14 +101,14 @@ def survey_of(hall: SteelHall, seed: int, options: TroublesOptions) -> SurveyDri
     height = np.array(options.heights)
     floor = hall.floor.height(points[:, :2])
     sensor = np.abs((points[:, 2] - floor)[:, None] - height).argmin(axis=1)
-    t = np.stack([each.t_lidar_mag for each in known_suite(options)])[sensor]
+    t = np.stack([each.t_lidar_mag for each in known_suite(options).values()])[sensor]
     return SurveyDrive(seed, sensor, R, points - np.einsum("nij,nj->ni", R, t), options.noise)
 
 
-def known_suite(options: TroublesOptions) -> list[KnownSensor]:
+def known_suite(options: TroublesOptions) -> dict[str, KnownSensor]:
     """Return the suite as its file has it, with sigmas: sensors one above the other."""
     covariance = np.diag(options.suite_sigmas**2)
-    return [
+    sensors = [
         KnownSensor(
             f"suite_{index}",
             np.array([0.0, ASIDE_M * (index - 1), height - LIDAR_M]),
@@ -117,6 +117,7 @@ def known_suite(options: TroublesOptions) -> list[KnownSensor]:
         )
         for index, height in enumerate(options.heights)
     ]
+    return {each.sensor: each for each in sensors}
 
 
 def _off(sensor: KnownSensor, error: FloatArray) -> KnownSensor:
