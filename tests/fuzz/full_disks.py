@@ -53,7 +53,7 @@ def small_disk(folder: Path, size: int) -> Iterator[None]:
     try:
         yield
     finally:
-        _run("umount", str(folder))
+        _run("umount", "--lazy", str(folder))  # workers may end a moment later
 
 
 def _run(*words: str) -> None:

@@ -63,7 +63,10 @@ def commands(folder: Path, demo: Path) -> list[Command]:
     study, otherwise = folder / "basin.yaml", folder / "otherwise.yaml"
     study.write_text(TINY_BASIN.model_dump_json())
     sigma = {"position_sigma_m": {"warn": 0.011, "fail": 0.031}}
-    otherwise.write_text(json.dumps({**CONFIG, "qa": {"halves": False, **sigma}}))
+    known_prior = {"length_scale": 0.8, "signal": 8.0, "noise": 0.1}
+    model = {"kind": "sliding_gp", "sliding_gp": {"hyperparameters": known_prior}}
+    changed = {"qa": {"halves": False, **sigma}, "mapping": {"model": model}}
+    otherwise.write_text(json.dumps({**CONFIG, **changed}))
     here, there = str(folder / "place" / "survey.bag"), ("--out", OUT)
     as_now, before = ("--config", str(place.config)), ("--config", str(otherwise))
     on_map = ("--map", f"{HERE}/map.npz")
@@ -140,6 +143,7 @@ def prepared(command: Command, folder: Path) -> Prepared:
         complete(command.words, there)
         runs.append(files(there))
     seconds = monotonic() - begun
+    assert runs[0] != old, "before and after are the same"
     assert runs[0].keys() == runs[1].keys()
     varying = frozenset(name for name, digest in runs[0].items() if runs[1][name] != digest)
     return Prepared(command, folder, old, runs[0], varying, seconds)
