@@ -10,7 +10,7 @@ from l2m_factors.key_pose_readings import (
     KeyPoseResiduals,
     key_pose_residuals,
 )
-from l2m_factors.keys import D, G, M, P, Q, S, T, U, X
+from l2m_factors.keys import D, G, M, P, Q, S, T, U, V, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import MapBatch, key_pose_factor
 from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
@@ -26,6 +26,11 @@ from l2m_factors.shared_errors import (
     shared_error,
     uncertain_block_factor,
     uncertain_reading_factor,
+)
+from l2m_factors.steady_drift import (
+    drift_weights,
+    drifting_fixed_axes_factor,
+    drifting_step_factor,
 )
 from l2m_factors.step import StepError, scaled_step_factor
 from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor
@@ -56,6 +61,7 @@ __all__ = [
     "TilePlaces",
     "U",
     "UncertainReadings",
+    "V",
     "WeightedField",
     "WhiteRows",
     "Whitening",
@@ -64,6 +70,9 @@ __all__ = [
     "block_factor",
     "distance_prior",
     "distortion_prior",
+    "drift_weights",
+    "drifting_fixed_axes_factor",
+    "drifting_step_factor",
     "effective_parameters_factor",
     "field_rate",
     "fixed_axes_step_factor",

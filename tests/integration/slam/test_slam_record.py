@@ -16,7 +16,7 @@ from l2m_gtsam.qa.metrics.trajectory import localised_trajectory
 from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.slam.map_prediction import poses_in
-from l2m_gtsam.slam.pose_graph import odometry_graph, scale_values
+from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
 from l2m_gtsam.slam.record import odometry_covariance, sensor_evidence
 from l2m_gtsam.storage.record_files import read_slam, write_slam
 from tests.drives.localised import WORLD, driven, localised, record
@@ -26,7 +26,7 @@ from tests.support.pose_errors import pose_nees, position_error
 def test_odometry_with_a_scale_is_as_sure_as_its_graph() -> None:
     drive = localised().solution.drive
     drive = replace(drive, steps=replace(drive.steps, scale=0.03))
-    values = scale_values(drive)
+    values = shared_values(drive)
     for k, pose in enumerate(drive.dead_reckoning()):
         values.insert(X(k), pose)
     marginals = gtsam.Marginals(odometry_graph(drive), values)
