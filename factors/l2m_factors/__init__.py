@@ -1,5 +1,6 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
+from l2m_factors.any_pose import magnetic_pose_factor
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.complexity import ComplexityPenalty, effective_parameters_factor
 from l2m_factors.field_map import DifferentiableMap
@@ -79,6 +80,7 @@ __all__ = [
     "held_directions",
     "key_pose_factor",
     "key_pose_residuals",
+    "magnetic_pose_factor",
     "map_weights_information",
     "map_weights_prior",
     "moved",

@@ -89,14 +89,15 @@ def far_motions(
 ) -> set[int]:
     """Return the steps of jumps with ends far apart that are motion, as after a gap of the poses.
 
-    One after the other, from all as recorded: each is a slip unless readings are likelier with it.
+    One after the other, from all as recorded: each is a slip if readings are likelier without it.
+    Where they say nothing the odometry stays as it is.
     """
     moved = {each.step: each for each in far[:MOST_FAR]}
     best = likelihood(drive.as_recorded(list(moved.values()))) if moved else 0.0
     for step in list(moved):
         others = {key: each for key, each in moved.items() if key != step}
         without = likelihood(drive.as_recorded(list(others.values())))
-        if best - without <= SLIPPED:
+        if without - best > SLIPPED:
             moved, best = others, without
     return set(moved)
 

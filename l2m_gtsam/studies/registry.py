@@ -12,7 +12,6 @@ from l2m_gtsam.studies.table1.study import TABLE1
 from l2m_gtsam.studies.troubles.study import TROUBLES
 
 STUDIES: dict[str, Study[Any, Any, Any]] = {
-    study.name: study
-    for study in (TABLE1, BASIN, ABLATION, HONESTY, SCALING, SLAM, TROUBLES)
+    study.name: study for study in (TABLE1, BASIN, ABLATION, HONESTY, SCALING, SLAM, TROUBLES)
 }
 """A new study is its own file and its name here."""
