@@ -1,5 +1,6 @@
 """GTSAM factors for magnetometers in a mapped field."""
 
+from l2m_factors.any_pose import magnetic_pose_factor
 from l2m_factors.check import assert_jacobians_match
 from l2m_factors.complexity import ComplexityPenalty, effective_parameters_factor
 from l2m_factors.field_map import DifferentiableMap
@@ -10,7 +11,7 @@ from l2m_factors.key_pose_readings import (
     KeyPoseResiduals,
     key_pose_residuals,
 )
-from l2m_factors.keys import D, G, M, P, Q, S, T, U, X
+from l2m_factors.keys import D, G, M, P, Q, S, T, U, V, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import MapBatch, key_pose_factor
 from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
@@ -26,6 +27,11 @@ from l2m_factors.shared_errors import (
     shared_error,
     uncertain_block_factor,
     uncertain_reading_factor,
+)
+from l2m_factors.steady_drift import (
+    drift_weights,
+    drifting_fixed_axes_factor,
+    drifting_step_factor,
 )
 from l2m_factors.step import StepError, scaled_step_factor
 from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor
@@ -56,6 +62,7 @@ __all__ = [
     "TilePlaces",
     "U",
     "UncertainReadings",
+    "V",
     "WeightedField",
     "WhiteRows",
     "Whitening",
@@ -64,12 +71,16 @@ __all__ = [
     "block_factor",
     "distance_prior",
     "distortion_prior",
+    "drift_weights",
+    "drifting_fixed_axes_factor",
+    "drifting_step_factor",
     "effective_parameters_factor",
     "field_rate",
     "fixed_axes_step_factor",
     "held_directions",
     "key_pose_factor",
     "key_pose_residuals",
+    "magnetic_pose_factor",
     "map_weights_information",
     "map_weights_prior",
     "moved",

@@ -10,7 +10,7 @@ error of its heading. With the turn R and the way d along the axes of the frame 
 import gtsam
 import numpy as np
 
-from l2m_factors.field_map import FloatArray
+from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.keys import X
 from l2m_factors.motion import skew
 
@@ -32,22 +32,28 @@ def fixed_axes_step_factor(
         Of a right perturbation of the next pose, rotation (rad) before translation (m).
     """
 
-    def error(
-        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
-    ) -> FloatArray:
-        before, after = values.atPose3(X(key_pose)), values.atPose3(X(key_pose + 1))
-        turned = before.rotation().between(after.rotation())
-        off = turn.between(turned)
-        back = after.rotation().matrix().T
-        apart = back @ (after.translation() - before.translation() - way)
-        if jacobians is not None:
-            by_turn = gtsam.Rot3.LogmapDerivative(gtsam.Rot3.Logmap(off))
-            by_before, by_after = np.zeros((6, 6)), np.zeros((6, 6))
-            by_before[:3, :3] = -by_turn @ turned.matrix().T
-            by_before[3:, 3:] = -turned.matrix().T
-            by_after[:3, :3], by_after[3:, 3:] = by_turn, np.eye(3)
-            by_after[3:, :3] = skew(apart[None])[0]
-            jacobians[0], jacobians[1] = by_before, by_after
-        return np.concatenate([gtsam.Rot3.Logmap(off), apart])
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+        poses = [values.atPose3(X(key_pose + end)) for end in (0, 1)]
+        return fixed_axes_residual(poses, turn, way, jacobians)
 
     return gtsam.CustomFactor(noise, [X(key_pose), X(key_pose + 1)], error)
+
+
+def fixed_axes_residual(
+    poses: list[gtsam.Pose3], turn: gtsam.Rot3, way: FloatArray, jacobians: Jacobians
+) -> FloatArray:
+    """Return e for the poses before and after a step; its derivatives go into ``jacobians``."""
+    before, after = poses
+    turned = before.rotation().between(after.rotation())
+    off = turn.between(turned)
+    back = after.rotation().matrix().T
+    apart = back @ (after.translation() - before.translation() - way)
+    if jacobians is not None:
+        by_turn = gtsam.Rot3.LogmapDerivative(gtsam.Rot3.Logmap(off))
+        by_before, by_after = np.zeros((6, 6)), np.zeros((6, 6))
+        by_before[:3, :3] = -by_turn @ turned.matrix().T
+        by_before[3:, 3:] = -turned.matrix().T
+        by_after[:3, :3], by_after[3:, 3:] = by_turn, np.eye(3)
+        by_after[3:, :3] = skew(apart[None])[0]
+        jacobians[0], jacobians[1] = by_before, by_after
+    return np.concatenate([gtsam.Rot3.Logmap(off), apart])

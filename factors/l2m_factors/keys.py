@@ -49,3 +49,11 @@ def U() -> int:
 def G() -> int:
     """Return the key of the share by which all ways are longer than odometry has them: double."""
     return int(gtsam.symbol("G", 0))
+
+
+def V() -> int:
+    """Return the key of odometry's steady drift: Vector 6, unit variance each.
+
+    Along the axes of the map, three that come with time and three that come with distance.
+    """
+    return int(gtsam.symbol("V", 0))

@@ -102,7 +102,7 @@ def study(
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Run a study: table1, basin, ablation, honesty, scaling or troubles.
+    """Run a study: table1, basin, ablation, honesty, scaling, slam or troubles.
 
     Started again with the same --out it goes on where it was stopped.
     """

@@ -65,7 +65,7 @@ def slam(
         *scan_lines(done.result.scans),
         *truth_lines(done.record.truth),
     )
-    say("\n".join(lines))
+    say(*lines)
     print_verdict(done.verdict)
     say(f"written: {out}")
     end_with(done.verdict.level, strict)

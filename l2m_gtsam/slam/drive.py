@@ -289,9 +289,33 @@ class Drive:
             covariance[each.step] = each.covariance
         return replace(self, steps=replace(self.steps, R=R, p=p, covariance=covariance))
 
+    def as_walk(self, over_m: float) -> "Drive":
+        """Return the drive for solvers of poses alone; see ``OdometrySteps``."""
+        return replace(self, steps=self.steps.as_walk(over_m))
+
     def with_scale_as_drift(self, over_m: float) -> "Drive":
         """Return the drive for solvers without a scale variable; see ``OdometrySteps``."""
         return replace(self, steps=self.steps.with_scale_as_drift(over_m))
+
+    def without_drift(self, drift: FloatArray | None, poses: list[gtsam.Pose3]) -> "Drive":
+        """Return the drive without a steady drift of its odometry.
+
+        Parameters
+        ----------
+        drift
+            In its standard deviations, along the axes of the poses, shape (6,); None for none.
+        poses
+            K key poses.
+        """
+        if drift is None or self.steps.steady is None:
+            return self
+        added = self.steps.steady @ drift.reshape(2, 3)
+        R = np.stack([pose.rotation().matrix() for pose in poses[:-1]])
+        own, fixed = np.einsum("nji,nj->ni", R, added), self.steps.fixed_axes
+        if fixed is not None:
+            fixed = fixed - added @ self.start.T_map_lidar.R
+        steps = replace(self.steps, p=self.steps.p - own, fixed_axes=fixed, steady=None)
+        return replace(self, steps=steps)
 
 
 def odometry_jumps(

@@ -20,7 +20,7 @@ from l2m_gtsam.slam.slips import judged, with_open_jumps
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution, map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
-from l2m_gtsam.slam.unknown_field.whole_smoother import map_whole_drive
+from l2m_gtsam.slam.unknown_field.whole_smoother import likelihood, map_whole_drive
 
 NO_REVISITS = "no place was revisited: readings of an unknown field remove little drift then"
 NOTHING_GAINED = (
@@ -98,7 +98,11 @@ def explore(
     progress("learning the field's prior", 0.0)
     by_scans = without_field(with_open_jumps(drive), options)
     drive = replace(drive, links=drive.links[by_scans.believed])
-    odometry = judged(drive, lambda each: solve_field(each, options, progress).solution)
+    odometry = judged(
+        drive,
+        lambda each: solve_field(each, options, progress).solution,
+        (lambda each: likelihood(each, options)) if has_one_sensor(drive) else None,
+    )
     drive = odometry.drive
     mapped = solve_field(drive, options, progress)
     refined = options.calibration is CalibrationUse.REFINED
@@ -123,14 +127,19 @@ def explore(
 
 def without_field(drive: Drive, options: SlamOptions) -> PoseGraph:
     """Solve a drive by odometry and scans alone."""
-    scaled = drive.with_scale_as_drift(options.drift.over_m)
+    scaled = drive.as_walk(options.drift.over_m)
     return solve_pose_graph(scaled, options.robust.confidence)
+
+
+def has_one_sensor(drive: Drive) -> bool:
+    """Return whether a drive has one sensor and nothing else that knows its places."""
+    return len(drive.sensors.names) == 1 and not len(drive.links)
 
 
 def solve_field(drive: Drive, options: SlamOptions, progress: Progress) -> FieldSolution:
     """Estimate poses and field of a drive whose links are believed; arguments as of ``explore``."""
     poses = without_field(drive, options).poses
-    if len(drive.sensors.names) == 1 and not len(drive.links):
+    if has_one_sensor(drive):
         mapped = map_whole_drive(drive, poses, options, progress)
         if mapped is not None:
             return mapped

@@ -105,7 +105,7 @@ def localise(
         search = find_start(drive, solver_map, options, progress)
         drive = replace(drive, start=start_found(search, options.start))
     by_scans = solve_pose_graph(
-        with_open_jumps(drive.with_scale_as_drift(options.drift.over_m)), options.robust.confidence
+        with_open_jumps(drive.as_walk(options.drift.over_m)), options.robust.confidence
     )
     drive = replace(drive, links=drive.links[by_scans.believed])
     odometry = judged(drive, lambda each: localise_drive(each, solver_map, options, progress))

@@ -42,6 +42,9 @@ class OdometrySteps:
     fixed_axes
         Steps along the axes of the first key pose in metres, shape (K - 1, 3), where odometry knows
         them along fixed axes; None where it knows them along those of the vehicle.
+    steady
+        What one standard deviation of a steady drift adds to each step, metres, shape (K - 1, 2):
+        of the drift that comes with time, and of that with distance. None for none.
     """
 
     R: FloatArray
@@ -50,6 +53,7 @@ class OdometrySteps:
     stated: bool
     scale: float = 0.0
     fixed_axes: FloatArray | None = None
+    steady: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.p)
@@ -68,7 +72,25 @@ class OdometrySteps:
             p=self.p[:count],
             covariance=self.covariance[:count],
             fixed_axes=fixed,
+            steady=None if self.steady is None else self.steady[:count],
         )
+
+    def as_walk(self, over_m: float) -> "OdometrySteps":
+        """Return steps for solvers without variables that all steps share.
+
+        Scale error and steady drift become independent noise of each step, with the same variance
+        after ``over_m`` metres.
+        """
+        walked = self.with_scale_as_drift(over_m)
+        if walked.steady is None:
+            return walked
+        length = np.linalg.norm(self.p, axis=1)
+        # Per metre at the drive's mean speed, both kinds together.
+        total = float(length.sum())
+        share = np.hypot(*walked.steady.sum(axis=0)) / total if total else 0.0
+        covariance = walked.covariance.copy()
+        covariance[:, 3:, 3:] += (share**2 * over_m * length)[:, None, None] * np.eye(3)
+        return replace(walked, covariance=covariance, steady=None)
 
     def with_scale_as_drift(self, over_m: float) -> "OdometrySteps":
         """Return steps for solvers without a scale variable.
@@ -134,18 +156,38 @@ def odometry_steps(
         fixed = np.diff(trajectory.p[rows], axis=0) @ trajectory.R[rows[0]]
     stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
     if stated is not None:  # the repair of jumps has put their covariance into the poses'
-        return OdometrySteps(
-            R,
-            p,
-            stated + isotropic_covariance(options.least_deg, options.least_m),
-            stated=True,
-            scale=options.scale,
-            fixed_axes=fixed,
-        )
-    covariance = drift_covariance(R, p, options)
-    for jump in jumps:
-        covariance[np.searchsorted(rows, jump.row)] += jump.covariance
-    return OdometrySteps(R, p, covariance, stated=False, scale=options.scale, fixed_axes=fixed)
+        covariance = stated + isotropic_covariance(options.least_deg, options.least_m)
+        share = options.steady or 0.0
+    else:
+        covariance = drift_covariance(R, p, options)
+        for jump in jumps:
+            covariance[np.searchsorted(rows, jump.row)] += jump.covariance
+        share = options.position_share if options.steady is None else options.steady
+    seconds = 1e-9 * np.diff(trajectory.stamp_ns[rows])
+    return OdometrySteps(
+        R,
+        p,
+        covariance,
+        stated=stated is not None,
+        scale=options.scale,
+        fixed_axes=fixed,
+        steady=None if options.scale or not share else steady_weights(seconds, p, share),
+    )
+
+
+def steady_weights(seconds: FloatArray, p: FloatArray, share: float) -> FloatArray:
+    """Return what a steady drift by a share of the distance adds to N steps, m, shape (N, 2).
+
+    Parameters
+    ----------
+    seconds, p
+        Times and steps, shapes (N,) and (N, 3), metres.
+    share
+        Standard deviation after the whole drive, half of its variance with time.
+    """
+    length = np.linalg.norm(p, axis=1)
+    speed = length.sum() / seconds.sum() if len(seconds) else 0.0
+    return np.asarray(np.sqrt(0.5) * share * np.column_stack([speed * seconds, length]))
 
 
 def _stated(

@@ -81,7 +81,7 @@ class WholeFieldOptions(Options):
     """Standard deviation per axis of what steel on the vehicle adds to the readings beyond the
     calibration, uT. It is estimated even where the calibration is fixed: the poses would have to
     explain it."""
-    distortion: float = Field(default=0.01, gt=0)
+    distortion: float = Field(default=0.1, gt=0)
     """And of the entries of C."""
 
 
@@ -139,6 +139,11 @@ class DriftOptions(Options):
     """Standard deviation of a relative error that all lengths share, as with wheels. It is
     estimated with the poses, and the other sigmas are of the remaining errors. With their wide
     defaults it is not needed."""
+    steady: float | None = Field(default=None, ge=0, lt=1)
+    """Standard deviation per axis of a drift that is the same all along the drive, along fixed axes
+    as by a current, wind or a slope, as a share of the distance. It is estimated with the poses
+    beside the independent errors. `position_share` where that counts, if not given; 0 for none. Not
+    with `scale`."""
     axes: StepAxes = StepAxes.VEHICLE
     """Along which axes steps are known: `vehicle`, as by wheels or scans, where an error of the
     heading turns all later steps; or `fixed`, as by beacons, where it turns none. The latter works
@@ -155,6 +160,8 @@ class DriftOptions(Options):
     def _scale_along_the_vehicle(self) -> "DriftOptions":
         if self.scale and self.axes is StepAxes.FIXED:
             raise ValueError("`scale` and `axes: fixed`: a scale is that of wheels, give one")
+        if self.scale and self.steady:
+            raise ValueError("`scale` and `steady`: one drive tells them hardly apart, give one")
         return self
 
 

@@ -5,7 +5,7 @@ found by graduated non-convexity on the whole pose graph (GTSAM's ``GncLMOptimiz
 P. Antonante, V. Tzoumas, L. Carlone, 2020), with start and odometry as known inliers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gtsam
@@ -15,7 +15,10 @@ from l2m_factors import (
     D,
     G,
     T,
+    V,
     X,
+    drifting_fixed_axes_factor,
+    drifting_step_factor,
     fixed_axes_step_factor,
     held_directions,
     scaled_step_factor,
@@ -28,6 +31,7 @@ from l2m_gtsam.solve.linear_algebra import information_root
 
 EXACT = 1e-9  # m, uT, or of an entry of C: sigma of parameters that are stated as exact
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
+DRIFT = 6  # components of a steady drift
 HALF = 0.5  # a link that weighs more is believed; in the end weights are nearly 0 or 1
 
 
@@ -53,6 +57,16 @@ def scaled_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:
     """Return the same with odometry's scale as a variable."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     return scaled_step_factor(number, drive.step(number), noise)
+
+
+def drifting_factor(drive: Drive, number: int, weights: FloatArray) -> gtsam.NonlinearFactor:
+    """Return the same with odometry's steady drift as a variable."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
+    if drive.steps.fixed_axes is None:
+        return drifting_step_factor(number, drive.step(number), weights, noise)
+    way = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
+    turn = gtsam.Rot3(drive.steps.R[number])
+    return drifting_fixed_axes_factor(number, turn, way, weights, noise)
 
 
 def link_pose(links: Links, number: int) -> gtsam.Pose3:
@@ -109,8 +123,14 @@ def calibration_values(sensors: KnownSensors) -> gtsam.Values:
 
 def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
     """Return the factors of start and odometry."""
-    graph, sigma = gtsam.NonlinearFactorGraph(), drive.steps.scale
+    graph, sigma, steady = gtsam.NonlinearFactorGraph(), drive.steps.scale, drive.steps.steady
     graph.add(start_factor(drive.start))
+    if steady is not None:
+        for number, weights in enumerate(steady):
+            graph.add(drifting_factor(drive, number, weights))
+        unit = gtsam.noiseModel.Unit.Create(DRIFT)
+        graph.add(gtsam.PriorFactorVector(V(), np.zeros(DRIFT), unit))
+        return graph
     one_step = scaled_factor if sigma else step_factor
     for number in range(len(drive.steps)):
         graph.add(one_step(drive, number))
@@ -120,12 +140,19 @@ def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def scale_values(drive: Drive) -> gtsam.Values:
-    """Return the initial value of odometry's scale, if it is a variable."""
+def shared_values(drive: Drive) -> gtsam.Values:
+    """Return initial values of odometry's scale and steady drift, if they are variables."""
     values = gtsam.Values()
     if drive.steps.scale:
         values.insert(G(), 0.0)
+    if drive.steps.steady is not None:
+        values.insert(V(), np.zeros(DRIFT))
     return values
+
+
+def steady_drift(values: gtsam.Values) -> FloatArray | None:
+    """Return odometry's steady drift in its standard deviations, shape (6,); None if it is none."""
+    return np.asarray(values.atVector(V())) if values.exists(V()) else None
 
 
 @dataclass(frozen=True)
@@ -150,14 +177,17 @@ def solve_pose_graph(drive: Drive, confidence: float) -> PoseGraph:
     Parameters
     ----------
     drive
-        K key poses with odometry and L links; its readings are not used.
+        K key poses with odometry and L links; its readings are not used. What its steps share
+        counts as none, and their axes as those of the vehicle; see ``Drive.as_walk``.
     confidence
         Share of links with only the stated errors that are believed.
     """
     poses = drive.dead_reckoning()
     if not len(drive.links):
         return PoseGraph(poses, np.empty(0, dtype=np.bool_))
-    graph = odometry_graph(drive)
+    # The optimiser copies its factors, which GTSAM cannot do with those that are written in Python.
+    plain = replace(drive.steps, scale=0.0, steady=None, fixed_axes=None)
+    graph = odometry_graph(replace(drive, steps=plain))
     sure = graph.size()
     graph.push_back(link_graph(drive.links))
     optimizer = gtsam.GncLMOptimizer(graph, _values(poses), _params(sure))
@@ -187,12 +217,13 @@ def _values(poses: list[gtsam.Pose3]) -> gtsam.Values:
 def write_g2o(path: Path, solution: DriveSolution) -> None:
     """Write localised key poses as vertices and odometry as edges.
 
-    The format knows no magnetic readings, no prior and no scale: lengths are corrected as they came
-    out. Numbers have six digits, as GTSAM writes them.
+    The format knows no magnetic readings, no prior, no scale and no drift: lengths are corrected as
+    they came out. Numbers have six digits, as GTSAM writes them.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for number in range(len(solution.drive.steps)):
-        graph.add(step_factor(solution.drive, number, solution.scale_error))
+    drive = solution.drive.without_drift(solution.steady, solution.poses)
+    for number in range(len(drive.steps)):
+        graph.add(step_factor(drive, number, solution.scale_error))
     for k, pose in enumerate(solution.poses):
         values.insert(X(k), pose)
     gtsam.writeG2o(graph, values, str(path))

@@ -175,13 +175,30 @@ def odometry_covariance(drive: Drive) -> FloatArray:
     """Return the covariance of each key pose by odometry alone, shape (K, 6, 6).
 
     Of right perturbations, rotation (rad) before translation (m): the start's, propagated, with
-    each step's and that of a wrong scale.
+    each step's and those of a wrong scale and of a steady drift.
     """
     covariance, steps = [drive.start.covariance], drive.steps
     for R, p, more in zip(steps.R, steps.p, steps.covariance, strict=True):
         covariance.append(moved(covariance[-1][None], RigidTransform(R, p))[0] + more)
-    by_scale = steps.scale * _moved_by_scale(drive.dead_reckoning())
-    return np.stack(covariance) + by_scale[:, :, None] * by_scale[:, None]
+    poses = drive.dead_reckoning()
+    by_scale = steps.scale * _moved_by_scale(poses)
+    by_drift = _moved_by_drift(drive, poses)
+    return (
+        np.stack(covariance)
+        + by_scale[:, :, None] * by_scale[:, None]
+        + by_drift @ by_drift.transpose(0, 2, 1)
+    )
+
+
+def _moved_by_drift(drive: Drive, poses: list[gtsam.Pose3]) -> FloatArray:
+    """Return right perturbations of K poses by units of a steady drift, shape (K, 6, 6)."""
+    moved_by = np.zeros((len(poses), 6, 6))
+    if drive.steps.steady is not None:
+        R_back = np.stack([each.rotation().matrix().T for each in poses])
+        sums = np.vstack([np.zeros(2), np.cumsum(drive.steps.steady, axis=0)])
+        moved_by[:, 3:, :3] = sums[:, :1, None] * R_back
+        moved_by[:, 3:, 3:] = sums[:, 1:, None] * R_back
+    return moved_by
 
 
 def _moved_by_scale(poses: list[gtsam.Pose3]) -> FloatArray:

@@ -58,6 +58,7 @@ def localisation_result(
     """
     alone = drive.as_recorded(drive.jumps).dead_reckoning()
     status, message = _verdict(solution, decoys)
+    steady = drive.without_drift(solution.steady, solution.poses)
     odometry = _trajectory(drive, alone)
     trajectory = replace(_trajectory(drive, solution.poses), covariance=solution.pose_covariance)
     return LocalisationResult(
@@ -68,7 +69,7 @@ def localisation_result(
         drift=drift_figures(trajectory, odometry),
         sensors=tuple(_use(solution, i) for i in range(len(drive.sensors.names))),
         calibration=None if refine is None else refined(refine, solution),
-        notes=slip_notes(drive, solution.poses, solution.scale_error),
+        notes=slip_notes(steady, solution.poses, solution.scale_error),
         bag=None,
         map=None,
         calibration_source=None,

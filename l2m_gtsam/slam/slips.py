@@ -13,7 +13,8 @@ likelihoods of both ends is, for a normal prior around the middle,
     log p(recorded) - log p(continued) = m / v
 
 for the prior is the same at both. Where both are so far apart that fields between them say nothing
-about either, no vehicle makes the recorded step: it is a slip.
+about either, the likelihoods of the whole drive with one and with the other are compared, where a
+solver gives them; otherwise no vehicle makes the recorded step: it is a slip.
 """
 
 from collections.abc import Callable
@@ -30,6 +31,7 @@ from l2m_gtsam.slam.solution import DriveSolution
 # Log odds that a step unlike the motion around it is a slip, before any reading: 20 to 1.
 SLIPPED = 3.0
 FAR_M, FAR_DEG = 0.3, 45.0  # between a recorded step and a continued one
+MOST_FAR = 10  # jumps with ends far apart; odometry with more has slips
 OPEN = 1.0  # standard deviation of the share of the difference; both ends are half of one away
 
 
@@ -49,28 +51,55 @@ class JudgedOdometry:
     notes: tuple[str, ...]
 
 
-def judged(drive: Drive, solve: Callable[[Drive], DriveSolution]) -> JudgedOdometry:
-    """Decide which jumps of odometry are slips, by solving the drive with their steps open.
+def judged(
+    drive: Drive,
+    solve: Callable[[Drive], DriveSolution],
+    likelihood: Callable[[Drive], float] | None = None,
+) -> JudgedOdometry:
+    """Decide which jumps of odometry are slips.
 
     Parameters
     ----------
     drive
         Its steps continue the motion where odometry jumps.
     solve
-        Solves a drive.
+        Solves a drive, here with the steps at jumps open.
+    likelihood
+        Log likelihood of a drive's readings given its odometry. Without it jumps whose ends are far
+        apart are slips.
     """
-    moved = set[int]()
+    far = [each for each in drive.jumps if is_far(each.jump)]
+    moved = set[int]() if likelihood is None else far_motions(drive, far, likelihood)
+    drive = drive.as_recorded([each for each in far if each.step in moved])
     open_jumps = [each for each in drive.jumps if not is_far(each.jump)]
     if open_jumps:
         doubtful = replace(drive, jumps=tuple(open_jumps))
         evidence = motion_evidence(doubtful, solve(with_open_jumps(doubtful)))
-        moved = {
+        moved |= {
             jump.step for jump, odds in zip(open_jumps, evidence, strict=True) if odds > SLIPPED
         }
     slipped = tuple(each for each in drive.jumps if each.step not in moved)
     recorded = drive.as_recorded([each for each in open_jumps if each.step in moved])
     notes = jump_notes([each.jump for each in slipped])
     return JudgedOdometry(replace(recorded, jumps=slipped), notes)
+
+
+def far_motions(
+    drive: Drive, far: list[OdometryJump], likelihood: Callable[[Drive], float]
+) -> set[int]:
+    """Return the steps of jumps with ends far apart that are motion, as after a gap of the poses.
+
+    One after the other, from all as recorded: each is a slip if readings are likelier without it.
+    Where they say nothing the odometry stays as it is.
+    """
+    moved = {each.step: each for each in far[:MOST_FAR]}
+    best = likelihood(drive.as_recorded(list(moved.values()))) if moved else 0.0
+    for step in list(moved):
+        others = {key: each for key, each in moved.items() if key != step}
+        without = likelihood(drive.as_recorded(list(others.values())))
+        if without - best > SLIPPED:
+            moved, best = others, without
+    return set(moved)
 
 
 def is_far(jump: Jump) -> bool:

@@ -32,7 +32,8 @@ from l2m_gtsam.slam.pose_graph import (
     link_graph,
     link_squared,
     odometry_graph,
-    scale_values,
+    shared_values,
+    steady_drift,
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
@@ -206,6 +207,7 @@ class SmoothingProblem:
             near_changes=np.zeros(len(weights), dtype=np.bool_),
             odometry_chi2=2 * self._odometry.error(values) / (6 * len(self._drive)),
             scale=odometry_scale(marginals, values),
+            steady=steady_drift(values),
             link_squared=link_squared(self._drive.links, values),
             ending=optimised.ending if ending is Ending.TOLERANCE else ending,
             step_covariance=jump_covariances(marginals, self._drive),
@@ -217,10 +219,10 @@ def localise_drive(
 ) -> DriveSolution:
     """Estimate the poses of a drive, and its calibrations if these are to be refined."""
     problem = SmoothingProblem(drive, field_map, options)
-    followed = drive.with_scale_as_drift(options.drift.over_m)
+    followed = drive.as_walk(options.drift.over_m)
     follower = Follower(followed, field_map, options.robust, free=problem.free)
     values = follow(follower, len(drive), progress)
-    values.insert(scale_values(drive))
+    values.insert(shared_values(drive))
     counts = np.ones(len(drive.readings), dtype=np.bool_)
     for round_, mu in enumerate(GRADUATION):
         progress("solving all poses", round_ / len(GRADUATION))

@@ -43,6 +43,9 @@ class DriveSolution:
         odometry's; 1 is consistent.
     scale
         Scale of odometry; None where it is no variable.
+    steady
+        Estimate of odometry's steady drift in its standard deviations, shape (6,), if it was a
+        variable.
     link_squared
         Squared lengths of the scan links' whitened residuals, shape (L,).
     ending
@@ -62,6 +65,7 @@ class DriveSolution:
     near_changes: BoolArray
     odometry_chi2: float
     scale: OdometryScale | None
+    steady: FloatArray | None
     link_squared: FloatArray
     ending: Ending
     step_covariance: FloatArray

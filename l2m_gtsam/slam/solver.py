@@ -35,7 +35,7 @@ from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.online.belief import POSE
 
-LAST = (ord("T"), ord("D"))
+LAST = (ord("T"), ord("D"), ord("V"))
 TOGETHER = 200  # poses: the covariance of so many is 11 MB
 
 

@@ -20,6 +20,7 @@ EVERY = 3  # of poses 6 cm apart is a key pose
 EXACT = np.full(15, 1e-6)
 # 6 cm and 0.1 degrees of walk per root metre.
 WALKING = DriftOptions(
+    steady=0.0,
     position_share=0.06 / np.sqrt(10),
     rotation_deg_per_m=0.1 / np.sqrt(10),
     rotation_share=0.0,

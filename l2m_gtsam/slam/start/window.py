@@ -160,7 +160,7 @@ def window_of(drive: Drive, path_m: float, most: int) -> DriveWindow:
         path_m=float(path[count - 1]),
         R=R[0].T @ R[:count],
         p=(p[:count] - p[0]) @ R[0],
-        covariance=drive.steps.with_scale_as_drift(path_m).covariance[: count - 1],
+        covariance=drive.steps.as_walk(path_m).covariance[: count - 1],
         readings=own[thinned(own, most)],
         sensors=drive.sensors,
         R_odom_lidar=R[0],

@@ -83,7 +83,7 @@ class Explorer:
             )
         if drive.steps.fixed_axes is not None:
             raise ConfigError("`slam.drift.axes: fixed` works off line; on line give `vehicle`")
-        drive = drive.with_scale_as_drift(options.drift.over_m)
+        drive = drive.as_walk(options.drift.over_m)
         self._drive, self._options = drive, options
         self._pace = ExploringOptions() if pace is None else pace
         self._memory = FieldMemory.at_start(drive)

@@ -30,7 +30,8 @@ from l2m_gtsam.slam.pose_graph import (
     link_graph,
     link_squared,
     odometry_graph,
-    scale_values,
+    shared_values,
+    steady_drift,
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
@@ -193,7 +194,7 @@ class TiledProblem:
         tiled = self._divided(motions, poses, sensors)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
-        values.insert(scale_values(self._drive))
+        values.insert(shared_values(self._drive))
         for k, pose in enumerate(poses):
             values.insert(X(k), pose)
         predicted = DrivePrediction(motions, tiled.prediction(values, sensors))
@@ -237,6 +238,7 @@ class TiledProblem:
             near_changes=np.zeros(len(solved.weights), dtype=np.bool_),
             odometry_chi2=2 * self._odometry.error(solved.values) / (6 * len(drive)),
             scale=odometry_scale(marginals, solved.values),
+            steady=steady_drift(solved.values),
             link_squared=link_squared(drive.links, solved.values),
             ending=solved.ending,
             step_covariance=jump_covariances(marginals, drive),

@@ -19,15 +19,20 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import poses_in
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.pose_graph import odometry_graph, scale_values
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, WholeFieldOptions
+from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances, weights_last
-from l2m_gtsam.slam.unknown_field.forward_pass import filtered_poses
+from l2m_gtsam.slam.unknown_field.forward_pass import FollowedDrive, followed
 from l2m_gtsam.slam.unknown_field.tiled_smoother import AWAY_M, FieldSolution, TiledProblem
 from l2m_gtsam.slam.unknown_field.whole_field import whole_prior
 
 CONVEX = 1.0  # of the loss, with weights at the poses of the filter
+# Factors of the readings' noise: with the noise alone the likelihood has maxima between the poses
+# of odometry and the best ones.
+COARSE = 2.0
+STAGES = (COARSE, 1.0)
+PASSES = 2  # of the filter
 
 
 def map_whole_drive(
@@ -51,23 +56,24 @@ def map_whole_drive(
     The poses; those of odometry where the readings are no less likely at them. None where the field
     has more detail than one basis holds.
     """
-    whole, largest = options.whole_field, options.robust.largest
-    free = replace(drive, sensors=drive.sensors.loosened(whole.distortion, whole.offset))
-    scaled = free.with_scale_as_drift(options.drift.over_m)
-    prior = whole_prior(free, initial, whole, options.tiles.learn_over_m)
-    if prior is None:
-        return None
+    whole = options.whole_field
+    free = loosened(drive, whole)
     progress("following the drive", 0.0)
-    poses = filtered_poses(scaled, prior.field, initial[0], largest)
+    start = followed_coarsely(free, initial, options)
+    if start is None:
+        return None
+    poses = start.poses
     prior = whole_prior(free, poses, whole)
     if prior is None:
         return None
-    progress("following the drive", 0.5)
-    poses = filtered_poses(scaled, prior.field, initial[0], largest)
-    progress("solving poses and field", 0.0)
     refined = options.model_copy(update={"calibration": CalibrationUse.REFINED})
     problem = TiledProblem(free, prior.divided, refined, weights_last)
-    found = problem.finished(problem.solved(poses, free.sensors, 1.0, CONVEX))
+    sensors = free.sensors
+    for stage, scale in enumerate(STAGES):
+        progress("solving poses and field", stage / len(STAGES))
+        solved = problem.solved(poses, sensors, scale, CONVEX)
+        poses, sensors = solved.poses, solved.sensors
+    found = problem.finished(solved)
     progress("solving poses and field", 1.0)
     solution = found.solution
     if options.calibration is CalibrationUse.FIXED:
@@ -91,9 +97,54 @@ def map_whole_drive(
     return found if gained > 0 else replace(found, solution=unchanged(drive, found), gained=False)
 
 
+def loosened(drive: Drive, options: WholeFieldOptions) -> Drive:
+    """Return a drive whose sensors may have steel beside them."""
+    return replace(drive, sensors=drive.sensors.loosened(options.distortion, options.offset))
+
+
+def followed_coarsely(
+    drive: Drive, initial: list[gtsam.Pose3], options: SlamOptions
+) -> FollowedDrive | None:
+    """Follow a drive twice, with the field learnt at its start and again at the poses found.
+
+    Parameters
+    ----------
+    drive
+        The drive, its sensors loosened.
+    initial
+        K key poses by odometry.
+    options
+        How the field is described.
+
+    Returns
+    -------
+    None where the field has more detail than one basis holds.
+    """
+    whole, noise = options.whole_field, COARSE * drive.sensors.noise
+    coarse = replace(drive, sensors=replace(drive.sensors, noise=noise))
+    scaled = coarse.with_scale_as_drift(options.drift.over_m)
+    poses, over_m = initial, options.tiles.learn_over_m
+    for _ in range(PASSES):
+        prior = whole_prior(coarse, poses, whole, over_m)
+        if prior is None:
+            return None
+        found = followed(scaled, prior.field, initial[0], options.robust.largest)
+        poses, over_m = found.poses, np.inf
+    return found
+
+
+def likelihood(drive: Drive, options: SlamOptions) -> float:
+    """Return the log likelihood of a drive's readings given its odometry, but for constants.
+
+    Poses and field are integrated out. Minus infinity where one basis does not hold the field.
+    """
+    found = followed_coarsely(loosened(drive, options.whole_field), drive.dead_reckoning(), options)
+    return -np.inf if found is None else found.log_likelihood
+
+
 def unchanged(drive: Drive, found: FieldSolution) -> DriveSolution:
     """Return a solution with the poses and covariances of odometry alone."""
-    values = scale_values(drive)
+    values = shared_values(drive)
     for k, pose in enumerate(drive.dead_reckoning()):
         values.insert(X(k), pose)
     graph = odometry_graph(drive)

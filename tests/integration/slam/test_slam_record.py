@@ -2,6 +2,7 @@
 
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -16,17 +17,20 @@ from l2m_gtsam.qa.metrics.trajectory import localised_trajectory
 from l2m_gtsam.records.localisation import OdometryScale
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.slam.map_prediction import poses_in
-from l2m_gtsam.slam.pose_graph import odometry_graph, scale_values
+from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
 from l2m_gtsam.slam.record import odometry_covariance, sensor_evidence
 from l2m_gtsam.storage.record_files import read_slam, write_slam
 from tests.drives.localised import WORLD, driven, localised, record
 from tests.support.pose_errors import pose_nees, position_error
 
 
-def test_odometry_with_a_scale_is_as_sure_as_its_graph() -> None:
+@pytest.mark.parametrize("changes", [{"scale": 0.03, "steady": None}, {}])
+def test_odometry_with_shared_errors_is_as_sure_as_its_graph(changes: dict[str, Any]) -> None:
+    """A scale, or a steady drift."""
     drive = localised().solution.drive
-    drive = replace(drive, steps=replace(drive.steps, scale=0.03))
-    values = scale_values(drive)
+    assert drive.steps.steady is not None
+    drive = replace(drive, steps=replace(drive.steps, **changes))
+    values = shared_values(drive)
     for k, pose in enumerate(drive.dead_reckoning()):
         values.insert(X(k), pose)
     marginals = gtsam.Marginals(odometry_graph(drive), values)
@@ -38,7 +42,7 @@ def test_odometry_with_a_scale_is_as_sure_as_its_graph() -> None:
 
 def test_odometry_is_as_sure_as_its_graph() -> None:
     drive = localised().solution.drive
-    values = gtsam.Values()
+    values = shared_values(drive)
     for k, pose in enumerate(drive.dead_reckoning()):
         values.insert(X(k), pose)
     marginals = gtsam.Marginals(odometry_graph(drive), values)

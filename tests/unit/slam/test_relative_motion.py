@@ -25,6 +25,7 @@ PARTS = 16
 EXACT = np.full(15, 1e-6)
 # 6 cm and 0.3 degrees of walk per root metre, and next to nothing beside.
 WALKING = DriftOptions(
+    steady=0.0,
     position_share=0.06 / np.sqrt(10),
     rotation_deg_per_m=0.3 / np.sqrt(10),
     rotation_share=0.0,

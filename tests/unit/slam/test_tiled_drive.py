@@ -20,7 +20,12 @@ from tests.worlds.exact import DipoleWorld, random_sensors
 EXACT, NOISE = np.full(15, 1e-6), 0.2
 # No odometry error to speak of, and no source: residuals are noise and nothing else.
 STILL = DriftOptions(
-    position_share=1e-6, rotation_deg_per_m=1e-6, rotation_share=0, least_m=1e-6, least_deg=1e-6
+    steady=0.0,
+    position_share=1e-6,
+    rotation_deg_per_m=1e-6,
+    rotation_share=0,
+    least_m=1e-6,
+    least_deg=1e-6,
 )
 UNIFORM = DipoleWorld(np.array([22.0, 3.0, -38.0]), np.zeros((1, 3)) - 9.0, np.zeros((1, 3)))
 WEAK = Hyperparameters(floor_scale=1e-3, ceiling_scale=1e-3)

@@ -1,0 +1,62 @@
+"""Steps of an odometry that drifts steadily: derivatives, and what they come to."""
+
+import gtsam
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from l2m_factors import (
+    V,
+    X,
+    assert_jacobians_match,
+    drift_weights,
+    drifting_fixed_axes_factor,
+    drifting_step_factor,
+    fixed_axes_step_factor,
+)
+from l2m_factors.field_map import FloatArray
+
+NOISE = gtsam.noiseModel.Diagonal.Sigmas(np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3]))
+
+
+def drawn(seed: int) -> tuple[gtsam.Pose3, FloatArray, gtsam.Values]:
+    """Return a step, weights of a drift, and two key poses that are about so far apart."""
+    rng, values = np.random.default_rng(seed), gtsam.Values()
+    step = gtsam.Pose3.Expmap(rng.normal(0, [0.5] * 3 + [1.0] * 3))
+    first = gtsam.Pose3.Expmap(rng.normal(size=6))
+    values.insert(X(4), first)
+    values.insert(X(5), first.compose(step).retract(rng.normal(0, 0.2, 6)))
+    values.insert(V(), rng.normal(size=6))
+    return step, rng.uniform(0.0, 0.3, 2), values
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(deadline=None, max_examples=30)
+def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
+    step, weights, values = drawn(seed)
+    assert_jacobians_match(drifting_step_factor(4, step, weights, NOISE), values)
+    way = step.translation()
+    assert_jacobians_match(
+        drifting_fixed_axes_factor(4, step.rotation(), way, weights, NOISE), values
+    )
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(deadline=None, max_examples=30)
+def test_a_step_without_its_drift_is_the_plain_one(seed: int) -> None:
+    """GTSAM's own factor and that of fixed axes; rounding of a logarithm is less than 1e-9."""
+    step, weights, values = drawn(seed)
+    added = drift_weights(weights) @ values.atVector(V())
+    own = values.atPose3(X(4)).rotation().unrotate(added)
+    still = gtsam.Pose3(step.rotation(), step.translation() - own)
+    plain = gtsam.BetweenFactorPose3(X(4), X(5), still, NOISE)
+    ours = drifting_step_factor(4, step, weights, NOISE)
+    np.testing.assert_allclose(
+        ours.unwhitenedError(values), plain.unwhitenedError(values), atol=1e-9
+    )
+    way, turn = step.translation(), step.rotation()
+    fixed = fixed_axes_step_factor(4, turn, way - added, NOISE)
+    drifting = drifting_fixed_axes_factor(4, turn, way, weights, NOISE)
+    np.testing.assert_allclose(
+        drifting.unwhitenedError(values), fixed.unwhitenedError(values), atol=1e-12
+    )

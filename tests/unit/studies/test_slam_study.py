@@ -1,0 +1,26 @@
+"""The summary and the page of the study of SLAM, from cells that are made up."""
+
+from l2m_gtsam.studies.slam.cells import SlamCell, SlamStudyOptions
+from l2m_gtsam.studies.slam.methods import MethodRow
+from l2m_gtsam.studies.slam.study import SLAM
+
+
+def test_what_is_lost_is_on_the_page() -> None:
+    options = SlamStudyOptions(recordings=("ship-1",), seeds=2)
+    keys = SLAM.keys(options)
+    assert len(keys) == len(set(keys)) == 8
+    alone = MethodRow(2.0, None, 0.0)
+    good, bad = MethodRow(0.5, 6.0, 50.0), MethodRow(2.5, 40.0, 50.0, unchanged=True)
+    peer = MethodRow(1.0, 9.0, 0.5)
+    cells = {
+        key: SlamCell(100.0, 300, alone, peer, bad if "walk-world" in key else good) for key in keys
+    }
+    summary = SLAM.summarise(options, cells)
+    assert [row.ours.removed for row in summary.rows] == [0.75, 0.75, -0.25, 0.75]
+    assert [row.ours.never_worse for row in summary.rows] == [True, True, False, True]
+    page = SLAM.page(summary)
+    assert "Where the filter's error is smaller: ship 1, walk, world." in page
+    assert "not within 3 to 12: ship 1, walk, world." in page
+    assert "nothing was gained: ship 1, walk, world (2)." in page
+    assert page.count("| 75 % |") == 3
+    assert set(SLAM.figures(summary)) == {"slam"}
