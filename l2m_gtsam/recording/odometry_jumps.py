@@ -108,8 +108,12 @@ class RepairedOdometry:
 
     def notes(self) -> tuple[str, ...]:
         """Return how many isolated poses were removed, if any, as a sentence."""
-        note = "isolated poses of odometry, far from those before and after, are left out"
-        return (f"{note}: {self.left_out}",) if self.left_out else ()
+        if not self.left_out:
+            return ()
+        return (
+            "isolated poses of odometry, far from those before and after, are left out: "
+            f"{self.left_out}",
+        )
 
 
 def jump_notes(jumps: Sequence[Jump]) -> tuple[str, ...]:
