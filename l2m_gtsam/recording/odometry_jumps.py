@@ -110,10 +110,11 @@ class RepairedOdometry:
         """Return how many isolated poses were removed, if any, as a sentence."""
         if not self.left_out:
             return ()
-        return (
+        note = (
             "isolated poses of odometry, far from those before and after, are left out: "
-            f"{self.left_out}",
+            f"{self.left_out}"
         )
+        return (note,)
 
 
 def jump_notes(jumps: Sequence[Jump]) -> tuple[str, ...]:
