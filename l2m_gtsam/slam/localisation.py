@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Traj
 from l2m_gtsam.errors import CalibrationError, ConfigError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.parallel.threads import one_blas_thread
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.dropouts import is_dead, mask_dropouts
 from l2m_gtsam.recording.odometry_jumps import RepairedOdometry, without_jumps
 from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
@@ -112,13 +112,21 @@ def localise(
     drive = odometry.drive
     solution = localise_drive(drive, solver_map, options, progress)
     maps = decoy_maps(drive, solver_map) if needs_misfit_test(solution) else ()
-    decoys = [localise_drive(drive, each, options, progress) for each in maps]
+    decoys = [found for each in maps if (found := in_decoy(drive, each, options)) is not None]
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, decoys)
     notes = (*notes, *odometry.notes, *result.notes)
     result = replace(result, notes=notes, bag=recording.source, start=search)
     return Localisation(result, solution)
+
+
+def in_decoy(drive: Drive, decoy: QueryableMap, options: SlamOptions) -> DriveSolution | None:
+    """Return a drive's solution in a decoy map; None where it has none: it does not fit."""
+    try:
+        return localise_drive(drive, decoy, options, silent)
+    except CalibrationError:
+        return None
 
 
 def prepared(
