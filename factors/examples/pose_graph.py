@@ -21,7 +21,7 @@ START = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
 NOISE_UT = 0.3
 
 
-class Dipoles:
+class DipoleField:
     """The field of dipoles in a uniform one."""
 
     uniform = np.array([20.0, 0.0, -40.0])
@@ -42,7 +42,7 @@ class Dipoles:
 
 
 @dataclass(frozen=True)
-class Drive:
+class MagneticDrive:
     """Two laps: true poses, odometry between them, and what two magnetometers read at each."""
 
     truth: list[gtsam.Pose3]
@@ -52,7 +52,7 @@ class Drive:
     sensors: Calibrations
 
 
-def driven(field_map: Dipoles, seed: int = 1) -> Drive:
+def driven(field_map: DipoleField, seed: int = 1) -> MagneticDrive:
     """Return a drive with errors as its noise models have them."""
     rng = np.random.default_rng(seed)
     step = gtsam.Pose3(gtsam.Rot3.Rz(TURN_RAD), np.array([STEP_M, 0.0, 0.0]))
@@ -72,10 +72,10 @@ def driven(field_map: Dipoles, seed: int = 1) -> Drive:
         B, _ = field_map.field_and_gradient(np.stack([pose.transformFrom(each) for each in t]))
         own = B @ pose.rotation().matrix() + sensors.distortion[:, 9:]
         field.append(own + rng.normal(0, NOISE_UT, own.shape))
-    return Drive(truth, steps, loops, np.stack(field), sensors)
+    return MagneticDrive(truth, steps, loops, np.stack(field), sensors)
 
 
-def owners_factors(drive: Drive, k: int) -> gtsam.NonlinearFactorGraph:
+def owners_factors(drive: MagneticDrive, k: int) -> gtsam.NonlinearFactorGraph:
     """Return the factors that the graph's owner adds with pose k."""
     graph = gtsam.NonlinearFactorGraph()
     if k == 0:
@@ -88,7 +88,7 @@ def owners_factors(drive: Drive, k: int) -> gtsam.NonlinearFactorGraph:
     return graph
 
 
-def magnetic_factor(drive: Drive, field_map: Dipoles, k: int) -> gtsam.NonlinearFactor:
+def magnetic_factor(drive: MagneticDrive, field_map: DipoleField, k: int) -> gtsam.NonlinearFactor:
     """Return what magnetometers add to pose k: these are the ten lines."""
     return magnetic_pose_factor(
         key=X(k),
@@ -100,7 +100,7 @@ def magnetic_factor(drive: Drive, field_map: Dipoles, k: int) -> gtsam.Nonlinear
     )
 
 
-def start_values(drive: Drive) -> gtsam.Values:
+def start_values(drive: MagneticDrive) -> gtsam.Values:
     """Return the poses of odometry."""
     values, pose = gtsam.Values(), drive.truth[0]
     values.insert(X(0), pose)
@@ -110,7 +110,7 @@ def start_values(drive: Drive) -> gtsam.Values:
     return values
 
 
-def without(drive: Drive) -> gtsam.Values:
+def without(drive: MagneticDrive) -> gtsam.Values:
     """Solve the graph as its owner has it."""
     graph = gtsam.NonlinearFactorGraph()
     for k in range(len(drive.truth)):
@@ -118,7 +118,7 @@ def without(drive: Drive) -> gtsam.Values:
     return gtsam.LevenbergMarquardtOptimizer(graph, start_values(drive)).optimize()
 
 
-def off_line(drive: Drive, field_map: Dipoles) -> gtsam.Values:
+def off_line(drive: MagneticDrive, field_map: DipoleField) -> gtsam.Values:
     """Solve all poses together with magnetometers, from where the owner's graph has them.
 
     From odometry that has drifted past a source, the field leads elsewhere.
@@ -130,7 +130,7 @@ def off_line(drive: Drive, field_map: Dipoles) -> gtsam.Values:
     return gtsam.LevenbergMarquardtOptimizer(graph, without(drive)).optimize()
 
 
-def on_line(drive: Drive, field_map: Dipoles) -> gtsam.Values:
+def on_line(drive: MagneticDrive, field_map: DipoleField) -> gtsam.Values:
     """Add pose after pose to iSAM2."""
     params = gtsam.ISAM2Params()
     params.setRelinearizeThreshold(0.01)
@@ -149,7 +149,7 @@ def on_line(drive: Drive, field_map: Dipoles) -> gtsam.Values:
     return isam.calculateEstimate()
 
 
-def error_m(drive: Drive, values: gtsam.Values) -> float:
+def error_m(drive: MagneticDrive, values: gtsam.Values) -> float:
     """Return the root mean square error of positions in metres."""
     off = [
         values.atPose3(X(k)).translation() - pose.translation()
@@ -159,7 +159,7 @@ def error_m(drive: Drive, values: gtsam.Values) -> float:
 
 
 if __name__ == "__main__":
-    dipoles = Dipoles()
+    dipoles = DipoleField()
     made = driven(dipoles)
     print(f"odometry and LiDAR:           {1e3 * error_m(made, without(made)):.0f} mm")
     print(f"with magnetometers, off line: {1e3 * error_m(made, off_line(made, dipoles)):.0f} mm")

@@ -5,7 +5,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from examples.pose_graph import Dipoles, driven, error_m, off_line, on_line, without
+from examples.pose_graph import DipoleField, driven, error_m, off_line, on_line, without
 from l2m_factors import Calibrations, assert_jacobians_match, magnetic_pose_factor
 
 KEY = gtsam.symbol("q", 7)
@@ -21,7 +21,7 @@ def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
     sensors = Calibrations(rng.normal(0, 0.2, (3, 3)), distortion, np.zeros(3))
     noise = gtsam.noiseModel.Diagonal.Sigmas(rng.uniform(0.1, 1.0, 12))
     factor = magnetic_pose_factor(
-        KEY, Dipoles(), sensors, np.array([0, 2, 1, 0]), rng.normal(0, 30, (4, 3)), noise
+        KEY, DipoleField(), sensors, np.array([0, 2, 1, 0]), rng.normal(0, 30, (4, 3)), noise
     )
     assert_jacobians_match(factor, values)
 
@@ -29,16 +29,16 @@ def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
 def test_the_field_of_the_example_has_its_gradient() -> None:
     """Central differences of 0.1 mm; the third derivative adds less than 1e-5 uT/m here."""
     points, step = np.random.default_rng(2).uniform(-1, 1, (20, 3)), 1e-4
-    _, gradient = Dipoles().field_and_gradient(points)
+    _, gradient = DipoleField().field_and_gradient(points)
     for axis in range(3):
         shift = step * np.eye(3)[axis]
-        high, low = (Dipoles().field_and_gradient(points + sign * shift)[0] for sign in (1, -1))
+        high, low = (DipoleField().field_and_gradient(points + sign * shift)[0] for sign in (1, -1))
         np.testing.assert_allclose(gradient[:, :, axis], (high - low) / (2 * step), atol=1e-4)
 
 
 def test_a_graph_of_others_gains_off_line_and_in_isam2() -> None:
     """Half of the error at most is left, and both solvers end at the same poses."""
-    drive, dipoles = driven(Dipoles()), Dipoles()
+    drive, dipoles = driven(DipoleField()), DipoleField()
     before = error_m(drive, without(drive))
     together, one_by_one = off_line(drive, dipoles), on_line(drive, dipoles)
     assert error_m(drive, together) < before / 2

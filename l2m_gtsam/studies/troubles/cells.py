@@ -21,7 +21,7 @@ from l2m_gtsam.studies.troubles.surveys import TroubledHall
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedSensor:
     """What a calibration says of one sensor, and what is true.
 
     Attributes
@@ -51,7 +51,7 @@ class TroublesCell:
 
     trouble: Trouble
     survey: int
-    sensors: tuple[Judged, ...]
+    sensors: tuple[JudgedSensor, ...]
 
 
 def cell_of(options: TroublesOptions, place: TroubledHall, trouble: Trouble) -> TroublesCell:
@@ -66,7 +66,7 @@ def cell_of(options: TroublesOptions, place: TroubledHall, trouble: Trouble) -> 
 
 def judged_drive(
     options: TroublesOptions, place: TroubledHall, trouble: Trouble, number: int
-) -> list[Judged]:
+) -> list[JudgedSensor]:
     """Return what the calibration of a drive says of each sensor; FAIL where there is none."""
     recording, truth = troubled_drive(options, place, trouble, number)
     stated = trouble is Trouble.POSES_STATED
@@ -80,7 +80,7 @@ def judged_drive(
         found = calibrated(recording, place.field_map, chosen)
         metrics = evaluate(recording, found, chosen, QaOptions())
     except L2MError:
-        return [Judged(Level.FAIL.value, None, None, None, None, 1.0)] * len(truth)
+        return [JudgedSensor(Level.FAIL.value, None, None, None, None, 1.0)] * len(truth)
     verdict = judge(found.result, metrics, QaOptions())
     return [
         judged_sensor(each, known, verdict.level)
@@ -88,15 +88,15 @@ def judged_drive(
     ]
 
 
-def judged_sensor(found: SensorCalibration, truth: KnownSensor, level: Level) -> Judged:
+def judged_sensor(found: SensorCalibration, truth: KnownSensor, level: Level) -> JudgedSensor:
     """Return what is said of a sensor beside the truth."""
     excess = found.unmodelled.largest
     covariance = found.covariance
     if not (np.isfinite(covariance).all() and np.isfinite(found.t_lidar_mag).all()):
-        return Judged(level.value, None, None, None, None, excess)
+        return JudgedSensor(level.value, None, None, None, None, excess)
     true = np.concatenate([truth.t_lidar_mag, truth.distortion.vector()])
     e = np.concatenate([found.t_lidar_mag, found.distortion.vector()]) - true
-    return Judged(
+    return JudgedSensor(
         level=level.value,
         distance_t=float(e[:3] @ np.linalg.solve(covariance[:3, :3], e[:3])),
         distance=float(e @ np.linalg.solve(covariance, e)),

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.statistics import LEVEL, Share
 from l2m_gtsam.studies.study import Study
-from l2m_gtsam.studies.troubles.cells import Judged, TroublesCell, cell_of
+from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell, cell_of
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
 from l2m_gtsam.studies.troubles.surveys import TroubledHall, troubled_hall
 
@@ -102,7 +102,7 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
         self, options: TroublesOptions, cells: Mapping[str, TroublesCell]
     ) -> TroublesSummary:
         """Return a row for each condition."""
-        by_trouble: dict[Trouble, list[Judged]] = {each: [] for each in Trouble}
+        by_trouble: dict[Trouble, list[JudgedSensor]] = {each: [] for each in Trouble}
         for cell in cells.values():
             by_trouble[cell.trouble] += cell.sensors
         rows = tuple(row_of(each, found) for each, found in by_trouble.items() if found)
@@ -153,7 +153,7 @@ def kind(trouble: Trouble) -> Trouble:
     return Trouble.SUITE if trouble.wrong_suite else Trouble.CLEAN
 
 
-def row_of(trouble: Trouble, found: list[Judged]) -> TroubleRow:
+def row_of(trouble: Trouble, found: list[JudgedSensor]) -> TroubleRow:
     """Return what came of a condition."""
     known = [each for each in found if each.distance is not None]
     passed = [each for each in known if each.level == Level.PASS.value]
@@ -172,7 +172,7 @@ def row_of(trouble: Trouble, found: list[Judged]) -> TroubleRow:
     )
 
 
-def count(found: list[Judged], level: Level) -> int:
+def count(found: list[JudgedSensor], level: Level) -> int:
     """Return how many were judged so."""
     return sum(each.level == level.value for each in found)
 

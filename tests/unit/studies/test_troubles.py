@@ -8,7 +8,7 @@ import pytest
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.steel_hall import steel_hall
-from l2m_gtsam.studies.troubles.cells import Judged, TroublesCell
+from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell
 from l2m_gtsam.studies.troubles.drives import bent, disturbance, pink
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
 from l2m_gtsam.studies.troubles.study import TROUBLES, kind, split
@@ -74,9 +74,9 @@ def test_a_survey_reads_where_its_suite_is() -> None:
         assert 0.05 < np.sqrt(np.mean((wrong.series[index].field - field) ** 2)) < 1.5
 
 
-def judged(level: Level, distance: float | None) -> Judged:
+def judged(level: Level, distance: float | None) -> JudgedSensor:
     known = None if distance is None else 0.01
-    return Judged(level.value, distance, distance, known, known, 1.0)
+    return JudgedSensor(level.value, distance, distance, known, known, 1.0)
 
 
 def test_conditions_are_counted() -> None:
