@@ -81,7 +81,7 @@ class WholeFieldOptions(Options):
     """Standard deviation per axis of what steel on the vehicle adds to the readings beyond the
     calibration, uT. It is estimated even where the calibration is fixed: the poses would have to
     explain it."""
-    distortion: float = Field(default=0.01, gt=0)
+    distortion: float = Field(default=0.03, gt=0)
     """And of the entries of C."""
 
 
