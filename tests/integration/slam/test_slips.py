@@ -58,7 +58,10 @@ def test_a_pivot_is_told_as_none_and_does_no_harm() -> None:
 
 
 @pytest.mark.study
-@pytest.mark.parametrize("held_out", [1, 2, 3, 4])
+@pytest.mark.parametrize(
+    "held_out",
+    [1, pytest.param(2, marks=pytest.mark.xfail(reason="NEES is 12.7, 12 are wanted")), 3, 4],
+)
 def test_slips_of_a_real_robot(shared_data: Path, held_out: int) -> None:
     """Ten slips of 10 cm and 5 degrees in a pass, in the map of the others; its pivots are real."""
     others = [robot_pass(shared_data, run) for run in (1, 2, 3, 4) if run != held_out]
@@ -113,4 +116,4 @@ def test_slips_of_a_real_robot(shared_data: Path, held_out: int) -> None:
     nees = pose_nees(truth, result.trajectory).mean()
     print(f"{held_out}: {1e3 * before:.0f} -> {1e3 * after:.0f} mm, NEES {nees:.1f}, {len(found)}")
     assert after < 0.15 * before
-    assert nees < 15  # 12.7 in the second pass, where 12 are wanted; the others are below
+    assert nees < 12
