@@ -136,8 +136,9 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }
-    written = _without_empty(_without_empty(content, "notes"), "traces")
-    write_yaml(path, written, HEADER)
+    for name in ("notes", "exact", "traces"):
+        content = _without_empty(content, name)
+    write_yaml(path, content, HEADER)
 
 
 def read_calibration(path: Path) -> CalibrationResult:
