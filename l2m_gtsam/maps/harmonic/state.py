@@ -47,7 +47,7 @@ def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapS
             "suite_pairs": np.stack([suite.reading, suite.sensor]),
             "suite_shift": suite.shift.astype(np.float32),
         }
-        origin |= {"suite": list(suite.sensors)}
+        origin |= {"suite_sensors": list(suite.sensors)}
     return MapState(kind, arrays, options.model_dump(mode="json"), origin)
 
 
@@ -148,7 +148,7 @@ def suite_from_state(state: MapState, count: int) -> SuiteErrors | None:
     """Return what errors of the sensors do to so many readings, after checks; none in most maps."""
     if "suite_covariance" not in state.arrays:
         return None
-    names = state.provenance.get("suite")
+    names = state.provenance.get("suite_sensors")
     covariance, pairs, shift = (
         state_array(state, f"suite_{name}") for name in ("covariance", "pairs", "shift")
     )
