@@ -29,7 +29,10 @@ def test_a_suite_is_calibrated_and_maps(shared_data: Path, tmp_path: Path) -> No
     assert -0.025 < sensor.time_offset.seconds < -0.015
     known = read_known_sensors(out)["imu/mag"]
     assert known.time_offset == sensor.time_offset.seconds
-    l2m("map", "build", bag, "--suite", out, "--config", config, "--out", tmp_path / "map.npz")
+    field_map = tmp_path / "map.npz"
+    l2m("map", "build", bag, "--suite", out, "--config", config, "--out", field_map)
+    # The errors that the suite states went into the file, and come out of it.
+    assert "as sure as stated" in l2m("map", "info", field_map).out
 
 
 def test_what_cannot_be_done_is_said_in_one_line(shared_data: Path, tmp_path: Path) -> None:
