@@ -41,6 +41,10 @@ class OutputError(L2MError):
     """A result that cannot be written."""
 
 
+class NoRoomError(OutputError):
+    """A disk or a quota that is full: nothing else can be written there either."""
+
+
 class ClusterError(L2MError):
     """Work that cannot be shared out."""
 

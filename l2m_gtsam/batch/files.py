@@ -17,7 +17,7 @@ from l2m_gtsam.options import Options, first_fault
 from l2m_gtsam.progress import Count, Progress, counter
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_recording
-from l2m_gtsam.storage.files import source_file
+from l2m_gtsam.storage.files import source_file, unwritten
 from l2m_gtsam.storage.map_file import load_map
 from l2m_gtsam.storage.regressors import read_scalars
 from l2m_gtsam.storage.tile_folder import tiles_beside
@@ -42,9 +42,7 @@ def ensure_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot be made as a folder for results: {error.strerror}"
-        ) from error
+        raise unwritten(folder, error, "cannot be made as a folder for results") from error
 
 
 @runtime_checkable

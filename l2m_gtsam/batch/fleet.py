@@ -9,7 +9,6 @@ from pathlib import Path
 from l2m_gtsam.batch.files import SavedMap, check_outputs
 from l2m_gtsam.batch.fleet_task import (
     CSV_FILE,
-    OUTCOME_FILE,
     PAGE_FILE,
     PARQUET_FILE,
     RESULTS,
@@ -23,6 +22,7 @@ from l2m_gtsam.batch.fleet_task import (
     map_of,
     open_map,
 )
+from l2m_gtsam.batch.reports import OUTCOME_FILE
 from l2m_gtsam.config import Config, load_config, with_poses
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
@@ -89,7 +89,7 @@ def run_fleet(order: FleetOrder, cluster: ClusterOptions, progress: Progress) ->
     ------
     L2MError
         Folder or manifest, a map or a configuration cannot be used, nothing can be written, or
-        there is no cluster.
+        there is no cluster. Page and tables stay as they were; drives that are done are kept.
     """
     out = order.out.absolute()
     drives = fleet_drives(order)

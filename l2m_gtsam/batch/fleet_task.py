@@ -9,12 +9,18 @@ from pathlib import Path
 from time import perf_counter
 
 from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, calibrate_drive
-from l2m_gtsam.batch.files import OpenMap, SavedMap, check_outputs, ensure_folder
-from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, calibration_results, report_calibration
+from l2m_gtsam.batch.files import OpenMap, SavedMap, check_outputs
+from l2m_gtsam.batch.reports import (
+    OUTCOME_FILE,
+    PDF_FILE,
+    REPORT_FILE,
+    calibration_results,
+    report_calibration,
+)
 from l2m_gtsam.batch.scan_poses import read_drive_on
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import Recording
-from l2m_gtsam.errors import BagError, ConfigError, L2MError, OutputError
+from l2m_gtsam.errors import BagError, ConfigError, L2MError, NoRoomError, OutputError
 from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.fleet import sensor_rows
 from l2m_gtsam.records.fleet import DATE, Computation, DriveOutcome, RowKey
@@ -26,10 +32,10 @@ from l2m_gtsam.storage.drive_lists import (
     is_folder,
     read_manifest,
 )
-from l2m_gtsam.storage.files import folder_names, printable, source_file
+from l2m_gtsam.storage.files import folder_names, printable, source_file, unwritten
 from l2m_gtsam.storage.parts import sweep
 from l2m_gtsam.storage.record_files import write_outcome
-from l2m_gtsam.storage.result_set import SET_FILE, finish
+from l2m_gtsam.storage.result_set import SET_FILE, finish, published
 
 PAGE_FILE, CSV_FILE, PARQUET_FILE = "index.html", "fleet.csv", "fleet.parquet"
 
@@ -182,7 +188,6 @@ def _with_folders(drives: Sequence[FleetDrive]) -> tuple[FleetDrive, ...]:
     return tuple(placed)
 
 
-OUTCOME_FILE = "outcome.json"
 RESULTS = (CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, REPORT_FILE)
 NANOSECONDS = 1_000_000_000
 
@@ -251,16 +256,20 @@ def open_map(path: Path) -> FleetMap:
 
 
 def calibrated_drive(task: FleetTask, shared: FleetMap) -> DriveOutcome:
-    """Calibrate a drive; write what `l2m calibrate` writes, and `outcome.json` at the very end."""
+    """Calibrate a drive; publish what `l2m calibrate` writes and `outcome.json`, or that alone.
+
+    Raises
+    ------
+    NoRoomError
+        The results cannot be written, as those of other drives could not; the old ones stay.
+    """
     begun = perf_counter()
     try:
-        outcome = _outcome(task, shared, begun)
-        if outcome.lasting:
-            ensure_folder(task.out)
-            write_outcome(task.out / OUTCOME_FILE, outcome)
+        return _outcome(task, shared, begun)
+    except NoRoomError:
+        raise
     except OutputError as error:
         return _failed(task, str(error), begun)
-    return outcome
 
 
 def lost_drive(task: FleetTask, reason: str) -> DriveOutcome:
@@ -270,18 +279,19 @@ def lost_drive(task: FleetTask, reason: str) -> DriveOutcome:
 
 def _outcome(task: FleetTask, shared: FleetMap, begun: float) -> DriveOutcome:
     """Return what became of a drive; an OutputError if its results cannot be written."""
-    _clear(task.out)
+    check_outputs(*_files(task.out))
     try:
-        if shared.opened is None or shared.saved is None:
-            return _failed(task, shared.error, begun)
-        return _calibrated(task, shared.opened, shared.saved, begun)
+        if shared.opened is not None and shared.saved is not None:
+            return _calibrated(task, shared.opened, shared.saved, begun)
+        outcome = _failed(task, shared.error, begun)
     except OutputError:
         raise
     except L2MError as error:
-        digest = digest_of(task.drive.bag)
-        return _failed(task, str(error), begun, digest)
+        outcome = _failed(task, str(error), begun, digest_of(task.drive.bag))
     except Exception as error:  # one drive is not the end of all others
-        return _failed(task, _unexpected(task.drive.bag, error), begun)
+        outcome = _failed(task, _unexpected(task.drive.bag, error), begun)
+    _replace(task.out, outcome)
+    return outcome
 
 
 def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float) -> DriveOutcome:
@@ -290,15 +300,18 @@ def _calibrated(task: FleetTask, opened: OpenMap, saved: SavedMap, begun: float)
     with calibration_results(task.out) as stage:
         found = calibrate_drive(recording, opened, task.config, stage, silent)
         verdict = report_calibration(stage, found, task.config.qa)
-    return DriveOutcome(
-        key=task.key(recording.source.sha256),
-        start=_start(recording),
-        duration=_duration(recording),
-        sensors=sensor_rows(found.result, verdict),
-        error="",
-        lasting=True,
-        made=_made(begun),
-    )
+        outcome = DriveOutcome(
+            key=task.key(recording.source.sha256),
+            start=_start(recording),
+            duration=_duration(recording),
+            sensors=sensor_rows(found.result, verdict),
+            error="",
+            lasting=True,
+            made=_made(begun),
+        )
+        write_outcome(stage / OUTCOME_FILE, outcome)
+    _sweep(task.out)
+    return outcome
 
 
 def _failed(task: FleetTask, reason: str, begun: float, digest: str = "") -> DriveOutcome:
@@ -313,17 +326,34 @@ def _unexpected(path: Path, error: Exception) -> str:
     return f"{path}: unexpected {type(error).__name__}: {text}; `l2m --debug calibrate` shows where"
 
 
-def _clear(folder: Path) -> None:
-    """Remove results of an earlier bag, map or configuration: they must not pass for new ones."""
-    files = [folder / name for name in (OUTCOME_FILE, *RESULTS, PDF_FILE, SET_FILE)]
-    check_outputs(*files)
-    try:
-        finish(folder)
-        for file in files:
-            sweep(file)
-            file.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+def _replace(folder: Path, outcome: DriveOutcome) -> None:
+    """Put an outcome in the place of results of an earlier bag, map or configuration.
+
+    They must not pass for new ones. Of an outcome that may be another tomorrow nothing is kept.
+    """
+    names = [each.name for each in _files(folder)]
+    if outcome.lasting:
+        with published(folder, *names, unlisted=(OUTCOME_FILE,)) as stage:
+            write_outcome(stage / OUTCOME_FILE, outcome)
+    elif folder.is_dir():
+        try:
+            finish(folder)
+            for name in names:
+                (folder / name).unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritten(folder, error) from error
+    _sweep(folder)
+
+
+def _sweep(folder: Path) -> None:
+    """Remove what runs that were killed left hidden."""
+    for each in _files(folder):
+        sweep(each)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Return what may be in the folder of a drive."""
+    return [folder / name for name in (OUTCOME_FILE, *RESULTS, PDF_FILE, SET_FILE)]
 
 
 def digest_of(path: Path) -> str:

@@ -138,6 +138,7 @@ def _run(browser: str, profile: str, page: Path, pdf: Path) -> str:
 
 REPORT_FILE = "report.html"
 PDF_FILE = "report.pdf"
+OUTCOME_FILE = "outcome.json"
 
 
 def report_folder(
@@ -178,6 +179,8 @@ def report_folder(
 def calibration_results(out: Path) -> Iterator[Path]:
     """Give a hidden folder for a calibration and its report, which are published together.
 
+    The outcome of a drive of a fleet may be among them; it goes where there is a new calibration.
+
     Parameters
     ----------
     out
@@ -188,10 +191,10 @@ def calibration_results(out: Path) -> Iterator[Path]:
     OutputError
         They cannot be written, or the folder holds a localisation, too.
     """
-    names = (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE, REPORT_FILE, PDF_FILE)
+    names = (CALIBRATION_FILE, OVERVIEW_FILE, METRICS_FILE, REPORT_FILE, PDF_FILE, OUTCOME_FILE)
     check_outputs(*(out / name for name in names))
     holds_localisation(out)
-    with published(out, *names) as stage:
+    with published(out, *names, unlisted=(OUTCOME_FILE,)) as stage:
         yield stage
 
 

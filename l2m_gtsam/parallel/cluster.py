@@ -1,19 +1,21 @@
 """Many independent tasks on local processes or on a running Dask cluster."""
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import cpu_count
+from time import sleep
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from pydantic import Field
 
-from l2m_gtsam.errors import ClusterError
+from l2m_gtsam.errors import ClusterError, L2MError
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import THREADS
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, Worker
 
 Key = TypeVar("Key")
 Place = TypeVar("Place")
@@ -21,6 +23,7 @@ Value = TypeVar("Value")
 
 LOOPBACK = "127.0.0.1"
 CONNECT_S = 20  # a scheduler that is there answers at once
+LOOK_AGAIN_S = 0.2
 NO_PAGES: dict[str, list[str]] = {
     "distributed.scheduler.http.routes": [],
     "distributed.worker.http.routes": [],
@@ -76,6 +79,8 @@ def computed(
 
     Raises
     ------
+    L2MError
+        A task raised it: no more are begun, and those that run have ended.
     ClusterError
         Dask is not installed, the scheduler does not answer or has no workers, or a task kills
         its workers.
@@ -86,16 +91,33 @@ def computed(
         from distributed.scheduler import KilledWorker
 
         alone: list[Key] = []
-        for key, future in _finished(client, work, keys):
+        futures = _begun(client, work, keys)
+        for future, key in _finished(futures):
             try:
                 value = future.result()
             except KilledWorker as error:
                 if work.lost is None:
                     raise ClusterError(f"{key}: {DIED}") from error
                 alone.append(key)
+            except L2MError:
+                _let_end(client, list(futures))
+                raise
             else:
                 yield key, value
         yield from _one_by_one(client, work, alone)
+
+
+def _let_end(client: "Client", futures: "Sequence[Future[Any]]") -> None:
+    """Begin no more tasks, and wait for those that run: one that is killed leaves parts."""
+    client.cancel(futures)
+    ours = {each.key for each in futures}
+    while any(ours & keys for keys in client.run(_running).values()):
+        sleep(LOOK_AGAIN_S)
+
+
+def _running(dask_worker: "Worker") -> set[Any]:
+    """Return the keys of the tasks that a worker runs, cancelled ones, too."""
+    return {each.key for each in dask_worker.state.executing}
 
 
 def _one_by_one(
@@ -119,7 +141,7 @@ def _alone(
     """Return the result of a task that has all workers to itself, or what stands for it."""
     from distributed.scheduler import KilledWorker
 
-    _, future = next(_finished(client, work, [key]))
+    (future,) = _begun(client, work, [key])
     try:
         value: Value = future.result()
     except KilledWorker as error:
@@ -131,20 +153,24 @@ def _alone(
     return value
 
 
-def _finished(
+def _begun(
     client: "Client", work: Work[Key, Place, Value], keys: Sequence[Key]
-) -> "Iterator[tuple[Key, Future[Any]]]":
-    """Yield the futures of tasks as they end, well or not; each is released after its turn."""
-    from distributed import as_completed
-
+) -> "dict[Future[Any], Key]":
+    """Hand tasks to the workers; return their futures."""
     places = list(dict.fromkeys(map(work.place, keys)))
     prepared = {place: client.submit(work.prepare, place, pure=False) for place in places}
-    names = {
+    # What is prepared is kept by the tasks that wait for it, and forgotten after the last.
+    return {
         client.submit(work.task, key, prepared[work.place(key)], pure=False): key for key in keys
     }
-    del prepared  # each is kept by the tasks that wait for it, and forgotten after the last
-    for future in as_completed(list(names)):
-        yield names[future], future
+
+
+def _finished(futures: "dict[Future[Any], Key]") -> "Iterator[tuple[Future[Any], Key]]":
+    """Yield futures with their keys as they end, well or not; each is released after its turn."""
+    from distributed import as_completed
+
+    for future in as_completed(list(futures)):
+        yield future, futures[future]
         future.release()
 
 
@@ -169,8 +195,11 @@ def connected(options: ClusterOptions) -> "Iterator[Client]":
     # Whoever talks to a scheduler runs code as its owner: keys of this run alone, never on a disk,
     # keep out other users of the machine. Each worker has a core to itself, and one thread.
     one = {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, THREADS: 1}
+    # What Dask has to say of its own processes is told by results, or by one line at the end.
+    silent = {"DASK_LOGGING__DISTRIBUTED": "critical"}
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with (
-        dask.config.set({**NO_PAGES, "distributed.nanny.pre-spawn-environ": one}),
+        dask.config.set({**NO_PAGES, "distributed.nanny.pre-spawn-environ": {**one, **silent}}),
         LocalCluster(
             n_workers=options.workers,
             threads_per_worker=1,

@@ -17,6 +17,7 @@ from l2m_gtsam.errors import OutputError
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.simulate.sensors import NoiseOptions
+from l2m_gtsam.storage.files import unwritten
 from l2m_gtsam.storage.parts import part_folder
 from l2m_gtsam.storage.ros_messages import (
     NANOSECONDS,
@@ -191,7 +192,7 @@ def write_bag(
                 path.rename(parent / "replaced")
             unfinished.rename(path)
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+        raise unwritten(path, error) from error
 
 
 def _is_replaceable(path: Path, kind: BagKind) -> bool:

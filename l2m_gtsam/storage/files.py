@@ -1,5 +1,6 @@
 """Files of any kind: written whole or not at all, their digests, and safe names for folders."""
 
+import errno
 import hashlib
 import os
 import unicodedata
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Protocol, TextIO
 
 from l2m_gtsam.data import SourceFile
-from l2m_gtsam.errors import L2MError, OutputError
+from l2m_gtsam.errors import L2MError, NoRoomError, OutputError
 from l2m_gtsam.storage.bounded import open_regular, opened
 from l2m_gtsam.storage.parts import part_file
 
@@ -80,7 +81,28 @@ def renamed_path(path: Path) -> Iterator[Path]:
             yield temporary
             temporary.replace(path)
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise unwritten(path, error) from error
+
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+
+
+def unwritten(path: Path, error: OSError, what: str = "cannot be written") -> OutputError:
+    """Return what to raise for a result that cannot be written: an error of its own without room.
+
+    Parameters
+    ----------
+    path
+        The result.
+    error
+        Why.
+    what
+        What cannot be done.
+    """
+    line = f"{path}: {what}: {error.strerror or error}"
+    if error.errno in NO_ROOM:
+        return NoRoomError(f"{line}; make room, and run it again")
+    return OutputError(line)
 
 
 def _flush(path: Path) -> None:

@@ -8,7 +8,7 @@ only has to move. ``results.json`` lists the files with their digests, under one
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ from pydantic import TypeAdapter, ValidationError
 from l2m_gtsam.errors import L2MError, OutputError
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.storage.bounded import read_content
-from l2m_gtsam.storage.files import source_file
+from l2m_gtsam.storage.files import source_file, unwritten
 from l2m_gtsam.storage.parts import only_one, part_folder
 
 SET_FILE = "results.json"
@@ -41,7 +41,9 @@ _SET = TypeAdapter(_SetFile)
 
 
 @contextmanager
-def published(folder: Path, *names: str, adds: bool = False) -> Iterator[Path]:
+def published(
+    folder: Path, *names: str, adds: bool = False, unlisted: Sequence[str] = ()
+) -> Iterator[Path]:
     """Give a hidden folder to write results to, and publish them together when the block ends well.
 
     Parameters
@@ -52,6 +54,9 @@ def published(folder: Path, *names: str, adds: bool = False) -> Iterator[Path]:
         Files that may be there. Those of an earlier run that this one does not write are removed.
     adds
         Whether files are added to the set that is there, whose others then stay.
+    unlisted
+        Files that are published with the others, but have no digest in the list: they hold times.
+        Where nothing else is written there is no list.
 
     Raises
     ------
@@ -65,12 +70,12 @@ def published(folder: Path, *names: str, adds: bool = False) -> Iterator[Path]:
         with made(folder), part_folder(folder / STAGE) as stage:
             with _said_of(stage, folder):
                 yield stage
-            kept, new = _files_of(folder) if adds else {}, _digests(stage)
-            gone = [] if adds else sorted(set(names) - set(new))
+            kept, new = _files_of(folder) if adds else {}, _digests(stage, unlisted)
+            gone = set() if adds else {*names} - {each.name for each in stage.iterdir()}
             _list(stage, {**kept, **new}, gone)
             _commit(stage, folder)
     except OSError as error:
-        raise OutputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+        raise unwritten(folder, error) from error
 
 
 @contextmanager
@@ -86,9 +91,7 @@ def made(folder: Path) -> Iterator[None]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot be made as a folder for results: {error.strerror}"
-        ) from error
+        raise unwritten(folder, error, "cannot be made as a folder for results") from error
     try:
         yield
     except BaseException:
@@ -151,21 +154,30 @@ def _files_of(folder: Path) -> dict[str, str]:
     return {} if listed is None else listed.files
 
 
-def _digests(stage: Path) -> dict[str, str]:
+def _digests(stage: Path, unlisted: Sequence[str]) -> dict[str, str]:
+    left_out = {SET_FILE, *unlisted}
     return {
-        each.name: source_file(each).sha256 for each in stage.iterdir() if each.name != SET_FILE
+        each.name: source_file(each).sha256 for each in stage.iterdir() if each.name not in left_out
     }
 
 
-def _list(stage: Path, files: Mapping[str, str], gone: Sequence[str]) -> None:
+def _list(stage: Path, files: Mapping[str, str], gone: Collection[str]) -> None:
     """Write the list of a set, with the fingerprint of all that is in it, and what it replaces."""
+    if not files:
+        _write_flushed(stage / GONE, "\n".join(sorted({*gone, SET_FILE})))
+        _flush(stage)
+        return
     text = "".join(f"{name}\0{digest}\0" for name, digest in sorted(files.items()))
     fingerprint = hashlib.sha256(text.encode()).hexdigest()
     content = _SetFile("l2m-results", 1, fingerprint, dict(sorted(files.items())))
-    (stage / SET_FILE).write_bytes(_SET.dump_json(content, indent=1) + b"\n")
-    (stage / GONE).write_text("\n".join(gone), encoding="utf-8")
-    for each in (stage / GONE, stage / SET_FILE, stage):
-        _flush(each)
+    _write_flushed(stage / SET_FILE, f"{_SET.dump_json(content, indent=1).decode()}\n")
+    _write_flushed(stage / GONE, "\n".join(sorted(gone)))
+    _flush(stage)
+
+
+def _write_flushed(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+    _flush(path)
 
 
 def _commit(stage: Path, folder: Path) -> None:

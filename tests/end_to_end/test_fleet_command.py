@@ -1,6 +1,7 @@
 """``l2m batch``: a small fleet through the command line, and what is computed again after it."""
 
 import csv
+import errno
 import json
 import os
 import re
@@ -17,10 +18,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from l2m_gtsam.batch import fleet as batch_fleet
+from l2m_gtsam.batch import fleet_task
 from l2m_gtsam.batch.files import SavedMap
 from l2m_gtsam.batch.fleet import fleet_tasks, run_fleet
 from l2m_gtsam.batch.fleet_task import (
-    OUTCOME_FILE,
     RESULTS,
     FleetOrder,
     FleetTask,
@@ -29,8 +30,10 @@ from l2m_gtsam.batch.fleet_task import (
     lost_drive,
     open_map,
 )
+from l2m_gtsam.batch.reports import OUTCOME_FILE
+from l2m_gtsam.errors import NoRoomError
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.parallel.cluster import ClusterOptions
+from l2m_gtsam.parallel.cluster import ClusterOptions, Work
 from l2m_gtsam.records.fleet import DriveOutcome
 from l2m_gtsam.storage.result_set import SET_FILE
 from l2m_gtsam.storage.trajectory_files import write_tum
@@ -289,6 +292,38 @@ def test_results_of_an_earlier_bag_do_not_stay(run: Run, tmp_path: Path) -> None
     outcome = calibrated_drive(task, open_map(there.place.map))
     assert outcome.lasting
     assert {each.name for each in task.out.iterdir()} == {OUTCOME_FILE}
+
+
+def test_a_full_disk_is_no_row(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It concerns all drives: the run ends, and old results stay, those of the drive included."""
+    there = run.copied(tmp_path)
+    vehicle(there.bags / "truck_1" / "day_0.bag", seed=8)
+    before = contents(there.out)
+
+    def serial(
+        work: Work[FleetTask, Path, DriveOutcome], tasks: list[FleetTask], _: ClusterOptions
+    ) -> Iterator[tuple[FleetTask, DriveOutcome]]:
+        for task in tasks:
+            yield task, work.task(task, work.prepare(work.place(task)))
+
+    def full(*_: object) -> NoReturn:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(batch_fleet, "computed", serial)
+    with monkeypatch.context() as patch:
+        patch.setattr(fleet_task, "write_outcome", full)  # the last of a drive's results
+        with pytest.raises(NoRoomError, match=r"day_0: .* No space left on device; make room"):
+            run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
+    assert contents(there.out) == before
+    fleet = run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
+    assert fleet.computed == 1
+    assert contents(there.out).keys() == before.keys()
+    assert contents(there.out) != before
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return all files, hidden ones, too."""
+    return {str(each): each.read_bytes() for each in folder.rglob("*") if each.is_file()}
 
 
 def test_what_nobody_expects_is_a_row_too(run: Run, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.storage.map_file import load_map, save_map
+from l2m_gtsam.storage.rosbags_bounds import ZSTD
 from tests.fuzz.changes import NUMBERS, VALUES, WORDS, changed_bytes, changed_tree
 from tests.support.bag_records import (
     CHUNK,
@@ -110,7 +111,7 @@ def changed_mcap(data: bytes, random: Random) -> bytes:
             place = random.choice(chunks)
             try:
                 chunk = mcap_chunk(records[place])
-            except (RuntimeError, struct.error, ValueError, EOFError):
+            except (RuntimeError, struct.error, ValueError, EOFError, ZSTD.ZstdError):
                 continue
             raw = (_inner if random.random() < 0.7 else changed_bytes)(chunk.raw, random)
             packing = random.choice(("", "lz4", "zstd"))

@@ -77,7 +77,7 @@ def commands(folder: Path, demo: Path) -> list[Command]:
     build = ("map", "build", here, "--out", f"{OUT}/m.npz")
     update = ("map", "update", f"{HERE}/map.npz", str(other), *as_now, "--out", f"{OUT}/m.npz")
     copied = ("--out", f"{OUT}/copy.bag", "--despite-verdict")
-    batch = ("batch", str(bags), *on_map, *as_now, "--workers", "1", *there)
+    batch = ("batch", str(bags), *on_map, "--workers", "1", *there)
     basin = ("study", "basin", "--options", str(study), "--workers", "1", *there)
     whole = ("calibrate", str(demo / "calibration_mcap"), *on_map, *there)
     return [
@@ -86,7 +86,7 @@ def commands(folder: Path, demo: Path) -> list[Command]:
         Command("map update", (*build, *before), update, (place.map,), 18),
         Command("apply", (), ("apply", str(drive), *calibrated, *copied), (), 14, once=True),
         Command("slam", (*slam, *before), (*slam, *as_now), (place.map,), 16),
-        Command("batch", (), batch, (place.map,), 5),
+        Command("batch", (*batch, *before), (*batch, *as_now), (place.map,), 5),
         Command("study", (), basin, (), 5),
         Command("calibrate, tiles kept", (), whole, (demo / "map.npz",), 4),
     ]

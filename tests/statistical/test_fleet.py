@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from l2m_gtsam.batch.fleet_task import OUTCOME_FILE
+from l2m_gtsam.batch.reports import OUTCOME_FILE
 from tests.drives.fleets import BROKEN, Place, make_place, vehicle
 from tests.support.command_line import l2m_process
 

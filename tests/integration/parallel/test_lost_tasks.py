@@ -3,12 +3,13 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
+from time import sleep
 
 import dask
 import distributed  # its configuration is loaded before a part of it is changed
 import pytest
 
-from l2m_gtsam.errors import ClusterError
+from l2m_gtsam.errors import ClusterError, NoRoomError
 from l2m_gtsam.parallel import cluster
 from l2m_gtsam.parallel.cluster import ClusterOptions, Work, computed
 
@@ -71,3 +72,33 @@ def test_a_scheduler_without_workers_is_not_waited_for(monkeypatch: pytest.Monke
     told = str(error.value)
     assert told.startswith(f"--scheduler {empty.scheduler_address}: has no workers; start some: ")
     assert "\n" not in told
+
+
+def folder_of(key: tuple[int, Path]) -> Path:
+    return key[1]
+
+
+def as_it_is(folder: Path) -> Path:
+    return folder
+
+
+def written(key: tuple[int, Path], folder: Path) -> int:
+    """Leave a file when it begins and one when it ends; the second of them ends all."""
+    (folder / f"{key[0]}.begun").touch()
+    if key[0] == 1:
+        raise NoRoomError("no room")
+    sleep(6.0)  # longer than Dask waits before it kills a worker
+    (folder / f"{key[0]}.ended").touch()
+    return key[0]
+
+
+def test_what_runs_ends_when_a_task_ends_all(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    keys = [(k, tmp_path) for k in range(12)]
+    with pytest.raises(NoRoomError, match="no room"):
+        list(computed(Work(folder_of, as_it_is, written), keys, ClusterOptions(workers=1)))
+    begun, ended = ({each.stem for each in tmp_path.glob(f"*.{how}")} for how in ("begun", "ended"))
+    assert begun - ended == {"1"}
+    assert len(begun) < 6  # of twelve
+    assert capfd.readouterr().err == ""

@@ -1,5 +1,6 @@
 """Results as a set: all or none, known by one fingerprint, refused when they are mixed."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -99,6 +100,23 @@ def test_stopped_at_any_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, st
     assert visible in (old, new)
     write(tmp_path, "next")
     assert there(tmp_path) == dict.fromkeys(NAMES, "next")
+
+
+def test_files_that_hold_times_are_published_but_not_listed(tmp_path: Path) -> None:
+    def write_timed(folder: Path, *names: str) -> None:
+        with published(folder, *NAMES, unlisted=("c.txt",)) as stage:
+            for name in names:
+                (stage / name).write_text(f"{name} of {folder.name}")
+
+    one, other = tmp_path / "one", tmp_path / "other"
+    for folder in (one, other):
+        write_timed(folder, "a.txt", "c.txt")
+    listed = json.loads((one / SET_FILE).read_text())["files"]
+    assert listed.keys() == {"a.txt"}
+    shutil.copy(other / "c.txt", one / "c.txt")
+    check_set(one / "c.txt", CalibrationError)
+    write_timed(one, "c.txt")
+    assert [each.name for each in one.iterdir()] == ["c.txt"]
 
 
 @pytest.mark.parametrize("name", NAMES)
