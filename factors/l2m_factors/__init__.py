@@ -11,7 +11,7 @@ from l2m_factors.key_pose_readings import (
     KeyPoseResiduals,
     key_pose_residuals,
 )
-from l2m_factors.keys import D, G, M, P, Q, S, T, U, V, X
+from l2m_factors.keys import D, F, G, M, P, Q, S, T, U, V, W, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import MapBatch, key_pose_factor
 from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
@@ -43,6 +43,7 @@ __all__ = [
     "ComplexityPenalty",
     "D",
     "DifferentiableMap",
+    "F",
     "G",
     "KeyPoseReadings",
     "KeyPoseResiduals",
@@ -63,6 +64,7 @@ __all__ = [
     "U",
     "UncertainReadings",
     "V",
+    "W",
     "WeightedField",
     "WhiteRows",
     "Whitening",

@@ -41,6 +41,16 @@ def Q(sensor: int) -> int:
     return int(gtsam.symbol("Q", sensor))
 
 
+def W(sensor: int) -> int:
+    """Return the key of how this sensor's H wanders on a drive: Vector, unit variance each."""
+    return int(gtsam.symbol("W", sensor))
+
+
+def F() -> int:
+    """Return the key of how the drive's frame is bent against the map's: Vector, unit variance."""
+    return int(gtsam.symbol("F", 0))
+
+
 def U() -> int:
     """Return the key of the errors of the sensors that surveyed: Vector, unit variance each."""
     return int(gtsam.symbol("U", 0))

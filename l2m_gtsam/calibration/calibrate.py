@@ -5,6 +5,7 @@ from importlib.metadata import version
 
 import numpy as np
 
+from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem, solve_moving
@@ -149,14 +150,16 @@ def calibrated(
         bags=tuple(drive.source for drive in recording.drives),
         notes=tuple(n for drive in recording.parts for n in (*drive.notes, *drive.origins)),
         traces=tuple(trace_of(drive.trajectory) for drive in recording.parts),
-        exact=taken_for_exact(alive, field_map),
+        exact=taken_for_exact(alive, field_map, solution.budget),
+        disturbances=solution.budget.named(alive.sensors),
     )
     return Calibrated(result, solution, field_map, solver_map)
 
 
-def taken_for_exact(readings: Readings, field_map: QueryableMap) -> tuple[str, ...]:
-    """Return what sigmas know no errors of, for want of stated ones."""
-    drive = () if readings.pose_root is not None else ("the drive's poses",)
+def taken_for_exact(readings: Readings, field_map: QueryableMap, budget: Budget) -> tuple[str, ...]:
+    """Return what sigmas know no errors of, for want of stated or found ones."""
+    known = readings.pose_root is not None or budget.poses is not None
+    drive = () if known else ("the drive's poses",)
     sensors = isinstance(field_map, KnowsSurvey) and field_map.sensors_uncertain
     survey = () if sensors else ("the survey's sensors",)
     return (*drive, *survey, "the survey's poses")

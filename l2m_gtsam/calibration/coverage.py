@@ -11,6 +11,7 @@ from scipy.linalg import cholesky
 from scipy.linalg.lapack import dpotri, dtrtri
 
 from l2m_factors import M, P, U, map_weights_information, pose_errors_prior
+from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.moving_fields import MovingFields
 from l2m_gtsam.calibration.pose_errors import PoseKnots, pose_seconds
@@ -139,6 +140,8 @@ class Coverage:
         When each pose was taken, as the knots count, shape (N,).
     moving
         The sensors that feel recorded numbers.
+    budget
+        Processes that were found in the readings.
     spread
         Standard deviations of the errors that the whole map has from the sensors that surveyed,
         shape (s,). As variables of the graph they have unit variance; see ``JointInformation``.
@@ -153,6 +156,7 @@ class Coverage:
     knots: PoseKnots | None
     seconds: FloatArray
     moving: MovingFields = field(default_factory=MovingFields)
+    budget: Budget = NOTHING_FOUND
     spread: FloatArray = field(default_factory=lambda: np.empty(0))
     shift: FloatArray = field(default_factory=lambda: np.empty((3, 0)))
 
@@ -176,7 +180,13 @@ class Coverage:
         knots = 0 if self.knots is None else len(self.knots.seconds)
         tiles = {M(tile): size for tile, size in self.tiles.items()}
         suite = {U(): len(self.spread)} if len(self.spread) else {}
-        return tiles | {P(knot): POSE for knot in range(knots)} | suite | self.moving.sizes
+        return (
+            tiles
+            | {P(knot): POSE for knot in range(knots)}
+            | suite
+            | self.moving.sizes
+            | self.budget.sizes
+        )
 
     @property
     def columns(self) -> dict[int, slice]:
@@ -201,6 +211,7 @@ class Coverage:
             unit = gtsam.noiseModel.Unit.Create(count)
             graph.add(gtsam.PriorFactorVector(U(), np.zeros(count), unit))
         graph.push_back(self.moving.prior())
+        graph.push_back(self.budget.prior())
         return graph
 
 

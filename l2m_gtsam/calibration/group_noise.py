@@ -105,6 +105,7 @@ def group_noise(
             SharedError(M(group.tile), R_lidar_map[group.rows] @ group.features),
             *of_suite(group),
             *coverage.moving.errors(group.sensor, None if q is None else q[group.rows]),
+            *coverage.budget.errors(group.sensor, group.rows),
         )
         for group in coverage.groups
     ]

@@ -103,6 +103,17 @@ class SensorSolution:
             unmodelled=excess.factors,
         )
 
+    def with_spread_of_H(self, spread: FloatArray) -> "SensorSolution":
+        """Return the same where H varies by as much, uT^2, shape (3, 3), on its own."""
+        covariance, at = self.joint_covariance.copy(), slice(12, 15)
+        covariance[at, at] += spread
+        root = self.shared_root
+        if root is not None:  # others' rows have nothing of it: what two have in common stays
+            scale = np.ones(len(root))
+            scale[at] = np.sqrt(np.diag(covariance)[at] / np.diag(self.joint_covariance)[at])
+            root = scale[:, None] * root
+        return replace(self, joint_covariance=covariance, shared_root=root)
+
     @property
     def covariance(self) -> FloatArray:
         """Of (t, C row by row, H) alone, shape (15, 15)."""

@@ -18,6 +18,7 @@ from typing import Protocol
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_estimate
+from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import (
@@ -81,6 +82,8 @@ class OneKeySolution:
         Whether estimate and weights agree: another round would repeat the last.
     uncertainty
         How the map's errors were counted: full needs a map that knows them.
+    budget
+        Processes that were found beside noise and the map's errors, where these are counted.
     """
 
     readings: Readings
@@ -92,6 +95,7 @@ class OneKeySolution:
     ending: Ending
     settled: bool
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
+    budget: Budget = NOTHING_FOUND
 
     @property
     def used(self) -> BoolArray:
@@ -226,6 +230,7 @@ def _solved(
         ending=full.ending,
         settled=joint.settled and full.settled,
         uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
+        budget=full.budget,
     )
 
 

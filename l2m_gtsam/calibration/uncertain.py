@@ -12,52 +12,30 @@ solve took 0.54 s of a processor so, 0.70 s with sensors last, 0.76 s and more w
 METIS was as fast, but GTSAM 4.3 can crash in it. QR is for graphs that Cholesky refuses.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
-import numpy as np
 
-from l2m_factors import D, Q, U, UncertainReadings, uncertain_block_factor, uncertain_reading_factor
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.cluster_robust import unmodelled
-from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
-from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
-from l2m_gtsam.calibration.group_noise import group_noise
-from l2m_gtsam.calibration.joint import SensorSolution, with_infinities
-from l2m_gtsam.calibration.joint_information import (
-    JointInformation,
-    Rows,
-    columns_at,
-    joint_information,
-    rows_of_factors,
+from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
+from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.joint import SensorSolution
+from l2m_gtsam.calibration.joint_information import JointInformation
+from l2m_gtsam.calibration.optimise import Ending, LinearSolver
+from l2m_gtsam.calibration.uncertain_graph import (
+    NEAR_SIGMAS,
+    UncertainDrive,
+    UncertainProblem,
+    starting_values,
 )
-from l2m_gtsam.calibration.moving_fields import Correction, moving_fields
-from l2m_gtsam.calibration.optimise import (
-    TOLERANCE,
-    Ending,
-    LinearSolver,
-    Optimised,
-    joint_covariance,
-    optimise,
-    polish,
-)
-from l2m_gtsam.calibration.priors import contradictions
-from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_of, keys_of
 from l2m_gtsam.calibration.view import QueryableMap, View
-from l2m_gtsam.data import FloatArray
-from l2m_gtsam.solve.linear_algebra import covariance_root
-from l2m_gtsam.solve.noise import HALF, estimate_noise, residual_figures
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6
-# A Gauss-Newton step of such a length leaves less than a hundredth of a sigma: from 0.17 it left
-# 0.0005 on a drive with 2,477 weights. It is taken with the information that is there for the
-# degrees of freedom; a linearisation and an elimination by GTSAM would cost a second.
-NEAR_SIGMAS = 0.3
 SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
-NEARLY = 0.1  # smallest decrease of the error, as a share, after which a descent goes on to there
-POLISHING_STEPS = 2  # each shortens what remains fourfold at least
+SEARCHES = 2  # sizes of what is found are those beside the noise that is left with it
 
 
 @dataclass(frozen=True)
@@ -74,12 +52,15 @@ class UncertainSolution:
         How the last optimisation ended.
     settled
         Whether another round would repeat the last.
+    budget
+        Processes that were found in what noise and map leave.
     """
 
     estimate: Estimate
     solved: tuple[SensorSolution, ...]
     ending: Ending
     settled: bool
+    budget: Budget = NOTHING_FOUND
 
 
 def solve_uncertain(
@@ -111,14 +92,51 @@ def solve_uncertain(
     progress(0.0)
     drive = UncertainDrive.of(view, field_map, errors, near, options)
     progress(1 / (MAX_ROUNDS + 1))
-    values = starting_values(near, view.sensors, drive.prior.coverage)
+    found = settle_by_any(drive, near, tests, options, progress)
+    for search in range(SEARCHES):
+        if found.ending is Ending.SINGULAR:
+            break
+        base = found if search == 0 else without_budget(drive, found, tests, options)
+        budget = base.problem.searched(base.joint)
+        if not budget.found:
+            break
+        with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
+        found = settle_by_any(with_them, found.estimate, tests, options, progress)
+    problem, joint = found.problem, found.joint
+    solved = problem.solutions(joint, found.values)
+    solved = problem.wandering(joint, found.values, problem.robust(joint, solved))
+    progress(1.0)
+    kept = found.drive.budget
+    return UncertainSolution(found.estimate, solved, found.ending, found.settled, kept)
+
+
+def settle_by_any(
+    drive: UncertainDrive,
+    near: Estimate,
+    tests: Mapping[int, Determinacy],
+    options: OneKeyOptions,
+    progress: Callable[[float], None],
+) -> "Settled":
+    """Solve by Cholesky, and where that is refused by QR."""
+    values = starting_values(near, drive.view.sensors, drive.prior.coverage)
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
         found = settle(drive, near, values, tests, options, solver, progress)
         if found.ending is not Ending.SINGULAR:
             break
-    solved = found.problem.robust(found.joint, found.problem.solutions(found.joint, found.values))
-    progress(1.0)
-    return UncertainSolution(found.estimate, solved, found.ending, found.settled)
+    return found
+
+
+def without_budget(
+    drive: UncertainDrive,
+    found: "Settled",
+    tests: Mapping[int, Determinacy],
+    options: OneKeyOptions,
+) -> "Settled":
+    """Return the graph without any process where one with them ended, with the noise of that."""
+    problem = UncertainProblem(drive, found.estimate, tests, options.factors)
+    values = starting_values(found.estimate, drive.view.sensors, drive.prior.coverage)
+    joint = problem.linearised(values)
+    return replace(found, drive=drive, problem=problem, joint=joint, values=values)
 
 
 def step_uncertain(
@@ -146,20 +164,14 @@ def step_uncertain(
     return UncertainSolution(estimate, solved, step.ending, settled=True)
 
 
-def starting_values(estimate: Estimate, sensors: list[int], coverage: Coverage) -> gtsam.Values:
-    """Return all variables of the graph, with no error of map or poses."""
-    values = estimate.values(sensors)
-    for key, size in coverage.sizes.items():
-        values.insert(key, np.zeros(size))
-    return values
-
-
 @dataclass(frozen=True)
 class Settled:
     """Where the rounds ended.
 
     Attributes
     ----------
+    drive
+        What it is about.
     problem, joint
         The graph of the last round, and all its variables together.
     values, estimate
@@ -170,7 +182,8 @@ class Settled:
         Whether another round would repeat the last.
     """
 
-    problem: "UncertainProblem"
+    drive: UncertainDrive
+    problem: UncertainProblem
     joint: JointInformation
     values: gtsam.Values
     estimate: Estimate
@@ -179,7 +192,7 @@ class Settled:
 
 
 def settle(
-    drive: "UncertainDrive",
+    drive: UncertainDrive,
     estimate: Estimate,
     values: gtsam.Values,
     tests: Mapping[int, Determinacy],
@@ -211,7 +224,7 @@ def settle(
         arrived = problem.arrive(values, options, solver, near=near)
         values, joint = arrived.values, arrived.joint
         if arrived.ending is Ending.SINGULAR:
-            return Settled(problem, joint, values, estimate, arrived.ending, settled=False)
+            return Settled(drive, problem, joint, values, estimate, arrived.ending, settled=False)
         if not near:  # then it was a descent
             ending = arrived.ending
         near = joint.furthest(sensors) < NEAR_SIGMAS
@@ -225,294 +238,4 @@ def settle(
         if settled:
             break
         progress((round_ + 2) / (MAX_ROUNDS + 1))
-    return Settled(problem, joint, values, estimate, ending, settled)
-
-
-@dataclass(frozen=True)
-class WeightsPrior:
-    """What is known of shared errors before any reading: the same in all rounds.
-
-    Attributes
-    ----------
-    coverage
-        The errors.
-    graph
-        Their prior as factors.
-    information
-        The same as a matrix, shape (K, K).
-    """
-
-    coverage: Coverage
-    graph: gtsam.NonlinearFactorGraph
-    information: FloatArray
-
-    @property
-    def sizes(self) -> dict[int, int]:
-        """Number of weights of each key."""
-        return self.coverage.sizes
-
-    @classmethod
-    def of(cls, coverage: Coverage) -> "WeightsPrior":
-        """Return the prior of the weights of a coverage."""
-        tiles = coverage.tile_information
-        information = np.zeros((sum(coverage.sizes.values()),) * 2)
-        information[: len(tiles), : len(tiles)] = tiles
-        if beside := list(coverage.sizes.items())[len(coverage.tiles) :]:
-            zero, ordering = gtsam.Values(), gtsam.Ordering()
-            for key, size in beside:
-                zero.insert(key, np.zeros(size))
-                ordering.push_back(key)
-            linear = coverage.prior_beside_tiles().linearize(zero)
-            information[len(tiles) :, len(tiles) :], _ = linear.hessian(ordering)
-        return cls(coverage, coverage.prior(), information)
-
-
-@dataclass(frozen=True)
-class UncertainDrive:
-    """What all rounds have in common: readings, the map, and the errors that readings share."""
-
-    view: View
-    field_map: QueryableMap
-    prior: WeightsPrior
-
-    @classmethod
-    def of(
-        cls,
-        view: View,
-        field_map: QueryableMap,
-        errors: UncertainMap,
-        near: Estimate,
-        options: OneKeyOptions,
-    ) -> "UncertainDrive":
-        """Return what readings share where an estimate puts them."""
-        coverage = cover(view, errors, near, options.pose_noise.correlation_s)
-        moving = moving_fields(view.readings, options.moving_field_ut)
-        return cls(view, field_map, WeightsPrior.of(replace(coverage, moving=moving)))
-
-
-@dataclass(frozen=True)
-class Arrival:
-    """Where a round ended.
-
-    Attributes
-    ----------
-    values
-        The optimum.
-    joint
-        All variables together, a step before it.
-    ending
-        How the optimisation ended.
-    """
-
-    values: gtsam.Values
-    joint: JointInformation
-    ending: Ending
-
-
-class UncertainProblem:
-    """The graph of one round: weights frozen at an estimate.
-
-    Parameters
-    ----------
-    drive
-        Readings and what they share.
-    estimate
-        Where the weights are taken.
-    tests
-        Rank test of each sensor.
-    factors
-        One factor for a group of readings or one for each; the mathematics is the same.
-    """
-
-    def __init__(
-        self,
-        drive: UncertainDrive,
-        estimate: Estimate,
-        tests: Mapping[int, Determinacy],
-        factors: FactorForm,
-    ) -> None:
-        view, field_map, prior = drive.view, drive.field_map, drive.prior
-        self._view, self._prior, self._tests = view, prior, tests
-        self._known = estimate.priors.among(view.sensors)
-        self._batch = batch_readings(view.readings, field_map)
-        self._noise = group_noise(view, field_map, prior.coverage, estimate)
-        self._groups = [
-            UncertainReadings(self._batch, group.rows, errors, W)
-            for group, errors, W in zip(
-                prior.coverage.groups, self._noise.errors, self._noise.whitenings, strict=True
-            )
-        ]
-        self._sensor_priors = prior_graph(estimate, {s: tests[s] for s in view.sensors})
-        self.graph = gtsam.NonlinearFactorGraph()
-        for readings in self._groups:
-            self.graph.push_back(_factors(readings, factors))
-        self.graph.push_back(prior.graph)
-        self.graph.push_back(self._sensor_priors)
-
-    def arrive(
-        self, values: gtsam.Values, options: OneKeyOptions, solver: LinearSolver, *, near: bool
-    ) -> Arrival:
-        """Go to the optimum, with the last step from the information of all variables.
-
-        Parameters
-        ----------
-        values
-            Where to start.
-        options
-            How to descend.
-        solver
-            Of the linear systems.
-        near
-            Whether the start is an optimum with other weights, from where one step does.
-        """
-        if near:
-            came = self.polish(values, 1, solver)
-        else:
-            came = self.descend(values, options, solver, NEARLY)
-        joint = self.linearised(came.values)
-        if joint.furthest(self._view.sensors) < NEAR_SIGMAS:
-            return Arrival(joint.stepped(came.values), joint, came.ending)
-        # Readings that cross from block to block of a map make steps in the error, which stop
-        # a descent; the gradient does not see them.
-        descent = self.descend(came.values, options, solver)
-        last = self.polish(descent.values, POLISHING_STEPS, solver)
-        ending = last.ending if last.ending is Ending.SINGULAR else descent.ending
-        joint = self.linearised(last.values)
-        close = joint.furthest(self._view.sensors) < NEAR_SIGMAS
-        return Arrival(joint.stepped(last.values) if close else last.values, joint, ending)
-
-    def descend(
-        self,
-        values: gtsam.Values,
-        options: OneKeyOptions,
-        solver: LinearSolver,
-        tolerance: float = TOLERANCE,
-    ) -> Optimised:
-        """Minimise the cost."""
-        optimizer, most = options.optimizer, options.joint_iterations
-        return optimise(self.graph, values, optimizer, most, solver, tolerance)
-
-    def polish(self, values: gtsam.Values, steps: int, solver: LinearSolver) -> Optimised:
-        """Take Gauss-Newton steps that a descent leaves out, as too short or uphill."""
-        return polish(self.graph, values, steps, solver)
-
-    def linearised(self, values: gtsam.Values) -> JointInformation:
-        """Return all variables together, linearised at some values."""
-        columns = self._columns()
-        rows = [
-            Rows(
-                each.sensor,
-                columns_at(columns, each.keys),
-                found.jacobian,
-                found.residual,
-                group.rows,
-            )
-            for each, group in zip(self._groups, self._prior.coverage.groups, strict=True)
-            if (found := each.linearised(values))
-        ]
-        owner = {key: s for s in self._view.sensors for key in keys_of(s)}
-        rows += rows_of_factors(self._sensor_priors.linearize(values), columns, owner)
-        at = np.concatenate([values.atVector(key) for key in self._prior.coverage.sizes])
-        joint = joint_information(columns, rows, self._prior.information, at)
-        spread = self._prior.coverage.spread
-        return joint.loosened(U(), spread) if len(spread) else joint
-
-    def noise(
-        self, joint: JointInformation, values: gtsam.Values, estimate: Estimate
-    ) -> FloatArray:
-        """Return the most likely noise of each sensor in uT, shape (S,)."""
-        noise, residual = estimate.noise.copy(), self._residuals(values)
-        for s in self._view.sensors:
-            rows, taken = self._batch.rows_of(s), self._taken(joint, s)
-            rows = rows[self._view.trust[rows] > HALF]
-            noise[s] = estimate_noise(residual[rows], self._noise.rest[rows], taken)
-        return noise
-
-    def solutions(
-        self, joint: JointInformation, values: gtsam.Values
-    ) -> tuple[SensorSolution, ...]:
-        """Return covariance and figures of every sensor."""
-        residual, sensors = self._residuals(values), tuple(self._view.sensors)
-        linear = self.graph.linearize(values)
-        system = joint_covariance(linear, values, joint.of_system)
-
-        def among(chosen: tuple[int, ...]) -> FloatArray:
-            return system(chosen) + joint.loose_among(chosen)
-
-        missed = contradictions(self._known, values, among)
-        every = among(sensors)
-        root = covariance_root(every, np.sqrt(np.diag(every)))
-        solutions = []
-        for row, s in enumerate(sensors):
-            rows, own = self._batch.rows_of(s), slice(SENSOR * row, SENSOR * (row + 1))
-            taken = self._taken(joint, s)
-            solutions.append(
-                SensorSolution(
-                    sensor=s,
-                    joint_covariance=with_infinities(every[own, own], self._tests[s]),
-                    figures=residual_figures(residual[rows], self._noise.alone[rows], taken),
-                    determinacy=self._tests[s],
-                    remaining_sigmas=joint.sigmas(s),
-                    contradictions=tuple(each for each in missed if s in each.sensors),
-                    moving=self._correction(s, joint, values),
-                    shared_root=root[own][:-1],
-                )
-            )
-        return tuple(solutions)
-
-    def robust(
-        self, joint: JointInformation, solved: Sequence[SensorSolution]
-    ) -> tuple[SensorSolution, ...]:
-        """Return solutions whose covariances hold what the scatter of parts of the drive shows."""
-        stated = columns_at(joint.columns, [U()] if len(self._prior.coverage.spread) else [])
-        widened = []
-        for found in solved:
-            s = found.sensor
-            rows = [
-                joint.after_step(each)
-                for each in joint.rows
-                if each.sensor == s and len(each.readings)
-            ]
-            own = columns_at(joint.columns, keys_of(s))
-            excess = unmodelled(self._view.readings, rows, own, joint.every, len(solved), stated)
-            widened.append(found.widened(excess))
-        return tuple(widened)
-
-    def _correction(
-        self, sensor: int, joint: JointInformation, values: gtsam.Values
-    ) -> Correction | None:
-        """Return what recorded numbers still add to a sensor's readings; none if it feels none."""
-        moving, key = self._prior.coverage.moving, Q(sensor)
-        if sensor not in moving.scales:
-            return None
-        C = values.atVector(D(sensor))[:9].reshape(3, 3)
-        return moving.correction(sensor, values.atVector(key), joint.covariance([key]), C)
-
-    def _taken(self, joint: JointInformation, sensor: int) -> float:
-        """Return the degrees of freedom that the fit took of a sensor's readings."""
-        return self._tests[sensor].free + joint.taken(sensor)
-
-    def _columns(self) -> dict[int, slice]:
-        """Return where each key's variables stand: weights first, then sensors."""
-        weights = self._prior.coverage.columns
-        first = len(self._prior.information)
-        own = columns_of(tuple(self._view.sensors))
-        return weights | {key: slice(first + at.start, first + at.stop) for key, at in own.items()}
-
-    def _residuals(self, values: gtsam.Values) -> FloatArray:
-        """Return ``e`` with the shared errors in it, uT, shape (N, 3)."""
-        residual = np.empty((len(self._view.readings), 3))
-        for group, readings in zip(self._prior.coverage.groups, self._groups, strict=True):
-            residual[group.rows] = readings.residual(values)
-        return residual
-
-
-def _factors(readings: UncertainReadings, form: FactorForm) -> gtsam.NonlinearFactorGraph:
-    """Return the factors of a group of readings."""
-    graph = gtsam.NonlinearFactorGraph()
-    if form is FactorForm.BLOCK:
-        graph.add(uncertain_block_factor(readings))
-    else:
-        for reading in range(len(readings)):
-            graph.add(uncertain_reading_factor(readings, reading))
-    return graph
+    return Settled(drive, problem, joint, values, estimate, ending, settled)

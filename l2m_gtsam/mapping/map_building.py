@@ -15,7 +15,7 @@ from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.suite_errors import SuiteErrors, errors_together
+from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.training import checked_readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -50,19 +50,19 @@ class SurveyReadings:
     points, field
         Where, in metres, and what, in uT, shapes (N, 3).
     suite
-        What errors of the sensors do to that; absent where they count as exact.
+        What errors of the sensors do to that.
     """
 
     points: FloatArray
     field: FloatArray
-    suite: SuiteErrors | None = None
+    suite: SuiteErrors
 
     def followed_by(self, other: "SurveyReadings") -> "SurveyReadings":
         """Return these readings and others."""
         return SurveyReadings(
             np.concatenate([self.points, other.points]),
             np.concatenate([self.field, other.field]),
-            errors_together(self.suite, other.suite, len(self.points)),
+            self.suite.followed_by(other.suite, len(self.points)),
         )
 
 
@@ -98,7 +98,7 @@ def map_recordings(
     read = suite_readings(recordings, suite, options.sync)
     field_map = build_map(read.points, read.field, options.model, cloud, read.suite)
     # Stated errors are counted; sensors that count as exact have to look like it.
-    if read.suite is None and isinstance(field_map, HarmonicMap):
+    if not read.suite.stated and isinstance(field_map, HarmonicMap):
         return field_map.doubted(suite_doubts(recordings, suite, options.suite))
     return field_map
 
@@ -189,12 +189,9 @@ def suite_readings(
         offset = np.array([each.time_offset for each in known])
         readings = synchronise(recording, sync, float(np.abs(offset).max(initial=0.0))).readings
         _refuse_stuck(readings, recording)
-        uncertain = any(each.covariance is not None for each in known)
-        if offset.any() or uncertain:
-            readings = with_offsets(readings, recording.trajectory, offset)
+        readings = with_offsets(readings, recording.trajectory, offset)
         points, field = sensor_positions(readings, known), map_fields(readings, known)
-        errors = suite_errors(readings, known) if uncertain else None
-        drives.append(SurveyReadings(points, field, errors))
+        drives.append(SurveyReadings(points, field, suite_errors(readings, known)))
     read = reduce(SurveyReadings.followed_by, drives)
     checked_readings(read.points, read.field)
     return read

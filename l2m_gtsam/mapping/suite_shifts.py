@@ -31,9 +31,8 @@ def suite_errors(readings: Readings, known: Sequence[KnownSensor]) -> SuiteError
     """
     shift = np.zeros((len(readings), SHIFT, SIZE))
     for index, sensor in enumerate(known):
-        if sensor.covariance is not None:
-            rows = readings.rows_of(index)
-            shift[rows] = sensor_shift(readings, rows, sensor)
+        rows = readings.rows_of(index)
+        shift[rows] = sensor_shift(readings, rows, sensor)
     names, every = tuple(each.sensor for each in known), np.arange(len(readings))
     return SuiteErrors(names, suite_covariance(known), every, readings.sensor, shift)
 

@@ -44,6 +44,11 @@ class SuiteErrors:
     sensor: IntArray
     shift: FloatArray
 
+    @property
+    def stated(self) -> bool:
+        """Whether any error is."""
+        return bool(self.covariance.any())
+
     def averaged(self, owner: IntArray, weight: FloatArray) -> "SuiteErrors":
         """Return the errors of averages over readings.
 
@@ -61,6 +66,11 @@ class SuiteErrors:
         np.add.at(shift, at, self.shift * share[:, None, None])
         reading, sensor = np.divmod(pairs, len(self.sensors))
         return replace(self, reading=reading, sensor=sensor, shift=shift)
+
+    def as_sure_as(self, other: "SuiteErrors") -> "SuiteErrors | None":
+        """Return the same with the covariance of others; None unless they are the same sensors."""
+        same = self.sensors == other.sensors
+        return replace(self, covariance=other.covariance) if same else None
 
     def followed_by(self, other: "SuiteErrors", first: int) -> "SuiteErrors":
         """Return the errors of these readings and of others that are numbered from ``first`` on.

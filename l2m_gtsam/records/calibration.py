@@ -14,6 +14,7 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
+from l2m_gtsam.records.disturbance import Disturbance
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
@@ -382,6 +383,8 @@ class CalibrationResult:
         What its drives are recognised by, whatever file they are in.
     exact
         What counts as exact, for want of errors that are stated.
+    disturbances
+        What was found beside noise and the map's errors; sigmas hold it.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
@@ -398,6 +401,7 @@ class CalibrationResult:
     judgement: Judgement | None = None
     traces: tuple[DriveTrace, ...] = ()
     exact: tuple[str, ...] = ()
+    disturbances: tuple[Disturbance, ...] = ()
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

@@ -84,6 +84,11 @@ MODEL = {
         "by; earlier: what the same numbers were judged before, by other thresholds"
     ),
     "exact": "what counts as exact, for want of stated errors: sigmas know nothing of its errors",
+    "disturbances": (
+        "processes found beside noise and the map's errors, which covariances hold: wander of H, "
+        "errors of poses that last, a drive's frame that is bent against the map's; sizes are "
+        "standard deviations, gain is twice a logarithm of likelihood"
+    ),
     "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
@@ -128,6 +133,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "doubts": plain["doubts"],
         "notes": plain["notes"],
         "exact": plain["exact"],
+        "disturbances": [_without_empty(each, "sensor") for each in plain["disturbances"]],
         "disagreements": disagreements,
         **source_entries(result),
         "traces": plain["traces"],
@@ -136,7 +142,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }
-    for name in ("notes", "exact", "traces"):
+    for name in ("notes", "exact", "disturbances", "traces"):
         content = _without_empty(content, name)
     write_yaml(path, content, HEADER)
 

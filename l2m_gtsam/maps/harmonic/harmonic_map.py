@@ -13,6 +13,7 @@ from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
+from l2m_gtsam.maps.harmonic.suite_sizes import sized, suite_sizes
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
@@ -95,7 +96,8 @@ class HarmonicMap:
         cloud
             Points of the structure that a LiDAR saw, in the map frame in metres, shape (M, 3).
         suite
-            What errors of the sensors do to the readings; absent where they count as exact.
+            What errors of the sensors do to the readings. Where none are stated they are looked
+            for in the readings; without this the sensors count as exact.
 
         Raises
         ------
@@ -109,8 +111,24 @@ class HarmonicMap:
         learnt = learn_map(readings, sources, options)
         if suite is not None:
             owner = cubes_of(readings.points, options.merge)
-            learnt = replace(learnt, suite=suite.averaged(owner, readings.weight))
+            return cls.surveyed_by(learnt, options, suite.averaged(owner, readings.weight))
         return cls.condition(learnt, options)
+
+    @classmethod
+    def surveyed_by(
+        cls, learnt: Learnt, options: HarmonicOptions, suite: SuiteErrors
+    ) -> "HarmonicMap":
+        """Return the map with the errors of its sensors: stated, or as the survey shows them."""
+        if suite.stated:
+            return cls.condition(replace(learnt, suite=suite), options)
+        exact = cls.condition(learnt, options)
+        sizes = suite_sizes(learnt, exact.tiles, suite)
+        if sizes is None:
+            return exact
+        learnt = replace(learnt, suite=sized(suite, sizes))
+        # The tiles are the same: errors of sensors enter what is asked of them.
+        found = cls(learnt, options, Tiles(learnt, exact.tiles.solved))
+        return found.doubted((sizes.doubt,))
 
     @classmethod
     def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
@@ -130,7 +148,9 @@ class HarmonicMap:
         Only tiles that the new readings take part in are solved again, with scales of their own
         anew; whether the field is explained is judged anew as well.
         """
-        new = additional_set(points, field)
+        new, old_suite = additional_set(points, field), self.learnt.suite
+        if suite is not None and not suite.stated:  # as exact as before
+            suite = None if old_suite is None else suite.as_sure_as(old_suite)
         learnt = explained(self.learnt.extended(new, self.options, suite), self.options)
         # A new reading may have moved an old one that it was merged with.
         box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap + self.options.merge

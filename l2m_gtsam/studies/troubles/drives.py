@@ -28,11 +28,15 @@ def troubled_drive(
         calibration_drive(place.hall, seed, span, options.noise, SENSORS, options.readings)
     )
     rng, readings = np.random.default_rng([seed, 12]), drive.readings
-    change = np.zeros_like(readings.field)
+    change, truth = np.zeros_like(readings.field), list(drive.sensors)
     for index in range(SENSORS):
         rows = readings.rows_of(index)
         seconds = 1e-9 * (readings.stamp_ns[rows] - readings.stamp_ns[rows.start])
         change[rows] = disturbance(options, trouble, readings.field[rows], seconds, rng)
+        if trouble.has(Trouble.NONLINEAR):
+            bent_scale = not_linear(options, readings.field[rows], rng)
+            change[rows] += bent_scale
+            truth[index] = linear_over(truth[index], readings.field[rows], bent_scale)
     trajectory = drive.trajectory
     if trouble.has(Trouble.WARP):
         trajectory = bent(trajectory, options, rng)
@@ -49,7 +53,7 @@ def troubled_drive(
         for index, sensor in enumerate(drive.sensors)
     )
     source = SourceFile(f"hall-{place.seed}-drive-{number}", "")
-    return Recording(trajectory, series, source), drive.sensors
+    return Recording(trajectory, series, source), tuple(truth)
 
 
 def disturbance(
@@ -66,10 +70,25 @@ def disturbance(
         change += options.drift_ut * np.cumsum(step * rng.standard_normal(field.shape), axis=0)
     if trouble.has(Trouble.PINK):
         change += options.pink_ut * pink(len(field), rng)
-    if trouble.has(Trouble.NONLINEAR):
-        sign = rng.choice([-1.0, 1.0], 3)
-        change += sign * options.nonlinear * field * np.abs(field) / STRONG_UT
     return change
+
+
+def not_linear(options: TroublesOptions, field: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return by how much readings are off by a scale that is not linear, uT, shape (N, 3)."""
+    sign = rng.choice([-1.0, 1.0], 3)
+    return np.asarray(sign * options.nonlinear * field * np.abs(field) / STRONG_UT)
+
+
+def linear_over(sensor: KnownSensor, field: FloatArray, change: FloatArray) -> KnownSensor:
+    """Return the sensor whose C and H come nearest to its readings over a drive's fields.
+
+    A scale that is not linear has no C but that of the fields it is used in.
+    """
+    known = np.column_stack([field, np.ones(len(field))])
+    slope, offset = np.split(np.linalg.lstsq(known, change, rcond=None)[0].T, [3], axis=1)
+    grown, old = np.eye(3) + slope, sensor.distortion
+    distortion = replace(old, C=grown @ old.C, H=grown @ old.H + offset[:, 0])
+    return replace(sensor, distortion=distortion)
 
 
 def pink(count: int, rng: np.random.Generator) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from l2m_factors import D, S, T
-from l2m_gtsam.calibration import uncertain
+from l2m_gtsam.calibration import uncertain_graph
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.factor_graph import FactorForm
 from l2m_gtsam.calibration.forecast import stated_at
@@ -20,7 +20,7 @@ from l2m_gtsam.calibration.optimise import (
     joint_covariance,
     polish,
 )
-from l2m_gtsam.calibration.uncertain import UncertainDrive, UncertainProblem, starting_values
+from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
 from l2m_gtsam.calibration.view import View, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -178,7 +178,7 @@ def test_a_round_arrives_from_near_and_from_far(last: LastGraph) -> None:
     for start, near in ((at, True), (at, False), (far, False)):
         end = problem.arrive(start, DEFAULT, LinearSolver.CHOLESKY, near=near)
         assert end.ending is Ending.TOLERANCE
-        assert end.joint.furthest(last.view.sensors) < uncertain.NEAR_SIGMAS
+        assert end.joint.furthest(last.view.sensors) < uncertain_graph.NEAR_SIGMAS
         for sensor in last.view.sensors:
             off = end.values.atPoint3(T(sensor)) - exact.atPoint3(T(sensor))
             assert np.abs(off).max() < 1e-6
@@ -210,7 +210,7 @@ def test_what_cholesky_refuses_qr_solves(
             return Optimised(values, Ending.SINGULAR)
         return polish(graph, values, steps, solver)
 
-    monkeypatch.setattr(uncertain, "polish", refusing)
+    monkeypatch.setattr(uncertain_graph, "polish", refusing)
     found = solve_one_key(readings, field_map, STARTS, DEFAULT)
     assert list(dict.fromkeys(asked)) == [LinearSolver.CHOLESKY, LinearSolver.QR]
     assert asked.count(LinearSolver.CHOLESKY) == 1

@@ -1,0 +1,124 @@
+"""The processes of a drive as variables of the last graph: ``W(i)`` and ``F()``.
+
+Weights have unit variance there. Errors of poses become those of ``pose_errors``, which know how
+they go on between the knots, as if they had been stated.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+
+from l2m_factors import F, SharedError, W
+from l2m_gtsam.calibration.budget.processes import LASTING_S, WANDER_MODES
+from l2m_gtsam.calibration.budget.search import FoundProcess
+from l2m_gtsam.data import FloatArray, IntArray, Readings
+from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
+
+AXES = 3
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The processes that were found, each at most once for all readings or for a sensor."""
+
+    found: tuple[FoundProcess, ...] = ()
+
+    @cached_property
+    def variables(self) -> dict[int, FoundProcess]:
+        """Those that are variables of their own, by key; the graph knows errors of poses."""
+        others = [each for each in self.found if each.process.kind is not DisturbanceKind.POSES]
+        return {_key(each): each for each in others}
+
+    @property
+    def sizes(self) -> dict[int, int]:
+        """Number of weights of each key of the graph."""
+        return {key: len(each.variances) for key, each in self.variables.items()}
+
+    @property
+    def poses(self) -> FoundProcess | None:
+        """Errors of poses, if there are any."""
+        own = [each for each in self.found if each.process.kind is DisturbanceKind.POSES]
+        return own[0] if own else None
+
+    def lasting(self, stated_s: float) -> float:
+        """Return how long errors of poses last: as found, or else as stated."""
+        return stated_s if self.poses is None else LASTING_S[self.poses.form]
+
+    def on(self, readings: Readings) -> Readings:
+        """Return readings whose poses are as wrong as was found."""
+        if self.poses is None:
+            return readings
+        root = np.diag(np.repeat(np.sqrt(self.poses.sizes), AXES))
+        return replace(readings, pose_root=np.broadcast_to(root, (len(readings), 6, 6)))
+
+    def errors(self, sensor: int, rows: IntArray) -> tuple[SharedError, ...]:
+        """Return what some readings of a sensor share."""
+        return tuple(
+            SharedError(key, each.process.features(rows) * np.sqrt(each.variances))
+            for key, each in self.variables.items()
+            if each.process.sensor in (None, sensor)
+        )
+
+    def prior(self) -> gtsam.NonlinearFactorGraph:
+        """Return the prior of all weights: none, with unit variance."""
+        graph = gtsam.NonlinearFactorGraph()
+        for key, size in self.sizes.items():
+            unit = gtsam.noiseModel.Unit.Create(size)
+            graph.add(gtsam.PriorFactorVector(key, np.zeros(size), unit))
+        return graph
+
+    def wander(self, sensor: int) -> FoundProcess | None:
+        """Return how H of a sensor wanders, if it does."""
+        return self.variables.get(W(sensor))
+
+    def named(self, sensors: Sequence[str]) -> tuple[Disturbance, ...]:
+        """Return what was found as records, with the names of all sensors."""
+        return tuple(_record(each, sensors) for each in self.found)
+
+
+def spread_of_H(found: FoundProcess, weights: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the mean square of H at any moment of a drive about H as reported, uT^2, (3, 3).
+
+    Parameters
+    ----------
+    found
+        How H wanders.
+    weights, covariance
+        Of unit variance by the prior, shapes (m,) and (m, m).
+    """
+    # Modes have a mean square of one over a drive, and are orthogonal to each other.
+    drives = len(weights) // (AXES * WANDER_MODES)
+    root = np.sqrt(found.variances)
+    moments = (covariance + np.outer(weights, weights)) * np.outer(root, root)
+    blocks = moments.reshape(len(root) // AXES, AXES, -1, AXES)
+    each = np.arange(len(blocks))
+    return np.asarray(blocks[each, :, each].sum(axis=0) / drives)
+
+
+def _key(found: FoundProcess) -> int:
+    sensor = found.process.sensor
+    return F() if sensor is None else W(sensor)
+
+
+def _record(found: FoundProcess, sensors: Sequence[str]) -> Disturbance:
+    kind, sensor = found.process.kind, found.process.sensor
+    sizes = np.sqrt(found.sizes)
+    if kind is DisturbanceKind.WANDER:
+        whole = np.sqrt((1 / np.arange(1.0, WANDER_MODES + 1)).sum())
+        named = {"noise_ut": sizes[0] * whole, "walk_ut": sizes[1]}
+    elif kind is DisturbanceKind.POSES:
+        named = {
+            "rotation_deg": np.rad2deg(sizes[0]),
+            "position_m": sizes[1],
+            "lasting_s": LASTING_S[found.form],
+        }
+    else:
+        named = {"shift_m": np.sqrt(found.sizes.sum())}
+    whose = None if sensor is None else sensors[sensor]
+    return Disturbance(kind, whose, {k: float(v) for k, v in named.items()}, found.gain)
+
+
+NOTHING_FOUND = Budget()

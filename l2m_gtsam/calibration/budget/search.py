@@ -1,0 +1,177 @@
+"""Which processes a drive has, and how large: by the likelihood of what all else leaves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from l2m_gtsam.calibration.budget.processes import Process
+from l2m_gtsam.calibration.joint_information import JointInformation, Rows
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.records.disturbance import DisturbanceKind
+from l2m_gtsam.solve.variance_components import VarianceComponents, WeightSystem
+
+# Twice a logarithm of likelihood. Where a process is not there, half of all drives give zero, and
+# 0.7 % more than this (a mixture of chi-square distributions, Self and Liang, JASA 82, 1987).
+LEAST_GAIN = 6.0
+HARDLY = 1.5  # standard deviations of a score: no more is not worth a likelihood
+
+
+@dataclass(frozen=True)
+class FoundProcess:
+    """A process with the sizes that explain the drive best.
+
+    Attributes
+    ----------
+    process
+        Its modes.
+    form
+        Which of its forms.
+    sizes
+        Variances of the parts of that form, shape (K,).
+    gain
+        Twice the logarithm of the likelihood beyond that without it.
+    """
+
+    process: Process
+    form: int
+    sizes: FloatArray
+    gain: float
+
+    @property
+    def variances(self) -> FloatArray:
+        """Of its weights, shape (m,)."""
+        return np.asarray(self.sizes @ self.process.forms[self.form])
+
+
+@dataclass(frozen=True)
+class Felt:
+    """What white readings say of the weights of several processes.
+
+    Attributes
+    ----------
+    processes
+        Each with its columns.
+    columns
+        Of each among all weights, shape (m,).
+    system
+        All weights together, with everything else taken out.
+    """
+
+    processes: Sequence[Process]
+    columns: Sequence[IntArray]
+    system: WeightSystem
+
+
+def felt(
+    processes: Sequence[Process],
+    joint: JointInformation,
+    rows: Sequence[Rows],
+    whitened: Sequence[FloatArray],
+    C: FloatArray,
+) -> Felt:
+    """Return what readings say of processes that are not in their graph.
+
+    Parameters
+    ----------
+    processes
+        What is looked for.
+    joint
+        All variables of the graph.
+    rows
+        White rows of readings at the optimum, one set for each group.
+    whitened
+        Of each group the matrix or matrices that make it white, (n, 3, 3) or (3 n, 3 n).
+    C
+        Of all readings, shape (N, 3, 3).
+    """
+    ends = np.cumsum([0, *(each.forms[0].shape[1] for each in processes)])
+    columns = [np.arange(ends[k], ends[k + 1]) for k in range(len(processes))]
+    count = int(ends[-1])
+    own, pull = np.zeros((count, count)), np.zeros(count)
+    across = np.zeros((len(joint.every), count))
+    for each, W in zip(rows, whitened, strict=True):
+        here = [k for k, one in enumerate(processes) if one.sensor in (None, each.sensor)]
+        at = np.concatenate([columns[k] for k in here])
+        F = np.concatenate([processes[k].features(each.readings) for k in here], axis=2)
+        Z = C[each.readings] @ F
+        Z = (W @ Z).reshape(len(each.residual), -1) if W.ndim == 3 else W @ Z.reshape(len(W), -1)
+        own[np.ix_(at, at)] += Z.T @ Z
+        pull[at] -= Z.T @ each.residual
+        across[np.ix_(each.columns, at)] += each.jacobian.T @ Z
+    everything = np.arange(len(across))
+    information = own - joint.every.across(everything, across)
+    return Felt(processes, columns, WeightSystem(0.5 * (information + information.T), pull))
+
+
+def search(known: Felt) -> tuple[FoundProcess, ...]:
+    """Return the processes without which a drive is much less likely.
+
+    The kind that explains most is taken first, for all sensors that show it; the others have to
+    explain what it leaves. In the end all sizes are found together.
+    """
+    taken: dict[int, FoundProcess] = {}
+    variances = np.zeros(len(known.system.pull))
+    kinds = set(DisturbanceKind)
+    while kinds:
+        left = known.system.beside(variances)
+        alone = {
+            k: _alone(each, left.among(known.columns[k]))
+            for k, each in enumerate(known.processes)
+            if each.kind in kinds
+        }
+        shown = {k: found for k, found in alone.items() if found.gain > LEAST_GAIN}
+        if not shown:
+            break
+        gains = {kind: _gain(shown, kind) for kind in kinds}
+        first = max(kinds, key=lambda kind: (gains[kind], kind))
+        kinds.remove(first)
+        for k, found in shown.items():
+            if found.process.kind is first:
+                taken[k] = found
+                variances[known.columns[k]] = found.variances
+    return _together(known, taken)
+
+
+def _gain(found: dict[int, FoundProcess], kind: DisturbanceKind) -> float:
+    return sum(each.gain for each in found.values() if each.process.kind is kind)
+
+
+def _alone(process: Process, system: WeightSystem) -> FoundProcess:
+    """Return a process in its most likely form, beside what a system leaves."""
+    fits = [
+        system.components(spectra)
+        if system.scores(spectra).max() > HARDLY
+        else VarianceComponents(np.zeros(len(spectra)), 0.0)
+        for spectra in process.forms
+    ]
+    form = int(np.argmax([fit.gain for fit in fits]))
+    return FoundProcess(process, form, fits[form].sizes, fits[form].gain)
+
+
+def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess, ...]:
+    """Return processes with the sizes that are most likely for all of them at once."""
+    if not taken:
+        return ()
+    spectra, owner = [], []
+    for k, found in taken.items():
+        for part in found.process.forms[found.form]:
+            whole = np.zeros(len(known.system.pull))
+            whole[known.columns[k]] = part
+            spectra.append(whole)
+            owner.append(k)
+    of, every = np.array(owner), np.array(spectra)
+    at = np.flatnonzero(every.any(axis=0))
+    system, every = known.system.among(at), every[:, at]
+    fit: VarianceComponents = system.components(every)
+    kept = []
+    for k, each in taken.items():
+        others = np.where(of == k, 0.0, fit.sizes) @ every
+        own = known.columns[k]
+        here = np.searchsorted(at, own)
+        left = system.beside(others).among(here)
+        sizes = fit.sizes[of == k]
+        gain = 2 * left.posterior(sizes @ each.process.forms[each.form]).likelihood
+        if gain > LEAST_GAIN:
+            kept.append(FoundProcess(each.process, each.form, sizes, gain))
+    return tuple(kept)

@@ -1,0 +1,154 @@
+r"""How far off the sensors of a survey are, as the survey itself tells, where nobody stated it.
+
+Several sensors at one place, or one under several headings, read one field. With r the residuals of
+a tile's posterior mean, and E what a unit of each error does to the readings,
+
+.. math::
+    I = E^T W (E - F \delta w) / \sigma^2, \qquad u = E^T W r / \sigma^2
+
+are the information and the pull of the errors with the field taken out. All places, all entries of
+C, all H and all time offsets have a size each, the most likely one.
+
+What all sensors have in common says nothing of that. A shift of all is one of the map; and a common
+C makes the field smaller, which any prior of a field finds more likely. Sizes are therefore those
+of the sensors' differences, and of H as it shows under several headings.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import null_space
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.error_modes import TileModes, moved_weights
+from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.suite_errors import SIZE, SuiteErrors
+from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.variance_components import VarianceComponents, WeightSystem
+
+MOST_TILES = 24  # of the survey, spread over it
+NAMES = ("t", "C", "H", "offset")
+PARTS = np.repeat(np.arange(len(NAMES)), [3, 9, 3, 1])
+H = NAMES.index("H")
+ROUNDS = 3
+LEAST_NOISE = 0.05  # of its variance
+LEAST_GAIN = 16.0  # twice a logarithm of likelihood; chance gives four sizes that in 0.1 % of maps
+
+
+@dataclass(frozen=True)
+class SuiteSizes:
+    """Standard deviations of a suite's errors, the same for all of its sensors.
+
+    Attributes
+    ----------
+    t_m, C, H_ut, offset_s
+        Of each coordinate, of each entry, of each axis, of the clocks.
+    """
+
+    t_m: float
+    C: float
+    H_ut: float
+    offset_s: float
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Of the errors of a sensor, shape (16,)."""
+        return np.array([self.t_m, self.C, self.H_ut, self.offset_s])[PARTS]
+
+    @property
+    def doubt(self) -> str:
+        """What that says of the survey."""
+        return (
+            "the survey's sensors are off by about "
+            f"{1e3 * self.t_m:.1f} mm, {self.C:.2%} of the field and {self.H_ut:.2g} uT each, "
+            "by the survey itself: sigmas hold that; calibrate them, and state how well that is "
+            "known (--suite)"
+        )
+
+
+def suite_sizes(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> SuiteSizes | None:
+    """Return how far off the sensors are; None where the survey shows nothing of it.
+
+    Parameters
+    ----------
+    learnt, tiles
+        Readings and prior of the map, and its tiles.
+    suite
+        What errors of the sensors do to the readings.
+    """
+    count = len(learnt.tiling)
+    some = np.unique(np.linspace(0, count - 1, min(count, MOST_TILES)).astype(int)).tolist()
+    seen = in_threads(lambda index: tile_view(learnt, tiles, suite, index), some)
+    turned, part = differences(len(suite.sensors))
+    spectra = (part == np.arange(len(NAMES))[:, None]).astype(np.float64)
+    information = np.sum([each.system.information for each in seen], axis=0)
+    pull = np.sum([each.system.pull for each in seen], axis=0)
+    system = WeightSystem(turned.T @ information @ turned, turned.T @ pull)
+    squares, found = sum(each.squares for each in seen), VarianceComponents(np.zeros(4), 0.0)
+    # The map's noise has these errors in it: what they explain is none.
+    less = 1.0
+    for _ in range(ROUNDS):
+        rescaled = WeightSystem(system.information / less, system.pull / less)
+        found = rescaled.components(spectra)
+        variances = found.sizes @ spectra
+        explained = system.pull @ (variances * rescaled.posterior(variances).rest)
+        less = max(1 - float(explained) / squares, LEAST_NOISE)
+    if found.gain < LEAST_GAIN:
+        return None
+    return SuiteSizes(*np.sqrt(found.sizes).tolist())
+
+
+def differences(sensors: int) -> tuple[FloatArray, IntArray]:
+    """Return directions of the errors that a survey shows, (16 S, k), and which part each is, (k,).
+
+    Orthonormal, so that errors of one size have that size along each.
+    """
+    spread = null_space(np.ones((1, sensors)))  # of S sensors, S - 1 differences
+    every = dict.fromkeys(range(len(NAMES)), spread) | {H: np.eye(sensors)}
+    columns, parts = [], []
+    for k, part in enumerate(PARTS.tolist()):
+        own = np.zeros((sensors, SIZE, every[part].shape[1]))
+        own[:, k] = every[part]
+        columns.append(own.reshape(sensors * SIZE, -1))
+        parts += [part] * every[part].shape[1]
+    return np.concatenate(columns, axis=1), np.array(parts)
+
+
+@dataclass(frozen=True)
+class TileView:
+    """What the readings of one tile say of the sensors' errors.
+
+    Attributes
+    ----------
+    system
+        Information and pull of all of them.
+    squares
+        Sum of squares of the residuals, white by the map's noise.
+    """
+
+    system: WeightSystem
+    squares: float
+
+
+def tile_view(learnt: Learnt, tiles: Tiles, suite: SuiteErrors, index: int) -> TileView:
+    """Return what one tile says, with the share of its readings that no other tile is made for."""
+    tile, rows = tiles[index], learnt.members[index]
+    readings, nothing = learnt.readings[rows], np.zeros((3, SIZE * len(suite.sensors)))
+    field, gradient = tile.field_and_gradient(readings.points)
+    wrong = suite.of_field(rows, gradient)
+    moved = TileModes(tile, moved_weights(learnt, suite, index, tile, nothing))
+    left = wrong - moved.features(readings.points)
+    # Neighbours have readings in common, which must not count twice.
+    own = np.mean(learnt.tiling.grid.block_of(readings.points) == index)
+    weight = readings.weight * own / tile.hyperparameters.noise**2
+    weighted = (wrong * weight[:, None, None]).reshape(-1, wrong.shape[2])
+    information = weighted.T @ left.reshape(len(weighted), -1)
+    residual = readings.field - field
+    system = WeightSystem(0.5 * (information + information.T), weighted.T @ residual.ravel())
+    return TileView(system, float(weight @ (residual**2).sum(axis=1)))
+
+
+def sized(suite: SuiteErrors, sizes: SuiteSizes) -> SuiteErrors:
+    """Return errors of a suite with these standard deviations."""
+    return replace(suite, covariance=np.diag(np.tile(sizes.sigmas**2, len(suite.sensors))))

@@ -1,0 +1,39 @@
+"""What disturbed a drive beside noise, as it was found in its readings."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class DisturbanceKind(StrEnum):
+    """What kind of process."""
+
+    WANDER = "wander"
+    """H of a sensor is not constant, or its noise lasts."""
+    POSES = "poses"
+    """Poses are wrong by errors that last."""
+    WARP = "warp"
+    """The drive's frame is bent against the map's."""
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A process that was found on a drive, and that sigmas hold.
+
+    Attributes
+    ----------
+    kind
+        What it is.
+    sensor
+        Whose readings it is in; all if none is named.
+    sizes
+        Standard deviations by name and unit: ``noise_ut`` (that lasts, 1/f) and ``walk_ut`` (of H
+        from the start to the end of a drive) along each axis; ``rotation_deg``, ``position_m``
+        and for how long, ``lasting_s``; ``shift_m`` along each axis of the floor.
+    gain
+        Twice the logarithm by which the drive is more likely with it.
+    """
+
+    kind: DisturbanceKind
+    sensor: str | None
+    sizes: dict[str, float]
+    gain: float

@@ -1,0 +1,132 @@
+r"""Sizes of several processes whose weights a linear system has in common, by their likelihood.
+
+Readings that are white after all else is taken out say of m weights w an information I and a pull
+u. With independent weights of variances :math:`S = \sum_k \theta_k d_k`, a spectrum d_k for each
+process, the logarithm of the likelihood, restricted for all else, exceeds that without weights by
+
+.. math::
+    \ell(\theta) = \tfrac12 u^T (S^{-1} + I)^{-1} u
+        - \tfrac12 \log\det(1 + S^{1/2} I S^{1/2})
+
+The sizes are found by the updates of Zhou, Hu, Qiao and Cho (MM algorithms for variance components,
+JCGS 28, 2019), each of which raises it and keeps all sizes positive:
+
+.. math::
+    \theta_k \leftarrow \theta_k
+        \sqrt{\frac{q^T d_k q}{\mathrm{tr}\, d_k M}}, \qquad
+    M = (1 + I S)^{-1} I, \quad q = (1 + I S)^{-1} u
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+
+from l2m_gtsam.data import FloatArray, IntArray
+
+MOST_UPDATES = 200
+ENOUGH = 0.02  # of a logarithm of likelihood: less than that in an update is no progress
+NEGLIGIBLE = 1e-3  # of a single weight's information: what a process says that is nothing
+
+
+@dataclass(frozen=True)
+class VarianceComponents:
+    """The most likely sizes.
+
+    Attributes
+    ----------
+    sizes
+        Variances theta of K processes, shape (K,); zero where none is there.
+    gain
+        Twice the logarithm of the likelihood beyond that without any of them.
+    """
+
+    sizes: FloatArray
+    gain: float
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Weights under a prior.
+
+    Attributes
+    ----------
+    likelihood
+        Its logarithm beyond that without weights.
+    rest
+        q, what the pull is that the weights leave, shape (m,).
+    root
+        Z with ``M = I - Z^T Z``, shape (k, m), of the k weights that may differ from zero.
+    """
+
+    likelihood: float
+    rest: FloatArray
+    root: FloatArray
+
+
+@dataclass(frozen=True)
+class WeightSystem:
+    """What readings say of m weights, before any prior of these.
+
+    Attributes
+    ----------
+    information
+        I, shape (m, m).
+    pull
+        u, shape (m,): the weights that fit best are ``I^-1 u``.
+    """
+
+    information: FloatArray
+    pull: FloatArray
+
+    def among(self, at: IntArray) -> "WeightSystem":
+        """Return the same for some weights, the others being zero."""
+        return WeightSystem(self.information[np.ix_(at, at)], self.pull[at])
+
+    def beside(self, variances: FloatArray) -> "WeightSystem":
+        """Return the same where weights may be as large as these variances, shape (m,), by others.
+
+        What is left of the weights is what they are beyond that.
+        """
+        found = self.posterior(variances)
+        return WeightSystem(self.information - found.root.T @ found.root, found.rest)
+
+    def posterior(self, variances: FloatArray) -> Posterior:
+        """Return what the readings make of weights of these prior variances, shape (m,)."""
+        at = np.flatnonzero(variances > 0)
+        root, I_at = np.sqrt(variances[at]), self.information[at]
+        inner = np.eye(len(at)) + root[:, None] * I_at[:, at] * root
+        lower = cholesky(inner, lower=True, check_finite=False)
+        white = solve_triangular(
+            lower, root[:, None] * np.column_stack([I_at, self.pull[at]]), lower=True
+        )
+        Z, v = white[:, :-1], white[:, -1]
+        likelihood = 0.5 * float(v @ v) - float(np.log(np.diag(lower)).sum())
+        return Posterior(likelihood, self.pull - Z.T @ v, Z)
+
+    def scores(self, spectra: FloatArray) -> FloatArray:
+        """Return how far K processes of these spectra, (K, m), are from not being there, (K,).
+
+        In standard deviations of what would be seen of them then; the square is about the gain.
+        """
+        found = spectra @ (self.pull**2 - np.diag(self.information))
+        spread = 2 * np.einsum("ki,ij,kj->k", spectra, self.information**2, spectra)
+        return np.asarray(found / np.sqrt(np.where(spread > 0, spread, 1.0)))
+
+    def components(self, spectra: FloatArray) -> VarianceComponents:
+        """Return the most likely sizes of K processes of these spectra, shape (K, m)."""
+        alone = np.diag(self.information)
+        felt = spectra @ alone
+        count = np.count_nonzero(spectra, axis=1)
+        sizes = np.where(felt > 0, count / np.where(felt > 0, felt, 1.0), 0.0)
+        last = -np.inf
+        for _ in range(MOST_UPDATES):
+            found = self.posterior(sizes @ spectra)
+            if found.likelihood - last < ENOUGH:
+                break
+            last = found.likelihood
+            informed = spectra @ (alone - np.einsum("ij,ij->j", found.root, found.root))
+            ratio = (spectra @ found.rest**2) / np.where(informed > 0, informed, 1.0)
+            sizes = sizes * np.sqrt(np.where(informed > 0, ratio, 0.0))
+            sizes = np.where(sizes * felt > NEGLIGIBLE, sizes, 0.0)
+        return VarianceComponents(sizes, 2 * self.posterior(sizes @ spectra).likelihood)
