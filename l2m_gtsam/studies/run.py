@@ -23,7 +23,7 @@ from l2m_gtsam.qa.report.svg import save_figure
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
 from l2m_gtsam.storage.parts import only_one
-from l2m_gtsam.storage.result_set import made
+from l2m_gtsam.storage.result_set import made, published
 from l2m_gtsam.studies.study import Study
 
 Opts = TypeVar("Opts", bound=Options)
@@ -153,7 +153,7 @@ def conclude(
     out: Path,
     command: str,
 ) -> StudyFile[Opts, Summary]:
-    """Write ``study.json``, page and figures of all cells; return what was read back."""
+    """Publish ``study.json``, page and figures of all cells; return what was read back."""
     made = Provenance(
         command,
         tuple(sorted({each.code for each in cells.values()})),
@@ -164,8 +164,9 @@ def conclude(
     summary = study.summarise(options, {key: each.cell for key, each in cells.items()})
     content = StudyFile(FORMAT, study.name, made, options, summary)
     plain = file_type(study).dump_python(content, mode="json")
-    write_text(out / STUDY_FILE, json.dumps(plain, indent=1, allow_nan=False) + "\n")
-    return render(study, out)
+    with published(out) as stage:
+        write_text(stage / STUDY_FILE, json.dumps(plain, indent=1, allow_nan=False) + "\n")
+        return render(study, stage)
 
 
 def render(study: Study[Opts, Any, Summary], folder: Path) -> StudyFile[Opts, Summary]:

@@ -72,6 +72,11 @@ async function look(browser, window_, scheme) {
   found.wider = await page.evaluate(
     () => document.documentElement.scrollWidth > document.documentElement.clientWidth,
   );
+  found.cut = await page.evaluate(() =>
+    [...document.querySelectorAll(".card .scroll")]
+      .filter((each) => each.scrollWidth > each.clientWidth + 1)
+      .map((each) => each.getAttribute("aria-label")),
+  );
   found.background = await page.evaluate(() => getComputedStyle(document.body).backgroundColor);
   found.text = await page.evaluate(() => document.body.innerText);
   found.title = await page.title();

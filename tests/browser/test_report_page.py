@@ -36,6 +36,10 @@ def test_it_fits_a_phone(looked: Looked) -> None:
     check_phone(looked)
 
 
+def test_no_card_is_cut_off(looked: Looked) -> None:
+    assert [each["cut"] for each in looked.looks] == [[]] * 4
+
+
 def test_light_and_dark_differ(looked: Looked) -> None:
     light, dark = (
         np.asarray(Image.open(looked.folder / f"desk-{scheme}.png").convert("L"), dtype=float)

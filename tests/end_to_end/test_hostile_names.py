@@ -17,42 +17,25 @@ from ruamel.yaml import YAML
 
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.qa.fleet import with_outliers
-from l2m_gtsam.qa.options import FleetOptions
+from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.qa.report.figures.vehicle import calibration_figure
 from l2m_gtsam.qa.report.fleet_page import fleet_page
+from l2m_gtsam.qa.report.localisation_page import localisation_page
 from l2m_gtsam.qa.report.svg import save_figure
-from l2m_gtsam.records.fleet import FleetRow
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import folder_names, printable
 from l2m_gtsam.storage.fleet_table import write_csv
 from l2m_gtsam.storage.record_files import read_metrics
 from l2m_gtsam.text.shown import shown_lines
 from tests.drives.bags import Entry, ros, write
-from tests.drives.fleet_rows import row, sensor_row
+from tests.drives.degenerate import eight, mounted
+from tests.drives.fleet_rows import row
+from tests.drives.fleets import CONFIG, PLACE, make_place
+from tests.drives.fleets import write as write_drive
+from tests.drives.hostile import NAMES, fleet_rows, localisation
+from tests.drives.localised import record
 from tests.support.command_line import Finished, ended, l2m
 
-NAMES = (
-    "<script>alert(1)</script>",
-    '"><img src=x onerror=alert(2)>',
-    "' onmouseover='alert(3)",
-    "</title></svg><script>alert(4)</script>",
-    "<!-- ]]> &amp; &#60;b&#62;",
-    "javascript:alert(5)",
-    "{{ 7 * 7 }}{% for x in y %}",
-    "${HOME} $(touch touched) `touch touched`",
-    "%s%n %(x)d {0} {x.y}",
-    "$\\frac{\\alpha$ \\input{x}",
-    "[red]bold[/] [link=x]",
-    "=cmd|' /C calc'!A0",
-    "!!python/object/apply:os.system [x]",
-    "'; DROP TABLE topics; --",
-    "../../../etc/passwd",
-    "C:\\con\\..\\nul.",
-    "\x1b[31mred\x1b]0;title\x07",
-    "\u202egnp.exe\u200b\ufeff",
-    "line\r\nl2m: all is well",
-    "n" * 400,
-)
 DANGEROUS = {"script", "img", "iframe", "object", "embed", "base", "form", "meta-refresh"}
 OTHERS = ("kalibr", "bias-scale", "px4", "ardupilot")  # seconds each, and of the same parts
 START = 1_700_000_000_000_000_000
@@ -226,27 +209,46 @@ def test_pictures(folder: Path, tmp_path: Path) -> None:
         assert len(picture.convert("L").getcolors(1 << 16) or []) > 20
 
 
-def rows() -> list[FleetRow]:
-    """Return drives whose vehicle, bag, sensor, reason and error are such names."""
-    found = []
-    for k, name in enumerate(NAMES):
-        sensor = sensor_row(name, reason=name)
-        found += [row(day, sensor, vehicle=name, bag=f"{name}.bag") for day in range(3)]
-        found.append(replace(row(4), vehicle=name, sensor=None, error=f"{name}: {NAMES[-k]}"))
-    return found
-
-
 def test_the_page_of_a_fleet() -> None:
     options = FleetOptions()
     plain = [row(day) for day in range(3)]
-    page = fleet_page(with_outliers(rows(), options), options)
+    page = fleet_page(with_outliers(fleet_rows(), options), options)
     check_page(page, fleet_page(with_outliers(plain, options), options))
+
+
+def test_the_page_of_a_localisation() -> None:
+    page = localisation_page(localisation(), QaOptions())
+    check_page(page, localisation_page(record(), QaOptions()))
+
+
+@pytest.mark.study
+def test_whole_commands(tmp_path: Path) -> None:
+    """A drive with a sensor of each name, in a fleet with a vehicle of such a name; and SLAM."""
+    place, config = make_place(tmp_path / "place"), tmp_path / "config.yaml"
+    known = [replace(mounted(PLACE)[0], sensor=name) for name in NAMES]
+    bag = write_drive(tmp_path / "drive.mcap", eight(), tuple(known), seed=1)
+    start = dict.fromkeys(NAMES, PLACE[0].tolist())
+    config.write_text(json.dumps({**CONFIG, "calibration": {"start": start}}))
+    fleet, made, found = (tmp_path / name for name in ("fleet", "made", "found"))
+    manifest = tmp_path / "fleet.yaml"
+    manifest.write_text(json.dumps([{"bag": bag.name, "vehicle": name} for name in NAMES[:2]]))
+    as_here = ("--map", place.map, "--config", config)
+    check_terminal(ended("batch", manifest, *as_here, "--out", fleet, "--workers", "1"))
+    check_terminal(ended("calibrate", bag, *as_here, "--out", made))
+    calibration = ("--calibration", made / "calibration.yaml")
+    check_terminal(ended("slam", bag, *as_here, *calibration, "--out", found))
+    for page in (fleet / "index.html", made / "report.html", found / "report.html"):
+        html = page.read_text()
+        scripts = _scripts(html)
+        assert len(scripts) <= 1  # that sorts the fleet's table
+        check_page(html, "".join(f"<{tag}>" for tag in scripts))
 
 
 def test_the_table_of_a_fleet(tmp_path: Path) -> None:
     """No cell is a formula of a spreadsheet, and each is in its column."""
     named = [
-        replace(each, vehicle=printable(each.vehicle), bag=printable(each.bag)) for each in rows()
+        replace(each, vehicle=printable(each.vehicle), bag=printable(each.bag))
+        for each in fleet_rows()
     ]
     write_csv(tmp_path / "fleet.csv", named)
     text = (tmp_path / "fleet.csv").read_text(encoding="utf-8")

@@ -1,7 +1,7 @@
 """Where the sensors sit on the vehicle, with their ellipses: in the report, and as one picture."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,8 +32,12 @@ COLOURS = {Level.PASS: GOOD, Level.WARN: FAIR, Level.FAIL: BAD}
 SHAPES = {Level.PASS: "o", Level.WARN: "^", Level.FAIL: "X"}
 # An ellipse that is less than this share of the picture is a dot: all are drawn larger then.
 SEEN = 0.1
-BEHIND = 0.08  # of the picture: names closer than this would cover each other
-FAR = 0.75  # of the picture: names beyond this are written on the left of their dot
+BEHIND = 12.0  # points: names of dots that are closer would cover each other
+LETTER, LINE = 0.7 * SMALL, 1.4 * SMALL  # points, about: how wide a letter is, and a line high
+GAP = np.array([10.0, 6.0])  # points from a dot to its name
+MOST_NAMES = 4  # of one label
+FAR = 0.75  # of the picture: names beyond this are written on the left of their dot, or below it
+MARGIN = 0.2  # around all places, of what they span
 ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200)
 
 
@@ -101,31 +105,69 @@ def _places(found: list[SensorCalibration], view: Viewpoint) -> FloatArray:
     return np.vstack([room, *own])
 
 
+@dataclass(frozen=True, eq=False)
+class _Label:
+    """Names beside a place in a view, which may be far on the right or high in it."""
+
+    at: FloatArray
+    names: tuple[str, ...]
+    right: bool
+    high: bool
+
+    @property
+    def lines(self) -> list[str]:
+        """What is written; of many names the first ones, and how many there are."""
+        shown = [*map(short_name, self.names)]
+        if len(shown) <= MOST_NAMES:
+            return shown
+        return [*shown[: MOST_NAMES - 1], f"and {len(shown) - MOST_NAMES + 1} others"]
+
+    @property
+    def hangs(self) -> bool:
+        """Whether lines are stacked downwards: there is no room for so many above."""
+        return self.high and len(self.lines) > 2
+
+    def covers(self, other: "_Label", scale: float) -> bool:
+        """Return whether it would be written over another one, with so many points to a metre."""
+        if np.abs(self.at - other.at).max() * scale < BEHIND:
+            return True
+        (low, high), (its_low, its_high) = self._box(scale), other._box(scale)
+        return bool(np.all((low < its_high) & (its_low < high)))
+
+    def _box(self, scale: float) -> tuple[FloatArray, FloatArray]:
+        """Return about where it is written, in points."""
+        width, height = LETTER * max(map(len, self.lines)), LINE * len(self.lines)
+        extent, back = np.array([width, height]), np.array([self.right, self.hangs])
+        low = scale * self.at + np.where(back, -extent - GAP, GAP)
+        return low, low + extent
+
+
 def _name(axes: Axes, found: list[SensorCalibration], view: Viewpoint) -> None:
-    """Write names; sensors that lie behind each other in this view share a label."""
-    near = BEHIND * float(np.ptp(_places(found, view), axis=0).max())
-    labels: list[tuple[FloatArray, list[str]]] = []
+    """Write names; those that would be written over each other share a label."""
+    places = _places(found, view)
+    room = np.array([axes.bbox.width, axes.bbox.height]) * 72.0 / axes.figure.dpi
+    scale = float((room / ((1 + 2 * MARGIN) * np.ptp(places, axis=0))).min())
+    far, top = places.min(axis=0) + FAR * np.ptp(places, axis=0)
+    labels: list[_Label] = []
     for sensor in found:
         at = sensor.t_lidar_mag[list(view.axes)]
-        there = next((names for place, names in labels if np.abs(place - at).max() < near), None)
-        if there is None:
-            labels.append((at, [sensor.sensor]))
-        else:
-            there.append(sensor.sensor)
-    x = _places(found, view)[:, 0]
-    far = x.min() + FAR * np.ptp(x)
-    for at, names in labels:
-        text = "\n".join(map(short_name, names))
-        right = at[0] > far
-        label = axes.annotate(
-            text,
-            tuple(at),
-            xytext=(-10 if right else 10, 6),
+        label = _Label(at, (sensor.sensor,), bool(at[0] > far), bool(at[1] > top))
+        # One that grows may reach others.
+        while there := next((each for each in labels if each.covers(label, scale)), None):
+            labels.remove(there)
+            label = replace(there, names=there.names + label.names)
+        labels.append(label)
+    for label in labels:
+        text = axes.annotate(
+            "\n".join(label.lines),
+            tuple(label.at),
+            xytext=tuple(np.where([label.right, label.hangs], -GAP, GAP)),
             textcoords="offset points",
-            ha="right" if right else "left",
+            ha="right" if label.right else "left",
+            va="top" if label.hangs else "bottom",
             fontsize=SMALL,
         )
-        label.set_in_layout(False)  # a long name is no reason to draw the vehicle smaller
+        text.set_in_layout(False)  # a long name is no reason to draw the vehicle smaller
 
 
 def _drawn(factor: int) -> str:
@@ -235,5 +277,5 @@ def _draw_vehicle(
         axes.plot([], [], "+", color=TRUTH, label="truth")
     axes.set(xlabel=f"{names[rows[0]]} (m)", ylabel=f"{names[rows[1]]} (m)")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.2)
+    axes.margins(MARGIN)
     axes.grid(alpha=0.3)

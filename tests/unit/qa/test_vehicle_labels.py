@@ -1,0 +1,69 @@
+"""Names of sensors in pictures of a vehicle: none is written over another, of however many."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Annotation
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.report.figures.vehicle import MOST_NAMES, SIDE, TOP, Viewpoint, vehicle_figure
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.verdict import Level, SensorVerdict, Verdict
+from l2m_gtsam.storage.calibration_file import read_calibration
+from tests.support.repository import REPOSITORY
+
+
+def calibration(places: FloatArray) -> CalibrationResult:
+    """Return a calibration with a sensor at each place, (N, 3) in metres."""
+    known = read_calibration(REPOSITORY / "tests" / "files" / "calibration.yaml")
+    (one,) = known.sensors
+    sensors = [
+        replace(one, sensor=f"mag_{k:02d}", t_lidar_mag=place) for k, place in enumerate(places)
+    ]
+    return replace(known, sensors=tuple(sensors))
+
+
+def labels(result: CalibrationResult, view: Viewpoint) -> tuple[list[str], FloatArray]:
+    """Return what is written beside sensors, and its corners in pixels, (N, 4)."""
+    sensors = tuple(SensorVerdict(each.sensor, Level.PASS, ()) for each in result.sensors)
+    figure = vehicle_figure(result, Verdict(Level.PASS, (), sensors), view)
+    FigureCanvasAgg(figure)
+    figure.draw_without_rendering()
+    found = [
+        each
+        for each in figure.findobj(Annotation)
+        if isinstance(each, Annotation) and each.get_text().startswith("mag_")
+    ]
+    boxes = [each.get_window_extent().extents for each in found]
+    return [each.get_text() for each in found], np.array(boxes)
+
+
+rng = np.random.default_rng(3)
+VEHICLES = {
+    "one": np.array([[0.3, 0.1, 0.2]]),
+    "at one place": 0.2 + rng.normal(0, 1e-3, (20, 3)),
+    "close together": rng.normal([0.2, -0.1, 0.15], 0.02, (20, 3)),
+    "all over": rng.uniform(-0.5, 0.5, (20, 3)),
+    "in a row": np.column_stack([np.linspace(-1, 1, 12), np.zeros(12), np.full(12, 0.1)]),
+}
+
+
+@pytest.mark.parametrize("view", [TOP, SIDE])
+@pytest.mark.parametrize("name", VEHICLES)
+def test_no_name_is_written_over_another(name: str, view: Viewpoint) -> None:
+    places = VEHICLES[name]
+    texts, boxes = labels(calibration(places), view)
+    told = 0
+    for text in texts:
+        lines = text.split("\n")
+        assert len(lines) <= MOST_NAMES
+        last = lines[-1]
+        others = int(last.split()[1]) if last.startswith("and ") else 0
+        told += len(lines) - bool(others) + others
+    assert told == len(places)
+    for one, other in combinations(boxes, 2):
+        # A pixel: letters have some room in their boxes.
+        assert np.any((one[2:] < other[:2] + 1) | (other[2:] < one[:2] + 1)), texts
