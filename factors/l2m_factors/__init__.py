@@ -11,7 +11,7 @@ from l2m_factors.key_pose_readings import (
     KeyPoseResiduals,
     key_pose_residuals,
 )
-from l2m_factors.keys import D, F, G, M, P, Q, S, T, U, V, W, X
+from l2m_factors.keys import D, F, G, M, N, P, Q, S, T, U, V, W, X
 from l2m_factors.motion import PoseMotion, moved, rotation_matrices, skew
 from l2m_factors.pose import MapBatch, key_pose_factor
 from l2m_factors.priors import distance_prior, distortion_prior, held_directions, rotation_prior
@@ -28,6 +28,7 @@ from l2m_factors.shared_errors import (
     uncertain_block_factor,
     uncertain_reading_factor,
 )
+from l2m_factors.slow_error import SlowBridge, SlowError, slow_bridge, slow_error_graph
 from l2m_factors.steady_drift import (
     drift_weights,
     drifting_fixed_axes_factor,
@@ -50,12 +51,15 @@ __all__ = [
     "M",
     "MagneticReadings",
     "MapBatch",
+    "N",
     "P",
     "PoseMotion",
     "Q",
     "ReadingResiduals",
     "S",
     "SharedError",
+    "SlowBridge",
+    "SlowError",
     "StepError",
     "T",
     "TileBatch",
@@ -94,6 +98,8 @@ __all__ = [
     "scaled_step_factor",
     "shared_error",
     "skew",
+    "slow_bridge",
+    "slow_error_graph",
     "tile_factor",
     "uncertain_block_factor",
     "uncertain_reading_factor",

@@ -3,6 +3,11 @@
 import gtsam
 
 
+def N(key_pose: int) -> int:
+    """Return the key of the slow error of readings at this key pose: Vector 3, unit variance."""
+    return int(gtsam.symbol("N", key_pose))
+
+
 def X(key_pose: int) -> int:
     """Return the key of this key pose, ``T_map_lidar``: Pose3, metres."""
     return int(gtsam.symbol("X", key_pose))

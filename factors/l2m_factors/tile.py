@@ -26,6 +26,7 @@ from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
 from l2m_factors.keys import M, X
 from l2m_factors.motion import skew
+from l2m_factors.slow_error import SlowError
 from l2m_factors.step import Slots, StepError
 from l2m_factors.whitening import Whitening
 
@@ -173,13 +174,17 @@ class TileBatch(KeyPoseBatch):
 
 
 def tile_factor(
-    batch: TileBatch, key_pose: int, whitening: Whitening, step: StepError | None = None
+    batch: TileBatch,
+    key_pose: int,
+    whitening: Whitening,
+    step: StepError | None = None,
+    slow: SlowError | None = None,
 ) -> gtsam.CustomFactor:
     """Return one factor for the readings of all sensors on a key pose in an unknown field.
 
     It is on ``X(k)``, the anchor ``X(a)``, the weights ``M(b)``, on the calibrations unless the
     batch has them fixed, and, if its readings are known to lie between two key poses, on
-    ``X(k+1)``.
+    ``X(k+1)``; with a slow error on ``W(k)`` and ``W(k+1)``.
 
     Parameters
     ----------
@@ -191,9 +196,11 @@ def tile_factor(
         Of its n readings.
     step
         What they feel of the error of the step to the next key pose; nothing without.
+    slow
+        What they have of a slow error of their sensor; nothing without.
     """
     rows = batch.rows_of(key_pose)
-    terms = [] if step is None else [step]
+    terms = [each for each in (step, slow) if each is not None]
     slots = Slots([*batch.keys_of(key_pose), *(key for each in terms for key in each.keys)])
 
     def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:

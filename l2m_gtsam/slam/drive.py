@@ -239,6 +239,8 @@ class Drive:
         Prior of the first key pose.
     sensors
         Calibrations of the S sensors.
+    reading_ns
+        Times of the N readings, shape (N,).
     links
         L scan registrations of key poses.
     jumps
@@ -250,6 +252,7 @@ class Drive:
     readings: KeyPoseReadings
     start: StartPose
     sensors: KnownSensors
+    reading_ns: IntArray
     links: Links = field(default_factory=Links.none)
     jumps: tuple[OdometryJump, ...] = ()
 
@@ -259,11 +262,13 @@ class Drive:
     def until(self, count: int) -> "Drive":
         """Return the drive as it is up to so many key poses."""
         links = self.links.key_pose < count
+        rows = np.flatnonzero(self.readings.key_pose < count - 1)
         return replace(
             self,
             stamp_ns=self.stamp_ns[:count],
             steps=self.steps.until(count - 1),
-            readings=self.readings[np.flatnonzero(self.readings.key_pose < count - 1)],
+            readings=self.readings[rows],
+            reading_ns=self.reading_ns[rows],
             links=self.links[links],
             jumps=tuple(each for each in self.jumps if each.step < count - 1),
         )
@@ -347,12 +352,10 @@ def as_pose(transform: RigidTransform) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3(transform.R), transform.t)
 
 
-def key_pose_readings(
+def thinned_readings(
     readings: Readings, trajectory: Trajectory, rows: IntArray, most: int
-) -> KeyPoseReadings:
-    """Express readings relative to the key pose before each, and thin them.
-
-    A reading at the time of a key pose belongs to the one before it, as the end of that step.
+) -> Readings:
+    """Return readings in order of key poses and sensors, at most so many of each on each.
 
     Parameters
     ----------
@@ -363,12 +366,25 @@ def key_pose_readings(
     rows
         Rows of the key poses in it, shape (K,).
     most
-        Limit of readings per sensor and key pose.
+        Limit of readings per sensor and key pose, spread over its time.
     """
-    key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns) - 1
-    key = np.clip(key, 0, len(rows) - 2)
-    kept = evenly_spread(np.column_stack([key, readings.sensor]), most)
-    readings, key = readings[kept], key[kept]
+    key = _key_poses(readings, trajectory, rows)
+    return readings[evenly_spread(np.column_stack([key, readings.sensor]), most)]
+
+
+def key_pose_readings(
+    readings: Readings, trajectory: Trajectory, rows: IntArray
+) -> KeyPoseReadings:
+    """Express readings relative to the key pose before each.
+
+    A reading at the time of a key pose belongs to the one before it, as the end of that step.
+
+    Parameters
+    ----------
+    readings, trajectory, rows
+        As of ``thinned_readings``.
+    """
+    key = _key_poses(readings, trajectory, rows)
     R_back, p = trajectory.R[rows[key]].transpose(0, 2, 1), trajectory.p[rows[key]]
     return KeyPoseReadings(
         key_pose=key,
@@ -378,6 +394,12 @@ def key_pose_readings(
         fraction=_fractions(trajectory, rows[key], rows[key + 1], readings.stamp_ns),
         field=readings.field,
     )
+
+
+def _key_poses(readings: Readings, trajectory: Trajectory, rows: IntArray) -> IntArray:
+    """Return the number of the key pose before each reading, shape (N,)."""
+    key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns) - 1
+    return np.asarray(np.clip(key, 0, len(rows) - 2))
 
 
 def _fractions(

@@ -18,9 +18,10 @@ from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
 from l2m_gtsam.slam.slips import judged, with_open_jumps
 from l2m_gtsam.slam.solution import DriveSolution
+from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution, map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
-from l2m_gtsam.slam.unknown_field.whole_smoother import likelihood, map_whole_drive
+from l2m_gtsam.slam.unknown_field.whole_smoother import DriveLikelihood, map_whole_drive
 
 NO_REVISITS = "no place was revisited: readings of an unknown field remove little drift then"
 NOTHING_GAINED = (
@@ -101,7 +102,7 @@ def explore(
     odometry = judged(
         drive,
         lambda each: solve_field(each, options, progress).solution,
-        (lambda each: likelihood(each, options)) if has_one_sensor(drive) else None,
+        DriveLikelihood(drive, options) if has_one_sensor(drive) else None,
     )
     drive = odometry.drive
     mapped = solve_field(drive, options, progress)
@@ -117,12 +118,22 @@ def explore(
             *result.notes,
             *([] if explored.returned else [NO_REVISITS]),
             *([] if mapped.gained else [NOTHING_GAINED]),
+            *([] if mapped.noise is None else [noise_note(mapped.noise, drive)]),
         ),
         bag=recording.source,
         explored=explored,
     )
     points, field = field_samples(mapped.solution.drive, mapped.solution)
     return Exploration(result, mapped.solution, points, field)
+
+
+def noise_note(noise: SensorNoise, drive: Drive) -> str:
+    """Return what the drive's own readings say of their noise, beside what the calibration says."""
+    return (
+        f"readings of {drive.sensors.names[0]} are off by {noise.white_ut:.2g} uT each and by "
+        f"{noise.slow_ut:.2g} uT that last {noise.slow_s:.2g} s, by the drive itself; its "
+        f"calibration states {drive.sensors.noise[0]:.2g} uT"
+    )
 
 
 def without_field(drive: Drive, options: SlamOptions) -> PoseGraph:

@@ -25,6 +25,7 @@ from l2m_gtsam.slam.drive import (
     key_pose_readings,
     link_stamps,
     odometry_jumps,
+    thinned_readings,
 )
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
@@ -161,12 +162,14 @@ def prepared(
     rows = np.union1d(key_pose_rows(odometry, options.key_poses), repaired.rows)
     if len(evidence):
         rows = with_rows_at(rows, odometry, link_stamps(evidence))
+    readings = thinned_readings(readings, odometry, rows, options.key_poses.readings)
     drive = Drive(
         stamp_ns=odometry.stamp_ns[rows],
         steps=odometry_steps(odometry, rows, options.drift, repaired.jumps),
-        readings=key_pose_readings(readings, odometry, rows, options.key_poses.readings),
+        readings=key_pose_readings(readings, odometry, rows),
         start=start_pose(odometry, options.start),
         sensors=known_sensors(calibrated),
+        reading_ns=readings.stamp_ns,
         links=key_pose_links(evidence, odometry, rows, options.drift),
         jumps=odometry_jumps(repaired, rows, options.drift),
     )

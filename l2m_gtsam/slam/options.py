@@ -81,8 +81,10 @@ class WholeFieldOptions(Options):
     """Standard deviation per axis of what steel on the vehicle adds to the readings beyond the
     calibration, uT. It is estimated even where the calibration is fixed: the poses would have to
     explain it."""
-    distortion: float = Field(default=0.03, gt=0)
-    """And of the entries of C."""
+    distortion: float = Field(default=0.3, gt=0)
+    """And of the entries of C: soft iron beside a sensor that was calibrated elsewhere, or not at
+    all, comes to that. A drive that turns tells most of them, so that a larger value costs
+    little."""
 
 
 class CalibrationUse(StrEnum):

@@ -76,7 +76,13 @@ class RelativeMotions:
         Q = self.covariance[self.readings.key_pose[rows]]
         return np.asarray((s * (1 - s))[:, None, None] * (F @ Q @ F.transpose(0, 2, 1)))
 
-    def whitening(self, rows: IntArray, own: FloatArray, by_lidar: FloatArray) -> Whitening:
+    def whitening(
+        self,
+        rows: IntArray,
+        own: FloatArray,
+        by_lidar: FloatArray,
+        more: FloatArray | None = None,
+    ) -> Whitening:
         """Return the joint whitening of the residuals of n readings on one key pose.
 
         Parameters
@@ -85,9 +91,11 @@ class RelativeMotions:
             As of ``interpolation_covariance``.
         own
             Whitening of each reading's own noise, 1/uT, shape (n, 3, 3).
+        more
+            What other errors add in one standard deviation of each, uT, shape (n, 3, q).
         """
         F, Q = by_lidar @ self.by_step[rows], self.covariance[self.readings.key_pose[rows[0]]]
-        return bridge_whitening(own, F, self.readings.fraction[rows], Q)
+        return bridge_whitening(own, F, self.readings.fraction[rows], Q, more)
 
     def step_error(self, rows: IntArray, by_lidar: FloatArray) -> StepError:
         """Return the derivatives of n readings on one key pose by the step; parameters as above."""
@@ -190,7 +198,9 @@ def shifted_readings(
     return replace(readings, R_key_lidar=R_end @ end.R_key_lidar, p_key_lidar=lever + p_end)
 
 
-def bridge_whitening(own: FloatArray, F: FloatArray, s: FloatArray, Q: FloatArray) -> Whitening:
+def bridge_whitening(
+    own: FloatArray, F: FloatArray, s: FloatArray, Q: FloatArray, more: FloatArray | None = None
+) -> Whitening:
     """Return the joint whitening of the residuals of n readings within one step.
 
     Parameters
@@ -203,6 +213,8 @@ def bridge_whitening(own: FloatArray, F: FloatArray, s: FloatArray, Q: FloatArra
         Share of the step that is done at each, shape (n,).
     Q
         Covariance of the step, shape (6, 6).
+    more
+        What other errors add in one standard deviation of each, uT, shape (n, 3, q).
     """
     at, F = _instants(s), F @ np.linalg.cholesky(Q)
     slot = np.abs(np.subtract.outer(s, at)).argmin(axis=1)
@@ -211,7 +223,10 @@ def bridge_whitening(own: FloatArray, F: FloatArray, s: FloatArray, Q: FloatArra
     # From the instant to the reading the walk counts as independent of other readings.
     rest = own @ F * np.sqrt(np.abs(s - at[slot]))[:, None, None]
     own = whitening(np.eye(3) + rest @ rest.transpose(0, 2, 1)) @ own
-    return Whitening.with_errors(own, errors.reshape(*own.shape[:2], -1))
+    errors = errors.reshape(*own.shape[:2], -1)
+    return Whitening.with_errors(
+        own, errors if more is None else np.concatenate([errors, more], axis=2)
+    )
 
 
 def _instants(s: FloatArray) -> FloatArray:

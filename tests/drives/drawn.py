@@ -65,7 +65,8 @@ def drawn_drive(
         covariance=np.tile(np.diag(sigma**2), (len(sensors), 1, 1)),
     )
     readings = drawn_readings(world, ideal, truth, odometry, every, rng, noise)
-    drive = Drive(truth.stamp_ns[rows], steps, readings, start, known)
+    times = np.repeat(truth.stamp_ns, len(sensors))
+    drive = Drive(truth.stamp_ns[rows], steps, readings, start, known, times)
     return DrawnDrive(drive, truth.R[rows], truth.p[rows], ideal)
 
 

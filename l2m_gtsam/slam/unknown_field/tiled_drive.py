@@ -20,6 +20,7 @@ from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_r
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field.linear_field import AXES, LinearField
+from l2m_gtsam.slam.unknown_field.sensor_noise import SlowErrors
 from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
     FieldPrior,
@@ -178,6 +179,7 @@ class TiledDrive:
         by_lidar: FloatArray,
         chosen: IntArray,
         fixed: Calibrations | None,
+        slow: SlowErrors | None = None,
     ) -> gtsam.NonlinearFactorGraph:
         """Return the factors of readings, and the prior of the tiles' weights.
 
@@ -195,6 +197,8 @@ class TiledDrive:
             Rows of the readings that count.
         fixed
             Calibrations where they are constants; None where they are variables.
+        slow
+            Slow errors of the readings, which are variables then.
         """
         graph = gtsam.NonlinearFactorGraph()
         for tile, penalty in zip(self.tiles, penalties, strict=True):
@@ -206,11 +210,15 @@ class TiledDrive:
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
                 for k in batch.key_poses:
                     own = rows[batch.rows_of(k)]
-                    white = motions.whitening(own, whitening[own], by_lidar[own])
-                    graph.add(tile_factor(batch, k, white, motions.step_error(own, by_lidar[own])))
+                    lasting, left = (None, None) if slow is None else slow.of(k, own)
+                    white = motions.whitening(own, whitening[own], by_lidar[own], left)
+                    step = motions.step_error(own, by_lidar[own])
+                    graph.add(tile_factor(batch, k, white, step, lasting))
                     factor = effective_parameters_factor(batch, k, penalty[batch.rows_of(k)])
                     if factor is not None:
                         graph.add(factor)
+        if slow is not None:
+            graph.push_back(slow.graph())
         return graph
 
 

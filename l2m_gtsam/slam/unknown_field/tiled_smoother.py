@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from l2m_factors import X
-from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.calibration.optimise import TOLERANCE, Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors
@@ -44,6 +44,7 @@ from l2m_gtsam.slam.solver import (
     sensor_covariances,
     weights_first,
 )
+from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from l2m_gtsam.solve.robust import WEIGHTS
@@ -73,12 +74,15 @@ class FieldSolution:
     gained
         Whether the readings are likelier at these poses than at those of odometry; if not, these
         are odometry's.
+    noise
+        Of the sensor, where it is estimated from the drive.
     """
 
     solution: DriveSolution
     tiles: int
     returns: IntArray
     gained: bool = True
+    noise: SensorNoise | None = None
 
 
 def map_drive(
@@ -162,6 +166,10 @@ class TiledProblem:
         Loss, calibration's use, and limit of iterations.
     ordering
         Elimination order of a graph's variables.
+    slow
+        Slow errors of the readings, parts of their noise; None where all of it is white.
+    close
+        Decrease of the error below which it has converged.
     """
 
     def __init__(
@@ -170,9 +178,11 @@ class TiledProblem:
         divided: Divided,
         options: SlamOptions,
         ordering: EliminationOrder = weights_first,
+        slow: SlowErrors | None = None,
+        close: float = TOLERANCE,
     ) -> None:
         self._drive, self._divided, self._options = drive, divided, options
-        self._ordering = ordering
+        self._ordering, self._slow, self._close = ordering, slow, close
         self._odometry, self._links = odometry_graph(drive), link_graph(drive.links)
         self._free = options.calibration is CalibrationUse.REFINED
 
@@ -205,15 +215,19 @@ class TiledProblem:
         penalties = tiled.penalties(noise, weights, predicted.prediction.squared(own))
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         fixed = None if self._free else self._drive.sensors.fixed()
+        if self._slow is not None:
+            own = predicted.prediction.whitening(self._slow.white * noise)
+            values.insert(self._slow.values())
         W, by_lidar = own * np.sqrt(weights)[:, None, None], predicted.prediction.by_lidar
-        graph = tiled.graph(motions, penalties, W, by_lidar, chosen, fixed)
+        graph = tiled.graph(motions, penalties, W, by_lidar, chosen, fixed, self._slow)
         graph.push_back(self._odometry)
         graph.push_back(self._links)
         if self._free:
             graph.push_back(calibration_graph(self._drive.sensors))
             values.insert(calibration_values(sensors))
         order = self._ordering(graph, values)
-        end = levenberg_marquardt(graph, values, order, self._options.max_iterations)
+        limit, close = self._options.max_iterations, self._close
+        end = levenberg_marquardt(graph, values, order, limit, close)
         found = list(poses_in(end.values, len(poses)).values())
         after = sensors_in(end.values, sensors)
         return TiledRound(tiled, graph, weights, end.values, found, after, end.ending)

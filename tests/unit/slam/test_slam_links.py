@@ -52,7 +52,7 @@ def scanned(truth: Trajectory, odometry: Trajectory, seen: ScanEvidence) -> tupl
     begin = StartPose(RigidTransform(truth.R[0], truth.p[0]), 1e-6 * np.eye(6))
     steps = odometry_steps(odometry, rows, DriftOptions())
     links = key_pose_links(seen, odometry, rows, DriftOptions())
-    return Drive(odometry.stamp_ns[rows], steps, empty, begin, sensors, links), rows
+    return Drive(odometry.stamp_ns[rows], steps, empty, begin, sensors, no, links), rows
 
 
 def errors(found: PoseGraph, truth: Trajectory, rows: IntArray) -> FloatArray:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import moved
-from l2m_gtsam.slam.drive import evenly_spread, key_pose_readings
+from l2m_gtsam.slam.drive import evenly_spread, key_pose_readings, thinned_readings
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import stated_information_root
@@ -106,7 +106,8 @@ def test_readings_hang_where_they_were() -> None:
     readings = Readings(
         ("a", "b"), sensor, drive.stamp_ns[twice], drive.R[twice], drive.p[twice], field
     )
-    hung = key_pose_readings(readings, drive, rows, most=1000)
+    kept = thinned_readings(readings, drive, rows, most=1000)
+    hung = key_pose_readings(kept, drive, rows)
     assert np.all(np.diff(hung.key_pose) >= 0)
     placed = hung.placed(drive.R[rows][hung.key_pose], drive.p[rows][hung.key_pose])
     back = np.argsort(placed.field[:, 0])
@@ -137,7 +138,7 @@ def test_what_is_read_at_rest_is_behind_no_more_of_the_way() -> None:
     readings = Readings(
         ("a",), np.zeros(n, np.int64), stamps, still, np.zeros((n, 3)), np.zeros((n, 3))
     )
-    hung = key_pose_readings(readings, drive, np.array([0, 4]), most=100)
+    hung = key_pose_readings(readings, drive, np.array([0, 4]))
     # 0.2 m of way and 0.2 rad of turning at an arm of a metre; creeping for 13 s is 13 um.
     np.testing.assert_allclose(hung.fraction, [0, 0.25, 0.25, 0.25, 0.5, 0.75, 1], atol=1e-4)
 

@@ -1,0 +1,97 @@
+"""What a sensor's readings are off by on a drive: white noise, and an error that lasts."""
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import N, SlowError, slow_bridge, slow_error_graph
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.solve.linear_algebra import covariance_root
+
+AXES = 3
+LEAST_WHITE = 0.09  # of the variance: what interpolation between key poses leaves is as large
+NS = 1e-9
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Errors of readings along each axis of the sensor.
+
+    Attributes
+    ----------
+    ut
+        Standard deviation in uT.
+    white
+        Share of its variance that is independent from reading to reading.
+    slow_s
+        Time in seconds over which the rest changes: its correlation falls by e.
+    """
+
+    ut: float
+    white: float
+    slow_s: float
+
+    @property
+    def white_ut(self) -> float:
+        """Standard deviation of the independent part in uT."""
+        return float(self.ut * np.sqrt(self.white))
+
+    @property
+    def slow_ut(self) -> float:
+        """Standard deviation of the other part in uT."""
+        return float(self.ut * np.sqrt(1 - self.white))
+
+    def floored(self) -> "SensorNoise":
+        """Return noise that is white enough for interpolated readings."""
+        return replace(self, white=max(self.white, LEAST_WHITE))
+
+    def scaled(self, factor: float) -> "SensorNoise":
+        """Return noise that is so many times as large."""
+        return replace(self, ut=factor * self.ut)
+
+
+class SlowErrors:
+    """Slow errors of the readings of a drive with one sensor, as factors.
+
+    Parameters
+    ----------
+    noise
+        Of the sensor.
+    stamp_ns
+        Times of the K key poses, shape (K,).
+    reading_ns
+        Times of the N readings, shape (N,).
+    """
+
+    def __init__(self, noise: SensorNoise, stamp_ns: IntArray, reading_ns: IntArray) -> None:
+        self._noise = noise
+        self._key_pose_s = NS * (stamp_ns - stamp_ns[0])
+        self._reading_s = NS * (reading_ns - stamp_ns[0])
+
+    @property
+    def white(self) -> float:
+        """Standard deviation of white noise in units of all noise."""
+        return float(np.sqrt(self._noise.white))
+
+    def of(self, key_pose: int, rows: IntArray) -> tuple[SlowError, FloatArray]:
+        """Return what readings on a key pose have of the errors at it and at the next.
+
+        With it what remains, in one standard deviation of each independent error, uT, (n, 3, q).
+        """
+        begin, end = self._key_pose_s[key_pose : key_pose + 2]
+        at = np.clip(self._reading_s[rows], begin, end)
+        bridge, ut = slow_bridge(at - begin, end - at, self._noise.slow_s), self._noise.slow_ut
+        left = np.einsum("ij,nm->nimj", ut * np.eye(AXES), covariance_root(bridge.covariance))
+        return SlowError(key_pose, ut * bridge.shares), left.reshape(len(rows), AXES, -1)
+
+    def graph(self) -> gtsam.NonlinearFactorGraph:
+        """Return their prior."""
+        return slow_error_graph(self._key_pose_s, self._noise.slow_s)
+
+    def values(self) -> gtsam.Values:
+        """Return initial values."""
+        values = gtsam.Values()
+        for k in range(len(self._key_pose_s)):
+            values.insert(N(k), np.zeros(AXES))
+        return values

@@ -1,0 +1,198 @@
+r"""Hyperparameters of a drive's field and noise, by the marginal likelihood of its readings.
+
+Learnt together, for each is taken for another where it is not free: strength and length of the
+field, size of the noise, which share of it is white and how long the rest lasts, and the distortion
+C, H of the sensor. With readings b that the calibration has corrected, ``A b + h`` is the field at
+the sensor, and
+
+.. math::
+    \log p(b) = \log N(A b + h; 0, F S F^T + T) + N \log |\det A|
+
+with the weights of the waves F integrated out, T of white noise and an Ornstein-Uhlenbeck process,
+and A and h by Laplace's approximation about the mode. ``log |det A|`` keeps A from shrinking all
+readings to nothing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import Bounds, minimize
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
+from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
+
+LEARNT_FROM, LEARNT_WITH = 300, 200  # readings and waves
+MARGIN = 1.5  # of the box about the path, in lengths of the field: on its faces the field is normal
+NEWTON, HALVINGS = 8, 20
+EVALUATIONS, AGAIN = 100, 50  # of the likelihood, and where it was searched before
+AXES = 3
+# Logarithms of: strength in that of the readings, length in m, noise in the same strength, odds of
+# white against slow noise, time of the latter in s.
+FIRST = np.array([0.0, 0.0, -2.0, -2.0, 0.7])
+LOWEST = np.array([-3.0, -1.2, -6.0, -7.0, -3.0])
+HIGHEST = np.array([3.0, 3.0, 1.0, 7.0, 4.0])
+
+
+@dataclass(frozen=True)
+class LearntReadings:
+    """N readings at an estimate of their places.
+
+    Attributes
+    ----------
+    x, R
+        Positions in metres (N, 3), rotations from the vehicle's axes (N, 3, 3).
+    field
+        Along the axes of the vehicle, corrected by the calibration, uT, shape (N, 3).
+    seconds
+        Their times, shape (N,).
+    """
+
+    x: FloatArray
+    R: FloatArray
+    field: FloatArray
+    seconds: FloatArray
+
+
+@dataclass(frozen=True)
+class FieldSpectrum:
+    """What is learnt of a field and of the sensor that reads it.
+
+    Attributes
+    ----------
+    prior
+        Of the potential.
+    noise
+        Of the readings.
+    log_likelihood
+        Of the readings, but for constants.
+    at
+        Where the search ended, to begin another.
+    """
+
+    prior: PotentialHyperparameters
+    noise: SensorNoise
+    log_likelihood: float
+    at: FloatArray
+
+
+def learnt_spectrum(
+    readings: LearntReadings,
+    distortion: float,
+    offset_ut: float,
+    first: FieldSpectrum | None = None,
+) -> FieldSpectrum:
+    """Return the hyperparameters of the largest marginal likelihood.
+
+    Parameters
+    ----------
+    readings
+        At an estimate of their places.
+    distortion, offset_ut
+        Standard deviations of what calibrations leave of C and, in uT, of H.
+    first
+        Where to begin.
+    """
+    evidence = Evidence(readings, distortion, offset_ut)
+    start = FIRST if first is None else first.at
+
+    def cost(at: FloatArray) -> float:
+        return -evidence.log_likelihood(at)
+
+    end = minimize(
+        cost,
+        start,
+        method="Nelder-Mead",
+        bounds=Bounds(LOWEST, HIGHEST),
+        options={
+            "xatol": 0.05,
+            "fatol": 0.3,
+            "maxfev": EVALUATIONS if first is None else AGAIN,
+            "initial_simplex": start + np.vstack([np.zeros(len(start)), 0.5 * np.eye(len(start))]),
+        },
+    )
+    return FieldSpectrum(
+        evidence.prior(end.x), evidence.noise(end.x), -float(end.fun), np.asarray(end.x)
+    )
+
+
+class Evidence:
+    """The marginal likelihood of readings; parameters as of ``learnt_spectrum``."""
+
+    def __init__(self, readings: LearntReadings, distortion: float, offset_ut: float) -> None:
+        x, b, self._count = readings.x, readings.field, len(readings.x)
+        level = np.einsum("nij,nj->ni", readings.R, b)
+        self._strength = float(np.sqrt(np.mean((level - level.mean(axis=0)) ** 2)))
+        first = PotentialHyperparameters(sigma=self._strength, length=1.0)
+        low, high = x.min(axis=0) - MARGIN, x.max(axis=0) + MARGIN
+        self._basis = PotentialBasis.over(low, high, first, LEARNT_WITH)
+        self._features = readings.R.transpose(0, 2, 1) @ self._basis.features(x)
+        corrected = np.zeros((self._count, AXES, 12))
+        for axis in range(AXES):
+            corrected[:, axis, 3 * axis : 3 * axis + 3] = b
+            corrected[:, axis, 9 + axis] = 1.0
+        self._corrected = corrected
+        self._apart = np.abs(np.subtract.outer(readings.seconds, readings.seconds))
+        self._mean = np.append(np.eye(AXES).ravel(), np.zeros(AXES))
+        self._variance = np.repeat([distortion**2, offset_ut**2], [9, 3])
+
+    def prior(self, at: FloatArray) -> PotentialHyperparameters:
+        """Return the potential's covariance at logarithms of the hyperparameters."""
+        strength, length = self._strength * np.exp(at[0]), np.exp(at[1])
+        return PotentialHyperparameters(sigma=float(strength * length), length=float(length))
+
+    def noise(self, at: FloatArray) -> SensorNoise:
+        """Return the noise there."""
+        white = 1 / (1 + np.exp(-at[3]))
+        return SensorNoise(
+            float(self._strength * np.exp(at[2])), float(white), float(np.exp(at[4]))
+        )
+
+    def log_likelihood(self, at: FloatArray) -> float:
+        """Return the log likelihood there, but for constants."""
+        noise = self.noise(at)
+        slow = (1 - noise.white) * np.exp(-self._apart / noise.slow_s)
+        root = cholesky(noise.ut**2 * (slow + noise.white * np.eye(self._count)), lower=True)
+
+        def white(rows: FloatArray) -> FloatArray:
+            flat = solve_triangular(root, rows.reshape(self._count, -1), lower=True)
+            return np.asarray(flat.reshape(AXES * self._count, -1))
+
+        F = white(self._features) * np.sqrt(self._basis.variances(self.prior(at)))
+        G = white(self._corrected)
+        lower = cholesky(np.eye(F.shape[1]) + F.T @ F, lower=True)
+        half = solve_triangular(lower, F.T @ G, lower=True)
+        volume = np.log(np.diag(lower)).sum() + AXES * np.log(np.diag(root)).sum()
+        return float(self._by_distortion(G.T @ G - half.T @ half) - volume)
+
+    def _by_distortion(self, information: FloatArray) -> float:
+        """Return the log likelihood with A, h integrated out, of readings of this information."""
+        a = self._mean.copy()
+        cost = self._cost(information, a)
+        for _ in range(NEWTON):
+            gradient, hessian = self._slopes(information, a)
+            step = np.linalg.solve(hessian, gradient)
+            for halving in range(HALVINGS):
+                trial = a - 0.5**halving * step
+                if (lower := self._cost(information, trial)) <= cost:
+                    a, cost = trial, lower
+                    break
+        own = np.sqrt(self._variance)
+        _, hessian = self._slopes(information, a)
+        return -cost - 0.5 * float(np.linalg.slogdet(own[:, None] * hessian * own)[1])
+
+    def _cost(self, information: FloatArray, a: FloatArray) -> float:
+        sign, volume = np.linalg.slogdet(a[:9].reshape(3, 3))
+        off = a - self._mean
+        fit = 0.5 * (a @ information @ a + off @ (off / self._variance))
+        return float(fit - self._count * volume) if sign > 0 else np.inf
+
+    def _slopes(self, information: FloatArray, a: FloatArray) -> tuple[FloatArray, FloatArray]:
+        # d log |det A| / dA = A^-T, and its derivative -A^-1_li A^-1_jk by A_ij and A_kl.
+        back = np.linalg.inv(a[:9].reshape(3, 3))
+        gradient = information @ a + (a - self._mean) / self._variance
+        gradient[:9] -= self._count * back.T.ravel()
+        hessian = information + np.diag(1 / self._variance)
+        hessian[:9, :9] += self._count * np.einsum("li,jk->ijkl", back, back).reshape(9, 9)
+        return gradient, hessian

@@ -1,0 +1,71 @@
+"""What is learnt of field and noise from readings at known places."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
+from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
+from l2m_gtsam.slam.unknown_field.spectrum import Evidence, LearntReadings, learnt_spectrum
+
+STRENGTH, LENGTH = 8.0, 1.0
+COUNT, PERIOD = 250, 0.4
+
+
+def slow_noise(noise: SensorNoise, seconds: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return white noise and a slow error at some times in uT, shape (N, 3)."""
+    alike = np.exp(-np.abs(np.subtract.outer(seconds, seconds)) / noise.slow_s)
+    root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(seconds)))
+    white, slow = rng.normal(size=(2, len(seconds), 3))
+    return np.asarray(noise.white_ut * white + noise.slow_ut * root @ slow)
+
+
+def read(noise: SensorNoise, C: FloatArray, seed: int) -> LearntReadings:
+    """Return readings along laps of 6 x 2 m in a field that the model holds."""
+    rng, at = np.random.default_rng(seed), np.linspace(0, 8 * np.pi, COUNT)
+    x = np.column_stack([3 * np.cos(at), np.sin(at), np.zeros(COUNT)])
+    x += rng.normal(0, 0.15, x.shape) * [1, 1, 0]
+    R = Rotation.from_euler("z", at[:, None]).as_matrix()
+    prior = PotentialHyperparameters(sigma=STRENGTH * LENGTH, length=LENGTH)
+    basis = PotentialBasis.over(x.min(axis=0) - 2, x.max(axis=0) + 2, prior, 200)
+    weights = np.sqrt(basis.variance) * rng.normal(size=len(basis))
+    seconds = PERIOD * np.arange(COUNT, dtype=np.float64)
+    b = np.einsum("nji,nj->ni", R, basis.features(x) @ weights)
+    return LearntReadings(x, R, b @ C.T + slow_noise(noise, seconds, rng), seconds)
+
+
+def test_lasting_noise_is_told_from_white_noise_and_from_the_field() -> None:
+    """Of some sixty independent values a standard deviation is known to a tenth; three times it."""
+    true = SensorNoise(1.5, 0.1, 3.0)
+    found = learnt_spectrum(read(true, np.eye(3), 0), distortion=0.01, offset_ut=1.0)
+    assert found.noise.ut == pytest.approx(true.ut, rel=0.35)
+    assert found.noise.white_ut == pytest.approx(true.white_ut, rel=0.5)
+    assert true.slow_s / 2.5 < found.noise.slow_s < 2.5 * true.slow_s
+    assert found.prior.length == pytest.approx(LENGTH, rel=0.2)
+
+
+def test_steel_beside_the_sensor_is_no_noise() -> None:
+    """With C free the noise is found as without steel; with C held it would be many times that."""
+    true, C = SensorNoise(0.3, 0.5, 3.0), np.diag([1.3, 0.8, 1.0])
+    readings = read(true, C, 1)
+    free, held = (learnt_spectrum(readings, each, 1.0) for each in (0.3, 1e-3))
+    assert free.noise.ut == pytest.approx(true.ut, rel=0.5)
+    assert free.log_likelihood > held.log_likelihood + 50
+
+
+def test_scaling_all_readings_down_is_no_gain() -> None:
+    """A and h are integrated out with their volume: without it A = 0 explains all readings."""
+    true = SensorNoise(0.5, 0.5, 3.0)
+    readings = read(true, np.eye(3), 2)
+    level = np.einsum("nij,nj->ni", readings.R, readings.field)
+    unit = (level - level.mean(axis=0)).std()  # of the strengths below
+    at = np.log([STRENGTH / unit, LENGTH, true.ut / unit, 1.0, true.slow_s])
+    tight, wide = (Evidence(readings, each, 1.0).log_likelihood(at) for each in (0.03, 3.0))
+    assert wide < tight
+
+
+def test_a_second_search_begins_where_the_first_ended() -> None:
+    readings = read(SensorNoise(1.0, 0.3, 2.0), np.eye(3), 3)
+    first = learnt_spectrum(readings, 0.1, 1.0)
+    assert learnt_spectrum(readings, 0.1, 1.0, first).log_likelihood >= first.log_likelihood - 1e-9
