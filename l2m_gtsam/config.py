@@ -10,7 +10,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.lidar.options import PointCloudOptions
 from l2m_gtsam.mapping.map_building import MappingOptions
-from l2m_gtsam.options import Options
+from l2m_gtsam.options import Options, words_of
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.qa.options import FleetOptions, QaOptions
 from l2m_gtsam.records.calibration import Uncertainty
@@ -129,7 +129,7 @@ def _explain(path: Path, error: ValidationError, model: type[BaseModel]) -> str:
     if fault["type"] == "extra_forbidden":
         accepted = ", ".join(_accepted(model, fault["loc"][:-1]))
         return f"{path}: unknown key {key!r}; accepted here: {accepted}"
-    why = shown(fault["msg"], LONGEST_REASON)
+    why = shown(words_of(fault), LONGEST_REASON)
     return f"{path}: {key}: {why}, got {shown_value(fault['input'])}"
 
 

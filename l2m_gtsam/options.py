@@ -10,6 +10,7 @@ from textwrap import dedent
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 UNIT = 1e-3  # a quaternion given to three digits is as long as this
 Components = tuple[float, float, float, float]
@@ -82,4 +83,19 @@ def first_fault(error: ValidationError, *above: str, hidden: Collection[str] = (
     """
     fault = error.errors()[0]
     keys = (*above, *(str(part) for part in fault["loc"] if part not in hidden))
-    return f"{'.'.join(keys) or 'the file'}: {fault['msg']}"
+    return f"{'.'.join(keys) or 'the file'}: {words_of(fault)}"
+
+
+WORDS = {
+    "tuple_type": "a list is expected",
+    "list_type": "a list is expected",
+    "dict_type": "names with values are expected",
+    "model_type": "names with values are expected",
+    "model_attributes_type": "names with values are expected",
+    "dataclass_type": "names with values are expected",
+}
+
+
+def words_of(fault: ErrorDetails) -> str:
+    """Return what is wrong in words of this project, or else in those of pydantic."""
+    return WORDS.get(fault["type"], fault["msg"].removeprefix("Value error, "))

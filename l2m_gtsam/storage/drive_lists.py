@@ -18,7 +18,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from l2m_gtsam.errors import BagError, ConfigError
-from l2m_gtsam.options import Options
+from l2m_gtsam.options import Options, words_of
 from l2m_gtsam.storage.yaml_file import read_yaml
 
 FILES = (".bag", ".mcap", ".db3", ".ulg")
@@ -182,7 +182,7 @@ def _fault(error: ValidationError) -> str:
     where = ": ".join([f"drive {int(number) + 1}", *map(str, keys)])
     if fault["type"] == "extra_forbidden":
         return f"{where}: unknown key; accepted here: {', '.join(ManifestEntry.model_fields)}"
-    return f"{where}: {fault['msg']}"
+    return f"{where}: {words_of(fault)}"
 
 
 def _seen_from_here(folder: Path, entry: ManifestEntry) -> ManifestEntry:

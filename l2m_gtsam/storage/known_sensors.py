@@ -98,11 +98,14 @@ class _KnownFile(_Finite):
         if not isinstance(sensors, dict):
             return sensors
         solved = SensorStatus.SOLVED.value
-        return {
+        known = {
             name: entry
             for name, entry in sensors.items()
             if not isinstance(entry, dict) or entry.get("status", solved) == solved
         }
+        if sensors and not known:
+            raise ValueError("none of them is solved; the `message` of each says why")
+        return known
 
 
 class _ListedFile(_Finite):

@@ -43,6 +43,7 @@ def test_the_effective_configuration_reads_back() -> None:
             "colour: red",
             r"unknown key 'colour'; accepted here: bag, calibration, fleet, lidar, mapping",
         ),
+        ("bag: {fields: 7}", r"bag.fields: a list is expected, got 7"),
         ("calibration: {solve: {optimizer: newton}}", r"calibration.solve.optimizer: .*'lm' or"),
         ("calibration: {sync: {max_pose_gap_s: soon}}", r"max_pose_gap_s: .*number.*'soon'"),
         ("[1, 2]", r"the file: "),

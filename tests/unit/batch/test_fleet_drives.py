@@ -276,7 +276,7 @@ def test_every_date_is_read_back_or_refused(date: datetime) -> None:
         ("- {bag: a.bag, vehicle: v, date: 0001-01-01T00:00:00+02:00}", "accepted: "),
         ("- {bag: a.bag, vehicle: v}\n" * 2, "a.bag: listed twice for vehicle 'v'"),
         ("- {bag: a.bag", "not valid YAML"),
-        ("- a.bag", "drive 1: Input should be a valid dictionary"),
+        ("- a.bag", "drive 1: names with values are expected"),
     ],
 )
 def test_a_wrong_manifest_is_one_line(tmp_path: Path, content: str, words: str) -> None:

@@ -76,3 +76,12 @@ def test_impossible_errors_are_refused_in_one_line(
         read(tmp_path, **entry)
     assert "\n" not in str(refused.value)
     assert "mag" in str(refused.value)
+
+
+def test_a_suite_of_which_nothing_is_solved_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "suite.yaml"
+    path.write_text(
+        "sensors: {mag: {status: not_converged, message: still moving, t_lidar_mag: [0, 0, 0]}}"
+    )
+    with pytest.raises(CalibrationError, match=r"sensors: none of them is solved; the `message`"):
+        read_known_sensors(path)
