@@ -133,7 +133,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "doubts": plain["doubts"],
         "notes": plain["notes"],
         "exact": plain["exact"],
-        "disturbances": [_without_empty(each, "sensor") for each in plain["disturbances"]],
+        "disturbances": plain["disturbances"],
         "disagreements": disagreements,
         **source_entries(result),
         "traces": plain["traces"],
