@@ -6,9 +6,10 @@ from importlib.metadata import version
 import numpy as np
 
 from l2m_gtsam.calibration.budget.found import Budget
+from l2m_gtsam.calibration.changed_places import solve_changed
 from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
-from l2m_gtsam.calibration.moving_solve import MovingProblem, solve_moving
+from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
@@ -21,6 +22,7 @@ from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
 from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.maps.sources.changed_map import ChangedMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.drive_trace import trace_of
@@ -52,7 +54,7 @@ class Calibrated:
     solution
         Of the solve, with its readings.
     field_map, solver_map
-        The map, and the form of it that is asked faster along the drive.
+        The map with the sources, and the form of it that is asked faster along the drive.
     """
 
     result: CalibrationResult
@@ -121,8 +123,11 @@ def calibrated(
         trajectory=recording.trajectory,
         priors=priors,
     )
-    outcome = solve_moving(problem, t_start)
+    changed = solve_changed(problem, solver_map, t_start, options.changes)
+    outcome, solver_map = changed.outcome, changed.solver_map
     solution = outcome.solution
+    if changed.sources is not None:
+        field_map = ChangedMap(field_map, changed.sources.found)
     explanations = explained(outcome.readings, solver_map, t_start, solution, options.solve)
     drive = SolvedDrive(
         synchronised=synchronised,
@@ -152,6 +157,7 @@ def calibrated(
         traces=tuple(trace_of(drive.trajectory) for drive in recording.parts),
         exact=taken_for_exact(alive, field_map, solution.budget),
         disturbances=solution.budget.named(alive.sensors),
+        sources=() if changed.sources is None else changed.sources.records,
     )
     return Calibrated(result, solution, field_map, solver_map)
 

@@ -3,6 +3,7 @@
 from pydantic import Field
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.calibration.prior_options import PriorOptions
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.options import Options
@@ -25,6 +26,8 @@ class CalibrationOptions(Options):
     """What is known of sensors beforehand: places, rotations, the geometry of arrays."""
     solve: OneKeyOptions = OneKeyOptions()
     """The one-key solve."""
+    changes: ChangesOptions = ChangesOptions()
+    """How places are judged that differ from the map."""
     models: ModelOptions = ModelOptions()
     """How models of each sensor are compared after the solve."""
     regressors: ResampleOptions = ResampleOptions()

@@ -25,7 +25,7 @@ CONVERGED_SIGMAS = 0.1
 ONE_POINT = float(chdtri(3, 0.01))
 
 # With more of its readings rejected than this, what a sensor's others agree on may be chance.
-MOST_REJECTED = 0.4
+MOST_REJECTED = 1 / 3
 
 UNSOLVED = "the sensor is not solved"
 

@@ -117,7 +117,7 @@ class QaOptions(Options):
     unexplained: Limit = Limit(warn=0.5, fail=0.75)
     """What the calibration leaves of the readings beside what a uniform field would leave (0 is
     all explained, 1 nothing): above it the map does not fit the drive."""
-    rejected: Limit = Limit(warn=0.02, fail=0.4)
+    rejected: Limit = Limit(warn=0.02, fail=1 / 3)
     """Share of the readings inside the map that no distortion explains."""
     outside_map: Limit = Limit(warn=0.3, fail=0.9)
     """Share of the readings for which the map has no data."""

@@ -15,6 +15,7 @@ from pydantic_core import CoreSchema, core_schema
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
 from l2m_gtsam.records.disturbance import Disturbance
+from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
@@ -385,6 +386,8 @@ class CalibrationResult:
         What counts as exact, for want of errors that are stated.
     disturbances
         What was found beside noise and the map's errors; sigmas hold it.
+    sources
+        Of field that came, went or were moved since the place was mapped; the solve knows them.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]
@@ -402,6 +405,7 @@ class CalibrationResult:
     traces: tuple[DriveTrace, ...] = ()
     exact: tuple[str, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
+    sources: tuple[ChangedSource, ...] = ()
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

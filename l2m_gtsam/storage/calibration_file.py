@@ -67,6 +67,12 @@ MODEL = {
         "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
         "ns, the lidar's path from p_from to p_to in m in the map, median residual (size) in uT"
     ),
+    "sources": (
+        "steel that came, went or was moved since the place was mapped, found in the readings and "
+        "taken into the solve: position and half_axis in m, moment in A m^2, map frame; gain: "
+        "twice the log of the likelihood ratio; explanations: what a change of the place, of the "
+        "moment, of the vehicle or of one sensor explains there, the best first"
+    ),
     "from_priors": (
         "what the readings leave open and only `calibration.priors` determine, or mostly (sigmas "
         "without them would be more than twice as large): parameters, and what was known of them"
@@ -135,6 +141,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "exact": plain["exact"],
         "disturbances": plain["disturbances"],
         "disagreements": disagreements,
+        "sources": plain["sources"],
         **source_entries(result),
         "traces": plain["traces"],
         "versions": plain["versions"],
@@ -142,7 +149,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }
-    for name in ("notes", "exact", "disturbances", "traces"):
+    for name in ("notes", "exact", "disturbances", "traces", "sources"):
         content = _without_empty(content, name)
     write_yaml(path, content, HEADER)
 

@@ -21,6 +21,7 @@ from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.qa.verdict.measured import Measured, measured
+from l2m_gtsam.qa.verdict.places import best_of, cause_sentence
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
 from l2m_gtsam.records.verdict import Level, SensorVerdict, Verdict
@@ -91,7 +92,9 @@ def calibration_page(
         figures: dict[str, Figure | Drawing] = {
             "vehicle-0": vehicle_figure(result, verdict, TOP),
             "vehicle-1": vehicle_figure(result, verdict, SIDE),
-            "map-strength": map_figures.strength_figure(metrics, result.disagreements),
+            "map-strength": map_figures.strength_figure(
+                metrics, result.disagreements, result.sources
+            ),
             "map-sigma": map_figures.sigma_figure(metrics),
         }
         for k, each in enumerate(result.sensors):
@@ -112,6 +115,8 @@ def calibration_page(
             pictures=pictures(figures),
             sections=sections,
             length=np.linalg.norm,
+            what_else=best_of,
+            cause=cause_sentence,
             strongest_correlation=statistics.strongest_correlation,
             thresholds=thresholds(options),
             parameters=PARAMETERS,

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
@@ -33,13 +34,16 @@ from l2m_gtsam.qa.report.hover import axes_image, places, some_and_marked
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.records.calibration import Disagreement
 from l2m_gtsam.records.metrics import MapPicture, Metrics, Row, Rows, Series
+from l2m_gtsam.records.places import ChangedSource
 
 # Of colour bars: a drive is wider than high more often than not.
 CELLS = 240  # along the longer side of a map
 BELOW: Any = {"location": "bottom", "shrink": 0.7, "aspect": 40, "pad": 0.02}
 
 
-def strength_figure(metrics: Metrics, stretches: Sequence[Disagreement]) -> Figure:
+def strength_figure(
+    metrics: Metrics, stretches: Sequence[Disagreement], sources: Sequence[ChangedSource] = ()
+) -> Figure:
     """Draw the field of the map, the drive, and where the place has changed."""
     figure, axes = strength_background(metrics.map)
     _drive(axes, metrics)
@@ -52,7 +56,20 @@ def strength_figure(metrics: Metrics, stretches: Sequence[Disagreement]) -> Figu
             markersize=7,
             markeredgecolor=PAPER,
         )
+    for number, source in enumerate(sources, start=1):
+        _source(axes, source, f"{number}: steel, {np.linalg.norm(source.moment):.2g} A m²")
     return figure
+
+
+def _source(axes: Axes, source: ChangedSource, name: str) -> None:
+    """Draw where a source is, how long it is, and how well its place is known."""
+    x, y = source.position[:2]
+    ends = np.array([source.position - source.half_axis, source.position + source.half_axis])
+    axes.plot(*ends[:, :2].T, color=BAD, linewidth=4, solid_capstyle="round")
+    axes.plot(x, y, "*", color=BAD, markersize=16, markeredgecolor=PAPER)
+    radius = 2 * float(np.max(source.position_sigma[:2]))
+    axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=BAD, linewidth=1.2))
+    mark_name(axes, source.position[:2], name)
 
 
 def sigma_figure(metrics: Metrics) -> Figure:
@@ -187,6 +204,11 @@ def _drive(axes: Axes, metrics: Metrics) -> None:
 def mark(axes: Axes, place: FloatArray, name: str) -> None:
     """Mark and name a place, shape (2,), on a map."""
     axes.plot(*place, "o", color="white", markeredgecolor="black", markersize=6)
+    mark_name(axes, place, name)
+
+
+def mark_name(axes: Axes, place: FloatArray, name: str) -> None:
+    """Name a place, shape (2,), on a map."""
     axes.annotate(
         name,
         tuple(place),

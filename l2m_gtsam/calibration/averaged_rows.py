@@ -1,0 +1,309 @@
+"""Readings of a solve, averaged along the drive, with all that may be wrong in them.
+
+What is asked is whether the *place* changed. Poses that a recording takes for exact would then turn
+every error of theirs into a change: they count as wrong by a little at least.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+from scipy.sparse import block_diag as sparse_block_diag
+from scipy.sparse import coo_array, csr_array
+
+from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
+from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
+from l2m_gtsam.calibration.pose_errors import pose_features
+from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
+from l2m_gtsam.geometry import isotropic_covariance
+from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.options import Options
+
+SENSOR = 16  # t, C row by row, H, time offset
+# What is known of them here: next to nothing, beside what the readings of a drive determine.
+WIDE = np.array([1.0] * 3 + [1.0] * 9 + [100.0] * 3 + [1.0])
+LEVER_M = 0.3  # that a rotation counts with along the path
+MOST_SLOTS = 3000  # of a drive; longer ones are averaged over longer parts
+
+
+class AveragingOptions(Options):
+    """How readings are averaged before places are judged."""
+
+    step_m: float = Field(default=0.1, gt=0.01, le=1)
+    """Path over which readings are averaged, metres: an average counts as one reading, since what
+    is not modelled lasts that long."""
+    pose_position_m: float = Field(default=0.003, ge=0, le=1)
+    """Poses count as wrong by this standard deviation at least, metres."""
+    pose_rotation_deg: float = Field(default=0.5, ge=0, le=10)
+    """The same of their rotation, degrees."""
+
+
+@dataclass(frozen=True)
+class Averages:
+    """Readings that stand for others near them on the path.
+
+    Attributes
+    ----------
+    readings
+        One for each sensor and slot, N of them.
+    slot
+        Part of the path that each is of, shape (N,).
+    residual
+        Mean of what the readings lack of the map, map frame, in uT, shape (N, 3).
+    counted
+        Share of the readings averaged that counted in the solve, shape (N,).
+    """
+
+    readings: Readings
+    slot: IntArray
+    residual: FloatArray
+    counted: FloatArray
+
+
+def averaged(
+    readings: Readings,
+    field_map: QueryableMap,
+    estimate: Estimate,
+    used: BoolArray,
+    options: AveragingOptions,
+) -> Averages:
+    """Return averages of readings inside the map, whether they counted or not.
+
+    Parameters
+    ----------
+    readings
+        All inside the map, M of them, of each sensor in order of time.
+    field_map, estimate
+        What they are compared with.
+    used
+        Which of them counted, shape (M,).
+    options
+        How far to average.
+    """
+    slot = slots_of(readings, estimate, options.step_m)
+    key = readings.sensor * (int(slot.max(initial=0)) + 1) + slot
+    _, own, count = np.unique(key, return_inverse=True, return_counts=True)
+    order = np.argsort(own, kind="stable")
+    first = np.cumsum(count) - count
+    middle = order[first + count // 2]
+    lacking = lacking_field(readings, field_map, estimate)
+    mean = np.stack([np.bincount(own, axis) for axis in lacking.T], axis=1) / count[:, None]
+    return Averages(readings[middle], slot[middle], mean, np.bincount(own, used) / count)
+
+
+def slots_of(readings: Readings, estimate: Estimate, step: float) -> IntArray:
+    """Return which part of the drive each reading is of, alike for all sensors, shape (N,)."""
+    late = np.round(1e9 * estimate.offset[readings.sensor]).astype(np.int64)
+    order = np.lexsort((readings.stamp_ns + late, readings.of_drive))
+    R, p, drive = (
+        a[order] for a in (readings.R_map_lidar, readings.p_map_lidar, readings.of_drive)
+    )
+    moved = np.linalg.norm(np.diff(p, axis=0), axis=1)
+    cosine = (np.einsum("nij,nij->n", R[1:], R[:-1]) - 1) / 2
+    moved += LEVER_M * np.arccos(np.clip(cosine, -1.0, 1.0))
+    path = np.concatenate([[0.0], np.cumsum(np.where(np.diff(drive) == 0, moved, 2 * step))])
+    step = max(step, float(path[-1]) / MOST_SLOTS)
+    _, number = np.unique(np.floor(path / step).astype(np.int64), return_inverse=True)
+    slot = np.empty(len(readings), dtype=np.int64)
+    slot[order] = number
+    return slot
+
+
+def lacking_field(readings: Readings, field_map: QueryableMap, estimate: Estimate) -> FloatArray:
+    """Return what readings have that the map has not, map frame, in uT, shape (N, 3)."""
+    C, H = estimate.C()[readings.sensor], estimate.distortion[readings.sensor, 9:]
+    b = np.linalg.solve(C, (readings.field - H)[:, :, None])[:, :, 0]
+    field, _ = field_map.field_and_gradient(places_of(readings, estimate.t))
+    return np.asarray(np.einsum("nij,nj->ni", readings.R_map_lidar, b) - field)
+
+
+@dataclass(frozen=True)
+class AveragedDrive:
+    """Averages with what the map predicts for them.
+
+    Attributes
+    ----------
+    averages
+        N of them.
+    view
+        The same as the solve looks at them.
+    estimate
+        Of their sensors.
+    noise
+        Roots of the noise of each slot: see ``slot_whitening``.
+    """
+
+    averages: Averages
+    view: View
+    estimate: Estimate
+
+    @classmethod
+    def of(cls, averages: Averages, field_map: QueryableMap, estimate: Estimate) -> "AveragedDrive":
+        """Return the averages inside the map."""
+        view = observe(averages.readings, field_map, estimate, 1)
+        kept = Averages(
+            view.readings,
+            averages.slot[view.rows],
+            averages.residual[view.rows],
+            averages.counted[view.rows],
+        )
+        return cls(kept, view, estimate)
+
+    def marginal(
+        self, field_map: QueryableMap, errors: UncertainMap, options: AveragingOptions
+    ) -> MarginalRows:
+        """Return the rows in which sources are looked for.
+
+        Parameters
+        ----------
+        field_map, errors
+            The map, and what it knows of its errors.
+        options
+            How wrong poses are at least.
+        """
+        readings = self.view.readings
+        exact = replace(self.view, readings=replace(readings, pose_root=None, regressors=None))
+        coverage = cover(exact, errors, self.estimate, 1.0)
+        whitening = slot_whitening(self, field_map, coverage.rest, options)
+        design, prior = nuisances(exact.readings, field_map, coverage, self.estimate)
+        return MarginalRows(
+            points=places_of(readings, self.estimate.t),
+            residual=self.averages.residual,
+            whitening=whitening,
+            nuisance=csr_array(whitening @ design),
+            prior=prior,
+            slot=self.averages.slot,
+        )
+
+
+def slot_whitening(
+    drive: AveragedDrive, field_map: QueryableMap, rest: FloatArray, options: AveragingOptions
+) -> csr_array:
+    """Return what makes noise white, slot by slot: readings of one pose share its error.
+
+    Parameters
+    ----------
+    drive
+        N averages.
+    field_map
+        The map, whose field errors of poses turn and whose gradient they follow.
+    rest
+        Variance of the map that is each reading's own, per axis in uT^2, shape (N, 3).
+    options
+        How wrong poses are at least.
+
+    Returns
+    -------
+    csr_array
+        In 1/uT, shape (3 N, 3 N).
+    """
+    readings, estimate = drive.view.readings, drive.estimate
+    R, N = readings.R_map_lidar, len(readings)
+    inverse = np.linalg.inv(estimate.C())[readings.sensor]  # of S matrices of three rows
+    spread = estimate.noise[readings.sensor][:, None, None] * (R @ inverse)
+    own = spread @ spread.transpose(0, 2, 1) + rest[:, :, None] * np.eye(3)
+    by_pose = pose_shares(readings, field_map, estimate, options)
+    order = np.argsort(drive.averages.slot, kind="stable")
+    blocks = np.split(order, np.flatnonzero(np.diff(drive.averages.slot[order])) + 1)
+    roots = []
+    for rows in blocks:
+        F = by_pose[rows].reshape(3 * len(rows), 6)
+        covariance = (F @ F.T).reshape(len(rows), 3, len(rows), 3)
+        each = np.arange(len(rows))
+        covariance[each, :, each] += own[rows]
+        lower = np.linalg.cholesky(covariance.reshape(3 * len(rows), -1))
+        roots.append(np.linalg.solve(lower, np.eye(len(lower))))
+    sorted_ = csr_array(sparse_block_diag(roots, format="csr"))
+    back = np.empty(N, dtype=np.int64)
+    back[order] = np.arange(N)
+    columns = (3 * back[:, None] + np.arange(3)).ravel()
+    return csr_array(sorted_[:, columns][columns])
+
+
+def pose_shares(
+    readings: Readings, field_map: QueryableMap, estimate: Estimate, options: AveragingOptions
+) -> FloatArray:
+    """Return what a sigma of each error of a pose does to readings, map frame, uT, (N, 3, 6)."""
+    least = isotropic_covariance(options.pose_rotation_deg, options.pose_position_m)
+    covariance = np.broadcast_to(least, (len(readings), 6, 6))
+    if (root := readings.pose_root) is not None:
+        covariance = covariance + root @ root.transpose(0, 2, 1)
+    values, axes = np.linalg.eigh(covariance)
+    roots = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    R, t = readings.R_map_lidar, estimate.t[readings.sensor]
+    field, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
+    R_lidar_map = R.transpose(0, 2, 1)
+    b = np.einsum("nij,nj->ni", R_lidar_map, field)
+    return np.asarray(R @ pose_features(roots, b, R_lidar_map @ gradient @ R, t))
+
+
+def nuisances(
+    readings: Readings, field_map: QueryableMap, coverage: Coverage, estimate: Estimate
+) -> tuple[csr_array, FloatArray]:
+    """Return errors that readings share: of the map, its survey's sensors, and their own.
+
+    Returns
+    -------
+    design
+        What a unit of each does to readings, map frame, uT, shape (3 N, K).
+    prior
+        Their information beforehand, shape (K, K).
+    """
+    tiles, suite = len(coverage.lower), len(coverage.spread)
+    first = tiles + suite
+    size = first + SENSOR * len(readings.sensors)
+    starts = dict(zip(coverage.tiles, np.cumsum([0, *coverage.tiles.values()]), strict=False))
+    design = _Sparse(len(readings), size)
+    _, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
+    for group in coverage.groups:
+        design.add(group.rows, int(starts[group.tile]), group.features)
+        if suite:
+            moved = group.common - gradient[group.rows] @ coverage.shift
+            design.add(group.rows, tiles, moved)
+    for sensor in np.unique(readings.sensor).tolist():
+        rows = np.arange(len(readings))[readings.rows_of(sensor)]
+        design.add(
+            rows, first + SENSOR * sensor, sensor_shares(readings, rows, field_map, estimate)
+        )
+    prior = np.zeros((size, size))
+    prior[:tiles, :tiles] = coverage.tile_information
+    prior[range(tiles, first), range(tiles, first)] = coverage.spread**-2
+    own = range(first, size)
+    prior[own, own] = np.tile(WIDE**-2, len(readings.sensors))
+    return design.matrix(), prior
+
+
+def sensor_shares(
+    readings: Readings, rows: IntArray, field_map: QueryableMap, estimate: Estimate
+) -> FloatArray:
+    """Return what a unit of each parameter of a sensor does to its readings, map frame.
+
+    In uT per unit of t, C row by row, H and time offset, shape (n, 3, 16).
+    """
+    own = readings[rows]
+    sensor = int(own.sensor[0])
+    batch = batch_readings(own, field_map)
+    found = batch.residuals(estimate.values([sensor]), sensor)
+    J = np.concatenate(batch.jacobians(found), axis=2)
+    of_map = own.R_map_lidar @ np.linalg.inv(estimate.C()[sensor])  # three rows
+    return np.asarray(of_map @ J)
+
+
+class _Sparse:
+    """Entries of a matrix of three rows for each reading."""
+
+    def __init__(self, readings: int, columns: int) -> None:
+        self._shape = 3 * readings, columns
+        self._parts: list[tuple[FloatArray, IntArray, IntArray]] = []
+
+    def add(self, rows: IntArray, first: int, values: FloatArray) -> None:
+        """Add values, shape (n, 3, k), of readings from a column on."""
+        n, _, k = values.shape
+        at = np.broadcast_to((3 * rows[:, None] + np.arange(3))[:, :, None], (n, 3, k))
+        columns = np.broadcast_to(first + np.arange(k), (n, 3, k))
+        self._parts.append((values.ravel(), at.ravel(), columns.ravel()))
+
+    def matrix(self) -> csr_array:
+        values, rows, columns = (np.concatenate(each) for each in zip(*self._parts, strict=True))
+        return coo_array((values, (rows, columns)), shape=self._shape).tocsr()

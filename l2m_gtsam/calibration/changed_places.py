@@ -1,0 +1,194 @@
+"""Places that changed since they were mapped: suspected, explained, taken into the solve.
+
+Sources are looked for in all readings inside the map, whether the solve trusted them or not: what
+was rejected is where a change is plainest. Then the map is given the sources and everything is
+solved again, with the sources as variables beside the sensors: readings that they explain count.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.averaged_rows import (
+    AveragedDrive,
+    AveragingOptions,
+    averaged,
+    pose_shares,
+)
+from l2m_gtsam.calibration.causes import changed_sources, offset_gain
+from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
+from l2m_gtsam.calibration.one_key import OneKeySolution
+from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.sources.changed_map import ChangedMap
+from l2m_gtsam.maps.sources.search import (
+    FoundSources,
+    SourceSearchOptions,
+    find_sources,
+    price,
+)
+from l2m_gtsam.options import Options
+from l2m_gtsam.records.places import ChangedSource
+from l2m_gtsam.solve.chi_square import quantile
+
+CELL_M = 1.0  # edge of the cells that are suspected
+SURE = 0.999  # of cells with nothing but noise so many are not
+AXES = 3
+ROUNDS = 3  # of solving with sources and looking for them again
+SETTLED_SIGMAS = 0.3
+
+
+class ChangesOptions(Options):
+    """How places are judged that differ from the map."""
+
+    sources: SourceSearchOptions = SourceSearchOptions()
+    """How sources are looked for that came, went or were moved."""
+    averaging: AveragingOptions = AveragingOptions()
+    """How readings are averaged for it."""
+
+
+@dataclass(frozen=True)
+class ChangedSources:
+    """Sources as a graph takes them, and as they are reported."""
+
+    found: FoundSources
+    records: tuple[ChangedSource, ...]
+
+
+def averaged_drive(
+    solution: OneKeySolution, field_map: QueryableMap, options: AveragingOptions
+) -> AveragedDrive:
+    """Return averages of a solve's readings inside the map, rejected ones among them."""
+    solved = [each.sensor for each in solution.solved]
+    inside = solution.inside & np.isin(solution.readings.sensor, solved)
+    readings = solution.readings.select(inside)
+    used = solution.used[inside]
+    return AveragedDrive.of(
+        averaged(readings, field_map, solution.estimate, used, options),
+        field_map,
+        solution.estimate,
+    )
+
+
+def suspected(
+    drive: AveragedDrive, field_map: QueryableMap, options: AveragingOptions
+) -> FloatArray:
+    """Return where readings differ from the map by more than it may err, metres, shape (M, 3).
+
+    Cell by cell of the floor, with all errors of the map in a cell alike: quick, and no more than
+    a first look.
+    """
+    readings, estimate = drive.view.readings, drive.estimate
+    places = places_of(readings, estimate.t)
+    _, cell = np.unique(np.floor(places[:, :2] / CELL_M), axis=0, return_inverse=True)
+    count = np.bincount(cell)
+    shares = pose_shares(readings, field_map, estimate, options)
+    own = np.einsum("nij,nij->ni", shares, shares) + estimate.noise[readings.sensor, None] ** 2
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.stack([np.bincount(cell, each) for each in values.T], axis=1) / count[:, None]
+
+    # Sensors share errors of poses: an average over cells of all of them is no better for it.
+    sensors = len(np.unique(readings.sensor))
+    variance = (
+        mean(drive.view.map_variance) + mean(own) * sensors / np.maximum(count, sensors)[:, None]
+    )
+    squared = np.sum(mean(drive.averages.residual) ** 2 / variance, axis=1)
+    wrong = squared > quantile(SURE, AXES)
+    wrong |= 1 - np.bincount(cell, drive.averages.counted) / count > 0.5
+    return np.asarray(mean(places)[wrong])
+
+
+def search(
+    solution: OneKeySolution,
+    field_map: QueryableMap,
+    options: ChangesOptions,
+    known: FoundSources | None,
+) -> ChangedSources | None:
+    """Return the sources that readings of a solve show; none if no place is suspected.
+
+    Offsets of sensors that are on where readings were rejected are the other explanation of all
+    these readings: if that is the better one, no place has changed.
+
+    Parameters
+    ----------
+    solution
+        The solve.
+    field_map
+        As it was surveyed.
+    options
+        How to look.
+    known
+        Sources that were found before, which the solve knows of.
+    """
+    if not options.sources.most or not isinstance(field_map, UncertainMap) or not solution.solved:
+        return None
+    drive = averaged_drive(solution, field_map, options.averaging)
+    places = suspected(drive, field_map, options.averaging)
+    if not len(places):
+        return None
+    rows = drive.marginal(field_map, field_map, options.averaging)
+    found = find_sources(rows, places, options.sources, known)
+    gained = rows.pull(rows.residual)[1] - found.left - price(rows, found.parameters)
+    if not len(found) or gained < offset_gain(rows, drive):
+        return None
+    return ChangedSources(found, changed_sources(rows, drive, found))
+
+
+@dataclass(frozen=True)
+class ChangedSolve:
+    """A solve with the sources that it knows of.
+
+    Attributes
+    ----------
+    outcome
+        Of the solve.
+    solver_map
+        The map that it was solved on: with the sources.
+    sources
+        What changed since the survey; none if nothing did.
+    """
+
+    outcome: MovingSolution
+    solver_map: RememberedMap
+    sources: ChangedSources | None
+
+
+def solve_changed(
+    problem: MovingProblem, solver_map: RememberedMap, t_start: FloatArray, options: ChangesOptions
+) -> ChangedSolve:
+    """Solve, look for sources, and solve again with them until both agree.
+
+    Parameters
+    ----------
+    problem
+        What to solve, on the map as it was surveyed.
+    solver_map
+        That map.
+    t_start
+        Where to start each sensor in the lidar frame in metres, shape (S, 3).
+    options
+        How to look for sources.
+    """
+    solved = ChangedSolve(solve_moving(problem, t_start), solver_map, None)
+    for _ in range(ROUNDS):
+        before = None if solved.sources is None else solved.sources.found
+        sources = search(solved.outcome.solution, solver_map, options, before)
+        if sources is None or settled(sources.found, before):
+            break
+        changed = RememberedMap(ChangedMap(solver_map, sources.found))
+        t = solved.outcome.solution.estimate.t
+        again = solve_moving(replace(problem, field_map=changed), t)
+        solved = ChangedSolve(again, changed, sources)
+    return solved
+
+
+def settled(found: FoundSources, before: FoundSources | None) -> bool:
+    """Return whether sources are where they were found before, to a share of their sigmas."""
+    if before is None or len(before) != len(found):
+        return False
+    old, new = (np.concatenate([s.vector for s in each.shapes]) for each in (before, found))
+    sigma = np.sqrt(np.diag(found.covariance))
+    free = sigma > 0
+    return bool((np.abs(new - old)[free] <= SETTLED_SIGMAS * sigma[free]).all())

@@ -1,0 +1,1 @@
+"""Sources that came, went or were moved since a place was mapped."""

@@ -1,0 +1,397 @@
+r"""Sources that explain what readings differ from a map by.
+
+A source is looked for on a coarse grid, where its moment is linear: with the precision P of the
+readings, D the field of unit moments, ``F = D^T P D`` and ``g = D^T P e``, it explains
+``g^T F^{-1} g``, twice the logarithm of the likelihood ratio. The best one is refined together with
+all that were found before, and stays if it explains more than its parameters do by chance.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial import cKDTree
+
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.dipoles import moment_features
+from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.maps.sources.source import (
+    HALF_AXIS,
+    MOMENT,
+    PARAMETERS,
+    UT_M3,
+    SourceShape,
+)
+from l2m_gtsam.options import Options
+
+BATCH = 128  # candidates that are asked together
+FELT_M = 4.0  # from a candidate: a source that is not felt there is none that matters
+STEPS = 20  # of a refinement
+SMALL_STEP = 0.01  # of a sigma squared: a refinement has ended
+HALF_LENGTH_M = 0.5  # standard deviation of half a bar's length before readings
+# Steel that comes and goes stands on the floor and is no higher than people move it: over the
+# sensors, metres, mean and standard deviation.
+HEIGHT_M = 0.5, 1.0
+# Between candidates a source explains more than at the best of them: not three times as much.
+HOPELESS = 0.4  # of the price
+MOMENT_AM2 = 1000.0  # standard deviation of a moment beforehand: a lorry's
+LONGEST_M = 0.3  # of a step of a refinement
+FIRST_HALF_M = (0.3, 0.8)  # where the length of a bar is started, near a dipole and elsewhere
+# Bars stand upright or lie: components of the axis that are zero stay so.
+STANDING = np.array([[0.0, 0.0, 1.0]])
+LYING = np.array([[0.92, 0.39, 0.0], [-0.39, 0.92, 0.0]])
+DIPOLE = 6  # parameters
+
+
+class SourceSearchOptions(Options):
+    """How sources are looked for that changed since a place was mapped."""
+
+    most: int = Field(default=8, ge=0)
+    """The most of them in a drive; 0 looks for none."""
+    spacing: float = Field(default=0.35, gt=0.05, le=2)
+    """Distance of the places that are tried first, metres."""
+    reach: float = Field(default=2.5, gt=0, le=10)
+    """Up to where from the readings sources are looked for, metres."""
+    nearest: float = Field(default=0.2, gt=0, le=2)
+    """Steel is no nearer to a sensor than this, metres."""
+    heights: tuple[float, ...] = (-0.4, 0.1, 0.6, 1.2, 2.0)
+    """Heights over the sensors that are tried first, metres."""
+
+
+@dataclass(frozen=True)
+class FoundSources:
+    """Sources with their covariance.
+
+    Attributes
+    ----------
+    shapes
+        The sources, K of them.
+    root
+        Of the covariance of their position, moment and half axis, source by source; what a dipole
+        does not have is zero, shape (9 K, q).
+    gains
+        How much each explains that the others do not: twice the logarithm of the likelihood ratio,
+        shape (K,).
+    left
+        Squared length of what all of them leave, white.
+    """
+
+    shapes: tuple[SourceShape, ...]
+    root: FloatArray
+    gains: FloatArray
+    left: float
+
+    def __len__(self) -> int:
+        return len(self.shapes)
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of all of them."""
+        return sum(int(_free(each).sum()) for each in self.shapes)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the parameters of all of them, shape (9 K, 9 K)."""
+        return np.asarray(self.root @ self.root.T)
+
+    def field(self, points: FloatArray) -> FloatArray:
+        """Return the field of all of them in uT, shape (N, 3)."""
+        return sum(
+            (each.field_and_gradient(points)[0] for each in self.shapes), np.zeros_like(points)
+        )
+
+
+def nothing_found(rows: MarginalRows) -> FoundSources:
+    """Return no sources."""
+    return FoundSources((), np.empty((0, 0)), np.empty(0), rows.pull(rows.residual)[1])
+
+
+def price(rows: MarginalRows, parameters: int) -> float:
+    """Return what a model of so many more parameters has to explain (Schwarz 1978)."""
+    return parameters * float(np.log(3 * max(len(rows), 2)))
+
+
+def find_sources(
+    rows: MarginalRows,
+    suspected: FloatArray,
+    options: SourceSearchOptions,
+    known: FoundSources | None,
+) -> FoundSources:
+    """Return the sources that explain what readings differ from the map by.
+
+    Parameters
+    ----------
+    rows
+        Averaged readings.
+    suspected
+        Places near which sources may be, metres, shape (M, 3).
+    options
+        How to look for them.
+    known
+        Where to begin: sources that were found before, if any.
+    """
+    found = refined(rows, known.shapes) if known else nothing_found(rows)
+    grid = Grid.over(rows, suspected, options)
+    trials = 2 * float(np.log(max(len(grid), 1)))  # Bonferroni, on the scale of the gain
+    while len(found) < options.most and len(grid):
+        starts = grid.starts(rows, rows.residual - found.field(rows.points))
+        if starts.gain < HOPELESS * price(rows, DIPOLE):
+            break
+        better = best_of(rows, found, starts.shapes)
+        least = price(rows, better.parameters - found.parameters) + trials
+        if found.left - better.left < least or too_near(better, rows, options):
+            break
+        found = better
+    return pruned(rows, found, price(rows, DIPOLE) + trials)
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Dipoles to begin with, the best first, and what that one explains where it stands."""
+
+    shapes: list[SourceShape]
+    gain: float
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Candidates for sources.
+
+    Attributes
+    ----------
+    positions
+        Metres, shape (C, 3).
+    information
+        Of each one's moment in (A m^2)^-2, shape (C, 3, 3).
+    """
+
+    positions: FloatArray
+    information: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    @classmethod
+    def over(
+        cls, rows: MarginalRows, suspected: FloatArray, options: SourceSearchOptions
+    ) -> "Grid":
+        """Return the candidates within reach of suspected places."""
+        positions = candidates(rows.points, suspected, options)
+        information = np.empty((len(positions), 3, 3))
+        tree = cKDTree(rows.points)
+        order = by_block(positions)
+        for part in np.array_split(order, max(1, -(-len(order) // BATCH))):
+            if not len(part):
+                continue
+            at = positions[part]
+            felt = np.zeros(len(rows), dtype=np.bool_)
+            felt[
+                np.concatenate([np.array(q, dtype=int) for q in tree.query_ball_point(at, FELT_M)])
+            ] = True
+            own = rows.near(felt)
+            white = own.whitened(UT_M3 * moment_features(own.points, at))
+            seen = own.projected(white)
+            for each, k in zip(part, range(len(part)), strict=True):
+                w, s = white[:, 3 * k : 3 * k + 3], seen[:, 3 * k : 3 * k + 3]
+                information[each] = w.T @ w - s.T @ s
+        return cls(positions, information)
+
+    def starts(self, rows: MarginalRows, residual: FloatArray, count: int = 3) -> Starts:
+        """Return the dipoles that explain most of residuals in uT, shape (N, 3), the best first."""
+        pulled, _ = rows.pull(residual)
+        g = np.empty((len(self), 3))
+        for part in np.array_split(np.arange(len(self)), max(1, -(-len(self) // BATCH))):
+            unit = UT_M3 * moment_features(rows.points, self.positions[part])
+            g[part] = np.einsum("nim,ni->m", unit, pulled).reshape(-1, 3)
+        size = np.trace(self.information, axis1=1, axis2=2)[:, None, None]
+        F = self.information + 1e-9 * size * np.eye(3)
+        moments = np.linalg.solve(F, g[:, :, None])[:, :, 0]
+        gains = np.einsum("ki,ki->k", g, moments)
+        order = np.argsort(-gains)
+        chosen: list[int] = []
+        for k in order:  # apart from each other: neighbours descend to the same optimum
+            apart = all(np.linalg.norm(self.positions[k] - self.positions[j]) > 0.8 for j in chosen)
+            if apart:
+                chosen.append(int(k))
+            if len(chosen) == count:
+                break
+        shapes = [SourceShape.dipole(self.positions[k], moments[k]) for k in chosen]
+        return Starts(shapes, float(gains.max()))
+
+
+def candidates(
+    points: FloatArray, suspected: FloatArray, options: SourceSearchOptions
+) -> FloatArray:
+    """Return places within reach of suspected ones and not nearer to readings than steel is."""
+    if not len(suspected):
+        return np.empty((0, 3))
+    low, high = (f(suspected[:, :2], axis=0) for f in (np.min, np.max))
+    x, y = (
+        np.arange(
+            low[k] - options.reach, high[k] + options.reach + options.spacing, options.spacing
+        )
+        for k in (0, 1)
+    )
+    flat = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    away, at = cKDTree(suspected[:, :2]).query(flat)
+    within = np.asarray(away) <= options.reach
+    levels = np.array(options.heights)
+    z = suspected[np.asarray(at)[within], 2][:, None] + levels
+    flat = flat[within]
+    every = np.concatenate([np.repeat(flat, len(levels), axis=0), z.reshape(-1, 1)], axis=1)
+    near, _ = cKDTree(points).query(every)
+    return np.asarray(every[near >= options.nearest])
+
+
+def by_block(positions: FloatArray) -> IntArray:
+    """Return the order of places in which those of one square of 2 m follow each other."""
+    cell = np.floor(positions[:, :2] / 2.0).astype(np.int64)
+    return np.asarray(np.lexsort((cell[:, 1], cell[:, 0])))
+
+
+def best_of(rows: MarginalRows, found: FoundSources, starts: list[SourceShape]) -> FoundSources:
+    """Return the best refinement of sources and one more, a dipole or a bar."""
+    dipole = min((refined(rows, (*found.shapes, each)) for each in starts), key=_left)
+    best, before = dipole, (*dipole.shapes[:-1],)
+    for axes in (STANDING, LYING):
+        near, elsewhere = FIRST_HALF_M
+        bars = [
+            refined(rows, (*before, dipole.shapes[-1].with_half_axis(near * axis))) for axis in axes
+        ]
+        bars += [
+            refined(rows, (*found.shapes, starts[0].with_half_axis(elsewhere * axis)))
+            for axis in axes
+        ]
+        bar = min(bars, key=_left)
+        if best.left - bar.left > price(rows, bar.parameters - best.parameters):
+            best = bar
+    return best
+
+
+def _left(found: FoundSources) -> float:
+    return found.left
+
+
+def refined(rows: MarginalRows, shapes: tuple[SourceShape, ...]) -> FoundSources:
+    """Return the most likely sources near some, by damped Gauss-Newton steps."""
+    if not shapes:
+        return nothing_found(rows)
+    free = np.concatenate([_free(each) for each in shapes])
+    theta = np.concatenate([each.vector for each in shapes])
+    prior = SourcePrior.of(len(shapes), float(np.median(rows.points[:, 2])), free)
+    state = _State.at(rows, theta, free, prior)
+    lengths = np.tile(~_is_moment(), len(shapes))[free]
+    damping = 1e-3
+    for _ in range(STEPS):
+        F = state.information + damping * np.diag(np.diag(state.information))
+        step = np.linalg.solve(F, state.gradient)
+        long = np.abs(step[lengths]).max(initial=0.0)
+        trial = theta.copy()
+        trial[free] += step * min(1.0, LONGEST_M / max(long, LONGEST_M))
+        after = _State.at(rows, trial, free, prior)
+        if after.cost < state.cost:
+            gained, state, theta = state.cost - after.cost, after, trial
+            damping = max(damping / 5, 1e-9)
+            if gained < SMALL_STEP:
+                break
+        else:
+            damping *= 8
+            if damping > 1e8:
+                break
+    root = np.zeros((len(theta), int(free.sum())))
+    root[free] = _inverse_root(state.information)
+    count = len(shapes)
+    return FoundSources(
+        tuple(SourceShape(each) for each in theta.reshape(count, PARAMETERS)),
+        root,
+        np.full(count, np.nan),
+        state.cost,
+    )
+
+
+@dataclass(frozen=True)
+class SourcePrior:
+    """What is known of sources beforehand: mean and information of the free parameters, (P,)."""
+
+    mean: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, count: int, height: float, free: BoolArray) -> "SourcePrior":
+        """Return the prior of so many sources, where sensors are at a height in metres."""
+        mean, information = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
+        mean[2], information[2] = height + HEIGHT_M[0], HEIGHT_M[1] ** -2
+        information[MOMENT] = MOMENT_AM2**-2
+        information[HALF_AXIS] = HALF_LENGTH_M**-2
+        return cls(np.tile(mean, count)[free], np.tile(information, count)[free])
+
+
+@dataclass(frozen=True)
+class _State:
+    """Cost at some sources, its gradient and information by the free parameters."""
+
+    cost: float
+    gradient: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def at(
+        cls, rows: MarginalRows, theta: FloatArray, free: BoolArray, prior: "SourcePrior"
+    ) -> "_State":
+        shapes = [SourceShape(each) for each in theta.reshape(-1, PARAMETERS)]
+        field = sum(
+            (s.field_and_gradient(rows.points)[0] for s in shapes), np.zeros_like(rows.points)
+        )
+        J = np.concatenate([s.derivatives(rows.points) for s in shapes], axis=2)[:, :, free]
+        pulled, squared = rows.pull(rows.residual - field)
+        off = theta[free] - prior.mean
+        return cls(
+            squared + float(prior.information @ off**2),
+            np.einsum("nim,ni->m", J, pulled) - prior.information * off,
+            rows.information(J) + np.diag(prior.information),
+        )
+
+
+def _free(shape: SourceShape) -> BoolArray:
+    """Return which parameters of a source are open: a dipole has no length, a bar a direction."""
+    return np.asarray(~_is_half_axis() | (shape.vector != 0))
+
+
+def _is_half_axis() -> BoolArray:
+    mask = np.zeros(PARAMETERS, dtype=np.bool_)
+    mask[HALF_AXIS] = True
+    return mask
+
+
+def _is_moment() -> BoolArray:
+    mask = np.zeros(PARAMETERS, dtype=np.bool_)
+    mask[MOMENT] = True
+    return mask
+
+
+def _inverse_root(information: FloatArray) -> FloatArray:
+    """Return a root of the inverse of an information matrix that may be nearly singular."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    scaled = information * scale * scale[:, None]
+    values, axes = np.linalg.eigh(scaled)
+    return np.asarray(scale[:, None] * axes / np.sqrt(np.maximum(values, 1e-12)))
+
+
+def pruned(rows: MarginalRows, found: FoundSources, least: float) -> FoundSources:
+    """Return the sources that explain enough which the others do not, with how much that is."""
+    while len(found):
+        without = [
+            refined(rows, found.shapes[:k] + found.shapes[k + 1 :]) for k in range(len(found))
+        ]
+        gains = np.array([each.left - found.left for each in without])
+        worst = int(np.argmin(gains))
+        if gains[worst] >= least:
+            return replace(found, gains=gains)
+        found = without[worst]
+    return nothing_found(rows)
+
+
+def too_near(found: FoundSources, rows: MarginalRows, options: SourceSearchOptions) -> bool:
+    """Return whether the last source found lies where a sensor was."""
+    away, _ = cKDTree(rows.points).query(found.shapes[-1].position)
+    return bool(away < 0.5 * options.nearest)

@@ -1,0 +1,83 @@
+"""What changed at the places that a drive came through, and what else would explain it."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from l2m_gtsam.data import Vector
+
+
+class Cause(StrEnum):
+    """What a disagreement of readings and map is of."""
+
+    PLACE = "place"
+    MOMENT = "moment"
+    VEHICLE = "vehicle"
+    SENSOR = "sensor"
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """How well a cause explains readings.
+
+    Attributes
+    ----------
+    cause
+        What may have changed.
+    gain
+        Twice the logarithm of its likelihood over that of no change, less what its parameters cost
+        (the BIC): above zero it is better than nothing, the largest is the best.
+    size
+        Of the change at the readings concerned: root mean square in uT.
+    """
+
+    cause: Cause
+    gain: float
+    size: float
+
+
+@dataclass(frozen=True)
+class ChangedSource:
+    """A source of field that came, went or was moved since the place was mapped.
+
+    What went has the moment of its opposite; what was moved is two sources.
+
+    Attributes
+    ----------
+    position, position_sigma
+        Its middle in the map, and standard deviations, metres, shape (3,).
+    moment, moment_sigma
+        Map frame, A m^2, shape (3,).
+    half_axis
+        From its middle to one end in metres, zero for a dipole, shape (3,).
+    gain
+        What it explains that other sources do not: twice the logarithm of the likelihood ratio.
+    nearest
+        Distance of the nearest reading in metres.
+    strongest
+        Its strongest field at a reading in uT.
+    passages
+        How often the drive came to where it is felt.
+    explanations
+        What the readings there say of each cause, the best first.
+    """
+
+    position: Vector
+    position_sigma: Vector
+    moment: Vector
+    moment_sigma: Vector
+    half_axis: Vector
+    gain: float
+    nearest: float
+    strongest: float
+    passages: int
+    explanations: tuple[Explanation, ...] = ()
+
+    @property
+    def cause(self) -> Cause | None:
+        """The cause that is clearly the best; none where two explain it about as well."""
+        best, *others = self.explanations or (Explanation(Cause.PLACE, 0.0, 0.0),)
+        tied = any(best.gain - each.gain < CLEAR for each in others)
+        return None if tied else best.cause
+
+
+CLEAR = 6.0  # of a gain: twice the logarithm of 20 to 1
