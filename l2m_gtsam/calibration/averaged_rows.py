@@ -11,6 +11,8 @@ from pydantic import Field
 from scipy.sparse import block_diag as sparse_block_diag
 from scipy.sparse import coo_array, csr_array
 
+from l2m_gtsam.calibration.budget.found import Budget
+from l2m_gtsam.calibration.budget.processes import Scene, processes
 from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.pose_errors import pose_features
@@ -19,11 +21,13 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.robust import MEDIAN
 
 SENSOR = 16  # t, C row by row, H, time offset
 # What is known of them here: next to nothing, beside what the readings of a drive determine.
 WIDE = np.array([1.0] * 3 + [1.0] * 9 + [100.0] * 3 + [1.0])
 LEVER_M = 0.3  # that a rotation counts with along the path
+FEWEST = 3  # readings of an average whose scatter is their noise
 MOST_SLOTS = 3000  # of a drive; longer ones are averaged over longer parts
 
 
@@ -53,12 +57,16 @@ class Averages:
         Mean of what the readings lack of the map, map frame, in uT, shape (N, 3).
     counted
         Share of the readings averaged that counted in the solve, shape (N,).
+    noise
+        Standard deviation of one reading of each sensor within a slot in uT, shape (S,). A solve
+        may have put it into errors that are correlated; here it counts as it is.
     """
 
     readings: Readings
     slot: IntArray
     residual: FloatArray
     counted: FloatArray
+    noise: FloatArray
 
 
 def averaged(
@@ -89,7 +97,30 @@ def averaged(
     middle = order[first + count // 2]
     lacking = lacking_field(readings, field_map, estimate)
     mean = np.stack([np.bincount(own, axis) for axis in lacking.T], axis=1) / count[:, None]
-    return Averages(readings[middle], slot[middle], mean, np.bincount(own, used) / count)
+    within = scatter(readings, lacking - mean[own], count[own])
+    noise = np.maximum(within, estimate.noise)
+    return Averages(readings[middle], slot[middle], mean, np.bincount(own, used) / count, noise)
+
+
+def scatter(readings: Readings, deviation: FloatArray, count: IntArray) -> FloatArray:
+    """Return the noise of each of S sensors by what readings differ from their average, uT, (S,).
+
+    Parameters
+    ----------
+    readings
+        M of them.
+    deviation
+        From the average that each went into, uT, shape (M, 3).
+    count
+        How many went into it, shape (M,).
+    """
+    noise = np.zeros(len(readings.sensors))
+    squared = np.sum(deviation**2, axis=1) * count / np.maximum(count - 1, 1)
+    for sensor in np.unique(readings.sensor).tolist():
+        own = (readings.sensor == sensor) & (count >= FEWEST)
+        if own.any():
+            noise[sensor] = np.sqrt(np.median(squared[own]) / MEDIAN)
+    return noise
 
 
 def slots_of(readings: Readings, estimate: Estimate, step: float) -> IntArray:
@@ -147,11 +178,16 @@ class AveragedDrive:
             averages.slot[view.rows],
             averages.residual[view.rows],
             averages.counted[view.rows],
+            averages.noise,
         )
         return cls(kept, view, estimate)
 
     def marginal(
-        self, field_map: QueryableMap, errors: UncertainMap, options: AveragingOptions
+        self,
+        field_map: QueryableMap,
+        errors: UncertainMap,
+        budget: Budget,
+        options: AveragingOptions,
     ) -> MarginalRows:
         """Return the rows in which sources are looked for.
 
@@ -159,6 +195,8 @@ class AveragedDrive:
         ----------
         field_map, errors
             The map, and what it knows of its errors.
+        budget
+            Processes that the solve found in the readings: they may be here, too.
         options
             How wrong poses are at least.
         """
@@ -166,7 +204,7 @@ class AveragedDrive:
         exact = replace(self.view, readings=replace(readings, pose_root=None, regressors=None))
         coverage = cover(exact, errors, self.estimate, 1.0)
         whitening = slot_whitening(self, field_map, coverage.rest, options)
-        design, prior = nuisances(exact.readings, field_map, coverage, self.estimate)
+        design, prior = nuisances(exact.readings, field_map, coverage, self.estimate, budget)
         return MarginalRows(
             points=places_of(readings, self.estimate.t),
             residual=self.averages.residual,
@@ -201,7 +239,7 @@ def slot_whitening(
     readings, estimate = drive.view.readings, drive.estimate
     R, N = readings.R_map_lidar, len(readings)
     inverse = np.linalg.inv(estimate.C())[readings.sensor]  # of S matrices of three rows
-    spread = estimate.noise[readings.sensor][:, None, None] * (R @ inverse)
+    spread = drive.averages.noise[readings.sensor][:, None, None] * (R @ inverse)
     own = spread @ spread.transpose(0, 2, 1) + rest[:, :, None] * np.eye(3)
     by_pose = pose_shares(readings, field_map, estimate, options)
     order = np.argsort(drive.averages.slot, kind="stable")
@@ -239,9 +277,13 @@ def pose_shares(
 
 
 def nuisances(
-    readings: Readings, field_map: QueryableMap, coverage: Coverage, estimate: Estimate
+    readings: Readings,
+    field_map: QueryableMap,
+    coverage: Coverage,
+    estimate: Estimate,
+    budget: Budget,
 ) -> tuple[csr_array, FloatArray]:
-    """Return errors that readings share: of the map, its survey's sensors, and their own.
+    """Return errors that readings share: of the map, its survey's sensors, their own, the drive's.
 
     Returns
     -------
@@ -252,7 +294,9 @@ def nuisances(
     """
     tiles, suite = len(coverage.lower), len(coverage.spread)
     first = tiles + suite
-    size = first + SENSOR * len(readings.sensors)
+    last = first + SENSOR * len(readings.sensors)
+    beside = process_shares(readings, field_map, estimate, budget)
+    size = last + sum(features.shape[2] for _, features in beside)
     starts = dict(zip(coverage.tiles, np.cumsum([0, *coverage.tiles.values()]), strict=False))
     design = _Sparse(len(readings), size)
     _, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
@@ -266,12 +310,41 @@ def nuisances(
         design.add(
             rows, first + SENSOR * sensor, sensor_shares(readings, rows, field_map, estimate)
         )
-    prior = np.zeros((size, size))
+    at = last
+    for rows, features in beside:
+        design.add(rows, at, features)
+        at += features.shape[2]
+    prior = np.eye(size)
     prior[:tiles, :tiles] = coverage.tile_information
     prior[range(tiles, first), range(tiles, first)] = coverage.spread**-2
-    own = range(first, size)
+    own = range(first, last)
     prior[own, own] = np.tile(WIDE**-2, len(readings.sensors))
     return design.matrix(), prior
+
+
+def process_shares(
+    readings: Readings, field_map: QueryableMap, estimate: Estimate, budget: Budget
+) -> list[tuple[IntArray, FloatArray]]:
+    """Return rows of readings and what a sigma of each weight of a process does to them.
+
+    In the map frame in uT, shapes (n,) and (n, 3, m).
+    """
+    scene = Scene.of(readings, field_map, estimate)
+    here = {
+        (each.kind, each.sensor): each
+        for each in processes(scene, np.unique(readings.sensor).tolist())
+    }
+    shares = []
+    for found in budget.found:
+        process = here[found.process.kind, found.process.sensor]
+        rows = np.arange(len(readings))
+        if process.sensor is not None:
+            rows = rows[readings.rows_of(process.sensor)]
+        features = readings.R_map_lidar[rows] @ process.features(rows)
+        count = min(features.shape[2], len(found.variances))
+        root = np.sqrt(found.variances[:count])
+        shares.append((rows, features[:, :, :count] * root))
+    return shares
 
 
 def sensor_shares(

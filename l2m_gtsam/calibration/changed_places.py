@@ -15,6 +15,7 @@ from l2m_gtsam.calibration.averaged_rows import (
     averaged,
     pose_shares,
 )
+from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources, offset_gain
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
@@ -35,7 +36,7 @@ from l2m_gtsam.solve.chi_square import quantile
 CELL_M = 1.0  # edge of the cells that are suspected
 SURE = 0.999  # of cells with nothing but noise so many are not
 AXES = 3
-ROUNDS = 3  # of solving with sources and looking for them again
+ROUNDS = 4  # of solving with sources and looking for them again
 SETTLED_SIGMAS = 0.3
 
 
@@ -84,7 +85,9 @@ def suspected(
     _, cell = np.unique(np.floor(places[:, :2] / CELL_M), axis=0, return_inverse=True)
     count = np.bincount(cell)
     shares = pose_shares(readings, field_map, estimate, options)
-    own = np.einsum("nij,nij->ni", shares, shares) + estimate.noise[readings.sensor, None] ** 2
+    own = (
+        np.einsum("nij,nij->ni", shares, shares) + drive.averages.noise[readings.sensor, None] ** 2
+    )
 
     def mean(values: FloatArray) -> FloatArray:
         return np.stack([np.bincount(cell, each) for each in values.T], axis=1) / count[:, None]
@@ -126,9 +129,12 @@ def search(
         return None
     drive = averaged_drive(solution, field_map, options.averaging)
     places = suspected(drive, field_map, options.averaging)
-    if not len(places):
+    if not len(places) and known is None:
         return None
-    rows = drive.marginal(field_map, field_map, options.averaging)
+    # Steel that a solve does not know of is steel that its processes have swallowed. Those of a
+    # solve that knows sources are what these have to stand beside.
+    budget = NOTHING_FOUND if known is None else solution.budget
+    rows = drive.marginal(field_map, field_map, budget, options.averaging)
     found = find_sources(rows, places, options.sources, known)
     gained = rows.pull(rows.residual)[1] - found.left - price(rows, found.parameters)
     if not len(found) or gained < offset_gain(rows, drive):
@@ -171,12 +177,14 @@ def solve_changed(
     options
         How to look for sources.
     """
-    solved = ChangedSolve(solve_moving(problem, t_start), solver_map, None)
+    plain = solved = ChangedSolve(solve_moving(problem, t_start), solver_map, None)
     for _ in range(ROUNDS):
         before = None if solved.sources is None else solved.sources.found
         sources = search(solved.outcome.solution, solver_map, options, before)
-        if sources is None or settled(sources.found, before):
-            break
+        if sources is None:
+            return plain
+        if settled(sources.found, before):
+            return replace(solved, sources=sources)
         changed = RememberedMap(ChangedMap(solver_map, sources.found))
         t = solved.outcome.solution.estimate.t
         again = solve_moving(replace(problem, field_map=changed), t)
