@@ -64,12 +64,9 @@ def averaged_drive(
     solved = [each.sensor for each in solution.solved]
     inside = solution.inside & np.isin(solution.readings.sensor, solved)
     readings = solution.readings.select(inside)
-    used = solution.used[inside]
-    return AveragedDrive.of(
-        averaged(readings, field_map, solution.estimate, used, options),
-        field_map,
-        solution.estimate,
-    )
+    estimate = solution.estimate
+    averages = averaged(readings, field_map, estimate, solution.used[inside], options)
+    return AveragedDrive.of(averages, field_map, estimate)
 
 
 def suspected(

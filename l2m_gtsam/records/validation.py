@@ -11,6 +11,7 @@ from typing import Annotated
 from pydantic import AliasChoices, Field
 
 from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Row, Series
+from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.verdict import Threshold, Verdict
 
@@ -216,6 +217,8 @@ class DriveValidation(Record):
         How the vehicle moved, and the map around it.
     doubts, notes
         What speaks against the outcome, and what is worth knowing of it, a sentence each.
+    sources
+        What changed at the place since it was mapped.
     """
 
     sensors: tuple[ValidatedSensor, ...]
@@ -224,6 +227,7 @@ class DriveValidation(Record):
     picture: MapPicture
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
+    sources: tuple[ChangedSource, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_factors import M, P
+from l2m_factors import M, P, U
 from l2m_factors.shared_errors import whitened
 from l2m_gtsam.calibration.coverage import Coverage, NothingShared, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
@@ -205,6 +205,9 @@ def prior_rows(coverage: Coverage, width: int, numbers: slice) -> FloatArray:
     rows = np.zeros((numbers.stop, width))
     rows[: len(tiles), tiles] = coverage.root_information
     rows[numbers, numbers] = np.eye(numbers.stop - numbers.start)
+    if len(coverage.spread):
+        common = at[U()]
+        rows[common, common] = np.diag(1 / coverage.spread)
     if coverage.knots is not None:
         # Errors of poses are a first-order Gauss-Markov process from knot to knot:
         # x_k = like x_(k-1) + sqrt(1 - like^2) w_k with white w_k.

@@ -5,12 +5,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
-from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile, same_content
+from l2m_gtsam.calibration.view import Compilable, QueryableMap, places_of
+from l2m_gtsam.data import (
+    FloatArray,
+    LidarMotion,
+    Readings,
+    Recording,
+    SourceFile,
+    same_content,
+)
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.maps.field_map import Summarised
+from l2m_gtsam.maps.sources.changed_map import ChangedMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.metrics.assemble import DRAWN, FEWEST, MOST, map_picture
@@ -23,8 +32,11 @@ from l2m_gtsam.records.validation import DriveValidation, NotValidated, Validate
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
-from l2m_gtsam.validation.innovation import KnownCalibration, knows_its_errors
-from l2m_gtsam.validation.recheck import SensorDrive, recheck
+from l2m_gtsam.validation.innovation import KnownCalibration, knows_its_errors, width
+from l2m_gtsam.validation.places import PlaceOrVehicle, place_or_vehicle
+from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
+
+REJECTED = 0.02  # share of a sensor's readings, from which something has changed
 
 SAME_MAP = (
     "This is the map that it was calibrated with: errors of the map that the calibration took over "
@@ -95,13 +107,20 @@ def validate(
     if not known:
         raise CalibrationError(nothing_shared(recording, calibration, missing))
     test = _test_of(recording, field_map, known, options, chance)
-    found: list[ValidatedSensor | NotValidated] = []
+    surveyed, found = field_map, list[ValidatedSensor | NotValidated]()
     for index, sensor in enumerate(known):
         progress("validating", index / len(known))
         found.append(_tested(test, sensor))
+    judged = _judged(test, known, found)
+    if judged is not None and judged.of_place:
+        changed = replace(test, field_map=ChangedMap(test.field_map, judged.found))
+        found = [_tested(changed, sensor) for sensor in known]
+        field_map = ChangedMap(field_map, judged.found)
     progress("validating", 1.0)
     places = np.concatenate([_places(test.readings, each) for each in known])
-    doubts, notes = doubts_and_notes(field_map, calibration, map_source)
+    doubts, notes = doubts_and_notes(surveyed, calibration, map_source)
+    if judged is not None:
+        doubts = (judged.sentence, *doubts)
     return DriveValidation(
         sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
         missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
@@ -109,6 +128,7 @@ def validate(
         picture=map_picture(field_map, places),
         doubts=doubts,
         notes=notes,
+        sources=() if judged is None else judged.sources,
     )
 
 
@@ -160,6 +180,70 @@ def _test_of(
         thinning=Thinning(
             readings.stamp_ns.min(keepdims=True), int(np.clip(DRAWN // len(known), FEWEST, MOST))
         ),
+    )
+
+
+def _judged(
+    test: _Test,
+    known: Sequence[SensorCalibration],
+    found: Sequence[ValidatedSensor | NotValidated],
+) -> PlaceOrVehicle | None:
+    """Return whether the place changed or the vehicle, where something did."""
+    pairs = zip(known, found, strict=True)
+    sound = [(one, each) for one, each in pairs if isinstance(each, ValidatedSensor)]
+    wrong = [
+        each
+        for _, each in sound
+        if each.changes or each.rejected > REJECTED * (each.readings + each.rejected)
+    ]
+    if not wrong:
+        return None
+    parameters = sum(width(change.part) for _, each in sound for change in each.changes)
+    kept = [one for one, _ in sound]
+    names = tuple(each.sensor for each in kept)
+    parts = [drive_of(test.readings, test.recording, each).at(offset_s(each)) for each in kept]
+    calibrations = [_known(test.recording, each) for each in kept]
+    vectors = np.array([each.vector for each in calibrations])
+    estimate = Estimate(
+        t=vectors[:, :3],
+        distortion=vectors[:, 3:15],
+        noise=np.array([each.noise for each in calibrations]),
+        ridge=np.zeros(len(kept)),
+        offset=vectors[:, 15],
+    )
+    readings = together(parts, names)
+    inside = test.field_map.query(places_of(readings, estimate.t)).inside
+    options = test.options
+    covariances = np.array([finite(joint_covariance(each), options.solve) for each in kept])
+    return place_or_vehicle(
+        readings.select(inside), test.field_map, estimate, covariances, parameters, options.changes
+    )
+
+
+def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
+    """Return readings of single sensors as those of all."""
+    counts = [len(each) for each in parts]
+
+    def joined(values: Sequence[FloatArray | None]) -> FloatArray | None:
+        known = [each for each in values if each is not None]
+        return np.concatenate(known) if len(known) == len(parts) else None
+
+    moving = [each.motion for each in parts]
+    motion = None
+    if all(each is not None for each in moving):
+        motion = LidarMotion(
+            np.concatenate([each.twist_lidar for each in moving if each is not None]),
+            np.concatenate([each.offset for each in moving if each is not None]),
+        )
+    return Readings(
+        sensors=names,
+        sensor=np.repeat(np.arange(len(parts)), counts),
+        stamp_ns=np.concatenate([each.stamp_ns for each in parts]),
+        R_map_lidar=np.concatenate([each.R_map_lidar for each in parts]),
+        p_map_lidar=np.concatenate([each.p_map_lidar for each in parts]),
+        field=np.concatenate([each.field for each in parts]),
+        motion=motion,
+        pose_root=joined([each.pose_root for each in parts]),
     )
 
 
