@@ -184,7 +184,7 @@ def tile_factor(
 
     It is on ``X(k)``, the anchor ``X(a)``, the weights ``M(b)``, on the calibrations unless the
     batch has them fixed, and, if its readings are known to lie between two key poses, on
-    ``X(k+1)``; with a slow error on ``W(k)`` and ``W(k+1)``.
+    ``X(k+1)``; with a slow error on ``N(k)`` and ``N(k+1)``.
 
     Parameters
     ----------
