@@ -117,17 +117,29 @@ def localise(
     refined = options.calibration is CalibrationUse.REFINED
     kept = calibration if refined else None
     result = localisation_result(drive, solution, by_scans, kept, decoys)
-    notes = (*notes, *odometry.notes, *result.notes)
+    notes = (*notes, *odometry.notes, *result.notes, *decoy_notes(len(maps), len(decoys)))
     result = replace(result, notes=notes, bag=recording.source, start=search)
     return Localisation(result, solution)
 
 
 def in_decoy(drive: Drive, decoy: QueryableMap, options: SlamOptions) -> DriveSolution | None:
-    """Return a drive's solution in a decoy map; None where it has none: it does not fit."""
+    """Return a drive's solution in a decoy map; None where it has none, which says nothing."""
     try:
         return localise_drive(drive, decoy, options, silent)
     except CalibrationError:
         return None
+
+
+def decoy_notes(made: int, solved: int) -> tuple[str, ...]:
+    """Return what is left open where a drive has no solution in some of the decoy maps."""
+    if solved == made:
+        return ()
+    note = (
+        f"the map was compared with {solved} of {made} copies of it that are turned by 180 "
+        "degrees: in the others the drive has no solution, so that less than usual tells the right "
+        "map from another place"
+    )
+    return (note,)
 
 
 def prepared(

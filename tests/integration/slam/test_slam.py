@@ -1,6 +1,7 @@
 """Drives whose odometry drifts, localised in magnetic maps."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +12,12 @@ from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import LocalisationResult, LocalisationStatus
+from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.localisation import localise
+from l2m_gtsam.slam.misfit import DecoyMap
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions
+from l2m_gtsam.slam.smoother import localise_drive
+from l2m_gtsam.slam.solution import DriveSolution
 from tests.drives.slam import COARSE, WIDE, SlamDrive, calibrated, small_hall
 from tests.support.pose_errors import position_error
 from tests.worlds.exact import dipole_world
@@ -90,6 +95,23 @@ def test_another_building_is_not_here() -> None:
     result = located(drive, dipole_world(99), calibrated(sensors))
     assert result.status is LocalisationStatus.NOT_HERE
     assert "another place" in result.message
+
+
+def test_a_decoy_without_a_solution_is_no_evidence_for_the_map(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A test that could not be made is told; a wrong map would pass it unseen."""
+
+    def failing(drive: Drive, field_map: QueryableMap, *rest: Any) -> DriveSolution:
+        if isinstance(field_map, DecoyMap):
+            raise CalibrationError("the covariances of the poses cannot be computed")
+        return localise_drive(drive, field_map, *rest)
+
+    monkeypatch.setattr("l2m_gtsam.slam.localisation.localise_drive", failing)
+    monkeypatch.setattr("l2m_gtsam.slam.localisation.needs_misfit_test", lambda _: True)
+    sensors, drive = small_hall(14, seconds=12)
+    result = located(drive, dipole_world(1), calibrated(sensors))
+    assert any("0 of 2 copies" in note for note in result.notes)
 
 
 def test_a_start_elsewhere_can_be_given() -> None:
