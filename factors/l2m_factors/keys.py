@@ -51,6 +51,11 @@ def W(sensor: int) -> int:
     return int(gtsam.symbol("W", sensor))
 
 
+def B() -> int:
+    """Return the key of how the field differs from the map's in time: Vector, unit variance."""
+    return int(gtsam.symbol("B", 0))
+
+
 def F() -> int:
     """Return the key of how the drive's frame is bent against the map's: Vector, unit variance."""
     return int(gtsam.symbol("F", 0))

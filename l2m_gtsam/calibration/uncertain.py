@@ -35,7 +35,6 @@ from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6
 SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
-SEARCHES = 2  # sizes of what is found are those beside the noise that is left with it
 
 
 @dataclass(frozen=True)
@@ -93,21 +92,17 @@ def solve_uncertain(
     drive = UncertainDrive.of(view, field_map, errors, near, options)
     progress(1 / (MAX_ROUNDS + 1))
     found = settle_by_any(drive, near, tests, options, progress)
-    for search in range(SEARCHES):
-        if found.ending is Ending.SINGULAR:
-            break
-        base = found if search == 0 else without_budget(drive, found, tests, options)
-        budget = base.problem.searched(base.joint)
-        if not budget.found:
-            break
+    budget = NOTHING_FOUND
+    if found.ending is not Ending.SINGULAR:
+        budget = found.problem.searched(found.joint)
+    if budget.found:
         with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
         found = settle_by_any(with_them, found.estimate, tests, options, progress)
     problem, joint = found.problem, found.joint
     solved = problem.solutions(joint, found.values)
     solved = problem.wandering(joint, found.values, problem.robust(joint, solved))
     progress(1.0)
-    kept = found.drive.budget
-    return UncertainSolution(found.estimate, solved, found.ending, found.settled, kept)
+    return UncertainSolution(found.estimate, solved, found.ending, found.settled, budget)
 
 
 def settle_by_any(
@@ -124,19 +119,6 @@ def settle_by_any(
         if found.ending is not Ending.SINGULAR:
             break
     return found
-
-
-def without_budget(
-    drive: UncertainDrive,
-    found: "Settled",
-    tests: Mapping[int, Determinacy],
-    options: OneKeyOptions,
-) -> "Settled":
-    """Return the graph without any process where one with them ended, with the noise of that."""
-    problem = UncertainProblem(drive, found.estimate, tests, options.factors)
-    values = starting_values(found.estimate, drive.view.sensors, drive.prior.coverage)
-    joint = problem.linearised(values)
-    return replace(found, drive=drive, problem=problem, joint=joint, values=values)
 
 
 def step_uncertain(

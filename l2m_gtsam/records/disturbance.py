@@ -11,6 +11,8 @@ class DisturbanceKind(StrEnum):
     """H of a sensor is not constant, or its noise lasts."""
     POSES = "poses"
     """Poses are wrong by errors that last."""
+    FIELD = "field"
+    """The field is not the map's for a time, for all sensors alike."""
     WARP = "warp"
     """The drive's frame is bent against the map's."""
 
@@ -26,9 +28,9 @@ class Disturbance:
     sensor
         Whose readings it is in; all if none is named.
     sizes
-        Standard deviations by name and unit: ``noise_ut`` (that lasts, 1/f) and ``walk_ut`` (of H
-        from the start to the end of a drive) along each axis; ``rotation_deg``, ``position_m``
-        and for how long, ``lasting_s``; ``shift_m`` along each axis of the floor.
+        Standard deviations by name and unit, along each axis: ``noise_ut`` (that lasts, 1/f) and
+        ``walk_ut`` (from the start to the end of a drive) of H or of a field; ``rotation_deg``,
+        ``position_m`` and for how long, ``lasting_s``; ``shift_m``, of the floor's axes.
     gain
         Twice the logarithm by which the drive is more likely with it.
     """

@@ -17,7 +17,7 @@ JCGS 28, 2019), each of which raises it and keeps all sizes positive:
     M = (1 + I S)^{-1} I, \quad q = (1 + I S)^{-1} u
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -26,6 +26,8 @@ from l2m_gtsam.data import FloatArray, IntArray
 
 MOST_UPDATES = 200
 ENOUGH = 0.02  # of a logarithm of likelihood: less than that in an update is no progress
+ROUNDS = 3  # of sizes and noise; they settle in two
+LEAST_NOISE = 0.05  # of its variance
 NEGLIGIBLE = 1e-3  # of a single weight's information: what a process says that is nothing
 
 
@@ -39,10 +41,13 @@ class VarianceComponents:
         Variances theta of K processes, shape (K,); zero where none is there.
     gain
         Twice the logarithm of the likelihood beyond that without any of them.
+    noise
+        Share of the noise's variance that is left beside them.
     """
 
     sizes: FloatArray
     gain: float
+    noise: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -130,3 +135,26 @@ class WeightSystem:
             sizes = sizes * np.sqrt(np.where(informed > 0, ratio, 0.0))
             sizes = np.where(sizes * felt > NEGLIGIBLE, sizes, 0.0)
         return VarianceComponents(sizes, 2 * self.posterior(sizes @ spectra).likelihood)
+
+    def whiter(self, noise: float) -> "WeightSystem":
+        """Return the same where the noise has this share of its variance only."""
+        return WeightSystem(self.information / noise, self.pull / noise)
+
+    def components_and_noise(self, spectra: FloatArray, squares: float) -> VarianceComponents:
+        """Return the most likely sizes where what they explain is no noise.
+
+        Parameters
+        ----------
+        spectra
+            Of K processes, shape (K, m).
+        squares
+            Sum of squares of all residuals, white by a noise that has all of that in it.
+        """
+        noise = 1.0
+        for _ in range(ROUNDS):
+            system = self.whiter(noise)
+            found = replace(system.components(spectra), noise=noise)
+            variances = found.sizes @ spectra
+            explained = self.pull @ (variances * system.posterior(variances).rest)
+            noise = max(1 - float(explained) / squares, LEAST_NOISE)
+        return found

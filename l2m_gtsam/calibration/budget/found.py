@@ -1,4 +1,4 @@
-"""The processes of a drive as variables of the last graph: ``W(i)`` and ``F()``.
+"""The processes of a drive as variables of the last graph: ``W(i)``, ``B()`` and ``F()``.
 
 Weights have unit variance there. Errors of poses become those of ``pose_errors``, which know how
 they go on between the knots, as if they had been stated.
@@ -11,8 +11,8 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from l2m_factors import F, SharedError, W
-from l2m_gtsam.calibration.budget.processes import LASTING_S, WANDER_MODES
+from l2m_factors import B, F, SharedError, W
+from l2m_gtsam.calibration.budget.processes import LASTING_S, POSE_MODES, WANDER_MODES
 from l2m_gtsam.calibration.budget.search import FoundProcess
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
@@ -100,14 +100,17 @@ def spread_of_H(found: FoundProcess, weights: FloatArray, covariance: FloatArray
 
 def _key(found: FoundProcess) -> int:
     sensor = found.process.sensor
-    return F() if sensor is None else W(sensor)
+    if sensor is not None:
+        return W(sensor)
+    return B() if found.process.kind is DisturbanceKind.FIELD else F()
 
 
 def _record(found: FoundProcess, sensors: Sequence[str]) -> Disturbance:
     kind, sensor = found.process.kind, found.process.sensor
     sizes = np.sqrt(found.sizes)
-    if kind is DisturbanceKind.WANDER:
-        whole = np.sqrt((1 / np.arange(1.0, WANDER_MODES + 1)).sum())
+    if kind in (DisturbanceKind.WANDER, DisturbanceKind.FIELD):
+        count = WANDER_MODES if kind is DisturbanceKind.WANDER else POSE_MODES
+        whole = np.sqrt((1 / np.arange(1.0, count + 1)).sum())
         named = {"noise_ut": sizes[0] * whole, "walk_ut": sizes[1]}
     elif kind is DisturbanceKind.POSES:
         named = {

@@ -23,7 +23,7 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.disturbance import DisturbanceKind
 
 WANDER_MODES = 24  # slower ones hold all but 2 % of a walk; faster ones of 1/f noise are noise
-POSE_MODES = 48  # of each of six errors
+POSE_MODES = 48  # of each of six errors, and of fields
 LASTING_S = (1.0, 2.0, 4.0, 8.0)  # how long errors of poses may last
 WARP_M = (3.0, 8.0)  # lengths over which a frame may be bent
 BEYOND_M = 2.0  # cosines are level at their ends: these lie outside the drive
@@ -178,6 +178,28 @@ class PoseProcess:
 
 
 @dataclass(frozen=True)
+class FieldProcess:
+    """The field is not the map's for a time: it changed, or the map misses what is on the way."""
+
+    scene: Scene
+    modes: TimeModes
+    kind: DisturbanceKind = DisturbanceKind.FIELD
+    sensor: int | None = None
+
+    @property
+    def forms(self) -> tuple[FloatArray, ...]:
+        """Of 1/f noise and of a random walk together, uT^2."""
+        j = np.repeat(self.modes.frequency, 3)
+        return (np.stack([1 / j, 1 / (np.pi * j) ** 2]),)
+
+    def features(self, rows: IntArray) -> FloatArray:
+        """Return what fields along the axes of the map are in the lidar frame, shape (n, 3, m)."""
+        R_lidar_map = self.scene.readings.R_map_lidar[rows].transpose(0, 2, 1)
+        found = np.einsum("nia,nj->nija", R_lidar_map, self.modes.values[rows])
+        return np.asarray(found.reshape(len(rows), 3, -1))
+
+
+@dataclass(frozen=True)
 class Warp:
     """The drive's frame is bent against the map's, in the plane of the floor.
 
@@ -232,7 +254,9 @@ def processes(scene: Scene, sensors: Sequence[int]) -> tuple[Process, ...]:
     drive = scene.readings.of_drive
     slow = TimeModes.of(scene.seconds, drive, WANDER_MODES)
     found: list[Process] = [Wander(scene, sensor, slow) for sensor in sensors]
+    fast = TimeModes.of(scene.seconds, drive, POSE_MODES)
+    if len(sensors) > 1:  # of one sensor's wander it cannot be told
+        found.append(FieldProcess(scene, fast))
     if scene.readings.pose_root is None:
-        fast = TimeModes.of(scene.seconds, drive, POSE_MODES)
         found.append(PoseProcess(scene, fast))
     return (*found, Warp.of(scene))

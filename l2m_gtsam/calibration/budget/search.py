@@ -56,11 +56,14 @@ class Felt:
         Of each among all weights, shape (m,).
     system
         All weights together, with everything else taken out.
+    squares
+        Sum of squares of the white residuals.
     """
 
     processes: Sequence[Process]
     columns: Sequence[IntArray]
     system: WeightSystem
+    squares: float
 
 
 def felt(
@@ -100,8 +103,12 @@ def felt(
         pull[at] -= Z.T @ each.residual
         across[np.ix_(each.columns, at)] += each.jacobian.T @ Z
     everything = np.arange(len(across))
-    information = own - joint.every.across(everything, across)
-    return Felt(processes, columns, WeightSystem(0.5 * (information + information.T), pull))
+    # The residuals are those of the system itself, which holds the survey's sensors tighter.
+    loose = joint.loose.T @ across
+    information = own - joint.every.across(everything, across) + loose.T @ loose
+    system = WeightSystem(0.5 * (information + information.T), pull)
+    squares = sum(float(each.residual @ each.residual) for each in rows)
+    return Felt(processes, columns, system, squares)
 
 
 def search(known: Felt) -> tuple[FoundProcess, ...]:
@@ -162,8 +169,10 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess
             owner.append(k)
     of, every = np.array(owner), np.array(spectra)
     at = np.flatnonzero(every.any(axis=0))
-    system, every = known.system.among(at), every[:, at]
-    fit: VarianceComponents = system.components(every)
+    every = every[:, at]
+    system = known.system.among(at)
+    fit = system.components_and_noise(every, known.squares)
+    system = system.whiter(fit.noise)
     kept = []
     for k, each in taken.items():
         others = np.where(of == k, 0.0, fit.sizes) @ every

@@ -25,14 +25,12 @@ from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SIZE, SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
-from l2m_gtsam.solve.variance_components import VarianceComponents, WeightSystem
+from l2m_gtsam.solve.variance_components import WeightSystem
 
 MOST_TILES = 24  # of the survey, spread over it
 NAMES = ("t", "C", "H", "offset")
 PARTS = np.repeat(np.arange(len(NAMES)), [3, 9, 3, 1])
 H = NAMES.index("H")
-ROUNDS = 3
-LEAST_NOISE = 0.05  # of its variance
 LEAST_GAIN = 16.0  # twice a logarithm of likelihood; chance gives four sizes that in 0.1 % of maps
 
 
@@ -85,15 +83,8 @@ def suite_sizes(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> SuiteSizes 
     information = np.sum([each.system.information for each in seen], axis=0)
     pull = np.sum([each.system.pull for each in seen], axis=0)
     system = WeightSystem(turned.T @ information @ turned, turned.T @ pull)
-    squares, found = sum(each.squares for each in seen), VarianceComponents(np.zeros(4), 0.0)
     # The map's noise has these errors in it: what they explain is none.
-    less = 1.0
-    for _ in range(ROUNDS):
-        rescaled = WeightSystem(system.information / less, system.pull / less)
-        found = rescaled.components(spectra)
-        variances = found.sizes @ spectra
-        explained = system.pull @ (variances * rescaled.posterior(variances).rest)
-        less = max(1 - float(explained) / squares, LEAST_NOISE)
+    found = system.components_and_noise(spectra, sum(each.squares for each in seen))
     if found.gain < LEAST_GAIN:
         return None
     return SuiteSizes(*np.sqrt(found.sizes).tolist())

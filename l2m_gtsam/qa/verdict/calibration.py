@@ -97,6 +97,13 @@ def _disturbed(found: Disturbance) -> str:
                 "themselves. Sigmas hold it; state the errors of your poses "
                 "(calibration.solve.pose_noise), or use better ones."
             )
+        case DisturbanceKind.FIELD:
+            return (
+                f"The field differs from the map's for a time, by {size['noise_ut']:.2g} uT and "
+                f"{size['walk_ut']:.2g} uT more by the end, for all sensors alike: steel or "
+                "currents near by changed, or the survey missed what is along the way. Sigmas "
+                "hold it; survey more densely, or again."
+            )
         case DisturbanceKind.WARP:
             return (
                 f"The frame of the drive is bent against the map's by about "

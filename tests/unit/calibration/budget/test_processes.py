@@ -1,0 +1,82 @@
+"""Modes of processes: their spectra are those of what they stand for."""
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.calibration.budget.found import spread_of_H
+from l2m_gtsam.calibration.budget.processes import LASTING_S, PoseProcess, TimeModes, Wander, Warp
+from l2m_gtsam.calibration.budget.search import FoundProcess
+from tests.support.scenes import scene
+
+SECONDS = np.linspace(0.0, 200.0, 801)
+ONE = np.zeros(len(SECONDS), dtype=np.int64)
+
+
+def test_time_modes_are_orthonormal_and_have_no_mean() -> None:
+    modes = TimeModes.of(SECONDS, ONE, 10).values
+    gram = modes.T @ modes / len(modes)
+    # Both ends of the time count in full here: 1 of 800.
+    np.testing.assert_allclose(gram, np.eye(10), atol=6e-3)
+    np.testing.assert_allclose(modes.mean(axis=0), 0, atol=4e-3)
+
+
+def test_each_drive_has_modes_of_its_own() -> None:
+    drive = (SECONDS > 120).astype(np.int64)
+    modes = TimeModes.of(SECONDS, drive, 4)
+    assert modes.values.shape == (len(SECONDS), 8)
+    assert not modes.values[drive == 0, 4:].any()
+    assert not modes.values[drive == 1, :4].any()
+    np.testing.assert_allclose(modes.duration, np.repeat([120.0, 79.75], 4))
+
+
+def test_a_walk_wanders_as_its_spectrum_says() -> None:
+    """Over many walks, coefficients of the modes have the spectrum's variances."""
+    rng, count = np.random.default_rng(0), 4000
+    steps = rng.standard_normal((count, len(SECONDS))) / np.sqrt(len(SECONDS))
+    walks = np.cumsum(steps, axis=1)
+    modes = TimeModes.of(SECONDS, ONE, 6)
+    found = (walks @ modes.values / len(SECONDS)).var(axis=0)
+    _, walk = Wander(scene(SECONDS), 0, modes).forms[0]
+    # 4,000 draws: 2.2 % a standard deviation; time is not continuous.
+    np.testing.assert_allclose(found, walk[::3], rtol=0.12)
+
+
+@pytest.mark.parametrize("form", range(len(LASTING_S)))
+def test_errors_of_poses_have_unit_variance_and_last(form: int) -> None:
+    modes = TimeModes.of(SECONDS, ONE, 400)  # all that matter, unlike the fewer that are looked for
+    turn, shift = PoseProcess(scene(SECONDS), modes).forms[form]
+    assert not (turn * shift).any()
+    variance = turn[::6]
+    like = (modes.values[400] * variance) @ modes.values.T
+    lasting = LASTING_S[form]
+    expected = np.exp(-np.abs(SECONDS - SECONDS[400]) / lasting)
+    # Cosines are not the series of this process near the ends, and stop at four a second.
+    np.testing.assert_allclose(like[200:600], expected[200:600], atol=0.17)
+
+
+def test_a_warp_has_a_metre_square_wherever_it_is() -> None:
+    warp = Warp.of(scene(SECONDS))
+    for spectrum in warp.forms[0]:
+        variance = warp.values**2 @ spectrum[::2]
+        assert np.mean(variance) == pytest.approx(1, abs=0.35)  # of few modes, over a lane
+
+
+def test_features_of_wander_add_to_the_readings_along_their_axes() -> None:
+    place = scene(SECONDS)
+    wander = Wander(place, 0, TimeModes.of(SECONDS, ONE, 2))
+    rows = np.arange(5)
+    added = place.C[rows] @ wander.features(rows)
+    mode = wander.modes.values[rows]
+    expected = np.einsum("nj,ia->nija", mode, np.eye(3)).reshape(5, 3, -1)
+    np.testing.assert_allclose(added, expected, atol=1e-12)
+
+
+def test_the_spread_of_H_is_its_mean_square_over_the_drive() -> None:
+    rng = np.random.default_rng(1)
+    modes = TimeModes.of(SECONDS, ONE, 24)
+    wander = FoundProcess(Wander(scene(SECONDS), 0, modes), 0, np.array([0.02, 0.3]), 99.0)
+    weights = rng.standard_normal(72)
+    drift = modes.values @ (np.sqrt(wander.variances) * weights).reshape(24, 3)
+    found = spread_of_H(wander, weights, np.zeros((72, 72)))
+    # A sum over 801 instants against an integral.
+    np.testing.assert_allclose(found, drift.T @ drift / len(drift), atol=0.02 * np.trace(found))
