@@ -65,8 +65,16 @@ class Excess:
 
         What is infinite, as not determined, stays so.
         """
-        scale, known = self.factors.scale, np.isfinite(np.diag(covariance))
-        added = self.brought * (np.outer(scale, scale) - 1)
+        known = np.isfinite(np.diag(covariance))
+        added = np.zeros_like(self.brought)
+        for name, block in BLOCKS.items():
+            if (factor := getattr(self.factors, name)) <= 1:
+                continue
+            # All that hangs on the block grows with it, so that what is known of sums stays so:
+            # the covariance ends between the model's and that times the largest factor.
+            across = self.brought[:, block]
+            explained = across @ np.linalg.solve(self.brought[block, block], across.T)
+            added += (factor - 1) * explained
         return np.asarray(covariance + np.where(np.outer(known, known), added, 0.0))
 
 

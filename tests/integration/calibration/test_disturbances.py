@@ -1,0 +1,100 @@
+"""Errors that last are found on a drive, sized, and held by the sigmas: one hall, one each."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
+from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.qa.evaluate import evaluate
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
+from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.studies.troubles.drives import troubled_drive
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
+from l2m_gtsam.studies.troubles.surveys import TroubledHall, troubled_hall
+
+OPTIONS = TroublesOptions(surveys=2, drives=1, survey_readings=900, readings=400)
+DRIVE = 1
+# Of 15 parameters of two sensors under one map; 1 of 1,000 each where sigmas are true.
+WITHIN = float(chi2.ppf(0.999, 15))
+
+
+@cache
+def hall(trouble: Trouble) -> TroubledHall:
+    return troubled_hall(OPTIONS, trouble, 0)
+
+
+@cache
+def drive(trouble: Trouble) -> tuple[Calibrated, tuple[KnownSensor, ...], Level]:
+    place = hall(Trouble.SUITE if trouble.wrong_suite else Trouble.CLEAN)
+    recording, truth = troubled_drive(OPTIONS, place, trouble, DRIVE)
+    found = calibrated(recording, place.field_map, CalibrationOptions())
+    metrics = evaluate(recording, found, CalibrationOptions(), QaOptions())
+    return found, truth, judge(found.result, metrics, QaOptions()).level
+
+
+def shown(trouble: Trouble, kind: DisturbanceKind) -> list[Disturbance]:
+    return [each for each in drive(trouble)[0].result.disturbances if each.kind is kind]
+
+
+def distances(trouble: Trouble) -> list[float]:
+    """Return the squared distance of (t, C, H) of each sensor from the truth."""
+    found, truth, _ = drive(trouble)
+    result = []
+    for each, known in zip(found.result.sensors, truth, strict=True):
+        e = each.t_lidar_mag - known.t_lidar_mag
+        e = np.concatenate([e, each.distortion.vector() - known.distortion.vector()])
+        result.append(float(e @ np.linalg.solve(each.covariance, e)))
+    return result
+
+
+def test_nothing_is_found_where_nothing_is() -> None:
+    found, _, level = drive(Trouble.CLEAN)
+    assert found.result.disturbances == ()
+    assert level is Level.PASS
+
+
+@pytest.mark.parametrize("trouble", [Trouble.DRIFT, Trouble.PINK, Trouble.POSES])
+def test_sigmas_hold_what_lasts(trouble: Trouble) -> None:
+    assert max(distances(trouble)) < WITHIN
+    assert drive(trouble)[2] is Level.WARN
+
+
+def test_a_wandering_offset_is_sized() -> None:
+    found = shown(Trouble.DRIFT, DisturbanceKind.WANDER)
+    assert [each.sensor for each in found] == ["mag_00", "mag_01"]
+    # Draws of three walks each: their size is known to a third.
+    for each in found:
+        assert each.sizes["walk_ut"] == pytest.approx(OPTIONS.drift_ut, rel=0.5)
+
+
+def test_errors_of_poses_are_sized_and_no_longer_taken_for_exact() -> None:
+    (found,) = shown(Trouble.POSES, DisturbanceKind.POSES)
+    assert found.sensor is None
+    assert found.sizes["rotation_deg"] == pytest.approx(OPTIONS.pose_deg, rel=0.5)
+    # Rotations are felt in tens of uT per radian everywhere, shifts where there is a gradient.
+    assert 0.3 < found.sizes["position_m"] / OPTIONS.pose_m < 3
+    result, clean = drive(Trouble.POSES)[0].result, drive(Trouble.CLEAN)[0].result
+    assert "the drive's poses" not in result.exact
+    assert "the drive's poses" in clean.exact
+
+
+def test_a_suite_that_is_off_is_sized_by_its_survey() -> None:
+    wrong, right = (hall(each).field_map for each in (Trouble.SUITE, Trouble.CLEAN))
+    assert isinstance(wrong, HarmonicMap)
+    assert isinstance(right, HarmonicMap)
+    assert right.learnt.suite is None
+    assert wrong.learnt.suite is not None
+    sigma = np.sqrt(np.diag(wrong.learnt.suite.covariance)[:15])
+    # Three sensors: nine draws of t and H each, less what they have in common; 27 of C.
+    assert sigma[12] == pytest.approx(OPTIONS.suite_H_ut, rel=0.7)
+    assert sigma[3] == pytest.approx(OPTIONS.suite_C, rel=0.5)
+    assert any("by the survey itself" in each for each in wrong.learnt.origin.survey)
+    assert max(distances(Trouble.SUITE)) < WITHIN
+    assert drive(Trouble.SUITE)[2] is Level.WARN
