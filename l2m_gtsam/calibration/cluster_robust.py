@@ -71,7 +71,7 @@ class Excess:
             if (factor := getattr(self.factors, name)) <= 1:
                 continue
             # All that hangs on the block grows with it, so that what is known of sums stays so:
-            # the covariance ends between the model's and that times the largest factor.
+            # the covariance ends between the model's and a multiple of that.
             across = self.brought[:, block]
             explained = across @ np.linalg.solve(self.brought[block, block], across.T)
             added += (factor - 1) * explained

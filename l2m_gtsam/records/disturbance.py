@@ -25,17 +25,17 @@ class Disturbance:
     ----------
     kind
         What it is.
-    sensor
-        Whose readings it is in; all if none is named.
     sizes
         Standard deviations by name and unit, along each axis: ``noise_ut`` (that lasts, 1/f) and
         ``walk_ut`` (from the start to the end of a drive) of H or of a field; ``rotation_deg``,
         ``position_m`` and for how long, ``lasting_s``; ``shift_m``, of the floor's axes.
     gain
         Twice the logarithm by which the drive is more likely with it.
+    sensor
+        Whose readings it is in; all if none is named.
     """
 
     kind: DisturbanceKind
-    sensor: str | None
     sizes: dict[str, float]
     gain: float
+    sensor: str | None = None

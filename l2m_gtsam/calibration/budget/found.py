@@ -121,7 +121,7 @@ def _record(found: FoundProcess, sensors: Sequence[str]) -> Disturbance:
     else:
         named = {"shift_m": np.sqrt(found.sizes.sum())}
     whose = None if sensor is None else sensors[sensor]
-    return Disturbance(kind, whose, {k: float(v) for k, v in named.items()}, found.gain)
+    return Disturbance(kind, {k: float(v) for k, v in named.items()}, found.gain, whose)
 
 
 NOTHING_FOUND = Budget()

@@ -14,7 +14,7 @@ from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
-from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
 from l2m_gtsam.studies.troubles.surveys import TroubledHall, troubled_hall
@@ -31,12 +31,12 @@ def hall(trouble: Trouble) -> TroubledHall:
 
 
 @cache
-def drive(trouble: Trouble) -> tuple[Calibrated, tuple[KnownSensor, ...], Level]:
+def drive(trouble: Trouble) -> tuple[Calibrated, tuple[KnownSensor, ...], Verdict]:
     place = hall(Trouble.SUITE if trouble.wrong_suite else Trouble.CLEAN)
     recording, truth = troubled_drive(OPTIONS, place, trouble, DRIVE)
     found = calibrated(recording, place.field_map, CalibrationOptions())
     metrics = evaluate(recording, found, CalibrationOptions(), QaOptions())
-    return found, truth, judge(found.result, metrics, QaOptions()).level
+    return found, truth, judge(found.result, metrics, QaOptions())
 
 
 def shown(trouble: Trouble, kind: DisturbanceKind) -> list[Disturbance]:
@@ -55,15 +55,24 @@ def distances(trouble: Trouble) -> list[float]:
 
 
 def test_nothing_is_found_where_nothing_is() -> None:
-    found, _, level = drive(Trouble.CLEAN)
+    found, _, verdict = drive(Trouble.CLEAN)
     assert found.result.disturbances == ()
-    assert level is Level.PASS
+    assert verdict.level is Level.PASS
 
 
-@pytest.mark.parametrize("trouble", [Trouble.DRIFT, Trouble.PINK, Trouble.POSES])
-def test_sigmas_hold_what_lasts(trouble: Trouble) -> None:
+@pytest.mark.parametrize(
+    ("trouble", "words"),
+    [
+        (Trouble.DRIFT, "H of mag_00 is not constant: it wanders by"),
+        (Trouble.PINK, "H of mag_01 is not constant"),
+        (Trouble.POSES, "Poses are wrong by about"),
+    ],
+)
+def test_sigmas_hold_what_lasts_and_the_verdict_says_so(trouble: Trouble, words: str) -> None:
     assert max(distances(trouble)) < WITHIN
-    assert drive(trouble)[2] is Level.WARN
+    verdict = drive(trouble)[2]
+    assert verdict.level is Level.WARN
+    assert any(words in reason.text for reason in verdict.reasons)
 
 
 def test_a_wandering_offset_is_sized() -> None:
@@ -97,4 +106,4 @@ def test_a_suite_that_is_off_is_sized_by_its_survey() -> None:
     assert sigma[3] == pytest.approx(OPTIONS.suite_C, rel=0.5)
     assert any("by the survey itself" in each for each in wrong.learnt.origin.survey)
     assert max(distances(Trouble.SUITE)) < WITHIN
-    assert drive(Trouble.SUITE)[2] is Level.WARN
+    assert drive(Trouble.SUITE)[2].level is Level.WARN

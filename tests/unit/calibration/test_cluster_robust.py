@@ -129,6 +129,25 @@ def test_an_error_that_lasts_is_found_and_counted() -> None:
         assert 0.7 < np.mean(found_distances) < 1.7, name
 
 
+@given(seed=st.integers(0, 10_000), factors=st.lists(st.floats(1.0, 50.0), min_size=4, max_size=4))
+@settings(max_examples=40, deadline=None)
+def test_a_wider_covariance_lies_between_the_models_and_its_largest_multiple(
+    seed: int, factors: list[float]
+) -> None:
+    """In every direction: one that is known well stays known better than the others."""
+    A = np.random.default_rng(seed).standard_normal((16, 20))
+    P = A @ A.T
+    excess = Excess(Unmodelled(*factors), P)
+    wide = excess.widened(P)
+    most = 1 + sum(factor - 1 for factor in factors)
+    size = np.linalg.norm(wide)
+    assert np.linalg.eigvalsh(wide - P).min() > -1e-9 * size
+    assert np.linalg.eigvalsh(most * P - wide).min() > -1e-9 * size
+    for factor, block in zip(factors, BLOCKS.values(), strict=True):
+        own = wide[block, block] - factor * P[block, block]
+        assert np.linalg.eigvalsh(own).min() > -1e-9 * size
+
+
 def test_few_readings_tell_nothing() -> None:
     one = fitted(np.random.default_rng(5), lasting=5.0)
     few = [Rows(0, r.columns, r.jacobian[:3], r.residual[:3], r.readings[:1]) for r in one.rows]
