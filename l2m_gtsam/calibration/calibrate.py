@@ -7,7 +7,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.changed_places import solve_changed
-from l2m_gtsam.calibration.coverage import KnowsSurvey
+from l2m_gtsam.calibration.coverage import KnowsSurvey, sigmas_hold
 from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
@@ -123,7 +123,8 @@ def calibrated(
         trajectory=recording.trajectory,
         priors=priors,
     )
-    changed = solve_changed(problem, solver_map, t_start, options.changes)
+    holds = sigmas_hold(field_map)
+    changed = solve_changed(problem, solver_map, t_start, options.changes, judged=holds)
     outcome, solver_map = changed.outcome, changed.solver_map
     solution = outcome.solution
     if changed.sources is not None:

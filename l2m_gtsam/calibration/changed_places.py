@@ -159,7 +159,12 @@ class ChangedSolve:
 
 
 def solve_changed(
-    problem: MovingProblem, solver_map: RememberedMap, t_start: FloatArray, options: ChangesOptions
+    problem: MovingProblem,
+    solver_map: RememberedMap,
+    t_start: FloatArray,
+    options: ChangesOptions,
+    *,
+    judged: bool,
 ) -> ChangedSolve:
     """Solve, look for sources, and solve again with them until both agree.
 
@@ -173,8 +178,12 @@ def solve_changed(
         Where to start each sensor in the lidar frame in metres, shape (S, 3).
     options
         How to look for sources.
+    judged
+        Whether the map's sigmas hold: what one misses that does not know its errors is no change.
     """
     plain = solved = ChangedSolve(solve_moving(problem, t_start), solver_map, None)
+    if not judged:
+        return plain
     for _ in range(ROUNDS):
         before = None if solved.sources is None else solved.sources.found
         sources = search(solved.outcome.solution, solver_map, options, before)

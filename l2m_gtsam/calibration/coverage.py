@@ -69,6 +69,20 @@ class KnowsSurvey(Protocol):
         """Whether errors of the sensors are stated."""
 
 
+@runtime_checkable
+class KnowsItself(Protocol):
+    """A map that was compared with readings that it had not read."""
+
+    @property
+    def sigmas_hold(self) -> bool:
+        """Whether these were within what it states."""
+
+
+def sigmas_hold(field_map: object) -> bool:
+    """Return whether nothing says that a map's errors are larger than it states."""
+    return not isinstance(field_map, KnowsItself) or field_map.sigmas_hold
+
+
 class NothingShared:
     """A map whose errors are independent: one tile with one weight that no reading feels."""
 

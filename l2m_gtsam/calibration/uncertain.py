@@ -19,7 +19,7 @@ import gtsam
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
-from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.joint_information import JointInformation
@@ -93,7 +93,8 @@ def solve_uncertain(
     progress(1 / (MAX_ROUNDS + 1))
     found = settle_by_any(drive, near, tests, options, progress)
     budget = NOTHING_FOUND
-    if found.ending is not Ending.SINGULAR:
+    # What a map leaves that does not know its own errors is no process of the drive.
+    if found.ending is not Ending.SINGULAR and sigmas_hold(errors):
         budget = found.problem.searched(found.joint)
     if budget.found:
         with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
@@ -215,7 +216,7 @@ def settle(
             after = replace(after, noise=problem.noise(joint, values, estimate))
         # The weights of the first round are those of the optimum with independent errors.
         at_rest = joint.furthest(sensors) < SETTLED_SIGMAS
-        settled = at_rest and after.same_noise(estimate) and round_ > 0
+        settled = at_rest and problem.same_noise(after, estimate) and round_ > 0
         estimate = after
         if settled:
             break

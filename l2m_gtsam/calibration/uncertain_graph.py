@@ -274,6 +274,17 @@ class UncertainProblem:
             noise[s] = estimate_noise(residual[rows], self._noise.rest[rows], taken)
         return noise
 
+    def same_noise(self, one: Estimate, other: Estimate) -> bool:
+        """Return whether no reading's standard deviation differs by more than 0.1 % for it.
+
+        Beside errors of poses that last a moment, a sensor's noise may be as good as nothing.
+        """
+        for s in self._view.sensors:
+            rest = float(self._noise.rest[self._batch.rows_of(s)].mean())
+            if abs(np.log((one.noise[s] ** 2 + rest) / (other.noise[s] ** 2 + rest))) > 2e-3:
+                return False
+        return True
+
     def solutions(
         self, joint: JointInformation, values: gtsam.Values
     ) -> tuple[SensorSolution, ...]:

@@ -58,6 +58,11 @@ class Explanation:
         return not np.isnan(self.spread)
 
     @property
+    def sigmas_hold(self) -> bool:
+        """Return whether nothing says that errors are larger than the map states."""
+        return not (self.spread > MOST_SPREAD or self.worst > MOST_SPREAD_OF_ONE)
+
+    @property
     def reasons(self) -> list[str]:
         """Return what speaks against the map."""
         reasons = []

@@ -206,6 +206,11 @@ class HarmonicMap:
         return self.learnt.suite is not None
 
     @property
+    def sigmas_hold(self) -> bool:
+        """Whether held-out readings of the survey are within what the map states."""
+        return self.learnt.origin.explanation.sigmas_hold
+
+    @property
     def summary(self) -> MapSummary:
         """Figures of the map."""
         return summary_of(self.kind, self.learnt)

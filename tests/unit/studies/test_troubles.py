@@ -5,11 +5,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import Trajectory
+from l2m_gtsam.data import Distortion, KnownSensor, Trajectory
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.steel_hall import steel_hall
 from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell
-from l2m_gtsam.studies.troubles.drives import bent, disturbance, pink
+from l2m_gtsam.studies.troubles.drives import bent, disturbance, linear_over, not_linear, pink
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
 from l2m_gtsam.studies.troubles.study import TROUBLES, kind, split
 from l2m_gtsam.studies.troubles.surveys import known_suite, survey_of
@@ -41,8 +41,22 @@ def test_each_trouble_is_of_the_size_that_is_told() -> None:
     assert size[Trouble.DRIFT][-1].std() == pytest.approx(OPTIONS.drift_ut, rel=0.25)
     assert size[Trouble.PINK].std() == pytest.approx(OPTIONS.pink_ut, rel=0.01)
     expected = OPTIONS.nonlinear * np.abs(field) * np.abs(field) / 50
-    np.testing.assert_allclose(np.abs(size[Trouble.NONLINEAR][:, :3]), expected)
+    np.testing.assert_allclose(np.abs(not_linear(OPTIONS, field, rng)), expected)
     assert (size[Trouble.ALL].std(axis=0) > size[Trouble.PINK].std(axis=0).min()).mean() > 0.8
+
+
+def test_of_a_scale_that_is_not_linear_the_nearest_linear_one_is_true() -> None:
+    rng = np.random.default_rng(3)
+    b_lidar = rng.normal(0, 20, (500, 3)) + np.array([0, 0, -40])
+    sensor = KnownSensor("mag", np.zeros(3), Distortion(1.1 * np.eye(3), np.array([1.0, 2, 3])))
+    field = sensor.distortion.apply(b_lidar)
+    change = not_linear(OPTIONS, field, rng)
+    near = linear_over(sensor, field, change)
+    left = field + change - near.distortion.apply(b_lidar)
+    # Nothing that is linear in the fields is left.
+    np.testing.assert_allclose(left.mean(axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(b_lidar.T @ left, 0, atol=1e-6)
+    assert np.square(left).sum() < 0.5 * np.square(change).sum()
 
 
 def test_a_bent_frame_moves_places_and_turns_nothing() -> None:
