@@ -102,7 +102,6 @@ def map_whole_drive(
     for stage, factor in enumerate(STAGES):
         progress("solving poses and field", stage / len(STAGES))
         noise = learnt.prior.spectrum.noise.floored().scaled(factor)
-        sensors = replace(sensors, noise=np.array([noise.ut]))
         problem = stage_problem(free, learnt.prior, noise, options)
         solved = settled(problem, learnt.poses, sensors, ROUNDS[stage])
         sensors = solved.last.sensors

@@ -71,11 +71,11 @@ def nees(drive: MovingDrive, result: CalibrationResult) -> list[float]:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_without_the_current_h_wanders_with_it_it_does_not(seed: int) -> None:
     found = calibrated(seed, (STRONG, STRONG))
-    # A current that nobody recorded looks like an offset that wanders, by several uT.
+    # A current that nobody recorded looks like an offset that wanders.
     silent = {each.sensor: each for each in found.silent.disturbances}
     for sensor in found.silent.sensors:
         assert silent[sensor.sensor].kind is DisturbanceKind.WANDER
-        assert silent[sensor.sensor].sizes["walk_ut"] > 1
+        assert silent[sensor.sensor].sizes["walk_ut"] > 0.5
         assert sensor.H_sigma.min() > 0.1
     # With H held constant that was over 1,000; 15 are expected.
     assert max(nees(found.drive, found.silent)) < 200
