@@ -212,7 +212,7 @@ def test_a_failed_write_leaves_nothing(
     monkeypatch.setattr(Ros1Writer, "write", full)
     monkeypatch.setattr(Ros2Writer, "write", full)
     path = bag_path(tmp_path, kind)
-    with pytest.raises(OutputError, match=f"{path.name} cannot be written: No space left"):
+    with pytest.raises(OutputError, match=f"{path.name}: cannot be written: No space left"):
         write_bag(path, kind, drive.recording)
     assert not list(tmp_path.iterdir())
 
