@@ -7,7 +7,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.changed_places import solve_changed
-from l2m_gtsam.calibration.coverage import KnowsSurvey, sigmas_hold
+from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
@@ -22,7 +22,6 @@ from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
 from l2m_gtsam.data import FloatArray, Readings, Recording, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.maps.field_map import Summarised
-from l2m_gtsam.maps.sources.changed_map import ChangedMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.drive_trace import trace_of
@@ -123,18 +122,15 @@ def calibrated(
         trajectory=recording.trajectory,
         priors=priors,
     )
-    holds = sigmas_hold(field_map)
-    changed = solve_changed(problem, solver_map, t_start, options.changes, judged=holds)
+    changed = solve_changed(problem, solver_map, t_start, options.changes)
     outcome, solver_map = changed.outcome, changed.solver_map
     solution = outcome.solution
-    if changed.sources is not None:
-        field_map = ChangedMap(field_map, changed.sources.found)
-    explanations = explained(outcome.readings, solver_map, t_start, solution, options.solve)
+    field_map = changed.taken_into(field_map)
     drive = SolvedDrive(
         synchronised=synchronised,
         readings=alive,
         outcome=outcome,
-        explained=explanations,
+        explained=explained(outcome.readings, solver_map, t_start, solution, options.solve),
         starts=tuple(found),
         moved=movement(recording.trajectory.R, recording.trajectory.p),
     )
@@ -158,7 +154,7 @@ def calibrated(
         traces=tuple(trace_of(drive.trajectory) for drive in recording.parts),
         exact=taken_for_exact(alive, field_map, solution.budget),
         disturbances=solution.budget.named(alive.sensors),
-        sources=() if changed.sources is None else changed.sources.records,
+        sources=changed.records,
     )
     return Calibrated(result, solution, field_map, solver_map)
 

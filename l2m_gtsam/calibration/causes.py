@@ -14,7 +14,7 @@ from l2m_gtsam.calibration.averaged_rows import AveragedDrive
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import FoundSources, price
-from l2m_gtsam.records.places import Cause, ChangedSource, Explanation
+from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 
 FELT_UT = 0.2  # weaker a source is not felt
 FELT_SHARE = 0.2  # of its strongest field: where a passage begins and ends
@@ -75,7 +75,7 @@ def explanations(
     field: FloatArray,
     residual: FloatArray,
     passage: IntArray,
-) -> tuple[Explanation, ...]:
+) -> tuple[CauseGain, ...]:
     """Return what each cause explains of residuals, the best first.
 
     Parameters
@@ -105,13 +105,13 @@ def explanations(
     width = offsets.shape[2]
     vehicle = float(_gains(rows, offsets, pulled, width)[0]) - width * one
     found = [
-        Explanation(Cause.PLACE, place, size),
-        Explanation(Cause.MOMENT, moment, size),
-        Explanation(Cause.VEHICLE, vehicle, size),
+        CauseGain(Cause.PLACE, place, size),
+        CauseGain(Cause.MOMENT, moment, size),
+        CauseGain(Cause.VEHICLE, vehicle, size),
     ]
     if len(per_sensor) > 1:
         single = float(alone - 2 * np.log(len(per_sensor)))
-        found.append(Explanation(Cause.SENSOR, single, size))
+        found.append(CauseGain(Cause.SENSOR, single, size))
     return tuple(sorted(found, key=lambda each: -each.gain))
 
 

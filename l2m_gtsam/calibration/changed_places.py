@@ -17,7 +17,7 @@ from l2m_gtsam.calibration.averaged_rows import (
 )
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources, offset_gain
-from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of
@@ -124,6 +124,9 @@ def search(
     """
     if not options.sources.most or not isinstance(field_map, UncertainMap) or not solution.solved:
         return None
+    # What a map misses that does not know its own errors is no change.
+    if not sigmas_hold(field_map):
+        return None
     drive = averaged_drive(solution, field_map, options.averaging)
     places = suspected(drive, field_map, options.averaging)
     if not len(places) and known is None:
@@ -157,14 +160,21 @@ class ChangedSolve:
     solver_map: RememberedMap
     sources: ChangedSources | None
 
+    @property
+    def records(self) -> tuple[ChangedSource, ...]:
+        """The sources as they are reported."""
+        return () if self.sources is None else self.sources.records
+
+    def taken_into(self, surveyed: QueryableMap) -> QueryableMap:
+        """Return a map as it was surveyed with the sources that came, went or were moved."""
+        return surveyed if self.sources is None else ChangedMap(surveyed, self.sources.found)
+
 
 def solve_changed(
     problem: MovingProblem,
     solver_map: RememberedMap,
     t_start: FloatArray,
     options: ChangesOptions,
-    *,
-    judged: bool,
 ) -> ChangedSolve:
     """Solve, look for sources, and solve again with them until both agree.
 
@@ -178,12 +188,8 @@ def solve_changed(
         Where to start each sensor in the lidar frame in metres, shape (S, 3).
     options
         How to look for sources.
-    judged
-        Whether the map's sigmas hold: what one misses that does not know its errors is no change.
     """
     plain = solved = ChangedSolve(solve_moving(problem, t_start), solver_map, None)
-    if not judged:
-        return plain
     for _ in range(ROUNDS):
         before = None if solved.sources is None else solved.sources.found
         sources = search(solved.outcome.solution, solver_map, options, before)

@@ -16,7 +16,7 @@ class Cause(StrEnum):
 
 
 @dataclass(frozen=True)
-class Explanation:
+class CauseGain:
     """How well a cause explains readings.
 
     Attributes
@@ -70,12 +70,12 @@ class ChangedSource:
     nearest: float
     strongest: float
     passages: int
-    explanations: tuple[Explanation, ...] = ()
+    explanations: tuple[CauseGain, ...] = ()
 
     @property
     def cause(self) -> Cause | None:
         """The cause that is clearly the best; none where two explain it about as well."""
-        best, *others = self.explanations or (Explanation(Cause.PLACE, 0.0, 0.0),)
+        best, *others = self.explanations or (CauseGain(Cause.PLACE, 0.0, 0.0),)
         tied = any(best.gain - each.gain < CLEAR for each in others)
         return None if tied else best.cause
 

@@ -1,17 +1,19 @@
 """Whether the place changed or the vehicle: the same readings under both, by likelihood."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.averaged_rows import SENSOR, AveragedDrive, averaged
+from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
-from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import FoundSources, find_sources, price, refined
 from l2m_gtsam.records.places import CLEAR, ChangedSource
@@ -87,6 +89,9 @@ def place_or_vehicle(
     """
     if not options.sources.most or not isinstance(field_map, UncertainMap):
         return None
+    # What a map misses that does not know its own errors is no change.
+    if not sigmas_hold(field_map):
+        return None
     every = np.ones(len(readings), dtype=np.bool_)
     averages = averaged(readings, field_map, estimate, every, options.averaging)
     drive = AveragedDrive.of(averages, field_map, estimate)
@@ -113,6 +118,33 @@ def place_or_vehicle(
     if result.of_place:
         return PlaceOrVehicle(found, changed_sources(free, drive, found), gains)
     return result
+
+
+def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
+    """Return readings of single sensors as those of all."""
+    counts = [len(each) for each in parts]
+
+    def joined(values: Sequence[FloatArray | None]) -> FloatArray | None:
+        known = [each for each in values if each is not None]
+        return np.concatenate(known) if len(known) == len(parts) else None
+
+    moving = [each.motion for each in parts]
+    motion = None
+    if all(each is not None for each in moving):
+        motion = LidarMotion(
+            np.concatenate([each.twist_lidar for each in moving if each is not None]),
+            np.concatenate([each.offset for each in moving if each is not None]),
+        )
+    return Readings(
+        sensors=names,
+        sensor=np.repeat(np.arange(len(parts)), counts),
+        stamp_ns=np.concatenate([each.stamp_ns for each in parts]),
+        R_map_lidar=np.concatenate([each.R_map_lidar for each in parts]),
+        p_map_lidar=np.concatenate([each.p_map_lidar for each in parts]),
+        field=np.concatenate([each.field for each in parts]),
+        motion=motion,
+        pose_root=joined([each.pose_root for each in parts]),
+    )
 
 
 def with_calibration(rows: MarginalRows, covariances: FloatArray) -> MarginalRows:

@@ -11,14 +11,12 @@ from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.view import Compilable, QueryableMap, places_of
 from l2m_gtsam.data import (
     FloatArray,
-    LidarMotion,
     Readings,
     Recording,
     SourceFile,
     same_content,
 )
 from l2m_gtsam.errors import CalibrationError, ConfigError
-from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
@@ -27,35 +25,16 @@ from l2m_gtsam.qa.metrics.changes import is_calibrated
 from l2m_gtsam.qa.metrics.coverage import drive_metrics
 from l2m_gtsam.recording.drive_trace import is_of
 from l2m_gtsam.recording.sync import stuck_sensors
-from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration, Uncertainty
+from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.validation import DriveValidation, NotValidated, ValidatedSensor
-from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
-from l2m_gtsam.validation.innovation import KnownCalibration, knows_its_errors, width
-from l2m_gtsam.validation.places import PlaceOrVehicle, place_or_vehicle
+from l2m_gtsam.validation.innovation import KnownCalibration, width
+from l2m_gtsam.validation.notes import doubts_and_notes
+from l2m_gtsam.validation.places import PlaceOrVehicle, place_or_vehicle, together
 from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
 
 REJECTED = 0.02  # share of a sensor's readings, from which something has changed
-
-SAME_MAP = (
-    "This is the map that it was calibrated with: errors of the map that the calibration took over "
-    "do not show. A map of another survey would show them."
-)
-NO_TRACES = (
-    "The calibration's file is older than poses in it: only the hash of its drive was compared, "
-    "and a copy of that drive would not be recognised."
-)
-UNJUDGED = "The calibration was not judged: its file holds no verdict."
-FAILED = "The calibration itself was judged FAIL when it was computed: calibration.yaml says why."
-NOT_CORRELATED = (
-    "This kind of map does not know how its errors are correlated; they count as each reading's "
-    "own, and chance may be reported as a change."
-)
-LOWER_BOUNDS = (
-    "The calibration's sigmas are lower bounds (`uncertainty: independent`): small changes may be "
-    "named that are none."
-)
 
 
 @one_blas_thread()
@@ -220,33 +199,6 @@ def _judged(
     )
 
 
-def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
-    """Return readings of single sensors as those of all."""
-    counts = [len(each) for each in parts]
-
-    def joined(values: Sequence[FloatArray | None]) -> FloatArray | None:
-        known = [each for each in values if each is not None]
-        return np.concatenate(known) if len(known) == len(parts) else None
-
-    moving = [each.motion for each in parts]
-    motion = None
-    if all(each is not None for each in moving):
-        motion = LidarMotion(
-            np.concatenate([each.twist_lidar for each in moving if each is not None]),
-            np.concatenate([each.offset for each in moving if each is not None]),
-        )
-    return Readings(
-        sensors=names,
-        sensor=np.repeat(np.arange(len(parts)), counts),
-        stamp_ns=np.concatenate([each.stamp_ns for each in parts]),
-        R_map_lidar=np.concatenate([each.R_map_lidar for each in parts]),
-        p_map_lidar=np.concatenate([each.p_map_lidar for each in parts]),
-        field=np.concatenate([each.field for each in parts]),
-        motion=motion,
-        pose_root=joined([each.pose_root for each in parts]),
-    )
-
-
 def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:
     """Return one sensor tested on the drive, or why it cannot be."""
     drive, options = drive_of(test.readings, test.recording, sensor), test.options
@@ -387,25 +339,3 @@ def is_own_drive(recording: Recording, calibration: CalibrationResult) -> bool:
     return any(same_content(drive, recording.source) for drive in calibration.drives) or any(
         is_of(trace, poses.stamp_ns, poses.p) for trace in calibration.traces
     )
-
-
-def doubts_and_notes(
-    field_map: QueryableMap, calibration: CalibrationResult, map_source: SourceFile | None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what speaks against the outcome, and what is worth knowing."""
-    of_map = field_map.summary.doubts if isinstance(field_map, Summarised) else ()
-    doubts, notes = [f"Of the map: {each}." for each in of_map], list[str]()
-    if same_content(calibration.map, map_source):
-        notes.append(SAME_MAP)
-    if not calibration.traces:
-        notes.append(NO_TRACES)
-    judged = calibration.judgement
-    if judged is None:
-        notes.append(UNJUDGED)
-    elif judged.level is Level.FAIL:
-        doubts.append(FAILED)
-    if not knows_its_errors(field_map):
-        notes.append(NOT_CORRELATED)
-    if calibration.uncertainty is Uncertainty.INDEPENDENT:
-        notes.append(LOWER_BOUNDS)
-    return tuple(doubts), tuple(notes)

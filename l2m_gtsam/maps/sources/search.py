@@ -131,7 +131,7 @@ def find_sources(
         Where to begin: sources that were found before, if any.
     """
     found = refined(rows, known.shapes) if known else nothing_found(rows)
-    grid = Grid.over(rows, suspected, options)
+    grid = SourcePlaces.over(rows, suspected, options)
     trials = 2 * float(np.log(max(len(grid), 1)))  # Bonferroni, on the scale of the gain
     while len(found) < options.most and len(grid):
         starts = grid.starts(rows, rows.residual - found.field(rows.points))
@@ -154,8 +154,8 @@ class Starts:
 
 
 @dataclass(frozen=True)
-class Grid:
-    """Candidates for sources.
+class SourcePlaces:
+    """Places where a source may be, with what the readings know of a moment there.
 
     Attributes
     ----------
@@ -174,7 +174,7 @@ class Grid:
     @classmethod
     def over(
         cls, rows: MarginalRows, suspected: FloatArray, options: SourceSearchOptions
-    ) -> "Grid":
+    ) -> "SourcePlaces":
         """Return the candidates within reach of suspected places."""
         positions = candidates(rows.points, suspected, options)
         information = np.empty((len(positions), 3, 3))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from l2m_gtsam.records.places import Cause, ChangedSource, Explanation
+from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 
 CAUSES = {
     Cause.PLACE: "the place changed",
@@ -37,6 +37,6 @@ def cause_sentence(source: ChangedSource) -> str:
     return f"It cannot be told whether {CAUSES[best.cause]} or {CAUSES[others[0].cause]}."
 
 
-def best_of(explanations: tuple[Explanation, ...]) -> str:
+def best_of(explanations: tuple[CauseGain, ...]) -> str:
     """Return the causes with what they explain, the best first, as a phrase."""
     return ", ".join(f"{CAUSES[each.cause]} ({each.gain:.0f})" for each in explanations)
