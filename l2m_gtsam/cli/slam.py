@@ -43,7 +43,7 @@ def slam(
     strict: StrictOption = False,
     wide: WideOption = False,
 ) -> None:
-    """Find where a drive went: in a magnetic map, or in the field that it meets on its way."""
+    """Find where a drive went: in a magnetic map, or in the unknown field along its path."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.slam import SlamInput, slam_bag
         from l2m_gtsam.cli.tables.slam import (

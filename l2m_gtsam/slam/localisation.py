@@ -17,16 +17,9 @@ from l2m_gtsam.recording.sync import SyncOptions, synchronise, with_offsets
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.slam.drive import (
-    Drive,
-    KnownSensors,
-    StartPose,
-    key_pose_links,
-    key_pose_readings,
-    link_stamps,
-    odometry_jumps,
-    thinned_readings,
-)
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, odometry_jumps
+from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
+from l2m_gtsam.slam.links import key_pose_links, link_stamps
 from l2m_gtsam.slam.misfit import decoy_maps, needs_misfit_test
 from l2m_gtsam.slam.odometry import key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StartPoseOptions, StepAxes
@@ -136,8 +129,8 @@ def decoy_notes(made: int, solved: int) -> tuple[str, ...]:
         return ()
     note = (
         f"the map was compared with {solved} of {made} copies of it that are turned by 180 "
-        "degrees: in the others the drive has no solution, so that less than usual tells the right "
-        "map from another place"
+        "degrees: in the others the drive has no solution, so that the test against another "
+        "place is weaker than usual"
     )
     return (note,)
 

@@ -83,8 +83,8 @@ class WholeFieldOptions(Options):
     explain it."""
     distortion: float = Field(default=0.3, gt=0)
     """And of the entries of C: soft iron beside a sensor that was calibrated elsewhere, or not at
-    all, comes to that. A drive that turns tells most of them, so that a larger value costs
-    little."""
+    all, comes to that. A drive that turns determines most of them, so that a larger value
+    costs little."""
 
 
 class CalibrationUse(StrEnum):
@@ -163,7 +163,7 @@ class DriftOptions(Options):
         if self.scale and self.axes is StepAxes.FIXED:
             raise ValueError("`scale` and `axes: fixed`: a scale is that of wheels, give one")
         if self.scale and self.steady:
-            raise ValueError("`scale` and `steady`: one drive tells them hardly apart, give one")
+            raise ValueError("`scale` and `steady`: one drive hardly separates them, give one")
         return self
 
 

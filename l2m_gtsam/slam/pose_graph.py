@@ -24,7 +24,8 @@ from l2m_factors import (
     scaled_step_factor,
 )
 from l2m_gtsam.data import BoolArray, FloatArray
-from l2m_gtsam.slam.drive import MAP, Drive, KnownSensors, Links, StartPose, as_pose
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.links import MAP, Links
 from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.solve.linear_algebra import information_root
@@ -45,9 +46,9 @@ def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.No
     """Return odometry's factor from a key pose to the next, its length corrected for an error."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     if drive.steps.fixed_axes is not None:
-        way = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
+        shift = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
         turn = gtsam.Rot3(drive.steps.R[number])
-        return fixed_axes_step_factor(number, turn, (1 + scale_error) * way, noise)
+        return fixed_axes_step_factor(number, turn, (1 + scale_error) * shift, noise)
     return gtsam.BetweenFactorPose3(
         X(number), X(number + 1), drive.step(number, scale_error), noise
     )
@@ -64,9 +65,9 @@ def drifting_factor(drive: Drive, number: int, weights: FloatArray) -> gtsam.Non
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     if drive.steps.fixed_axes is None:
         return drifting_step_factor(number, drive.step(number), weights, noise)
-    way = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
+    shift = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
     turn = gtsam.Rot3(drive.steps.R[number])
-    return drifting_fixed_axes_factor(number, turn, way, weights, noise)
+    return drifting_fixed_axes_factor(number, turn, shift, weights, noise)
 
 
 def link_pose(links: Links, number: int) -> gtsam.Pose3:

@@ -77,7 +77,7 @@ def test_signals(tmp_path: Path, number: signal.Signals) -> None:
     )
     late = monotonic() + 60
     while not ready.exists() and monotonic() < late:
-        sleep(0.02)
+        sleep(0.02)  # between looks: the process shows by a file that it writes
     os.kill(run.pid, number)
     _, err = run.communicate(timeout=60)
     assert run.returncode == endings.SIGNAL + number

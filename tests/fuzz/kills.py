@@ -66,7 +66,7 @@ def _await(number: int, is_time: Callable[[], bool], most_s: float) -> None:
     while monotonic() < late and not is_time():
         if os.waitid(os.P_PID, number, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
             return
-        sleep(LOOK_AGAIN_S)
+        sleep(LOOK_AGAIN_S)  # between looks: what a process has written is seen in files alone
 
 
 def kill_all(

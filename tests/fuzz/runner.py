@@ -129,7 +129,7 @@ def _awaited(number: int) -> tuple[int, resource.struct_rusage, bool]:
         if monotonic() - begun > MOST_WALL_S and not late:
             late = True
             os.kill(number, signal.SIGKILL)
-        sleep(LOOK_AGAIN_S)
+        sleep(LOOK_AGAIN_S)  # `wait4` has no time limit of its own
 
 
 def _judged(status: int, said: str, late: bool, peak: int) -> str:

@@ -49,7 +49,7 @@ def kill_at_half(command: list[str], out: Path) -> set[Path]:
     while len(done(out)) < VEHICLES * DRIVES // 2:
         assert time.monotonic() < deadline
         assert started.poll() is None
-        time.sleep(0.2)  # until it is looked at again
+        time.sleep(0.2)  # between looks at the folder: the run shows its progress by files alone
     os.killpg(started.pid, signal.SIGKILL)
     started.wait()
     return done(out)

@@ -11,7 +11,7 @@ def slow(arguments):
     with atomic_path(ready.with_name("result")) as temporary:
         temporary.write_text("half")
         ready.touch()
-        time.sleep(60)
+        time.sleep(60)  # until the signal of the test arrives
 
 app.app = slow
 app.main()

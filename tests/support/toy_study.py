@@ -61,7 +61,7 @@ class ToyStudy(Study[ToyOptions, ToyCell, ToySummary]):
             begun = Path(options.log).read_text().count(f"{key}\n")
             if key == options.deadly and begun == 1:
                 os._exit(1)
-        time.sleep(options.seconds)
+        time.sleep(options.seconds)  # long enough for a test to kill the run between cells
         return ToyCell(shared + float(np.random.default_rng([options.seed, int(key[5:])]).normal()))
 
     def summarise(self, options: ToyOptions, cells: Mapping[str, ToyCell]) -> ToySummary:

@@ -6,7 +6,8 @@ import numpy as np
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.slam.drive import Drive, KnownSensors, evenly_spread
+from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.key_pose_readings import evenly_spread
 
 AXES = 3
 

@@ -133,8 +133,8 @@ def _moved(
         F[3:, :3] -= step.rotation().matrix().T @ skew(drift[None])[0]
     else:
         turn = step.rotation()
-        way = pose.translation() + steps.fixed_axes[number] - W @ steady
-        after = gtsam.Pose3(pose.rotation().compose(turn), way)
+        place = pose.translation() + steps.fixed_axes[number] - W @ steady
+        after = gtsam.Pose3(pose.rotation().compose(turn), place)
         F[:3, :3] = F[3:, 3:] = turn.matrix().T
     by_drift[3:] = -after.rotation().matrix().T @ W
     return after, F, by_drift

@@ -94,11 +94,11 @@ def learnt_spectrum(
     first
         Where to begin.
     """
-    evidence = Evidence(readings, distortion, offset_ut)
+    likelihood = SpectrumLikelihood(readings, distortion, offset_ut)
     start = FIRST if first is None else first.at
 
     def cost(at: FloatArray) -> float:
-        return -evidence.log_likelihood(at)
+        return -likelihood.log_likelihood(at)
 
     end = minimize(
         cost,
@@ -113,11 +113,11 @@ def learnt_spectrum(
         },
     )
     return FieldSpectrum(
-        evidence.prior(end.x), evidence.noise(end.x), -float(end.fun), np.asarray(end.x)
+        likelihood.prior(end.x), likelihood.noise(end.x), -float(end.fun), np.asarray(end.x)
     )
 
 
-class Evidence:
+class SpectrumLikelihood:
     """The marginal likelihood of readings; parameters as of ``learnt_spectrum``."""
 
     def __init__(self, readings: LearntReadings, distortion: float, offset_ut: float) -> None:

@@ -1,7 +1,7 @@
 """How an odometry is made of true poses, as the publication on the model ship does.
 
-Each step gets white noise and the same small drift, each turn white noise. Two ways to put the
-steps together: along the axes of the world, so that headings drift beside positions that know
+Each step gets white noise and the same small drift, each turn white noise. Steps are put together
+in one of two forms: along the axes of the world, so that headings drift beside positions that know
 nothing of it, or as the vehicle sees them, so that a wrong heading turns all later steps.
 """
 

@@ -90,7 +90,7 @@ def test_where_no_place_is_come_to_again_it_is_said() -> None:
 def test_a_calibration_is_refined_without_a_map() -> None:
     """Places on the vehicle known to 5 cm: those of sensors to each other come out; all is covered.
 
-    Where the whole array sits is told by turns alone, and hardly: the map shifts with it.
+    Where the whole array sits follows from turns alone, and hardly: the map shifts with it.
     """
     sensors, drive = drive_in(3, laps(60))
     sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])

@@ -94,7 +94,7 @@ def test_a_scale_that_is_no_variable_is_missed() -> None:
 
 
 def test_odometry_alone_is_as_unsure_as_its_scale_makes_it() -> None:
-    """Over drives of one kind: squared errors of the last pose beside what is told, six each.
+    """Over drives of one kind: squared errors of the last pose beside what is reported, six each.
 
     Chi-square of 8 x 6 passes its band in 1 of 1,000.
     """

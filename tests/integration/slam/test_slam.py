@@ -43,7 +43,7 @@ def test_a_known_map_takes_the_drift_out() -> None:
     assert before > 0.1
     assert after < 0.05
     assert after < 0.5 * before
-    # The drift that is told is that from the localised poses: as true as these are.
+    # The reported drift is that from the localised poses: as true as these are.
     end = float(np.linalg.norm(result.odometry.p[-1] - drive.truth.p[-1]))
     assert result.drift.end_m == pytest.approx(end, abs=0.1)
     assert result.calibration is None
@@ -100,7 +100,7 @@ def test_another_building_is_not_here() -> None:
 def test_a_decoy_without_a_solution_is_no_evidence_for_the_map(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A test that could not be made is told; a wrong map would pass it unseen."""
+    """A test that could not be made is reported; a wrong map would pass it unseen."""
 
     def failing(drive: Drive, field_map: QueryableMap, *rest: Any) -> DriveSolution:
         if isinstance(field_map, DecoyMap):

@@ -162,8 +162,8 @@ def test_a_sensor_that_lies_is_rejected(drive: SlamDrive, sensors: tuple[KnownSe
     series = drive.recording.series[0]
     wander = np.zeros_like(series.field)
     wander[HALF:] = np.linspace(0, 15, len(wander) - HALF)[:, None]
-    told = replaced(drive, {0: replace(series, field=series.field + wander)})
-    result = found(told, calibrated(sensors)).result
+    wandering = replaced(drive, {0: replace(series, field=series.field + wander)})
+    result = found(wandering, calibrated(sensors)).result
     assert error(drive, result) < 0.06
     first, second = (each.rejected / each.readings for each in result.sensors)
     assert 0.3 < first < 0.5
@@ -252,7 +252,7 @@ def three() -> tuple[KnownSensor, ...]:
     return random_sensors(21, 3)
 
 
-def test_a_door_that_opens_is_told_and_does_not_pull(three: tuple[KnownSensor, ...]) -> None:
+def test_a_door_that_opens_is_reported_and_does_not_pull(three: tuple[KnownSensor, ...]) -> None:
     """60 A m^2 appear 0.8 m beside the way at half time: felt over four metres of the last lap."""
     truth, known = rounds(40), calibrated(three)
     beside = truth.p[600] + truth.R[600] @ np.array([0.0, 0.8, -0.2])
@@ -272,8 +272,8 @@ def test_a_door_that_opens_is_told_and_does_not_pull(three: tuple[KnownSensor, .
     assert np.quantile(away, 0.9) < 4.0
     late = solution.drive.stamp_ns[solution.drive.readings.key_pose[lost]]
     assert np.mean(late - truth.stamp_ns[0] > 20e9) > 0.95
-    told = localisation_record(done.result, solution, RecordContext(known, WORLD, {}, 0.5))
-    texts = [each.text for each in judge_localisation(told, QaOptions()).reasons]
+    written = localisation_record(done.result, solution, RecordContext(known, WORLD, {}, 0.5))
+    texts = [each.text for each in judge_localisation(written, QaOptions()).reasons]
     assert any("the place has changed since it was mapped" in each for each in texts)
 
 
@@ -295,9 +295,9 @@ def later(recording: Recording, sensor: int, seconds: float) -> Recording:
 def test_a_sensor_whose_clock_is_set_is_rejected_from_then_on(
     drive: SlamDrive, sensors: tuple[KnownSensor, ...], seconds: float
 ) -> None:
-    """18 cm of way: most of its readings fit no more, the other sensor holds the poses."""
-    told = replace(drive, recording=later(drive.recording, 0, seconds))
-    result = found(told, calibrated(sensors)).result
+    """18 cm of path: most of its readings fit no more, the other sensor holds the poses."""
+    shifted = replace(drive, recording=later(drive.recording, 0, seconds))
+    result = found(shifted, calibrated(sensors)).result
     assert result.status is LocalisationStatus.LOCALISED
     assert error(drive, result) < 0.06
     first, second = (each.rejected / each.readings for each in result.sensors)

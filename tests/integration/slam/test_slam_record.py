@@ -53,10 +53,10 @@ def test_odometry_is_as_sure_as_its_graph() -> None:
         )
         np.testing.assert_allclose(pose.rotation().matrix(), R[k], atol=1e-12)
     sigma = np.sqrt(np.diagonal(to_ros(found, R), axis1=1, axis2=2))
-    told = localised_trajectory(record()).odometry_sigma
+    drawn = localised_trajectory(record()).odometry_sigma
     # Nine digits are kept.
-    np.testing.assert_allclose(told[:, :3], sigma[:, :3], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(told[:, 3:], np.rad2deg(sigma[:, 3:]), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(drawn[:, :3], sigma[:, :3], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(drawn[:, 3:], np.rad2deg(sigma[:, 3:]), rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("index", [0, 1])
@@ -99,12 +99,12 @@ def test_errors_against_the_truth() -> None:
     truth, result, drive = record().truth, localised().result, driven()[0]
     assert truth is not None
     assert truth.poses == len(result.trajectory)
-    for told, found in ((truth.odometry, result.odometry), (truth.localised, result.trajectory)):
-        assert told.rms_m == pytest.approx(position_error(drive.truth, found), rel=1e-9)
+    for stated, found in ((truth.odometry, result.odometry), (truth.localised, result.trajectory)):
+        assert stated.rms_m == pytest.approx(position_error(drive.truth, found), rel=1e-9)
     assert truth.nees == pytest.approx(pose_nees(drive.truth, result.trajectory).mean(), rel=1e-6)
 
 
-def test_a_refined_calibration_is_told_with_both_sigmas() -> None:
+def test_a_refined_calibration_has_both_sigmas() -> None:
     result, known = localised().result, driven()[1]
     assert result.calibration is not None
     for each in record().refined:
@@ -118,12 +118,12 @@ def test_a_refined_calibration_is_told_with_both_sigmas() -> None:
 
 
 def test_the_file_comes_back(tmp_path: Path) -> None:
-    path, told = tmp_path / "slam.json", record()
-    nothing = replace(told.sensors[0].use, rms=float("nan"), chi2_per_dof=float("nan"))
-    dead = replace(told.sensors[0], use=nothing, fit=None, normalised=None, series=None)
-    poses = (replace(told.poses[0], covariance=None), *told.poses[1:])
-    less = replace(told, sensors=(dead,), truth=None, refined=(), poses=poses)
-    for each in (told, less, replace(told, scale=OdometryScale(-0.011, 0.002))):
+    path, whole = tmp_path / "slam.json", record()
+    nothing = replace(whole.sensors[0].use, rms=float("nan"), chi2_per_dof=float("nan"))
+    dead = replace(whole.sensors[0], use=nothing, fit=None, normalised=None, series=None)
+    poses = (replace(whole.poses[0], covariance=None), *whole.poses[1:])
+    less = replace(whole, sensors=(dead,), truth=None, refined=(), poses=poses)
+    for each in (whole, less, replace(whole, scale=OdometryScale(-0.011, 0.002))):
         write_slam(path, each)
         back = read_slam(path)
         write_slam(tmp_path / "again.json", back)
@@ -135,15 +135,15 @@ def test_the_file_comes_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "told"),
+    ("text", "message"),
     [
         ("{", "not a localisation file of this program"),
         ('{"format": "l2m-slam", "version": 1}', "version"),
         ('{"format": "l2m-metrics", "version": 2}', "format"),
     ],
 )
-def test_other_files_are_told(tmp_path: Path, text: str, told: str) -> None:
+def test_other_files_are_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "slam.json"
     path.write_text(text)
-    with pytest.raises(CalibrationError, match=told):
+    with pytest.raises(CalibrationError, match=message):
         read_slam(path)

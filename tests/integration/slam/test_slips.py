@@ -47,7 +47,7 @@ def test_slips_are_found_and_pivots_are_motion() -> None:
     assert slipped(prepared_drive) == [int(odometry.stamp_ns[row + 1]) for row in ROWS[1::2]]
 
 
-def test_a_pivot_is_told_as_none_and_does_no_harm() -> None:
+def test_a_pivot_is_not_reported_and_does_no_harm() -> None:
     truth = jumped(rounds(30), shift(250, 0.0, 15), shift(400, 0.15, -15))
     drive = slam_drive(WORLD, SENSORS, truth, np.random.default_rng(3))
     assert len(without_jumps(drive.recording.trajectory, JumpOptions()).jumps) == 2
@@ -57,11 +57,14 @@ def test_a_pivot_is_told_as_none_and_does_no_harm() -> None:
     assert pose_nees(drive.truth, result.trajectory).mean() < 12
 
 
+# Slips of pass 2 are found and 87 % of the drift goes, but sigmas are 4 % too small: NEES 13.1. In
+# a map noise counts as white; this robot's lasts a second or two, and its recorded poses are off
+# by a degree for as long. Not mended.
+SMALL_SIGMAS = pytest.mark.xfail(reason="NEES 13.1, up to 12 wanted: noise that lasts", strict=True)
+
+
 @pytest.mark.study
-@pytest.mark.parametrize(
-    "held_out",
-    [1, pytest.param(2, marks=pytest.mark.xfail(reason="NEES is 12.7, 12 are wanted")), 3, 4],
-)
+@pytest.mark.parametrize("held_out", [1, pytest.param(2, marks=SMALL_SIGMAS), 3, 4])
 def test_slips_of_a_real_robot(shared_data: Path, held_out: int) -> None:
     """Ten slips of 10 cm and 5 degrees in a pass, in the map of the others; its pivots are real."""
     others = [robot_pass(shared_data, run) for run in (1, 2, 3, 4) if run != held_out]

@@ -94,7 +94,7 @@ def test_a_step_into_a_hall_is_too_little() -> None:
     assert "longer drive" in found.message
 
 
-def test_two_rooms_alike_are_both_told() -> None:
+def test_two_rooms_alike_are_both_reported() -> None:
     """The second room is the first once more, 30 m away."""
     room = strange_hall(3)
     apart = np.array([30.0, 0.0, 0.0])

@@ -89,7 +89,7 @@ def test_a_killed_study_goes_on(tmp_path: Path, expected: ToySummary) -> None:
     while not list(cells.glob("cell-*.json")):
         assert time.monotonic() < deadline
         assert started.poll() is None
-        time.sleep(0.05)
+        time.sleep(0.05)  # between looks: a run shows finished cells by files alone
     os.killpg(started.pid, signal.SIGKILL)
     started.wait()
     before = {path.stem for path in cells.glob("cell-*.json")}
@@ -114,7 +114,7 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
     deadline = time.monotonic() + 60
     while not file.exists() or not file.read_text():
         assert time.monotonic() < deadline
-        time.sleep(0.05)
+        time.sleep(0.05)  # between looks: the scheduler writes its address to a file
     yield json.loads(file.read_text())["address"]
     for process in reversed(started):
         process.terminate()

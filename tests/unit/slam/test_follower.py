@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import D, T, X
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FieldSample, FloatArray, Trajectory
-from l2m_gtsam.slam.drive import MAP, Drive, Links
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.links import MAP, Links
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.measurements import CELL_M, CachedVariance

@@ -7,7 +7,11 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
-from l2m_gtsam.slam.unknown_field.spectrum import Evidence, LearntReadings, learnt_spectrum
+from l2m_gtsam.slam.unknown_field.spectrum import (
+    LearntReadings,
+    SpectrumLikelihood,
+    learnt_spectrum,
+)
 
 STRENGTH, LENGTH = 8.0, 1.0
 COUNT, PERIOD = 250, 0.4
@@ -61,7 +65,9 @@ def test_scaling_all_readings_down_is_no_gain() -> None:
     level = np.einsum("nij,nj->ni", readings.R, readings.field)
     unit = (level - level.mean(axis=0)).std()  # of the strengths below
     at = np.log([STRENGTH / unit, LENGTH, true.ut / unit, 1.0, true.slow_s])
-    tight, wide = (Evidence(readings, each, 1.0).log_likelihood(at) for each in (0.03, 3.0))
+    tight, wide = (
+        SpectrumLikelihood(readings, each, 1.0).log_likelihood(at) for each in (0.03, 3.0)
+    )
     assert wide < tight
 
 

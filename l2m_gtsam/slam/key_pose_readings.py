@@ -1,0 +1,87 @@
+"""Readings of a drive relative to its key poses."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_factors import KeyPoseReadings
+from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory
+
+ARM_M = 1.0  # lever arm that converts a rotation into a distance
+CREEP_M_S = 1e-6  # makes the progress of a parked vehicle increase with time
+
+
+def thinned_readings(
+    readings: Readings, trajectory: Trajectory, rows: IntArray, most: int
+) -> Readings:
+    """Return readings in order of key poses and sensors, at most so many of each on each.
+
+    Parameters
+    ----------
+    readings
+        N readings with poses of odometry.
+    trajectory
+        Odometry, M poses.
+    rows
+        Rows of the key poses in it, shape (K,).
+    most
+        Limit of readings per sensor and key pose, spread over its time.
+    """
+    key = _key_poses(readings, trajectory, rows)
+    return readings[evenly_spread(np.column_stack([key, readings.sensor]), most)]
+
+
+def key_pose_readings(
+    readings: Readings, trajectory: Trajectory, rows: IntArray
+) -> KeyPoseReadings:
+    """Express readings relative to the key pose before each.
+
+    A reading at the time of a key pose belongs to the one before it, as the end of that step.
+
+    Parameters
+    ----------
+    readings, trajectory, rows
+        As of ``thinned_readings``.
+    """
+    key = _key_poses(readings, trajectory, rows)
+    R_back, p = trajectory.R[rows[key]].transpose(0, 2, 1), trajectory.p[rows[key]]
+    return KeyPoseReadings(
+        key_pose=key,
+        sensor=readings.sensor,
+        R_key_lidar=R_back @ readings.R_map_lidar,
+        p_key_lidar=np.einsum("nij,nj->ni", R_back, readings.p_map_lidar - p),
+        fraction=_fractions(trajectory, rows[key], rows[key + 1], readings.stamp_ns),
+        field=readings.field,
+    )
+
+
+def _key_poses(readings: Readings, trajectory: Trajectory, rows: IntArray) -> IntArray:
+    """Return the number of the key pose before each reading, shape (N,)."""
+    key = np.searchsorted(trajectory.stamp_ns[rows], readings.stamp_ns) - 1
+    return np.asarray(np.clip(key, 0, len(rows) - 2))
+
+
+def _fractions(
+    trajectory: Trajectory, first: IntArray, last: IntArray, stamp_ns: IntArray
+) -> FloatArray:
+    """Return the fraction of the motion from a first pose to a last that is done, shape (N,)."""
+    turn = Rotation.from_matrix(trajectory.R[:-1].transpose(0, 2, 1) @ trajectory.R[1:]).magnitude()
+    seconds = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
+    distance = np.linalg.norm(np.diff(trajectory.p, axis=0), axis=1)
+    done = np.append(0.0, np.cumsum(distance + ARM_M * turn + CREEP_M_S * np.diff(seconds)))
+    at = np.interp(1e-9 * (stamp_ns - trajectory.stamp_ns[0]), seconds, done)
+    return np.asarray(np.clip((at - done[first]) / (done[last] - done[first]), 0.0, 1.0))
+
+
+def evenly_spread(groups: IntArray, most: int) -> IntArray:
+    """Return at most so many rows of each group, spread over it, ordered by group.
+
+    ``groups`` has a row of labels for each, shape (N, L); members of a group come in order.
+    """
+    order = np.lexsort(groups.T[::-1])
+    ends = np.flatnonzero(np.diff(groups[order], axis=0).any(axis=1)) + 1
+    return np.concatenate([_evenly(part, most) for part in np.split(order, ends)])
+
+
+def _evenly(rows: IntArray, most: int) -> IntArray:
+    chosen = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
+    return np.asarray(rows[chosen])
