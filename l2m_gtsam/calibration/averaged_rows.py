@@ -12,19 +12,21 @@ from scipy.sparse import block_diag as sparse_block_diag
 from scipy.sparse import coo_array, csr_array
 
 from l2m_gtsam.calibration.budget.found import Budget
-from l2m_gtsam.calibration.budget.processes import Scene, processes
+from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.pose_errors import pose_features
+from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
 from l2m_gtsam.geometry import isotropic_covariance
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.options import Options
+from l2m_gtsam.solve.linear_algebra import lower_information_root, right_divided
 from l2m_gtsam.solve.robust import MEDIAN
 
-SENSOR = 16  # t, C row by row, H, time offset
-# What is known of them here: next to nothing, beside what the readings of a drive determine.
+# What is known of a sensor's t, C row by row, H and time offset here: next to nothing, beside what
+# the readings of a drive determine.
 WIDE = np.array([1.0] * 3 + [1.0] * 9 + [100.0] * 3 + [1.0])
 LEVER_M = 0.3  # that a rotation counts with along the path
 FEWEST = 3  # readings of an average whose scatter is their noise
@@ -238,8 +240,8 @@ def slot_whitening(
     """
     readings, estimate = drive.view.readings, drive.estimate
     R, N = readings.R_map_lidar, len(readings)
-    inverse = np.linalg.inv(estimate.C())[readings.sensor]  # of S matrices of three rows
-    spread = drive.averages.noise[readings.sensor][:, None, None] * (R @ inverse)
+    spread = right_divided(R, estimate.C()[readings.sensor])
+    spread = drive.averages.noise[readings.sensor][:, None, None] * spread
     own = spread @ spread.transpose(0, 2, 1) + rest[:, :, None] * np.eye(3)
     by_pose = pose_shares(readings, field_map, estimate, options)
     order = np.argsort(drive.averages.slot, kind="stable")
@@ -250,8 +252,7 @@ def slot_whitening(
         covariance = (F @ F.T).reshape(len(rows), 3, len(rows), 3)
         each = np.arange(len(rows))
         covariance[each, :, each] += own[rows]
-        lower = np.linalg.cholesky(covariance.reshape(3 * len(rows), -1))
-        roots.append(np.linalg.solve(lower, np.eye(len(lower))))
+        roots.append(lower_information_root(covariance.reshape(3 * len(rows), -1)))
     sorted_ = csr_array(sparse_block_diag(roots, format="csr"))
     back = np.empty(N, dtype=np.int64)
     back[order] = np.arange(N)
@@ -329,21 +330,15 @@ def process_shares(
 
     In the map frame in uT, shapes (n,) and (n, 3, m).
     """
-    scene = Scene.of(readings, field_map, estimate)
-    here = {
-        (each.kind, each.sensor): each
-        for each in processes(scene, np.unique(readings.sensor).tolist())
-    }
+    places = ReadingPlaces.of(readings, field_map, estimate)
     shares = []
     for found in budget.found:
-        process = here[found.process.kind, found.process.sensor]
+        process = found.process.on(places)
         rows = np.arange(len(readings))
         if process.sensor is not None:
             rows = rows[readings.rows_of(process.sensor)]
         features = readings.R_map_lidar[rows] @ process.features(rows)
-        count = min(features.shape[2], len(found.variances))
-        root = np.sqrt(found.variances[:count])
-        shares.append((rows, features[:, :, :count] * root))
+        shares.append((rows, features * np.sqrt(found.variances)))
     return shares
 
 
@@ -359,8 +354,7 @@ def sensor_shares(
     batch = batch_readings(own, field_map)
     found = batch.residuals(estimate.values([sensor]), sensor)
     J = np.concatenate(batch.jacobians(found), axis=2)
-    of_map = own.R_map_lidar @ np.linalg.inv(estimate.C()[sensor])  # three rows
-    return np.asarray(of_map @ J)
+    return np.asarray(right_divided(own.R_map_lidar, estimate.C()[sensor]) @ J)
 
 
 class _Sparse:

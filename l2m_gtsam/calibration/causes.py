@@ -15,6 +15,7 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import FoundSources, price
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
+from l2m_gtsam.solve.linear_algebra import right_divided
 
 FELT_UT = 0.2  # weaker a source is not felt
 FELT_SHARE = 0.2  # of its strongest field: where a passage begins and ends
@@ -132,8 +133,7 @@ def offset_gain(rows: MarginalRows, drive: AveragedDrive) -> float:
 def sensor_offsets(drive: AveragedDrive) -> FloatArray:
     """Return what offsets of all S sensors do to readings, map frame, no unit, (N, 3, 3 S)."""
     readings, estimate = drive.view.readings, drive.estimate
-    inverse = np.linalg.inv(estimate.C())[readings.sensor]  # of S matrices of three rows
-    own = readings.R_map_lidar @ inverse
+    own = right_divided(readings.R_map_lidar, estimate.C()[readings.sensor])
     offsets = np.zeros((len(readings), 3, len(readings.sensors), 3))
     offsets[np.arange(len(readings)), :, readings.sensor] = own
     present = np.unique(readings.sensor)

@@ -4,14 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dtrtri
 
 from l2m_factors import M, P, SharedError, U
 from l2m_gtsam.calibration.coverage import Coverage, Group
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.pose_errors import PoseKnots, error_of_poses
-from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.calibration.view import QueryableMap, View, places_of
 from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.solve.linear_algebra import lower_information_root
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 
 
@@ -124,7 +124,7 @@ def group_noise(
         blocks = covariance.reshape(len(each), 3, len(each), 3)  # a view
         left[group.rows] = blocks[each, :, each]
         blocks[each, :, each] += own[group.rows]
-        whitenings.append(_inverse_root(covariance))
+        whitenings.append(lower_information_root(covariance))
     pairs = zip(shared, coverage.groups, strict=True)
     return GroupNoise(
         errors=tuple((*each, *pose.errors(group)) for each, group in pairs),
@@ -145,8 +145,7 @@ def suite_share(
     if not len(coverage.spread):
         return lambda _: ()
     R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
-    x = np.einsum("nij,nj->ni", readings.R_map_lidar, estimate.t[readings.sensor])
-    _, gradient = field_map.field_and_gradient(x + readings.p_map_lidar)
+    _, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
 
     def share(group: Group) -> tuple[SharedError, ...]:
         moved = group.common - gradient[group.rows] @ coverage.shift
@@ -166,13 +165,6 @@ def pose_share(
     knots, seconds = coverage.knots, coverage.seconds
     weights, at_knots = knots.weights(seconds), knots.at_knots(seconds)
     return PoseShare(knots, seconds, F, C @ F, weights, at_knots)
-
-
-def _inverse_root(covariance: FloatArray) -> FloatArray:
-    """Return the lower triangular W with ``W S W^T = I``."""
-    # S = K K^T, hence W = K^-1: rows that stay in order of time, each less what those before say.
-    inverse, _ = dtrtri(np.linalg.cholesky(covariance), lower=1)
-    return np.ascontiguousarray(inverse)
 
 
 def _mean_variance(covariance: FloatArray) -> FloatArray:

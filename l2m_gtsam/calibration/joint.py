@@ -31,7 +31,8 @@ from l2m_gtsam.calibration.priors import Contradiction, contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.records.calibration import EXPLAINED, ResidualFigures, Unmodelled
+from l2m_gtsam.records.calibration import ResidualFigures
+from l2m_gtsam.records.disturbance import EXPLAINED, Unmodelled
 from l2m_gtsam.solve.noise import (
     HALF,
     estimate_noise,

@@ -16,7 +16,7 @@ import numpy as np
 
 from l2m_factors import skew
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 
 SEGMENTS = 60  # of a drive, at most: six weights at each end of one
@@ -121,8 +121,7 @@ def error_of_poses(readings: Readings, field_map: QueryableMap, estimate: Estima
     if readings.pose_root is None:
         return np.zeros((len(readings), 3, 6))
     R, t = readings.R_map_lidar, estimate.t[readings.sensor]
-    x = np.einsum("nij,nj->ni", R, t) + readings.p_map_lidar
-    field, gradient = field_map.field_and_gradient(x)
+    field, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
     R_lidar_map = R.transpose(0, 2, 1)
     b_lidar = np.einsum("nij,nj->ni", R_lidar_map, field)
     return pose_features(readings.pose_root, b_lidar, R_lidar_map @ gradient @ R, t)

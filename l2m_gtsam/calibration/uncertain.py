@@ -34,6 +34,7 @@ from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6
+SEARCHED = 0.6  # of the way, when it is known which processes a drive has
 SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
 
 
@@ -90,15 +91,20 @@ def solve_uncertain(
     """
     progress(0.0)
     drive = UncertainDrive.of(view, field_map, errors, near, options)
-    progress(1 / (MAX_ROUNDS + 1))
-    found = settle_by_any(drive, near, tests, options, progress)
+    found = settle_by_any(drive, near, tests, options, lambda done: progress(SEARCHED * done))
     budget = NOTHING_FOUND
     # What a map leaves that does not know its own errors is no process of the drive.
     if found.ending is not Ending.SINGULAR and sigmas_hold(errors):
         budget = found.problem.searched(found.joint)
     if budget.found:
         with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
-        found = settle_by_any(with_them, found.estimate, tests, options, progress)
+        found = settle_by_any(
+            with_them,
+            found.estimate,
+            tests,
+            options,
+            lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
+        )
     problem, joint = found.problem, found.joint
     solved = problem.solutions(joint, found.values)
     solved = problem.wandering(joint, found.values, problem.robust(joint, solved))

@@ -17,7 +17,7 @@ from l2m_factors import (
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget, spread_of_H
-from l2m_gtsam.calibration.budget.processes import Scene, processes
+from l2m_gtsam.calibration.budget.processes import ReadingPlaces, processes
 from l2m_gtsam.calibration.budget.search import felt, search
 from l2m_gtsam.calibration.cluster_robust import unmodelled
 from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
@@ -178,7 +178,7 @@ class UncertainProblem:
     ) -> None:
         view, field_map, prior = drive.view, drive.field_map, drive.prior
         self._view, self._prior, self._tests = view, prior, tests
-        self._scene = Scene.of(view.readings, field_map, estimate)
+        self._field_map, self._estimate = field_map, estimate
         self._known = estimate.priors.among(view.sensors)
         self._batch = batch_readings(view.readings, field_map)
         self._noise = group_noise(view, field_map, prior.coverage, estimate)
@@ -319,9 +319,10 @@ class UncertainProblem:
 
     def searched(self, joint: JointInformation) -> Budget:
         """Return the processes that are not in the graph, and that its residuals show."""
-        looked_for = processes(self._scene, self._view.sensors)
+        places = ReadingPlaces.of(self._view.readings, self._field_map, self._estimate)
+        looked_for = processes(places, self._view.sensors)
         rows = [joint.after_step(each) for each in joint.rows if len(each.readings)]
-        known = felt(looked_for, joint, rows, self._noise.whitenings, self._scene.C)
+        known = felt(looked_for, joint, rows, self._noise.whitenings, places.C)
         return Budget(search(known))
 
     def robust(

@@ -97,8 +97,8 @@ def map_recordings(
     """
     read = suite_readings(recordings, suite, options.sync)
     field_map = build_map(read.points, read.field, options.model, cloud, read.suite)
-    # Stated errors are counted; sensors that count as exact have to look like it.
-    if not read.suite.stated and isinstance(field_map, HarmonicMap):
+    # Errors that are stated or found are counted; sensors that count as exact have to look like it.
+    if isinstance(field_map, HarmonicMap) and field_map.learnt.suite is None:
         return field_map.doubted(suite_doubts(recordings, suite, options.suite))
     return field_map
 

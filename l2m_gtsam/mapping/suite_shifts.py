@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
+from l2m_gtsam.solve.linear_algebra import right_divided
 
 TIME = 15  # the column of the time offset
 
@@ -43,8 +44,7 @@ def sensor_shift(readings: Readings, rows: slice, sensor: KnownSensor) -> FloatA
         raise ValueError("the readings have no motion, so that no clock can be judged")
     R, twist = readings.R_map_lidar[rows], readings.motion.twist_lidar[rows]
     b_lidar = sensor.distortion.undo(readings.field[rows])
-    # R C^-1 without an inverse: the solution X of X C = R.
-    undone = np.linalg.solve(sensor.distortion.C.T, R.transpose(0, 2, 1)).transpose(0, 2, 1)
+    undone = right_divided(R, sensor.distortion.C)
     shift = np.zeros((len(R), SHIFT, SIZE))
     shift[:, :3, :3] = R
     velocity = np.cross(twist[:, :3], sensor.t_lidar_mag) + twist[:, 3:]

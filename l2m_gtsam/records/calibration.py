@@ -14,7 +14,7 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
-from l2m_gtsam.records.disturbance import Disturbance
+from l2m_gtsam.records.disturbance import EXPLAINED, Disturbance, Unmodelled
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
@@ -211,38 +211,6 @@ class Disagreement:
     size: float
     passed_again: Return
     bag: str = ""
-
-
-@dataclass(frozen=True)
-class Unmodelled:
-    """How many times larger the scatter of a drive's parts is than noise, map and poses explain.
-
-    The covariances that are reported hold it, in the share of them that comes from the readings.
-    One where the scatter is what is expected, or differs from it by no more than chance.
-
-    Attributes
-    ----------
-    t, C, H, offset
-        Mean over the parameters of each, in their own sigmas.
-    """
-
-    t: float = 1.0
-    C: float = 1.0
-    H: float = 1.0
-    offset: float = 1.0
-
-    @property
-    def largest(self) -> float:
-        """The largest of them."""
-        return max(self.t, self.C, self.H, self.offset)
-
-    @property
-    def scale(self) -> FloatArray:
-        """Factor of each sigma, t, C row by row, H, time offset, shape (16,)."""
-        return np.asarray(np.sqrt(np.repeat([self.t, self.C, self.H, self.offset], (3, 9, 3, 1))))
-
-
-EXPLAINED = Unmodelled()
 
 
 @dataclass(frozen=True)

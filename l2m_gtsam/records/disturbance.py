@@ -1,7 +1,11 @@
-"""What disturbed a drive beside noise, as it was found in its readings."""
+"""What disturbed a drive beside noise, as its readings show it."""
 
 from dataclasses import dataclass
 from enum import StrEnum
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
 
 
 class DisturbanceKind(StrEnum):
@@ -39,3 +43,35 @@ class Disturbance:
     sizes: dict[str, float]
     gain: float
     sensor: str | None = None
+
+
+@dataclass(frozen=True)
+class Unmodelled:
+    """How many times larger the scatter of a drive's parts is than noise, map and poses explain.
+
+    The covariances that are reported hold it, in the share of them that comes from the readings.
+    One where the scatter is what is expected, or differs from it by no more than chance.
+
+    Attributes
+    ----------
+    t, C, H, offset
+        Mean over the parameters of each, in their own sigmas.
+    """
+
+    t: float = 1.0
+    C: float = 1.0
+    H: float = 1.0
+    offset: float = 1.0
+
+    @property
+    def largest(self) -> float:
+        """The largest of them."""
+        return max(self.t, self.C, self.H, self.offset)
+
+    @property
+    def scale(self) -> FloatArray:
+        """Factor of each sigma, t, C row by row, H, time offset, shape (16,)."""
+        return np.asarray(np.sqrt(np.repeat([self.t, self.C, self.H, self.offset], (3, 9, 3, 1))))
+
+
+EXPLAINED = Unmodelled()

@@ -2,6 +2,7 @@
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dtrtri
 
 from l2m_gtsam.data import FloatArray
 
@@ -66,6 +67,29 @@ def correlation_factor(covariance: FloatArray, ridge: float) -> FloatArray:
     # Metres beside microtesla: scaled to correlations before factorising.
     correlation = covariance / np.outer(sigma, sigma) + ridge * np.eye(len(sigma))
     return np.asarray(cholesky(correlation, lower=True, check_finite=False))
+
+
+def lower_information_root(covariance: FloatArray) -> FloatArray:
+    """Return the lower triangle W with ``W S W^T = I``, both of shape (n, n).
+
+    Of a covariance that is well scaled and positive definite; row by row, each is what a component
+    says beyond those before it.
+
+    Raises
+    ------
+    LinAlgError
+        The covariance is not positive definite.
+    """
+    # S = K K^T, hence W = K^-1.
+    W, _ = dtrtri(np.linalg.cholesky(covariance), lower=1)
+    return np.ascontiguousarray(W)
+
+
+def right_divided(A: FloatArray, C: FloatArray) -> FloatArray:
+    """Return ``A C^-1``, the solution X of ``X C = A``; shapes (..., m, n) and (..., n, n)."""
+    shape = np.broadcast_shapes(A.shape[:-2], C.shape[:-2])
+    A_T = np.broadcast_to(A.swapaxes(-1, -2), (*shape, *A.shape[:-3:-1]))
+    return np.asarray(np.linalg.solve(C.swapaxes(-1, -2), A_T).swapaxes(-1, -2))
 
 
 def inverse(matrices: FloatArray) -> FloatArray:

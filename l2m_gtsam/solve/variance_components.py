@@ -51,7 +51,7 @@ class VarianceComponents:
 
 
 @dataclass(frozen=True)
-class Posterior:
+class WeightPosterior:
     """Weights under a prior.
 
     Attributes
@@ -96,7 +96,7 @@ class WeightSystem:
         found = self.posterior(variances)
         return WeightSystem(self.information - found.root.T @ found.root, found.rest)
 
-    def posterior(self, variances: FloatArray) -> Posterior:
+    def posterior(self, variances: FloatArray) -> WeightPosterior:
         """Return what the readings make of weights of these prior variances, shape (m,)."""
         at = np.flatnonzero(variances > 0)
         root, I_at = np.sqrt(variances[at]), self.information[at]
@@ -107,7 +107,7 @@ class WeightSystem:
         )
         Z, v = white[:, :-1], white[:, -1]
         likelihood = 0.5 * float(v @ v) - float(np.log(np.diag(lower)).sum())
-        return Posterior(likelihood, self.pull - Z.T @ v, Z)
+        return WeightPosterior(likelihood, self.pull - Z.T @ v, Z)
 
     def scores(self, spectra: FloatArray) -> FloatArray:
         """Return how far K processes of these spectra, (K, m), are from not being there, (K,).

@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.data import FloatArray, RigidTransform, SourceFile
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import (
-    EXPLAINED,
     CalibrationResult,
     SensorCalibration,
     Uncertainty,
 )
+from l2m_gtsam.records.disturbance import EXPLAINED
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
 from l2m_gtsam.storage.result_set import check_set
 from l2m_gtsam.storage.yaml_file import read_checked, write_yaml

@@ -32,7 +32,7 @@ def test_a_suite_is_calibrated_and_maps(shared_data: Path, tmp_path: Path) -> No
     field_map = tmp_path / "map.npz"
     l2m("map", "build", bag, "--suite", out, "--config", config, "--out", field_map)
     # The errors that the suite states went into the file, and come out of it.
-    assert "as sure as stated" in l2m("map", "info", field_map).out
+    assert "their errors are in the sigmas" in l2m("map", "info", field_map).out
 
 
 def test_what_cannot_be_done_is_said_in_one_line(shared_data: Path, tmp_path: Path) -> None:

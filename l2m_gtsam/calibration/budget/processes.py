@@ -10,17 +10,18 @@ the spectrum of a field that is smooth over a length (Solin and Sarkka, Statisti
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.pose_errors import pose_features, pose_seconds
-from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.calibration.pose_errors import pose_features
+from l2m_gtsam.calibration.view import QueryableMap, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.disturbance import DisturbanceKind
+from l2m_gtsam.solve.linear_algebra import right_divided
 
 WANDER_MODES = 24  # slower ones hold all but 2 % of a walk; faster ones of 1/f noise are noise
 POSE_MODES = 48  # of each of six errors, and of fields
@@ -31,7 +32,7 @@ FAINT = 0.01  # of the largest variance of a mode: what less have is left out
 
 
 @dataclass(frozen=True)
-class Scene:
+class ReadingPlaces:
     """What N readings are taken at, by an estimate.
 
     Attributes
@@ -58,20 +59,14 @@ class Scene:
     slope: FloatArray
 
     @classmethod
-    def of(cls, readings: Readings, field_map: QueryableMap, estimate: Estimate) -> "Scene":
+    def of(cls, readings: Readings, field_map: QueryableMap, estimate: Estimate) -> "ReadingPlaces":
         """Return what a map says where an estimate puts readings."""
-        R, t = readings.R_map_lidar, estimate.t[readings.sensor]
-        x = np.einsum("nij,nj->ni", R, t) + readings.p_map_lidar
+        x = places_of(readings, estimate.t)
         field, gradient = field_map.field_and_gradient(x)
-        R_lidar_map = R.transpose(0, 2, 1)
+        R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
         b_lidar = np.einsum("nij,nj->ni", R_lidar_map, field)
-        C = estimate.C()[readings.sensor]
+        t, C = estimate.t[readings.sensor], estimate.C()[readings.sensor]
         return cls(readings, t, C, x, b_lidar, R_lidar_map @ gradient)
-
-    @cached_property
-    def seconds(self) -> FloatArray:
-        """When poses were taken, shape (N,)."""
-        return pose_seconds(self.readings)
 
 
 class Process(Protocol):
@@ -92,72 +87,111 @@ class Process(Protocol):
     def features(self, rows: IntArray, /) -> FloatArray:
         """Return what weights do to the field in uT, lidar frame, shape (n, 3, m)."""
 
+    def on(self, places: ReadingPlaces, /) -> "Process":
+        """Return the same modes, weight by weight, in other readings."""
+
 
 @dataclass(frozen=True)
 class TimeModes:
-    """Cosines over the time of each drive of a scene.
+    """Cosines over the time of each of D drives.
 
     Attributes
     ----------
-    values
-        Shape (N, D J) with D drives, zero in others' readings.
-    frequency
-        j of each, shape (D J,).
-    duration
-        Of its drive in seconds, shape (D J,).
+    drives
+        Their numbers, shape (D,).
+    first_ns, last_ns
+        When they began and ended, shapes (D,).
+    count
+        J, of each drive.
     """
 
-    values: FloatArray
-    frequency: FloatArray
-    duration: FloatArray
+    drives: IntArray
+    first_ns: IntArray
+    last_ns: IntArray
+    count: int
 
     @classmethod
-    def of(cls, seconds: FloatArray, drive: IntArray, count: int) -> "TimeModes":
-        """Return so many modes for times of drives, shapes (N,)."""
-        drives, j = np.unique(drive), np.arange(1.0, count + 1)
-        values, duration = np.zeros((len(seconds), len(drives) * count)), []
-        for number, each in enumerate(drives):
-            rows = np.flatnonzero(drive == each)
-            u = seconds[rows] - seconds[rows].min()
-            length = max(float(u.max()), 1e-9)
-            own = slice(number * count, (number + 1) * count)
-            values[rows, own] = np.sqrt(2) * np.cos(np.pi * j * (u / length)[:, None])
-            duration += [length] * count
-        return cls(values, np.tile(j, len(drives)), np.array(duration))
+    def over(cls, readings: Readings, count: int) -> "TimeModes":
+        """Return so many modes for each drive of some readings."""
+        drives = np.unique(readings.of_drive)
+        stamps = [readings.stamp_ns[readings.of_drive == each] for each in drives]
+        first = np.array([each.min() for each in stamps])
+        return cls(drives, first, np.array([each.max() for each in stamps]), count)
+
+    @property
+    def frequency(self) -> FloatArray:
+        """J of each mode, shape (D J,)."""
+        return np.tile(np.arange(1.0, self.count + 1), len(self.drives))
+
+    @property
+    def duration(self) -> FloatArray:
+        """Of each mode's drive in seconds, shape (D J,)."""
+        return np.repeat(self._lengths, self.count)
+
+    @property
+    def _lengths(self) -> FloatArray:
+        return np.asarray(np.maximum(1e-9 * (self.last_ns - self.first_ns), 1e-9))
+
+    def values(self, readings: Readings, rows: IntArray) -> FloatArray:
+        """Return the modes at some of the readings, zero in other drives', shape (n, D J)."""
+        drive, stamp = readings.of_drive[rows], readings.stamp_ns[rows]
+        j, values = (
+            np.arange(1, self.count + 1),
+            np.zeros((len(rows), len(self.drives), self.count)),
+        )
+        for number, (each, length) in enumerate(zip(self.drives, self._lengths, strict=True)):
+            own = np.flatnonzero(drive == each)
+            u = 1e-9 * (stamp[own] - self.first_ns[number]) / length
+            values[own, number] = np.sqrt(2) * np.cos(np.pi * j * u[:, None])
+        return values.reshape(len(rows), -1)
+
+
+def pink_and_walk(modes: TimeModes) -> FloatArray:
+    """Return spectra of 1/f noise and of a random walk of a vector, shape (2, 3 D J)."""
+    j = np.repeat(modes.frequency, 3)
+    return np.stack([1 / j, 1 / (np.pi * j) ** 2])
+
+
+def times_modes(features: FloatArray, modes: FloatArray) -> FloatArray:
+    """Return what weights of J modes, (n, J), of a quantities do, (n, 3, a): shape (n, 3, J a)."""
+    product = np.einsum("nia,nj->nija", features, modes)
+    return np.asarray(product.reshape(len(features), 3, -1))
 
 
 @dataclass(frozen=True)
 class Wander:
     """H of a sensor wanders: 1/f noise, a random walk, or both."""
 
-    scene: Scene
+    places: ReadingPlaces
     sensor: int
     modes: TimeModes
     kind: DisturbanceKind = DisturbanceKind.WANDER
 
-    @property
+    @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
         """Of 1/f noise and of a random walk together, uT^2."""
-        j = np.repeat(self.modes.frequency, 3)
-        return (np.stack([1 / j, 1 / (np.pi * j) ** 2]),)
+        return (pink_and_walk(self.modes),)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what adds to the readings along their axes, shape (n, 3, m)."""
-        modes = self.modes.values[rows]
-        along = np.linalg.solve(self.scene.C[rows], np.broadcast_to(np.eye(3), (len(rows), 3, 3)))
-        return np.asarray(np.einsum("nia,nj->nija", along, modes).reshape(len(rows), 3, -1))
+        along = right_divided(np.eye(3), self.places.C[rows])
+        return times_modes(along, self.modes.values(self.places.readings, rows))
+
+    def on(self, places: ReadingPlaces) -> "Wander":
+        """Return the same modes in other readings."""
+        return replace(self, places=places)
 
 
 @dataclass(frozen=True)
 class PoseProcess:
     """Errors of poses that last; rotation and translation have sizes of their own."""
 
-    scene: Scene
+    places: ReadingPlaces
     modes: TimeModes
     kind: DisturbanceKind = DisturbanceKind.POSES
     sensor: int | None = None
 
-    @property
+    @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
         """Of rotation (rad^2) and of translation (m^2), for each of ``LASTING_S``."""
         turn, forms = np.repeat([1.0, 0.0], 3), []
@@ -169,94 +203,118 @@ class PoseProcess:
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what rotations and translations make of the field, shape (n, 3, m)."""
-        scene, unit = self.scene, np.broadcast_to(np.eye(6), (len(rows), 6, 6))
-        slope = scene.slope[rows] @ scene.readings.R_map_lidar[rows]
-        F = pose_features(unit, scene.b_lidar[rows], slope, scene.t[rows])
-        return np.asarray(
-            np.einsum("nia,nj->nija", F, self.modes.values[rows]).reshape(len(rows), 3, -1)
-        )
+        places, unit = self.places, np.broadcast_to(np.eye(6), (len(rows), 6, 6))
+        slope = places.slope[rows] @ places.readings.R_map_lidar[rows]
+        F = pose_features(unit, places.b_lidar[rows], slope, places.t[rows])
+        return times_modes(F, self.modes.values(places.readings, rows))
+
+    def on(self, places: ReadingPlaces) -> "PoseProcess":
+        """Return the same modes in other readings."""
+        return replace(self, places=places)
 
 
 @dataclass(frozen=True)
 class FieldProcess:
     """The field is not the map's for a time: it changed, or the map misses what is on the way."""
 
-    scene: Scene
+    places: ReadingPlaces
     modes: TimeModes
     kind: DisturbanceKind = DisturbanceKind.FIELD
     sensor: int | None = None
 
-    @property
+    @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
         """Of 1/f noise and of a random walk together, uT^2."""
-        j = np.repeat(self.modes.frequency, 3)
-        return (np.stack([1 / j, 1 / (np.pi * j) ** 2]),)
+        return (pink_and_walk(self.modes),)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what fields along the axes of the map are in the lidar frame, shape (n, 3, m)."""
-        R_lidar_map = self.scene.readings.R_map_lidar[rows].transpose(0, 2, 1)
-        found = np.einsum("nia,nj->nija", R_lidar_map, self.modes.values[rows])
-        return np.asarray(found.reshape(len(rows), 3, -1))
+        readings = self.places.readings
+        R_lidar_map = readings.R_map_lidar[rows].transpose(0, 2, 1)
+        return times_modes(R_lidar_map, self.modes.values(readings, rows))
+
+    def on(self, places: ReadingPlaces) -> "FieldProcess":
+        """Return the same modes in other readings."""
+        return replace(self, places=places)
+
+
+@dataclass(frozen=True)
+class FloorModes:
+    """Products of cosines over a rectangle of the floor.
+
+    Attributes
+    ----------
+    low, length
+        Its corner and its sides along x and y in metres, shapes (2,).
+    waves
+        Half waves of each mode along x and y, shape (J, 2).
+    """
+
+    low: FloatArray
+    length: FloatArray
+    waves: IntArray
+
+    @classmethod
+    def over(cls, x: FloatArray, finest: float) -> "FloorModes":
+        """Return modes of all wavenumbers up to one in 1/m, around places, shape (N, 3)."""
+        floor = x[:, :2]
+        low = floor.min(axis=0) - BEYOND_M
+        length = floor.max(axis=0) + BEYOND_M - low
+        count = np.ceil(finest * length / np.pi).astype(int) + 1
+        waves = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1).reshape(-1, 2)
+        modes = cls(low, length, waves)
+        return replace(modes, waves=waves[modes.wavenumber2 <= finest**2])
+
+    @property
+    def wavenumber2(self) -> FloatArray:
+        """Squares of the wavenumbers in 1/m^2, shape (J,)."""
+        return np.asarray(np.square(np.pi * self.waves / self.length).sum(axis=1))
+
+    def values(self, x: FloatArray) -> FloatArray:
+        """Return the modes, of mean square one over the floor, at places (n, 3): shape (n, J)."""
+        phase = np.pi * (x[:, :2] - self.low) / self.length
+        norm = np.sqrt(np.where(self.waves, 2.0, 1.0)).prod(axis=1)
+        return np.asarray(norm * np.cos(phase[:, None] * self.waves).prod(axis=2))
 
 
 @dataclass(frozen=True)
 class Warp:
-    """The drive's frame is bent against the map's, in the plane of the floor.
+    """The drive's frame is bent against the map's, in the plane of the floor."""
 
-    Attributes
-    ----------
-    scene
-        The readings.
-    values
-        Modes at their places, shape (N, J).
-    wavenumber2
-        Squares of the wavenumbers in 1/m^2, shape (J,).
-    """
-
-    scene: Scene
-    values: FloatArray
-    wavenumber2: FloatArray
+    places: ReadingPlaces
+    modes: FloorModes
     kind: DisturbanceKind = DisturbanceKind.WARP
     sensor: int | None = None
 
     @classmethod
-    def of(cls, scene: Scene) -> "Warp":
-        """Return the modes over the floor of a scene."""
-        floor = scene.x[:, :2]
-        low = floor.min(axis=0) - BEYOND_M
-        length = floor.max(axis=0) + BEYOND_M - low
-        highest = np.sqrt(-2 * np.log(FAINT)) / min(WARP_M)  # wavenumber that still counts
-        count = np.ceil(highest * length / np.pi).astype(int) + 1
-        i, j = (each.ravel() for each in np.meshgrid(*map(np.arange, count), indexing="ij"))
-        k2 = (np.pi * i / length[0]) ** 2 + (np.pi * j / length[1]) ** 2
-        near = np.flatnonzero(k2 <= highest**2)
-        phase = np.pi * (floor - low) / length
-        along = np.cos(phase[:, :1] * i[near]) * np.cos(phase[:, 1:] * j[near])
-        norm = np.sqrt(np.where(i[near], 2.0, 1.0) * np.where(j[near], 2.0, 1.0))
-        return cls(scene, norm * along, k2[near])
+    def of(cls, places: ReadingPlaces) -> "Warp":
+        """Return the modes over the floor of some readings."""
+        finest = np.sqrt(-2 * np.log(FAINT)) / min(WARP_M)  # wavenumber that still counts
+        return cls(places, FloorModes.over(places.x, finest))
 
-    @property
+    @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
         """Of two lengths together, m^2."""
-        variance = np.exp(-0.5 * np.square(WARP_M)[:, None] * self.wavenumber2)
+        variance = np.exp(-0.5 * np.square(WARP_M)[:, None] * self.modes.wavenumber2)
         return (np.repeat(variance / variance.sum(axis=1, keepdims=True), 2, axis=1),)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what shifts along x and y of the map make of the field, shape (n, 3, m)."""
-        slope = self.scene.slope[rows, :, :2]
-        return np.asarray(
-            np.einsum("nia,nj->nija", slope, self.values[rows]).reshape(len(rows), 3, -1)
-        )
+        slope = self.places.slope[rows, :, :2]
+        return times_modes(slope, self.modes.values(self.places.x[rows]))
+
+    def on(self, places: ReadingPlaces) -> "Warp":
+        """Return the same modes in other readings."""
+        return replace(self, places=places)
 
 
-def processes(scene: Scene, sensors: Sequence[int]) -> tuple[Process, ...]:
+def processes(places: ReadingPlaces, sensors: Sequence[int]) -> tuple[Process, ...]:
     """Return all that is looked for; errors of poses only where none are stated."""
-    drive = scene.readings.of_drive
-    slow = TimeModes.of(scene.seconds, drive, WANDER_MODES)
-    found: list[Process] = [Wander(scene, sensor, slow) for sensor in sensors]
-    fast = TimeModes.of(scene.seconds, drive, POSE_MODES)
+    slow = TimeModes.over(places.readings, WANDER_MODES)
+    found: list[Process] = [Wander(places, sensor, slow) for sensor in sensors]
+    fast = TimeModes.over(places.readings, POSE_MODES)
     if len(sensors) > 1:  # of one sensor's wander it cannot be told
-        found.append(FieldProcess(scene, fast))
-    if scene.readings.pose_root is None:
-        found.append(PoseProcess(scene, fast))
-    return (*found, Warp.of(scene))
+        found.append(FieldProcess(places, fast))
+    if places.readings.pose_root is None:
+        found.append(PoseProcess(places, fast))
+    return (*found, Warp.of(places))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -38,7 +39,7 @@ class FoundProcess:
     sizes: FloatArray
     gain: float
 
-    @property
+    @cached_property
     def variances(self) -> FloatArray:
         """Of its weights, shape (m,)."""
         return np.asarray(self.sizes @ self.process.forms[self.form])

@@ -7,6 +7,7 @@ from l2m_gtsam.maps.harmonic.explanation import Explanation
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.survey import narrow
 
+IN_SIGMAS = "their errors are in the sigmas"
 LOCAL = "its own, about those of the map"
 
 
@@ -28,7 +29,7 @@ def summary_of(kind: str, learnt: Learnt) -> MapSummary:
             "hyperparameters": learnt.origin.learning.described,
             "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
             "sources": described(learnt),
-            "survey's sensors": "as sure as stated" if learnt.suite else "taken for exact",
+            "survey's sensors": IN_SIGMAS if learnt.suite else "taken for exact",
             "field": judged(learnt.origin.explanation),
             "tiles": len(learnt.tiling),
             "tile (m)": float(learnt.tiling.grid.size),

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.verdict.disturbances import disturbance_sentence
 from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.places import source_sentence
 from l2m_gtsam.qa.verdict.repeatability import repeat
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, misfit, precision
 from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
-from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
 
@@ -75,41 +75,8 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
         more = f"The place differs from the map along {len(shared) - MANY} more stretches."
         reasons.append(Reason(Level.WARN, more))
     # A map of another place is no evidence on this one.
-    reasons += [Reason(Level.WARN, _disturbed(each)) for each in result.disturbances]
+    reasons += [Reason(Level.WARN, disturbance_sentence(each)) for each in result.disturbances]
     return _wrong_map(cases) or [*_on_drive(cases), *reasons, *_exact(result)]
-
-
-def _disturbed(found: Disturbance) -> str:
-    """Return what a process is, and its remedy."""
-    size = found.sizes
-    match found.kind:
-        case DisturbanceKind.WANDER:
-            return (
-                f"H of {found.sensor} is not constant: it wanders by {size['walk_ut']:.2g} uT from "
-                f"the start of the drive to its end, beside noise of {size['noise_ut']:.2g} uT "
-                "that lasts. Its sigmas are those at any moment of the drive; let the sensor warm "
-                "up, and keep currents away from it."
-            )
-        case DisturbanceKind.POSES:
-            return (
-                f"Poses are wrong by about {1e3 * size['position_m']:.1f} mm and "
-                f"{size['rotation_deg']:.2f} degrees over {size['lasting_s']:g} s, by the readings "
-                "themselves. Sigmas hold it; state the errors of your poses "
-                "(calibration.solve.pose_noise), or use better ones."
-            )
-        case DisturbanceKind.FIELD:
-            return (
-                f"The field differs from the map's for a time, by {size['noise_ut']:.2g} uT and "
-                f"{size['walk_ut']:.2g} uT more by the end, for all sensors alike: steel or "
-                "currents near by changed, or the survey missed what is along the way. Sigmas "
-                "hold it; survey more densely, or again."
-            )
-        case DisturbanceKind.WARP:
-            return (
-                f"The frame of the drive is bent against the map's by about "
-                f"{1e3 * size['shift_m']:.1f} mm. Sigmas hold it; use poses on the same "
-                "point cloud for survey and drive."
-            )
 
 
 def _exact(result: CalibrationResult) -> list[Reason]:

@@ -6,6 +6,8 @@ from l2m_gtsam.solve.linear_algebra import (
     correlation_factor,
     covariance_root,
     information_root,
+    lower_information_root,
+    right_divided,
     triangular_information_root,
 )
 
@@ -51,3 +53,19 @@ def test_correlations_are_factored() -> None:
     P = np.array([[4.0, 1.0], [1.0, 9.0]])
     L = correlation_factor(P, 0.0)
     np.testing.assert_allclose(L @ L.T, [[1.0, 1 / 6], [1 / 6, 1.0]], rtol=1e-12)
+
+
+def test_a_lower_root_of_the_information_whitens_row_by_row() -> None:
+    half = np.random.default_rng(2).normal(size=(9, 12))
+    S = half @ half.T
+    W = lower_information_root(S)
+    np.testing.assert_array_equal(W, np.tril(W))
+    np.testing.assert_allclose(W @ S @ W.T, np.eye(9), atol=1e-12)
+
+
+def test_what_is_divided_from_the_right_comes_back() -> None:
+    rng = np.random.default_rng(3)
+    A, C = rng.normal(size=(5, 2, 3)), np.eye(3) + 0.2 * rng.normal(size=(5, 3, 3))
+    np.testing.assert_allclose(right_divided(A, C) @ C, A, atol=1e-13)
+    np.testing.assert_allclose(right_divided(A, C[0]) @ C[0], A, atol=1e-13)
+    np.testing.assert_allclose(right_divided(np.eye(3), C) @ C, [np.eye(3)] * 5, atol=1e-13)

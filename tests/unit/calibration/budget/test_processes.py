@@ -1,19 +1,32 @@
 """Modes of processes: their spectra are those of what they stand for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from l2m_gtsam.calibration.budget.found import spread_of_H
-from l2m_gtsam.calibration.budget.processes import LASTING_S, PoseProcess, TimeModes, Wander, Warp
+from l2m_gtsam.calibration.budget.processes import (
+    LASTING_S,
+    FieldProcess,
+    PoseProcess,
+    Process,
+    ReadingPlaces,
+    TimeModes,
+    Wander,
+    Warp,
+)
 from l2m_gtsam.calibration.budget.search import FoundProcess
 from tests.support.scenes import scene
 
 SECONDS = np.linspace(0.0, 200.0, 801)
-ONE = np.zeros(len(SECONDS), dtype=np.int64)
+PLACES = scene(SECONDS)
+READINGS = PLACES.readings
+ROWS = np.arange(len(SECONDS))
 
 
 def test_time_modes_are_orthonormal_and_have_no_mean() -> None:
-    modes = TimeModes.of(SECONDS, ONE, 10).values
+    modes = TimeModes.over(READINGS, 10).values(READINGS, ROWS)
     gram = modes.T @ modes / len(modes)
     # Both ends of the time count in full here: 1 of 800.
     np.testing.assert_allclose(gram, np.eye(10), atol=6e-3)
@@ -22,10 +35,12 @@ def test_time_modes_are_orthonormal_and_have_no_mean() -> None:
 
 def test_each_drive_has_modes_of_its_own() -> None:
     drive = (SECONDS > 120).astype(np.int64)
-    modes = TimeModes.of(SECONDS, drive, 4)
-    assert modes.values.shape == (len(SECONDS), 8)
-    assert not modes.values[drive == 0, 4:].any()
-    assert not modes.values[drive == 1, :4].any()
+    readings = replace(READINGS, drive=drive)
+    modes = TimeModes.over(readings, 4)
+    values = modes.values(readings, ROWS)
+    assert values.shape == (len(SECONDS), 8)
+    assert not values[drive == 0, 4:].any()
+    assert not values[drive == 1, :4].any()
     np.testing.assert_allclose(modes.duration, np.repeat([120.0, 79.75], 4))
 
 
@@ -34,20 +49,20 @@ def test_a_walk_wanders_as_its_spectrum_says() -> None:
     rng, count = np.random.default_rng(0), 4000
     steps = rng.standard_normal((count, len(SECONDS))) / np.sqrt(len(SECONDS))
     walks = np.cumsum(steps, axis=1)
-    modes = TimeModes.of(SECONDS, ONE, 6)
-    found = (walks @ modes.values / len(SECONDS)).var(axis=0)
-    _, walk = Wander(scene(SECONDS), 0, modes).forms[0]
+    modes = TimeModes.over(READINGS, 6)
+    found = (walks @ modes.values(READINGS, ROWS) / len(SECONDS)).var(axis=0)
+    _, walk = Wander(PLACES, 0, modes).forms[0]
     # 4,000 draws: 2.2 % a standard deviation; time is not continuous.
     np.testing.assert_allclose(found, walk[::3], rtol=0.12)
 
 
 @pytest.mark.parametrize("form", range(len(LASTING_S)))
 def test_errors_of_poses_have_unit_variance_and_last(form: int) -> None:
-    modes = TimeModes.of(SECONDS, ONE, 400)  # all that matter, unlike the fewer that are looked for
-    turn, shift = PoseProcess(scene(SECONDS), modes).forms[form]
+    modes = TimeModes.over(READINGS, 400)  # all that matter, unlike the fewer that are looked for
+    turn, shift = PoseProcess(PLACES, modes).forms[form]
     assert not (turn * shift).any()
-    variance = turn[::6]
-    like = (modes.values[400] * variance) @ modes.values.T
+    variance, values = turn[::6], modes.values(READINGS, ROWS)
+    like = (values[400] * variance) @ values.T
     lasting = LASTING_S[form]
     expected = np.exp(-np.abs(SECONDS - SECONDS[400]) / lasting)
     # Cosines are not the series of this process near the ends, and stop at four a second.
@@ -55,28 +70,46 @@ def test_errors_of_poses_have_unit_variance_and_last(form: int) -> None:
 
 
 def test_a_warp_has_a_metre_square_wherever_it_is() -> None:
-    warp = Warp.of(scene(SECONDS))
+    warp = Warp.of(PLACES)
     for spectrum in warp.forms[0]:
-        variance = warp.values**2 @ spectrum[::2]
+        variance = warp.modes.values(PLACES.x) ** 2 @ spectrum[::2]
         assert np.mean(variance) == pytest.approx(1, abs=0.35)  # of few modes, over a lane
 
 
 def test_features_of_wander_add_to_the_readings_along_their_axes() -> None:
-    place = scene(SECONDS)
-    wander = Wander(place, 0, TimeModes.of(SECONDS, ONE, 2))
-    rows = np.arange(5)
-    added = place.C[rows] @ wander.features(rows)
-    mode = wander.modes.values[rows]
-    expected = np.einsum("nj,ia->nija", mode, np.eye(3)).reshape(5, 3, -1)
+    modes, rows = TimeModes.over(READINGS, 2), np.arange(5)
+    added = PLACES.C[rows] @ Wander(PLACES, 0, modes).features(rows)
+    expected = np.einsum("nj,ia->nija", modes.values(READINGS, rows), np.eye(3)).reshape(5, 3, -1)
     np.testing.assert_allclose(added, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [Wander, FieldProcess, PoseProcess, Warp])
+def test_other_readings_feel_the_same_weights(kind: type) -> None:
+    """A part of the readings, with the modes of all of them, feels what it feels among all."""
+    part = np.arange(300, 420)
+    few = ReadingPlaces(
+        READINGS[part],
+        *(getattr(PLACES, name)[part] for name in ("t", "C", "x", "b_lidar", "slope")),
+    )
+    modes = TimeModes.over(READINGS, 6)
+    every: Process
+    if kind is Warp:
+        every = Warp.of(PLACES)
+    elif kind is Wander:
+        every = Wander(PLACES, 0, modes)
+    else:
+        every = kind(PLACES, modes)
+    np.testing.assert_array_equal(
+        every.on(few).features(np.arange(len(part))), every.features(part)
+    )
 
 
 def test_the_spread_of_H_is_its_mean_square_over_the_drive() -> None:
     rng = np.random.default_rng(1)
-    modes = TimeModes.of(SECONDS, ONE, 24)
-    wander = FoundProcess(Wander(scene(SECONDS), 0, modes), 0, np.array([0.02, 0.3]), 99.0)
+    modes = TimeModes.over(READINGS, 24)
+    wander = FoundProcess(Wander(PLACES, 0, modes), 0, np.array([0.02, 0.3]), 99.0)
     weights = rng.standard_normal(72)
-    drift = modes.values @ (np.sqrt(wander.variances) * weights).reshape(24, 3)
+    drift = modes.values(READINGS, ROWS) @ (np.sqrt(wander.variances) * weights).reshape(24, 3)
     found = spread_of_H(wander, weights, np.zeros((72, 72)))
     # A sum over 801 instants against an integral.
     np.testing.assert_allclose(found, drift.T @ drift / len(drift), atol=0.02 * np.trace(found))
