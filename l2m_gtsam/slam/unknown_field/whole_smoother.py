@@ -22,7 +22,7 @@ from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose
-from l2m_gtsam.slam.map_prediction import poses_in
+from l2m_gtsam.slam.map_prediction import PlacedReadings, poses_in
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
 from l2m_gtsam.slam.solution import DriveSolution
@@ -51,6 +51,7 @@ STAGES = (4.0, 2.0, 1.0)  # of the smoother's stages
 ROUNDS = (2, 2, 3)  # of each: readings are hung and weighed anew at the poses
 ITERATIONS = 4  # of each round
 CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
+HELD = 1e-3  # of odometry's sigmas: steps that are known so well leave the poses where they are
 SETTLED = 1.0  # movement of the poses in the last round, in their sigmas
 
 
@@ -103,33 +104,44 @@ def map_whole_drive(
         progress("solving poses and field", stage / len(STAGES))
         noise = learnt.prior.spectrum.noise.floored().scaled(factor)
         problem = stage_problem(free, learnt.prior, noise, options)
-        solved = settled(problem, learnt.poses, sensors, ROUNDS[stage])
+        solved = settled(problem, learnt.poses, with_noise(sensors, noise), ROUNDS[stage])
         sensors = solved.last.sensors
         prior = learnt_prior(drive, solved.last.poses, whole, learnt.prior.spectrum)
         if prior is None:
             return None
         learnt = LearntPoses(solved.last.poses, prior)
     found = problem.finished(solved.last)
-    progress("solving poses and field", 1.0)
-    ending = Ending.TOLERANCE if is_settled(solved, found.solution) else Ending.ITERATION_LIMIT
-    solution = replace(found.solution, ending=ending)
-    if options.calibration is CalibrationUse.FIXED:
-        own = replace(drive.sensors, noise=solution.drive.sensors.noise)
-        solution = replace(
-            solution,
-            drive=replace(solution.drive, sensors=own),
-            calibration_covariance=drive.sensors.covariance,
-        )
-    p = np.stack([pose.translation() for pose in solution.poses])
-    found = replace(
-        found,
-        solution=solution,
-        returns=returned(p, drive.steps.path, learnt.prior.spectrum.prior.length),
-        noise=noise,
-    )
-    bent = 0.5 * solution.odometry_chi2 * 6 * len(drive)
+    bent = 0.5 * found.solution.odometry_chi2 * 6 * len(drive)
     gained = learnt.prior.spectrum.log_likelihood - first.spectrum.log_likelihood - bent
-    return found if gained > 0 else replace(found, solution=unchanged(drive, found), gained=False)
+    if gained > 0:
+        ending = Ending.TOLERANCE if is_settled(solved, found.solution) else Ending.ITERATION_LIMIT
+        found = replace(found, solution=replace(found.solution, ending=ending), noise=noise)
+    else:
+        learnt, found = LearntPoses(initial, first), at_odometry(drive, first, options)
+    solution = found.solution
+    if options.calibration is CalibrationUse.FIXED:
+        solution = as_calibrated(solution, drive.sensors)
+    progress("solving poses and field", 1.0)
+    p = np.stack([pose.translation() for pose in solution.poses])
+    near = learnt.prior.spectrum.prior.length
+    return replace(found, solution=solution, returns=returned(p, drive.steps.path, near))
+
+
+def as_calibrated(solution: DriveSolution, sensors: KnownSensors) -> DriveSolution:
+    """Return a solution whose field is that by given calibrations, as its readers will have it."""
+    readings = solution.prediction.placed.readings
+    known = replace(sensors, noise=solution.drive.sensors.noise)
+    return replace(
+        solution,
+        drive=replace(solution.drive, sensors=known),
+        calibration_covariance=sensors.covariance,
+        prediction=replace(solution.prediction, placed=PlacedReadings.of(readings, known)),
+    )
+
+
+def with_noise(sensors: KnownSensors, noise: SensorNoise) -> KnownSensors:
+    """Return sensors, one, with such noise."""
+    return replace(sensors, noise=np.array([noise.ut]))
 
 
 def stage_problem(
@@ -140,7 +152,7 @@ def stage_problem(
         update={"calibration": CalibrationUse.REFINED, "max_iterations": ITERATIONS}
     )
     slow = SlowErrors(noise, drive.stamp_ns, drive.reading_ns)
-    heard = replace(drive, sensors=replace(drive.sensors, noise=np.array([noise.ut])))
+    heard = replace(drive, sensors=with_noise(drive.sensors, noise))
     return TiledProblem(heard, prior.divided, refined, weights_last, slow, CLOSE)
 
 
@@ -241,16 +253,43 @@ class DriveLikelihood:
         return None if learnt is None else learnt.spectrum
 
 
-def unchanged(drive: Drive, found: FieldSolution) -> DriveSolution:
-    """Return a solution with the poses and covariances of odometry alone."""
+def at_odometry(drive: Drive, prior: WholePrior, options: SlamOptions) -> FieldSolution:
+    """Return the field along the poses of odometry, which stay what they are.
+
+    Parameters
+    ----------
+    drive
+        The drive.
+    prior
+        What was learnt of field and noise at odometry's poses.
+    options
+        How to solve.
+
+    Returns
+    -------
+    The field, and odometry's poses with their own covariances.
+    """
+    whole, noise = options.whole_field, prior.spectrum.noise.floored()
+    steps = replace(
+        drive.steps, covariance=HELD**2 * drive.steps.covariance, scale=0.0, steady=None
+    )
+    sensors = with_noise(drive.sensors.loosened(whole.distortion, whole.offset), noise)
+    problem = stage_problem(replace(drive, steps=steps, sensors=sensors), prior, noise, options)
+    found = problem.finished(settled(problem, drive.dead_reckoning(), sensors, ROUNDS[-1]).last)
     values = shared_values(drive)
     for k, pose in enumerate(drive.dead_reckoning()):
         values.insert(X(k), pose)
     graph = odometry_graph(drive)
     marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
-    poses = list(poses_in(values, len(drive)).values())
-    covariance = pose_covariances(marginals, len(drive))
-    return replace(found.solution, poses=poses, pose_covariance=covariance, odometry_chi2=0.0)
+    solution = replace(
+        found.solution,
+        drive=replace(drive, sensors=found.solution.drive.sensors),
+        poses=list(poses_in(values, len(drive)).values()),
+        pose_covariance=pose_covariances(marginals, len(drive)),
+        odometry_chi2=0.0,
+        ending=Ending.TOLERANCE,
+    )
+    return replace(found, solution=solution, gained=False, noise=noise)
 
 
 def returned(p: FloatArray, path: FloatArray, near_m: float) -> IntArray:

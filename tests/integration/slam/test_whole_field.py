@@ -5,22 +5,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.data import Distortion
+from l2m_gtsam.data import Distortion, SourceFile, Trajectory
+from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult, Uncertainty
-from l2m_gtsam.slam.exploration import NOTHING_GAINED, explore
+from l2m_gtsam.slam.exploration import NOTHING_GAINED, Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.slam.recipes import DriftRecipe, Form, drifted
 from l2m_gtsam.studies.slam.recordings import SHIP, TrueDrive, ship_run
 from tests.drives.calibrations import sensor
+from tests.worlds.yard import NOISE as YARD_NOISE_UT
+from tests.worlds.yard import route, world
 
 NOISE_UT = 1.5
 
 
-def ideal() -> CalibrationResult:
+def ideal(noise_ut: float = NOISE_UT) -> CalibrationResult:
     """Return a calibration that undoes nothing, as the recording comes without one."""
     entry = replace(
-        sensor(covariance=1e-10 * np.eye(15), noise=NOISE_UT, time_offset=None),
+        sensor(covariance=1e-10 * np.eye(15), noise=noise_ut, time_offset=None),
         t_lidar_mag=np.zeros(3),
         distortion=Distortion.identity(),
         R_lidar_mag=np.eye(3),
@@ -64,3 +68,27 @@ def test_without_a_field_the_poses_are_those_of_odometry(shared_data: Path) -> N
     flat = replace(drive, field=uniform + rng.normal(0, NOISE_UT, uniform.shape))
     before, after, _ = errors(flat, Form.VEHICLE, 0)
     assert after <= 1.05 * before
+
+
+def yard_drive(noise_ut: float) -> Exploration:
+    """A meander beside a steel post, whose odometry is right and whose noise is stated so."""
+    p = route(-2, 0.5)[:200]
+    R = Rotation.from_rotvec(np.outer(np.linspace(0, 5, len(p)), [0, 0, 1])).as_matrix()
+    stamps = 100_000_000 * np.arange(len(p), dtype=np.int64)
+    rng = np.random.default_rng(4)
+    field = np.einsum("nji,nj->ni", R, world().field_and_gradient(p)[0])
+    field += rng.normal(0, YARD_NOISE_UT, field.shape)
+    drive = TrueDrive(Trajectory(stamps, R, p, "map", "lidar"), field, SourceFile("yard", ""))
+    options = SlamOptions.model_validate({"key_poses": {"distance_m": 0.5, "angle_deg": 30}})
+    return explore(drive.recording(drive.truth), ideal(noise_ut), options, silent)
+
+
+def test_the_stated_noise_does_not_count_and_the_field_is_the_true_one() -> None:
+    """Where odometry is kept, its field is that at odometry's poses, by the given calibration."""
+    one, other = yard_drive(0.02), yard_drive(5.0)
+    assert NOTHING_GAINED in one.result.notes
+    np.testing.assert_array_equal(one.result.trajectory.p, other.result.trajectory.p)
+    np.testing.assert_array_equal(one.field, other.field)
+    truth = world().field_and_gradient(one.points)[0]
+    # Noise, and positions of readings that are interpolated over half a metre of the meander.
+    assert np.sqrt(np.mean((one.field - truth) ** 2)) < 2 * YARD_NOISE_UT
