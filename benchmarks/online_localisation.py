@@ -19,6 +19,7 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.slam.online.follower import SECTION, Follower
+from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.worlds.exact import random_sensors
@@ -64,12 +65,13 @@ def laps(count: int) -> Trajectory:
 
 def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: int = SECTION) -> Run:
     """Follow a drive and take the time of each key pose."""
-    follower = Follower(drawn.drive, field_map, RobustOptions(), free=free, section=section)
+    drive, robust = drawn.drive, RobustOptions()
+    follower = Follower(drive.start, drive.sensors, field_map, robust, free=free, section=section)
     count, warm = len(drawn.drive), len(drawn.drive) // 10
     cost, off, memory = np.zeros(count), np.zeros(count), 0.0
-    for number in range(count):
+    for number, key_pose in enumerate(key_poses_of(drive)):
         begin = time.process_time()
-        belief = follower.step(number)
+        belief = follower.add(key_pose)
         cost[number] = time.process_time() - begin
         off[number] = np.linalg.norm(belief.pose.translation() - drawn.p[number])
         if number == warm:

@@ -1,5 +1,7 @@
 """Readings of a drive relative to its key poses."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -51,6 +53,27 @@ def key_pose_readings(
         p_key_lidar=np.einsum("nij,nj->ni", R_back, readings.p_map_lidar - p),
         fraction=_fractions(trajectory, rows[key], rows[key + 1], readings.stamp_ns),
         field=readings.field,
+    )
+
+
+def no_readings() -> KeyPoseReadings:
+    """Return the readings of a stretch that has none."""
+    no = np.empty(0, dtype=np.int64)
+    return KeyPoseReadings(
+        no, no, np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), np.empty((0, 3))
+    )
+
+
+def joined_readings(parts: Sequence[KeyPoseReadings]) -> KeyPoseReadings:
+    """Return readings of some key poses, whose clocks are no variables, as one."""
+    parts = [no_readings(), *parts]
+    return KeyPoseReadings(
+        np.concatenate([each.key_pose for each in parts]),
+        np.concatenate([each.sensor for each in parts]),
+        np.concatenate([each.R_key_lidar for each in parts]),
+        np.concatenate([each.p_key_lidar for each in parts]),
+        np.concatenate([each.fraction for each in parts]),
+        np.concatenate([each.field for each in parts]),
     )
 
 

@@ -1,5 +1,6 @@
 """Scan registrations of a drive as links of its key poses."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,17 @@ class Links:
         """Return the links of a drive without scans."""
         no = np.empty(0, dtype=np.int64)
         return cls(no, no, np.empty((0, 3, 3)), np.empty((0, 3)), np.empty((0, 6, 6)))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Links"]) -> "Links":
+        """Return the links of some parts of a drive as one."""
+        return cls(
+            np.concatenate([each.origin for each in parts]),
+            np.concatenate([each.key_pose for each in parts]),
+            np.concatenate([each.R for each in parts]),
+            np.concatenate([each.p for each in parts]),
+            np.concatenate([each.covariance for each in parts]),
+        )
 
     @property
     def in_map(self) -> BoolArray:

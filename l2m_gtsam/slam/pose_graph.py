@@ -42,6 +42,12 @@ def start_factor(start: StartPose) -> gtsam.NonlinearFactor:
     return gtsam.PriorFactorPose3(X(0), as_pose(start.T_map_lidar), noise)
 
 
+def between_factor(number: int, step: gtsam.Pose3, covariance: FloatArray) -> gtsam.NonlinearFactor:
+    """Return the factor of a step from a key pose to the next, with its covariance, (6, 6)."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    return gtsam.BetweenFactorPose3(X(number), X(number + 1), step, noise)
+
+
 def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.NonlinearFactor:
     """Return odometry's factor from a key pose to the next, its length corrected for an error."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
@@ -49,9 +55,8 @@ def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.No
         shift = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
         turn = gtsam.Rot3(drive.steps.R[number])
         return fixed_axes_step_factor(number, turn, (1 + scale_error) * shift, noise)
-    return gtsam.BetweenFactorPose3(
-        X(number), X(number + 1), drive.step(number, scale_error), noise
-    )
+    step = drive.step(number, scale_error)
+    return between_factor(number, step, drive.steps.covariance[number])
 
 
 def scaled_factor(drive: Drive, number: int) -> gtsam.NonlinearFactor:

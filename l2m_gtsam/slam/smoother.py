@@ -220,8 +220,10 @@ def localise_drive(
     """Estimate the poses of a drive, and its calibrations if these are to be refined."""
     problem = SmoothingProblem(drive, field_map, options)
     followed = drive.as_walk(options.drift.over_m)
-    follower = Follower(followed, field_map, options.robust, free=problem.free)
-    values = follow(follower, len(drive), progress)
+    follower = Follower(
+        followed.start, followed.sensors, field_map, options.robust, free=problem.free
+    )
+    values = follow(follower, followed, progress)
     values.insert(shared_values(drive))
     counts = np.ones(len(drive.readings), dtype=np.bool_)
     for round_, mu in enumerate(GRADUATION):

@@ -12,6 +12,7 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.exploration import EXACT_START, Exploration, explore
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.belief import Belief
+from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
 from tests.drives.slam import SlamDrive, calibrated, slam_drive
@@ -39,10 +40,12 @@ class OnLine:
         pace: ExploringOptions,
     ) -> "OnLine":
         """Follow a drive."""
-        explorer, beliefs, sizes = Explorer(drive, options, pace=pace), [], []
-        for number in range(len(drive)):
-            beliefs.append(explorer.step(number))
+        drive = drive.as_walk(options.drift.over_m)
+        explorer, beliefs, sizes = Explorer(drive.start, drive.sensors, options, pace=pace), [], []
+        for key_pose in key_poses_of(drive):
+            beliefs.append(explorer.add(key_pose))
             sizes.append(len(explorer.memory.known.covariance))
+        beliefs[-1] = explorer.finish()
         return cls(explorer, drive, beliefs, truth, sizes)
 
     def off(self, poses: list[gtsam.Pose3]) -> FloatArray:

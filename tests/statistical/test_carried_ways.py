@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.drives.following import followed_beliefs
 from tests.drives.slam import rounds
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -61,8 +61,7 @@ def solved(seed: int, sensors: int, every: int) -> tuple[Errors, Errors]:
     """Return errors of all poses solved together, and of those found on line."""
     drawn, world = drive(seed, sensors, every), dipole_world(seed)
     batch = localise_drive(drawn.drive, world, SlamOptions(), lambda _stage, _share: None)
-    follower = Follower(drawn.drive, world, RobustOptions(), free=False)
-    beliefs = [follower.step(number) for number in range(len(drawn.drive))]
+    beliefs = followed_beliefs(drawn.drive, world, RobustOptions(), free=False)
     covariance = np.stack([each.pose_covariance for each in beliefs])
     poses, each = [belief.pose for belief in beliefs], EVERY // every
     found = errors(drawn, batch.poses, batch.pose_covariance, each)

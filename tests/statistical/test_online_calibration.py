@@ -8,11 +8,11 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.drives.following import followed_beliefs
 from tests.drives.slam import rounds
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -79,8 +79,7 @@ def one_drive(seed: int) -> Outcome:
     rng, world = np.random.default_rng(seed), dipole_world(seed)
     sensors, truth = random_sensors(seed, SENSORS), thinned(rounds(SECONDS))
     drawn = drawn_drive(world, sensors, truth, rng, FAR, every=EVERY)
-    follower = Follower(drawn.drive, world, RobustOptions(), free=True)
-    beliefs = [follower.step(number) for number in range(len(drawn.drive))]
+    beliefs = followed_beliefs(drawn.drive, world, RobustOptions(), free=True)
     last = beliefs[-1]
     on_line = nees(
         drawn,

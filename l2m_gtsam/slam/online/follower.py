@@ -18,13 +18,15 @@ import gtsam
 import numpy as np
 from scipy.linalg import block_diag
 
-from l2m_factors import D, MapBatch, StepError, T, Whitening, X, key_pose_factor
+from l2m_factors import D, KeyPoseReadings, MapBatch, StepError, T, Whitening, X, key_pose_factor
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import IntArray
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.slam.drive import Drive, as_pose
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.key_pose_readings import joined_readings
+from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.map_prediction import sensors_in
 from l2m_gtsam.slam.online.belief import POSE, Belief, PredictedBelief
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
 from l2m_gtsam.slam.online.measurements import (
     CachedVariance,
     StepMeasurement,
@@ -35,14 +37,13 @@ from l2m_gtsam.slam.online.measurements import (
 )
 from l2m_gtsam.slam.online.section import Section
 from l2m_gtsam.slam.pose_graph import (
+    between_factor,
     calibration_graph,
     calibration_values,
     link_factor,
     link_pose,
     start_factor,
-    step_factor,
 )
-from l2m_gtsam.slam.relative_motion import interpolated_readings
 from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.solve.robust import RobustOptions
 
@@ -58,15 +59,15 @@ class AcceptedReadings:
 
     Attributes
     ----------
-    rows
-        Their rows in the drive, shape (n,).
+    readings
+        n readings, relative to the first key pose by the filter's estimate of the step.
     whitening
         Of the n residuals together.
     step
         The filter's estimate of the step, and the residuals' derivatives by it.
     """
 
-    rows: IntArray
+    readings: KeyPoseReadings
     whitening: Whitening
     step: StepError
 
@@ -93,8 +94,10 @@ class Follower:
 
     Parameters
     ----------
-    drive
-        K key poses with odometry and readings.
+    start
+        Prior of the first key pose.
+    sensors
+        Calibrations.
     field_map
         Map that is queried for field and variance.
     robust
@@ -107,28 +110,29 @@ class Follower:
 
     def __init__(
         self,
-        drive: Drive,
+        start: StartPose,
+        sensors: KnownSensors,
         field_map: QueryableMap,
         robust: RobustOptions,
         *,
         free: bool,
         section: int = SECTION,
     ) -> None:
-        self._drive, self._map, self._robust, self._free = drive, field_map, robust, free
+        self._sensors, self._map, self._robust, self._free = sensors, field_map, robust, free
         self._variance = CachedVariance(field_map)
-        self._ends = np.searchsorted(drive.readings.key_pose, np.arange(len(drive) + 1))
-        fixes = np.flatnonzero(drive.links.in_map)
-        self._fixes = fixes[np.argsort(drive.links.key_pose[fixes], kind="stable")]
-        self._fix_ends = np.searchsorted(
-            drive.links.key_pose[self._fixes], np.arange(len(drive) + 1)
-        )
-        sensors = range(len(drive.sensors.names) if free else 0)
-        self._calibrations = [key for i in sensors for key in (T(i), D(i))]
-        self._length, self._first, self._past = section, 0, gtsam.Values()
+        numbers = range(len(sensors.names) if free else 0)
+        self._calibrations = [key for i in numbers for key in (T(i), D(i))]
+        self._length, self._first, self._last = section, 0, -1
+        self._past = gtsam.Values()
         self._section = Section(self._calibrations)
-        self._belief, self._pending = self._prior(), self._opening()
+        self._belief, self._pending = self._prior(start), self._opening(start)
 
-    def step(self, number: int) -> Belief:
+    @property
+    def belief(self) -> Belief:
+        """The posterior of the last key pose."""
+        return self._belief
+
+    def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior.
 
         Raises
@@ -136,15 +140,21 @@ class Follower:
         CalibrationError
             The system is too badly scaled to be solved.
         """
+        number = key_pose.number
         if number > 0:
-            self._advance(number)
-        self._update_by_fixes(number)
+            self._advance(key_pose)
+        self._update_by_fixes(key_pose.links)
         self._pending.values.insert(X(number), self._belief.pose)
-        last = len(self._drive) - 1
+        self._last = number
         # Not before there was a reading: iSAM2 needs the filter's estimate of calibrations far off.
-        if 0 < number < EARLY or (number + 1) % GROUP == 0 or number == last:
-            with reported_ill_conditioning():
-                self._update_section(number)
+        if 0 < number < EARLY or (number + 1) % GROUP == 0:
+            self._update_section()
+        return self._belief
+
+    def finish(self) -> Belief:
+        """Solve for the key poses that the filter alone has had so far."""
+        if self._pending.values.size():
+            self._update_section()
         return self._belief
 
     def values(self) -> gtsam.Values:
@@ -153,24 +163,23 @@ class Follower:
         values.insert(self._section.values())
         return values
 
-    def _opening(self) -> PendingKeyPoses:
+    def _opening(self, start: StartPose) -> PendingKeyPoses:
         """Return the priors of the first key pose and the calibrations."""
         pending = PendingKeyPoses()
-        pending.graph.add(start_factor(self._drive.start))
+        pending.graph.add(start_factor(start))
         if self._free:
-            pending.graph.push_back(calibration_graph(self._drive.sensors))
+            pending.graph.push_back(calibration_graph(self._sensors))
         return pending
 
-    def _prior(self) -> Belief:
-        start, sensors = self._drive.start, self._drive.sensors
-        known = sensors.covariance if self._free else ()
+    def _prior(self, start: StartPose) -> Belief:
+        known = self._sensors.covariance if self._free else ()
         covariance = block_diag(start.covariance, *known)
-        return Belief(as_pose(start.T_map_lidar), sensors, covariance)
+        return Belief(as_pose(start.T_map_lidar), self._sensors, covariance)
 
-    def _update_by_fixes(self, number: int) -> None:
+    def _update_by_fixes(self, links: Links) -> None:
         """Update by the scan fixes of a key pose that pass the gate."""
-        links, most = self._drive.links, self._robust.largest_of(POSE)
-        for row in self._fixes[self._fix_ends[number] : self._fix_ends[number + 1]].tolist():
+        most = self._robust.largest_of(POSE)
+        for row in np.flatnonzero(links.in_map).tolist():
             covariance = self._belief.pose_covariance + links.covariance[row]
             off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
             if off @ np.linalg.solve(covariance, off) <= most:
@@ -178,28 +187,31 @@ class Follower:
                 self._belief = self._belief.updated(measure)
                 self._pending.graph.add(link_factor(links, row))
 
-    def _advance(self, number: int) -> None:
+    def _advance(self, key_pose: ArrivedKeyPose) -> None:
         """Predict a key pose from the one before, and update by the readings between them."""
-        before, steps = number - 1, self._drive.steps
-        belief = self._belief.predicted(self._drive.step(before), steps.covariance[before])
-        self._belief = self._update_by_readings(before, belief).marginalize_previous()
-        self._pending.graph.add(step_factor(self._drive, before))
+        belief = self._belief.predicted(key_pose.step, key_pose.covariance)
+        self._belief = self._update_by_readings(key_pose, belief).marginalize_previous()
+        before = key_pose.number - 1
+        self._pending.graph.add(between_factor(before, key_pose.step, key_pose.covariance))
 
-    def _update_by_readings(self, number: int, belief: PredictedBelief) -> PredictedBelief:
+    def _update_by_readings(
+        self, key_pose: ArrivedKeyPose, belief: PredictedBelief
+    ) -> PredictedBelief:
         """Return the belief updated by the readings after a key pose that pass the gate."""
-        rows = np.arange(self._ends[number], self._ends[number + 1])
-        if not len(rows):
+        if not len(key_pose.readings):
             return belief
-        measurement = StepMeasurement(StepReadings.of(self._drive, rows, number), self._map)
+        of_step = StepReadings(key_pose.readings, key_pose.step, key_pose.covariance)
+        measurement = StepMeasurement(of_step, self._map)
         gated = gate(measurement, self._variance, belief, self._robust)
         if not len(gated.rows):
             return belief
         updated = update(measurement.of(gated.rows), gated.own, belief)
-        step = StepError(number, updated.belief.step, updated.by_step)
-        self._pending.accepted.append(AcceptedReadings(rows[gated.rows], updated.whitening, step))
+        step = StepError(key_pose.number - 1, updated.belief.step, updated.by_step)
+        readings = of_step[gated.rows].shifted(updated.belief.step)
+        self._pending.accepted.append(AcceptedReadings(readings, updated.whitening, step))
         return updated.belief
 
-    def _update_section(self, number: int) -> None:
+    def _update_section(self) -> None:
         """Add the pending key poses to iSAM2, and take the posterior of the last from it."""
         pending, self._pending = self._pending, PendingKeyPoses()
         for factor in self._reading_factors(pending):
@@ -207,21 +219,20 @@ class Follower:
         if self._free and pending.values.exists(X(0)):
             # From the filter's estimate: linearised far off, readings would lead astray.
             pending.values.insert(calibration_values(self._belief.sensors))
-        self._section.add(pending.graph, pending.values, number, AGAIN)
-        sensors, section = self._drive.sensors, self._section
-        if self._free:
-            sensors = sensors_in(section.calibration(), sensors)
-        self._belief = Belief(section.pose(number), sensors, section.covariance(number))
-        if number - self._first >= self._length:
-            self._hand_over(number)
+        sensors, section, last = self._sensors, self._section, self._last
+        with reported_ill_conditioning():
+            section.add(pending.graph, pending.values, last, AGAIN)
+            if self._free:
+                sensors = sensors_in(section.calibration(), sensors)
+            self._belief = Belief(section.pose(last), sensors, section.covariance(last))
+            if last - self._first >= self._length:
+                self._hand_over(last)
 
     def _reading_factors(self, pending: PendingKeyPoses) -> Iterator[gtsam.NonlinearFactor]:
         if not pending.accepted:
             return
-        rows = np.concatenate([each.rows for each in pending.accepted])
-        steps = [each.step.step for each in pending.accepted for _ in each.rows]
-        readings = interpolated_readings(self._drive, rows, steps)
-        fixed = None if self._free else self._drive.sensors.fixed()
+        fixed = None if self._free else self._sensors.fixed()
+        readings = joined_readings([each.readings for each in pending.accepted])
         batch = MapBatch(self._map, readings, fixed)
         for each in pending.accepted:
             yield key_pose_factor(batch, each.step.key_pose, each.whitening, step=each.step)
@@ -234,9 +245,10 @@ class Follower:
         self._first = last
 
 
-def follow(follower: Follower, count: int, progress: Progress) -> gtsam.Values:
-    """Follow a drive of ``count`` key poses to its end and return its values."""
-    for number in range(count):
-        follower.step(number)
-        progress("following the drive", (number + 1) / count)
+def follow(follower: Follower, drive: Drive, progress: Progress) -> gtsam.Values:
+    """Follow a drive to its end and return its values."""
+    for key_pose in key_poses_of(drive):
+        follower.add(key_pose)
+        progress("following the drive", (key_pose.number + 1) / len(drive))
+    follower.finish()
     return follower.values()

@@ -9,7 +9,6 @@ import numpy as np
 from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, key_pose_residuals
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.online.belief import POSE, SENSOR, Belief, PredictedBelief, WhitenedMeasurement
 from l2m_gtsam.slam.pose_graph import stated_information_root
@@ -71,11 +70,6 @@ class StepReadings:
     readings: KeyPoseReadings
     step: gtsam.Pose3
     covariance: FloatArray
-
-    @classmethod
-    def of(cls, drive: Drive, rows: IntArray, number: int) -> "StepReadings":
-        """Return some of a drive's readings, all on the key pose of this number."""
-        return cls(drive.readings[rows], drive.step(number), drive.steps.covariance[number])
 
     def __getitem__(self, rows: IntArray) -> "StepReadings":
         return replace(self, readings=self.readings[rows])

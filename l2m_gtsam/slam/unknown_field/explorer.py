@@ -16,9 +16,10 @@ from pydantic import Field
 
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.options import Options
-from l2m_gtsam.slam.drive import Drive, as_pose
+from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.online.belief import Belief
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
 from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory
 from l2m_gtsam.slam.unknown_field.open_section import OpenSection
@@ -54,8 +55,8 @@ class Explorer:
 
     Parameters
     ----------
-    drive
-        K key poses with odometry and readings.
+    start, sensors
+        Prior of the first key pose, and calibrations.
     options
         As of a localisation. Fewer `tiles.modes` take far less time.
     prior
@@ -71,7 +72,8 @@ class Explorer:
 
     def __init__(
         self,
-        drive: Drive,
+        start: StartPose,
+        sensors: KnownSensors,
         options: SlamOptions,
         prior: FieldPrior | None = None,
         pace: ExploringOptions | None = None,
@@ -81,14 +83,14 @@ class Explorer:
                 "`slam.calibration: refined` works off line where there is no map; on line give "
                 "`fixed`"
             )
-        if drive.steps.fixed_axes is not None:
+        if options.drift.axes is StepAxes.FIXED:
             raise ConfigError("`slam.drift.axes: fixed` works off line; on line give `vehicle`")
-        drive = drive.as_walk(options.drift.over_m)
-        self._drive, self._options = drive, options
+        self._start, self._sensors, self._options = start, sensors, options
         self._pace = ExploringOptions() if pace is None else pace
-        self._memory = FieldMemory.at_start(drive)
-        self._path = drive.steps.path
-        self._first = self._solved = 0
+        self._memory = FieldMemory.at_start(start)
+        self._waiting: list[ArrivedKeyPose] = []  # until they are solved
+        self._path_m = self._solved_m = self._opened_m = 0.0
+        self._first, self._solved = 0, -1
         self._past: list[MarginalizedPose] = []
         self._belief = self._prior()
         self._section = None if prior is None else self._opened(prior)
@@ -98,7 +100,12 @@ class Explorer:
         """The memory, without the last stretch."""
         return self._memory
 
-    def step(self, number: int) -> Belief:
+    @property
+    def belief(self) -> Belief:
+        """The posterior of the last key pose."""
+        return self._belief
+
+    def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior.
 
         Raises
@@ -108,17 +115,26 @@ class Explorer:
         MapError
             There are too few readings to learn a prior of the field from.
         """
-        pending = range(number, number + 1)
-        if self._section is None and self._is_learnt_by(number):
-            part = self._drive.until(number + 1)
-            prior = drive_prior(part, part.dead_reckoning(), self._options.tiles)
-            self._section, self._belief = self._opened(prior), self._prior()
-            pending = range(number + 1)
-        for k in pending:
-            self._dead_reckon(k)
-            if self._section is not None and self._is_due(k):
-                with reported_ill_conditioning():
-                    self._solve(self._section, k)
+        self._waiting.append(key_pose)
+        self._dead_reckon(key_pose)
+        if self._section is None and self._path_m >= self._options.tiles.learn_over_m:
+            self._learn()
+        elif self._section is not None and self._is_due():
+            self._solve(self._section)
+        return self._belief
+
+    def finish(self) -> Belief:
+        """Solve for the key poses that odometry alone has had so far.
+
+        Raises
+        ------
+        MapError
+            There are too few readings to learn a prior of the field from.
+        """
+        if self._section is None:
+            self._learn()
+        elif self._waiting:
+            self._solve(self._section)
         return self._belief
 
     def poses(self) -> list[gtsam.Pose3]:
@@ -130,34 +146,45 @@ class Explorer:
         return [*past, *(now.pose(k) for k in range(len(past), self._solved + 1))]
 
     def _prior(self) -> Belief:
-        start = as_pose(self._drive.start.T_map_lidar)
-        return Belief(start, self._drive.sensors, self._memory.known.covariance)
+        start = as_pose(self._start.T_map_lidar)
+        return Belief(start, self._sensors, self._start.covariance)
 
     def _opened(self, prior: FieldPrior) -> OpenSection:
-        return OpenSection(self._drive, prior, self._options, self._memory, 0)
+        return OpenSection(self._sensors, prior, self._options, self._memory, 0)
 
-    def _is_learnt_by(self, number: int) -> bool:
-        """Return whether the prior can be learnt, or must be because the drive ends."""
-        far = self._path[number] >= self._options.tiles.learn_over_m
-        return bool(far or number == len(self._drive) - 1)
+    def _learn(self) -> None:
+        """Learn the prior at the poses of odometry, and solve for the key poses so far."""
+        part = drive_of(self._waiting, self._start, self._sensors)
+        prior = drive_prior(part, part.dead_reckoning(), self._options.tiles)
+        self._section = self._opened(prior)
+        waiting, self._waiting = self._waiting, []
+        self._belief, self._path_m = self._prior(), 0.0
+        for each in waiting:
+            self._waiting.append(each)
+            self._dead_reckon(each)
+            if self._is_due():
+                self._solve(self._section)
 
-    def _is_due(self, number: int) -> bool:
-        path, count = self._path[number] - self._path[self._solved], number - self._solved
-        return bool(path >= self._pace.group_m or count >= GROUP or number == len(self._drive) - 1)
+    def _is_due(self) -> bool:
+        path = self._path_m - self._solved_m
+        return bool(path >= self._pace.group_m or len(self._waiting) >= GROUP)
 
-    def _dead_reckon(self, number: int) -> None:
+    def _dead_reckon(self, key_pose: ArrivedKeyPose) -> None:
         """Predict the belief by odometry."""
-        if number > 0:
-            drift = self._drive.steps.covariance[number - 1]
-            predicted = self._belief.predicted(self._drive.step(number - 1), drift)
+        if key_pose.number > 0:
+            predicted = self._belief.predicted(key_pose.step, key_pose.covariance)
             self._belief = predicted.marginalize_previous()
+            self._path_m += key_pose.length_m
 
-    def _solve(self, section: OpenSection, number: int) -> None:
-        """Solve the last stretch up to a key pose, and begin another if it is long."""
-        self._belief, self._solved = section.extend(number), number
-        path, count = self._path[number] - self._path[self._first], number - self._first
-        if path >= self._pace.section_m or count >= SECTION:
-            self._hand_over(section, number)
+    def _solve(self, section: OpenSection) -> None:
+        """Solve the last stretch with what is waiting, and begin another if it is long."""
+        with reported_ill_conditioning():
+            self._belief = section.extend(self._waiting)
+            self._solved, self._solved_m = self._waiting[-1].number, self._path_m
+            self._waiting = []
+            long = self._path_m - self._opened_m >= self._pace.section_m
+            if long or self._solved - self._first >= SECTION:
+                self._hand_over(section, self._solved)
 
     def _hand_over(self, section: OpenSection, last: int) -> None:
         for k in range(len(self._past), last + 1):
@@ -165,5 +192,5 @@ class Explorer:
             self._past.append(
                 MarginalizedPose(anchor, section.pose(anchor).between(section.pose(k)))
             )
-        self._memory, self._first = section.closed(), last
+        self._memory, self._first, self._opened_m = section.closed(), last, self._path_m
         self._section = section.next(self._memory, last)

@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.slam.drive import Drive, as_pose
+from l2m_gtsam.slam.drive import StartPose, as_pose
 from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.unknown_field.tiles import WaveTile, level_axes, tile_about
 from l2m_gtsam.solve.linear_algebra import correlation_factor, triangular_information_root
@@ -265,7 +265,7 @@ class RememberedTile:
         Its own number, and that of the key pose that anchors it.
     field
         Basis of its m weights.
-    taught
+    past_information
         Information about the weights by readings of marginalised poses, shape (m, m).
     """
 
@@ -296,11 +296,11 @@ class FieldMemory:
     tiles: tuple[RememberedTile, ...] = field(default=())
 
     @classmethod
-    def at_start(cls, drive: Drive) -> "FieldMemory":
+    def at_start(cls, start: StartPose) -> "FieldMemory":
         """Return the memory before a drive."""
         values = gtsam.Values()
-        values.insert(X(0), as_pose(drive.start.T_map_lidar))
-        return cls(JointGaussian(values, {X(0): POSE}, drive.start.covariance))
+        values.insert(X(0), as_pose(start.T_map_lidar))
+        return cls(JointGaussian(values, {X(0): POSE}, start.covariance))
 
 
 def tile_of(pose: gtsam.Pose3, anchors: list[gtsam.Pose3], core: float) -> int:

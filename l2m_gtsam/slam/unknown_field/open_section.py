@@ -1,18 +1,28 @@
 """The last stretch of a drive through an unknown field, solved again as it grows."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
-from l2m_factors import M, TileBatch, Whitening, X, effective_parameters_factor, tile_factor
+from l2m_factors import (
+    KeyPoseReadings,
+    M,
+    TileBatch,
+    Whitening,
+    X,
+    effective_parameters_factor,
+    tile_factor,
+)
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings
 from l2m_gtsam.slam.online.belief import POSE, Belief
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.pose_graph import step_factor
+from l2m_gtsam.slam.pose_graph import between_factor
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt
 from l2m_gtsam.slam.unknown_field.field_memory import (
@@ -33,6 +43,14 @@ ONWARDS = (4.0, 1.0)
 AGAIN = (16.0, 4.0, 1.0)
 CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
 SOFT = 1.0  # convexity of the loss for new readings, mu of ``solve.robust``
+
+
+@dataclass(frozen=True)
+class SectionReadings:
+    """Readings of a section so far, and the calibrations of their sensors."""
+
+    readings: KeyPoseReadings
+    sensors: KnownSensors
 
 
 @dataclass(frozen=True)
@@ -88,18 +106,20 @@ class TileReadings:
         variance = noise[:, None] ** 2 + laid.field.unresolved(laid.placed.x)
         return cls(laid, chosen, W, variance[chosen] / weights[chosen, None])
 
-    def factors(self, drive: Drive) -> Iterator[gtsam.NonlinearFactor]:
+    def factors(self, of_section: SectionReadings) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the readings' factors of poses and weights."""
-        batch = self._batch(drive)
+        batch = self._batch(of_section)
         for k in batch.key_poses:
             white = Whitening.independent(self.whitening[batch.rows_of(k)])
             yield tile_factor(batch, k, white)
 
-    def penalties(self, drive: Drive, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
+    def penalties(
+        self, of_section: SectionReadings, tile: RememberedTile
+    ) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the penalties of the parameters that the readings determine (Mallows' C_p)."""
         if not len(self.chosen):
             return
-        batch, x = self._batch(drive), self.laid.placed.x[self.chosen]
+        batch, x = self._batch(of_section), self.laid.placed.x[self.chosen]
         penalty = self.laid.field.penalty(x, self.variance, tile.past_information)
         for k in batch.key_poses:
             factor = effective_parameters_factor(batch, k, penalty[batch.rows_of(k)])
@@ -110,11 +130,9 @@ class TileReadings:
         """Return the readings' information about the tile's m weights, shape (m, m)."""
         return self.laid.field.information(self.laid.placed.x[self.chosen], self.variance)
 
-    def _batch(self, drive: Drive) -> TileBatch:
-        readings = drive.readings[self.laid.rows[self.chosen]]
-        return TileBatch(
-            self.laid.number, self.laid.anchor, self.laid.field, readings, drive.sensors.fixed()
-        )
+    def _batch(self, of_section: SectionReadings) -> TileBatch:
+        laid, readings = self.laid, of_section.readings[self.laid.rows[self.chosen]]
+        return TileBatch(laid.number, laid.anchor, laid.field, readings, of_section.sensors.fixed())
 
 
 class OpenSection:
@@ -122,22 +140,27 @@ class OpenSection:
 
     Parameters
     ----------
-    drive, prior, options
-        The drive, the prior of its field, how to solve.
+    sensors, prior, options
+        Calibrations, the prior of the field, how to solve.
     memory
         Joint Gaussian of ``X(first)`` and the tiles.
     first
-        Its first key pose. Readings on it count if it is that of the drive; otherwise they have
-        counted in the section before.
+        Its first key pose; readings before it have counted in the section before.
     """
 
     def __init__(
-        self, drive: Drive, prior: FieldPrior, options: SlamOptions, memory: FieldMemory, first: int
+        self,
+        sensors: KnownSensors,
+        prior: FieldPrior,
+        options: SlamOptions,
+        memory: FieldMemory,
+        first: int,
     ) -> None:
-        self._drive, self._field_prior, self._options = drive, prior, options
+        self._sensors, self._field_prior, self._options = sensors, prior, options
         self._memory, self._tiles = memory, list(memory.tiles)
-        self._first, self._last = first, first if first else -1
-        self._begin = int(np.searchsorted(drive.readings.key_pose, self._last + 1))
+        self._first = self._last = first
+        self._key_poses: list[ArrivedKeyPose] = []
+        self._of_section = SectionReadings(joined_readings([]), sensors)
         self._shared = [X(first)]  # with the memory
         self._values = part_of(memory.known.values, [X(first)])
         self._tile_of: dict[int, int] = {}
@@ -145,18 +168,23 @@ class OpenSection:
         self._prior: gtsam.NonlinearFactorGraph | None = None
         self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
 
-    def extend(self, last: int) -> Belief:
-        """Add the key poses up to one, solve, and return its posterior."""
-        new = np.arange(self._last + 1, last + 1)
-        self._predict(new, last)
-        entered = [self._enter(k) for k in new.tolist()]
+    def extend(self, new: Sequence[ArrivedKeyPose]) -> Belief:
+        """Add key poses, solve, and return the posterior of the last."""
+        self._key_poses += [each for each in new if each.number > self._first]
+        parts = [each.readings for each in self._key_poses]
+        self._of_section = SectionReadings(joined_readings(parts), self._sensors)
+        self._predict(new)
+        numbers = [each.number for each in new]
+        if self._first not in self._tile_of:
+            numbers = [self._first, *(k for k in numbers if k > self._first)]
+        entered = [self._enter(k) for k in numbers]
         stages = AGAIN if any(entered) else ONWARDS
         for scale in stages[:-1]:
-            self._solve(self._factors(int(new[0]), scale), 1)
-        graph = self._factors(int(new[0]), stages[-1])
+            self._solve(self._factors(numbers[0], scale), 1)
+        graph = self._factors(numbers[0], stages[-1])
         for each in self._counted:
             tile = self._tiles[each.laid.number]
-            for factor in each.penalties(self._drive, tile):
+            for factor in each.penalties(self._of_section, tile):
                 graph.add(factor)
         self._solve(graph, self._options.max_iterations)
         return self._belief()
@@ -176,7 +204,7 @@ class OpenSection:
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
         """Return a new section from a key pose on."""
-        return OpenSection(self._drive, self._field_prior, self._options, memory, first)
+        return OpenSection(self._sensors, self._field_prior, self._options, memory, first)
 
     def pose(self, number: int) -> gtsam.Pose3:
         """Return the estimate of a key pose of the section, or of the memory."""
@@ -187,18 +215,13 @@ class OpenSection:
         """Return the tile of a key pose of the section."""
         return self._tiles[self._tile_of[number]]
 
-    def _predict(self, new: IntArray, last: int) -> None:
+    def _predict(self, new: Sequence[ArrivedKeyPose]) -> None:
         """Initialise new key poses by odometry."""
-        for k in new.tolist():
-            if k > self._first:
-                there = self.pose(k - 1).compose(self._drive.step(k - 1))
-                self._values.insert(X(k), there)
-        self._last = last
-
-    def _rows(self) -> IntArray:
-        """Return the readings of the section so far."""
-        end = np.searchsorted(self._drive.readings.key_pose, self._last + 1)
-        return np.arange(self._begin, end)
+        for each in new:
+            if each.number > self._first:
+                there = self.pose(each.number - 1).compose(each.step)
+                self._values.insert(X(each.number), there)
+                self._last = each.number
 
     def _enter(self, k: int) -> bool:
         """Assign a key pose to its tile; return whether the section enters a tile of the memory."""
@@ -221,35 +244,35 @@ class OpenSection:
 
     def _waves(self, anchor: int) -> WaveTile:
         """Return the waves of a new tile at a key pose; sensors and readings bound its height."""
-        R, rows = self.pose(anchor).rotation().matrix(), self._rows()
+        R, count = self.pose(anchor).rotation().matrix(), len(self._of_section.readings)
         level, options = R.T @ level_axes(R[None])[0], self._field_prior.options
-        x = self._drive.sensors.t
-        if len(rows):
-            x = np.vstack([x, self._place(rows, anchor).x])
+        x = self._sensors.t
+        if count:
+            x = np.vstack([x, self._place(np.arange(count), anchor).x])
         near = np.abs(x @ level[:, :2]).max(axis=1) <= options.edge / 2
         return WaveTile.about(self._field_prior, level, x[near] if near.any() else x)
 
     def _place(self, rows: IntArray, anchor: int) -> PlacedReadings:
-        readings, origin = self._drive.readings[rows], self.pose(anchor)
+        readings, origin = self._of_section.readings[rows], self.pose(anchor)
         own = {int(k): origin.between(self.pose(int(k))) for k in np.unique(readings.key_pose)}
-        return place_readings(readings, own, self._drive.sensors)
+        return place_readings(readings, own, self._sensors)
 
     def _factors(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
-        """Return odometry, the prior of new tiles, and readings, those from ``new`` on scaled."""
+        """Return odometry, the prior of new tiles, and readings, those since ``new`` scaled."""
         graph, old = gtsam.NonlinearFactorGraph(), len(self._memory.tiles)
-        for k in range(self._first, self._last):
-            graph.add(step_factor(self._drive, k))
+        for each in self._key_poses:
+            graph.add(between_factor(each.number - 1, each.step, each.covariance))
         for tile in self._tiles[old:]:
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
             graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
-        rows = self._rows()
-        owner = np.array([self._tile_of[int(k)] for k in self._drive.readings.key_pose[rows]])
+        key = self._of_section.readings.key_pose
+        owner = np.array([self._tile_of[int(k)] for k in key], dtype=np.int64)
         self._counted = [
-            self._weighed(self._tiles[number], rows[owner == number], new, scale)
+            self._weighed(self._tiles[number], np.flatnonzero(owner == number), new, scale)
             for number in np.unique(owner).tolist()
         ]
-        for each in self._counted:
-            for factor in each.factors(self._drive):
+        for tile_readings in self._counted:
+            for factor in tile_readings.factors(self._of_section):
                 graph.add(factor)
         return graph
 
@@ -257,11 +280,11 @@ class OpenSection:
         self, tile: RememberedTile, rows: IntArray, new: int, scale: float
     ) -> TileReadings:
         """Return the readings of a tile with weights by its current prediction."""
-        sensors, readings = self._drive.sensors, self._drive.readings
+        sensors, readings = self._sensors, self._of_section.readings
         laid = OccupiedTile(
             tile.number, tile.anchor, rows, tile.field, self._place(rows, tile.anchor)
         )
-        recent = readings.key_pose[rows] >= new
+        recent = readings.key_pose[rows] >= new - 1  # they come with the key pose after them
         if not self._values.atVector(M(tile.number)).any():
             likely = laid.robust_weights(sensors, scale * sensors.noise)
             self._values.update(M(tile.number), likely)
@@ -302,4 +325,4 @@ class OpenSection:
 
     def _belief(self) -> Belief:
         known = self._known([X(self._last)])
-        return Belief(self.pose(self._last), self._drive.sensors, known.covariance)
+        return Belief(self.pose(self._last), self._sensors, known.covariance)

@@ -114,4 +114,4 @@ def test_where_nothing_is_read_odometry_carries_on() -> None:
 def test_calibrations_are_not_refined_on_line(round_and_round: OnLine) -> None:
     refined = SlamOptions.model_validate({**QUICK, "calibration": "refined"})
     with pytest.raises(ConfigError, match="works off line"):
-        Explorer(round_and_round.drive, refined)
+        Explorer(round_and_round.drive.start, round_and_round.drive.sensors, refined)

@@ -9,9 +9,9 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.localisation import prepared
-from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.smoother import localise_drive
+from tests.drives.following import followed_beliefs
 from tests.drives.slam import COARSE, calibrated, small_hall
 from tests.worlds.exact import dipole_world
 
@@ -31,8 +31,7 @@ def test_a_calibration_that_is_far_off_converges_on_line() -> None:
     options = SlamOptions(calibration=CalibrationUse.REFINED, key_poses=COARSE)
     drive, _ = prepared(recorded.recording, rough, options)
     world = dipole_world(1)
-    follower = Follower(drive, world, options.robust, free=True, section=50)
-    last = [follower.step(number) for number in range(len(drive))][-1]
+    last = followed_beliefs(drive, world, options.robust, free=True, section=50)[-1]
     batch = localise_drive(drive, world, options, silent)
     sigma = np.sqrt(np.einsum("sii->si", batch.calibration_covariance))
     apart = np.abs(vectors(last.sensors) - vectors(batch.drive.sensors)) / sigma
@@ -55,8 +54,8 @@ def test_sensors_may_be_heard_late(heard: str) -> None:
     late, readings = {"one": [1], "none": range(len(sensors))}[heard], drive.readings
     silent = np.isin(readings.sensor, late) & (readings.key_pose < LATE)
     drive = replace(drive, readings=readings[np.flatnonzero(~silent)])
-    follower = Follower(drive, dipole_world(1), options.robust, free=True, section=50)
-    known = [follower.step(number).sensors for number in range(len(drive))]
+    found = followed_beliefs(drive, dipole_world(1), options.robust, free=True, section=50)
+    known = [each.sensors for each in found]
     np.testing.assert_allclose(vectors(known[LATE - 1])[1], vectors(drive.sensors)[1], atol=1e-9)
     ideal = np.stack([np.append(each.t_lidar_mag, each.distortion.vector()) for each in sensors])
     before, after = (np.abs(vectors(each) - ideal)[1, 12:] for each in (drive.sensors, known[-1]))

@@ -14,12 +14,14 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.links import MAP, Links
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.follower import Follower
+from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.online.measurements import CELL_M, CachedVariance
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import calibration_values, odometry_graph
 from l2m_gtsam.slam.smoother import SmoothingProblem
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive
+from tests.drives.following import followed_beliefs
 from tests.drives.slam import rounds
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
 
@@ -71,8 +73,7 @@ def drawn(seconds: float) -> DrawnDrive:
 
 
 def followed(drive: Drive, world: QueryableMap = WORLD, section: int = 200) -> list[Belief]:
-    follower = Follower(drive, world, RobustOptions(), free=True, section=section)
-    return [follower.step(number) for number in range(len(drive))]
+    return followed_beliefs(drive, world, RobustOptions(), free=True, section=section)
 
 
 def apart(one: Belief, other: Belief) -> float:
@@ -149,10 +150,11 @@ def test_a_field_that_bends_does_not_lead_astray() -> None:
 def test_what_a_key_pose_costs_does_not_grow() -> None:
     """The map is asked as often late in a drive as early, once the calibration has settled."""
     field_map, drive = CountingMap(WORLD), drawn(40.0).drive
-    follower = Follower(drive, field_map, RobustOptions(), free=True, section=20)
+    robust = RobustOptions()
+    follower = Follower(drive.start, drive.sensors, field_map, robust, free=True, section=20)
     asked = []
-    for number in range(len(drive)):
-        follower.step(number)
+    for key_pose in key_poses_of(drive):
+        follower.add(key_pose)
         asked.append(field_map.asked)
     fifths = np.array_split(np.diff([0, *asked]), 5)
     assert fifths[-1].mean() < 1.1 * fifths[1].mean()

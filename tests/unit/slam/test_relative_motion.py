@@ -11,12 +11,12 @@ from scipy.spatial.transform import Rotation
 from l2m_factors import KeyPoseReadings, KeyPoseResiduals, Whitening, X, key_pose_residuals
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.slam.odometry import odometry_steps
-from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.options import DriftOptions, SlamOptions
 from l2m_gtsam.slam.relative_motion import bridge_whitening, shifted_readings
 from l2m_gtsam.slam.smoother import SmoothingProblem, localise_drive
 from l2m_gtsam.solve.robust import RobustOptions
 from tests.drives.drawn import DrawnDrive, drawn_drive, moved, perturbations
+from tests.drives.following import followed_beliefs
 from tests.drives.slam import rounds
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -156,8 +156,8 @@ def test_on_line_key_poses_far_apart_know_as_much_too() -> None:
     far, near = drive(4), drive(1)
     beliefs = []
     for each in (far, near):
-        follower = Follower(each.drive, WORLD, RobustOptions(confidence=1 - 1e-9), free=False)
-        beliefs.append([follower.step(number) for number in range(len(each.drive))])
+        robust = RobustOptions(confidence=1 - 1e-9)
+        beliefs.append(followed_beliefs(each.drive, WORLD, robust, free=False))
     for one, other in zip(beliefs[0][1:], beliefs[1][4::4], strict=True):
         sigmas = np.sqrt(np.diag(other.pose_covariance))
         apart = gtsam.Pose3.Logmap(other.pose.between(one.pose)) / sigmas

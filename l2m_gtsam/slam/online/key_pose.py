@@ -1,0 +1,115 @@
+"""Key poses as they come: the step from the one before, its readings, its scan registrations.
+
+All estimators on line take these one by one, from a recording (``key_poses_of``) or as a vehicle
+drives (:mod:`.intake`). Readings between two key poses come with the second of them.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from l2m_factors import KeyPoseReadings
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
+from l2m_gtsam.slam.key_pose_readings import joined_readings, no_readings
+from l2m_gtsam.slam.links import Links
+from l2m_gtsam.slam.odometry import OdometrySteps
+
+POSE = 6
+
+
+@dataclass(frozen=True)
+class ArrivedKeyPose:
+    """A key pose with what came since the one before.
+
+    Attributes
+    ----------
+    number
+        From 0 on.
+    stamp_ns
+        Its time.
+    R, p
+        By odometry in the frame of the key pose before, shapes (3, 3) and (3,), metres.
+    covariance
+        Of a right perturbation of this step, rotation (rad) before translation (m), shape (6, 6).
+    readings
+        n readings between both, relative to the one before.
+    reading_ns
+        Their times, shape (n,).
+    links
+        Scan registrations of this key pose.
+    """
+
+    number: int
+    stamp_ns: int
+    R: FloatArray
+    p: FloatArray
+    covariance: FloatArray
+    readings: KeyPoseReadings
+    reading_ns: IntArray
+    links: Links
+
+    @property
+    def step(self) -> gtsam.Pose3:
+        """The step from the key pose before."""
+        return gtsam.Pose3(gtsam.Rot3(self.R), self.p)
+
+    @property
+    def length_m(self) -> float:
+        """Length of the step in metres."""
+        return float(np.linalg.norm(self.p))
+
+    @classmethod
+    def first(cls, stamp_ns: int, links: Links) -> "ArrivedKeyPose":
+        """Return the first key pose of a drive."""
+        none = np.empty(0, dtype=np.int64)
+        still = np.eye(3), np.zeros(3), np.zeros((POSE, POSE))
+        return cls(0, stamp_ns, *still, no_readings(), none, links)
+
+
+def key_poses_of(drive: Drive) -> Iterator[ArrivedKeyPose]:
+    """Yield the key poses of a recorded drive in order."""
+    key, links = drive.readings.key_pose, drive.links
+    ends = np.searchsorted(key, np.arange(len(drive)))
+    order = np.argsort(links.key_pose, kind="stable")
+    of_links = np.searchsorted(links.key_pose[order], np.arange(len(drive) + 1))
+    for k in range(len(drive)):
+        own = links[order[of_links[k] : of_links[k + 1]]]
+        stamp = int(drive.stamp_ns[k])
+        if k == 0:
+            yield ArrivedKeyPose.first(stamp, own)
+            continue
+        last = len(key) if k == len(drive) - 1 else ends[k]
+        rows = np.arange(ends[k - 1], last)
+        steps = drive.steps
+        yield ArrivedKeyPose(
+            k,
+            stamp,
+            steps.R[k - 1],
+            steps.p[k - 1],
+            steps.covariance[k - 1],
+            drive.readings[rows],
+            drive.reading_ns[rows],
+            own,
+        )
+
+
+def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: KnownSensors) -> Drive:
+    """Return key poses, from the first on, as a drive."""
+    steps = key_poses[1:]
+    return Drive(
+        stamp_ns=np.array([each.stamp_ns for each in key_poses], dtype=np.int64),
+        steps=OdometrySteps(
+            np.reshape([each.R for each in steps], (-1, 3, 3)),
+            np.reshape([each.p for each in steps], (-1, 3)),
+            np.reshape([each.covariance for each in steps], (-1, POSE, POSE)),
+            stated=False,
+        ),
+        readings=joined_readings([each.readings for each in key_poses]),
+        start=start,
+        sensors=sensors,
+        reading_ns=np.concatenate([each.reading_ns for each in key_poses]),
+        links=Links.joined([each.links for each in key_poses]),
+    )
