@@ -102,7 +102,7 @@ def study(
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Run a study: table1, basin, ablation, honesty, scaling, slam or troubles.
+    """Run a study: one of those in docs/studies, such as table1, honesty or changes.
 
     Started again with the same --out it goes on where it was stopped.
     """

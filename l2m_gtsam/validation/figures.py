@@ -12,13 +12,8 @@ from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, refitted, series
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
 from l2m_gtsam.records.validation import Change, ChiSquare, MinimumDetectableChange, ValidatedSensor
-from l2m_gtsam.validation.innovation import (
-    COLUMNS,
-    PARAMETERS,
-    columns_of,
-    detectable_change,
-    width,
-)
+from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, columns_of, width
+from l2m_gtsam.validation.innovation import detectable_change
 from l2m_gtsam.validation.recheck import Recheck, SensorDrive
 
 BAND = np.array([0.025, 0.975])

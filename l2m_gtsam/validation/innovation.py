@@ -28,18 +28,9 @@ from l2m_gtsam.calibration.view import QueryableMap, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.solve.chi_square import chance_beyond
+from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, columns_of, width
 
 ROWS = 4000  # that are reduced at once
-PARAMETERS = 16  # t, C row by row, H, time offset
-COLUMNS = {
-    CalibrationPart.PLACE: slice(0, 3),
-    CalibrationPart.ROTATION: slice(3, 6),
-    CalibrationPart.GAINS: slice(6, 9),
-    CalibrationPart.ANGLES: slice(9, 12),
-    CalibrationPart.OFFSET: slice(12, 15),
-    CalibrationPart.CLOCK: slice(15, 16),
-}
-PAIRS = ((0, 1), (1, 2), (2, 0))
 UNOBSERVABLE = 1e-9  # of the best observed direction of a part: zero but for rounding
 OPEN_SIGMAS = 30.0  # of the largest useful ones: a parameter that a calibration leaves open
 
@@ -267,35 +258,6 @@ def marginalise_calibration(
     return ChangeLikelihood(found.root, found.white, found.rest + likelihood.rest)
 
 
-def changes_of(C: FloatArray) -> FloatArray:
-    """Return what a change of each part does to (t, C row by row, H, time offset), (16, 16).
-
-    Columns are those of ``COLUMNS``: metres; degrees by which the sensor turns about its own axes,
-    R_lidar_mag to R_lidar_mag exp(d), so that field vectors turn by -d in it and C becomes
-    exp(-d) C; relative gains; degrees by which the angles x y, y z, z x between axes become
-    smaller; microtesla; seconds.
-    """
-    basis = np.zeros((PARAMETERS, PARAMETERS))
-    basis[:3, COLUMNS[CalibrationPart.PLACE]] = np.eye(3)
-    basis[12:15, COLUMNS[CalibrationPart.OFFSET]] = np.eye(3)
-    basis[15:, COLUMNS[CalibrationPart.CLOCK]] = 1.0
-    degree = np.deg2rad(1.0)
-    for k, (i, j) in enumerate(PAIRS):
-        turn, skew, gain = np.zeros((3, 3, 3))
-        # about the axis that completes the pair: -[d]x, what a sensor that turns by d reads
-        turn[j, i], turn[i, j] = -degree, degree
-        skew[i, j] = skew[j, i] = degree / 2
-        gain[k, k] = 1.0
-        axis = 3 - i - j
-        for part, column, A in (
-            (CalibrationPart.ROTATION, axis, turn),
-            (CalibrationPart.ANGLES, k, skew),
-            (CalibrationPart.GAINS, k, gain),
-        ):
-            basis[3:12, COLUMNS[part].start + column] = (A @ C).ravel()
-    return basis
-
-
 def parts_changed(
     likelihood: ChangeLikelihood, freedom: int, chance: float
 ) -> tuple[CalibrationPart, ...]:
@@ -327,16 +289,6 @@ def parts_changed(
             break
         named.append(left.pop(best))
     return tuple(named)
-
-
-def columns_of(parts: Sequence[CalibrationPart]) -> list[int]:
-    """Return the columns of parts, in their order."""
-    return [k for part in parts for k in range(COLUMNS[part].start, COLUMNS[part].stop)]
-
-
-def width(part: CalibrationPart) -> int:
-    """Return the number of coordinates of a part."""
-    return COLUMNS[part].stop - COLUMNS[part].start
 
 
 def is_observable(likelihood: ChangeLikelihood, part: CalibrationPart) -> bool:

@@ -1,4 +1,9 @@
-"""Whether the place changed or the vehicle: the same readings under both, by likelihood."""
+"""Whether the place changed or the vehicle: the same readings under both, by likelihood.
+
+Steel is looked for with the sensors free, so that nothing that happened to them is taken for steel.
+Then the readings are asked for each explanation, with what it needs and no more: sources, parts of
+sensors that a test named without sources, parts that it names beside them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,10 +22,40 @@ from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import FoundSources, find_sources, price, refined
 from l2m_gtsam.records.places import CLEAR, ChangedSource
+from l2m_gtsam.records.validation import CalibrationPart
+from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 
-PLACE = "The place changed, not the vehicle"
-VEHICLE = "The vehicle changed, not the place"
-BOTH = "Both the place and the vehicle changed"
+TIE = "It cannot be told which"
+Parts = tuple[CalibrationPart, ...]
+# Standard deviations of a part that changed, in its own units: anything.
+ANYTHING = {
+    CalibrationPart.PLACE: 1.0,
+    CalibrationPart.ROTATION: 60.0,
+    CalibrationPart.GAINS: 1.0,
+    CalibrationPart.ANGLES: 60.0,
+    CalibrationPart.OFFSET: 100.0,
+    CalibrationPart.CLOCK: 1.0,
+}
+
+
+@dataclass(frozen=True)
+class Explained:
+    """One explanation of readings.
+
+    Attributes
+    ----------
+    words
+        What changed.
+    gain
+        Over that nothing did: twice the logarithm of the likelihood ratio, less what its
+        parameters cost (the BIC).
+    of_place
+        Whether the place has changed by it.
+    """
+
+    words: str
+    gain: float
+    of_place: bool
 
 
 @dataclass(frozen=True)
@@ -29,50 +64,120 @@ class PlaceOrVehicle:
 
     Attributes
     ----------
+    explanations
+        The best first.
     found, sources
         What changed at the place, if it did.
-    gains
-        Of each explanation over that of no change: twice the logarithm of the likelihood ratio,
-        less what its parameters cost (the BIC).
     """
 
+    explanations: tuple[Explained, ...]
     found: FoundSources
     sources: tuple[ChangedSource, ...]
-    gains: dict[str, float]
 
     @property
-    def winner(self) -> str:
+    def best(self) -> Explained:
         """The explanation with the largest gain."""
-        return max(self.gains, key=lambda each: self.gains[each])
+        return self.explanations[0]
 
     @property
-    def of_place(self) -> bool:
-        """Whether the place has changed by it."""
-        return self.winner != VEHICLE
+    def tied(self) -> bool:
+        """Whether another explains the readings about as well."""
+        gains = [each.gain for each in self.explanations]
+        return len(gains) > 1 and gains[0] - gains[1] < CLEAR
 
     @property
     def sentence(self) -> str:
         """What the readings say; a tie is called one."""
-        ranked = sorted(self.gains, key=lambda each: -self.gains[each])
-        figures = ", ".join(
-            f"{each[0].lower()}{each[1:]}: {self.gains[each]:.0f}" for each in ranked
-        )
-        first, second = ranked[:2]
-        head = f"{first}"
-        if self.gains[first] - self.gains[second] < CLEAR:
-            head = f"It cannot be told which: {first.lower()}, or {second.lower()}"
+        figures = ", ".join(f"{each.words}: {each.gain:.0f}" for each in self.explanations)
+        head = capitalised(self.best.words)
+        if self.tied:
+            others = self.explanations[1].words
+            head = f"{TIE}: {self.best.words}, or {others}"
         return f"{head}, by the likelihood of the same readings ({figures})."
 
 
-def place_or_vehicle(
-    readings: Readings,
-    field_map: QueryableMap,
-    estimate: Estimate,
-    covariances: FloatArray,
-    parameters: int,
-    options: ChangesOptions,
-) -> PlaceOrVehicle | None:
-    """Return what explains readings; none where no place is suspected, or no source stands out.
+@dataclass(frozen=True)
+class ShownSources:
+    """Sources that a drive shows whatever happened to its sensors.
+
+    Attributes
+    ----------
+    rows, drive
+        Averaged readings, the sensors free.
+    found
+        The sources.
+    """
+
+    rows: MarginalRows
+    drive: AveragedDrive
+    found: FoundSources
+
+    def judged(
+        self, covariances: FloatArray, alone: Sequence[Parts], beside: Sequence[Parts]
+    ) -> PlaceOrVehicle:
+        """Return whether these sources, the vehicle or both explain the readings.
+
+        Parameters
+        ----------
+        covariances
+            The calibration's, of t, C by row, H and time offset, finite, (S, 16, 16).
+        alone, beside
+            Parts of each sensor that have changed if the place did not, and if it did.
+        """
+        held = with_calibration(self.rows, covariances)
+        before = held.pull(held.residual)[1]
+        steel = price(held, self.found.parameters)
+        at_place = refined(held, self.found.shapes)
+        fits = [at_place]
+        explained = [
+            Explained("the place changed, not the vehicle", before - at_place.left - steel, True)
+        ]
+        if any(alone):
+            fits.append(refined(self.opened(covariances, alone), ()))
+            gain = before - fits[-1].left - self.cost(alone)
+            explained.append(Explained(f"{self.who(alone)} changed, not the place", gain, False))
+        if any(beside):
+            fits.append(refined(self.opened(covariances, beside), self.found.shapes))
+            gain = before - fits[-1].left - steel - self.cost(beside)
+            explained.append(
+                Explained(f"both the place and {self.who(beside)} changed", gain, True)
+            )
+        order = sorted(range(len(fits)), key=lambda k: -explained[k].gain)
+        found = fits[order[0]]
+        found = replace(found, gains=self.found.gains) if len(found) else found
+        sources = changed_sources(self.rows, self.drive, found)
+        return PlaceOrVehicle(tuple(explained[k] for k in order), found, sources)
+
+    def opened(self, covariances: FloatArray, parts: Sequence[Parts]) -> MarginalRows:
+        """Return the readings with parts of each sensor free, the others as calibrated."""
+        C = self.drive.estimate.C()
+        each = zip(covariances, C, parts, strict=True)
+        return with_calibration(self.rows, np.array([P + spread(c, own) for P, c, own in each]))
+
+    def cost(self, parts: Sequence[Parts]) -> float:
+        """Return what parts of the sensors have to explain."""
+        return price(self.rows, sum(width(part) for each in parts for part in each))
+
+    def who(self, parts: Sequence[Parts]) -> str:
+        """Return what of the vehicle changed."""
+        return who_changed(self.drive.view.readings.sensors, parts)
+
+
+def who_changed(sensors: Sequence[str], parts: Sequence[Parts]) -> str:
+    """Return what of a vehicle changed: one sensor of several, or more."""
+    names = [name for name, each in zip(sensors, parts, strict=True) if each]
+    return f"sensor {names[0]} alone" if len(names) == 1 < len(parts) else "the vehicle"
+
+
+def capitalised(words: str) -> str:
+    """Return words that begin a sentence."""
+    return f"{words[0].upper()}{words[1:]}"
+
+
+def shown_sources(
+    readings: Readings, field_map: QueryableMap, estimate: Estimate, options: ChangesOptions
+) -> ShownSources | None:
+    """Return sources that readings show; none where no place is suspected, or none stands out.
 
     Parameters
     ----------
@@ -80,17 +185,12 @@ def place_or_vehicle(
         Of S sensors, inside the map, at their calibrated time offsets.
     field_map
         The map.
-    estimate, covariances
-        The calibration; covariances of t, C by row, H and time offset, finite, (S, 16, 16).
-    parameters
-        How many of the vehicle's have changed, as tested without a change of the place.
+    estimate
+        The calibration.
     options
         How to look for sources.
     """
-    if not options.sources.most or not isinstance(field_map, UncertainMap):
-        return None
-    # What a map misses that does not know its own errors is no change.
-    if not sigmas_hold(field_map):
+    if not (isinstance(field_map, UncertainMap) and is_searched(field_map, options)):
         return None
     every = np.ones(len(readings), dtype=np.bool_)
     averages = averaged(readings, field_map, estimate, every, options.averaging)
@@ -98,26 +198,28 @@ def place_or_vehicle(
     places = suspected(drive, field_map, options.averaging)
     if not len(places):
         return None
-    free = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
-    found = find_sources(free, places, options.sources, None)
-    if not len(found):
-        return None
-    held = with_calibration(free, covariances)
-    unchanged = held.pull(held.residual)[1]
-    at_place = refined(held, found.shapes)
-    sources = price(free, found.parameters)
-    vehicle = price(free, max(parameters, 1))
-    gains = {
-        PLACE: unchanged - at_place.left - sources,
-        VEHICLE: unchanged - free.pull(free.residual)[1] - vehicle,
-        BOTH: unchanged - found.left - sources - vehicle,
-    }
-    result = PlaceOrVehicle(found, (), gains)
-    if result.winner == PLACE:
-        found = replace(at_place, gains=found.gains)
-    if result.of_place:
-        return PlaceOrVehicle(found, changed_sources(free, drive, found), gains)
-    return result
+    rows = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
+    found = find_sources(rows, places, options.sources, None)
+    return ShownSources(rows, drive, found) if len(found) else None
+
+
+def is_searched(field_map: QueryableMap, options: ChangesOptions) -> bool:
+    """Return whether steel is looked for: what a map misses that does not know itself is none."""
+    return (
+        bool(options.sources.most)
+        and isinstance(field_map, UncertainMap)
+        and sigmas_hold(field_map)
+    )
+
+
+def spread(C: FloatArray, parts: Parts) -> FloatArray:
+    """Return the covariance of a change of parts by anything, shape (16, 16)."""
+    sigma = np.zeros(PARAMETERS)
+    for part in parts:
+        sigma[COLUMNS[part]] = ANYTHING[part]
+    at = columns_of(parts)
+    root = changes_of(C)[:, at] * sigma[at]
+    return np.asarray(root @ root.T)
 
 
 def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:

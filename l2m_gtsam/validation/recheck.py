@@ -1,5 +1,6 @@
 """A calibration beside readings that it did not see: what is no longer right, and by how much."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,13 +12,19 @@ from l2m_gtsam.data import BoolArray, FloatArray, Readings, Trajectory
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.solve.robust import grown, median_noise
+from l2m_gtsam.validation.coordinates import (
+    COLUMNS,
+    NO_CHANGE,
+    PARAMETERS,
+    changed_vector,
+    changes_of,
+    columns_of,
+)
 from l2m_gtsam.validation.innovation import (
     OPEN_SIGMAS,
     ChangeLikelihood,
     KnownCalibration,
     change_likelihood,
-    changes_of,
-    columns_of,
     marginalise_calibration,
     parts_changed,
 )
@@ -108,7 +115,7 @@ def recheck(
         used = used & inside(drive, field_map, known)
         if used.sum() < options.min_readings:
             used = usable(drive, field_map, known, options)
-        likelihood = _about(drive, field_map, known, known, used, options)
+        likelihood = _about(drive, field_map, known, used, options)
         likelihood = marginalise_calibration(likelihood, spread, basis)
     # What is open takes a degree of freedom, unless readings do not depend on it, as on a clock
     # where motion is not known. (All depend on C, where coordinates are not the parameters.)
@@ -137,13 +144,14 @@ def _followed(
     options: OneKeyOptions,
     chance: float,
 ) -> _Followed:
-    basis = changes_of(known.vector[3:12].reshape(3, 3))
+    C, change = known.vector[3:12].reshape(3, 3), NO_CHANGE
     used = usable(drive, field_map, known, options)
     last, here = np.empty(0), known
     parts: tuple[CalibrationPart, ...] = ()
     # Gauss-Newton: linearise about the changed calibration, test and estimate the change anew.
     for _ in range(ROUNDS):
-        likelihood = _about(drive, field_map, here, known, used, options)
+        basis = changes_of(C, change)
+        likelihood = _about(drive, field_map, here, used, options).recentred(basis @ change)
         likelihood = marginalise_calibration(likelihood, spread, basis)
         before, parts = parts, parts_changed(likelihood, 3 * int(used.sum()), chance)
         columns = columns_of(parts)
@@ -151,7 +159,8 @@ def _followed(
         if parts == before and _settled(found.change - last, found.covariance):
             break
         last = found.change
-        here = replace(known, vector=known.vector + limited(basis[:, columns] @ found.change))
+        change = limited(columns, found.change)
+        here = replace(known, vector=changed_vector(known.vector, change))
         seen = usable(drive, field_map, here, options)
         if seen.sum() < options.min_readings:
             break
@@ -168,14 +177,12 @@ def _about(
     drive: SensorDrive,
     field_map: QueryableMap,
     here: KnownCalibration,
-    known: KnownCalibration,
     used: BoolArray,
     options: OneKeyOptions,
 ) -> ChangeLikelihood:
-    """Return the likelihood of a change of the calibration, linearised elsewhere."""
+    """Return the likelihood of a change of a calibration, linearised there."""
     readings = drive.at(float(here.vector[15])).select(used)
-    likelihood = change_likelihood(readings, field_map, here, options.pose_noise.correlation_s)
-    return likelihood.recentred(here.vector - known.vector)
+    return change_likelihood(readings, field_map, here, options.pose_noise.correlation_s)
 
 
 def inside(drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration) -> BoolArray:
@@ -214,8 +221,11 @@ def finite(covariance: FloatArray, options: OneKeyOptions) -> FloatArray:
     return np.asarray(spread + np.diag(np.where(known, 0.0, wide**2)))
 
 
-def limited(change: FloatArray) -> FloatArray:
-    """Return a change of (t, C, H, time offset), shape (16,), no larger than can be followed."""
-    most = np.full(16, np.inf)
-    most[:3], most[15] = FURTHEST_M, LONGEST_S
+def limited(columns: Sequence[int], values: FloatArray) -> FloatArray:
+    """Return coordinates of a change, shape (16,), no larger than can be followed."""
+    change = np.zeros(PARAMETERS)
+    change[columns] = values
+    most = np.full(PARAMETERS, np.inf)
+    most[COLUMNS[CalibrationPart.PLACE]] = FURTHEST_M
+    most[COLUMNS[CalibrationPart.CLOCK]] = LONGEST_S
     return np.asarray(np.clip(change, -most, most))

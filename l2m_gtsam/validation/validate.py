@@ -26,15 +26,27 @@ from l2m_gtsam.qa.metrics.coverage import drive_metrics
 from l2m_gtsam.recording.drive_trace import is_of
 from l2m_gtsam.recording.sync import stuck_sensors
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.validation import DriveValidation, NotValidated, ValidatedSensor
+from l2m_gtsam.records.validation import (
+    CalibrationPart,
+    DriveValidation,
+    NotValidated,
+    ValidatedSensor,
+)
 from l2m_gtsam.solve.correction import without_moving
 from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
-from l2m_gtsam.validation.innovation import KnownCalibration, width
+from l2m_gtsam.validation.innovation import KnownCalibration
 from l2m_gtsam.validation.notes import doubts_and_notes
-from l2m_gtsam.validation.places import PlaceOrVehicle, place_or_vehicle, together
+from l2m_gtsam.validation.places import (
+    PlaceOrVehicle,
+    capitalised,
+    is_searched,
+    shown_sources,
+    together,
+    who_changed,
+)
 from l2m_gtsam.validation.recheck import SensorDrive, finite, recheck
 
-REJECTED = 0.02  # share of a sensor's readings, from which something has changed
+NO_STEEL = "the readings show no steel that came or went"
 
 
 @one_blas_thread()
@@ -90,16 +102,17 @@ def validate(
     for index, sensor in enumerate(known):
         progress("validating", index / len(known))
         found.append(_tested(test, sensor))
-    judged = _judged(test, known, found)
-    if judged is not None and judged.of_place:
-        changed = replace(test, field_map=ChangedMap(test.field_map, judged.found))
-        found = [_tested(changed, sensor) for sensor in known]
-        field_map = ChangedMap(field_map, judged.found)
+    judged, beside = _judged(test, known, found)
+    if judged is not None and judged.best.of_place:
+        field_map, found = ChangedMap(field_map, judged.found), beside
     progress("validating", 1.0)
     places = np.concatenate([_places(test.readings, each) for each in known])
     doubts, notes = doubts_and_notes(surveyed, calibration, map_source)
     if judged is not None:
         doubts = (judged.sentence, *doubts)
+    elif is_searched(test.field_map, options.changes) and any(map(parts_of, found)):
+        who = who_changed([each.sensor for each in known], [parts_of(each) for each in found])
+        notes = (f"{capitalised(who)} changed, not the place: {NO_STEEL}.", *notes)
     return DriveValidation(
         sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
         missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),
@@ -166,37 +179,47 @@ def _judged(
     test: _Test,
     known: Sequence[SensorCalibration],
     found: Sequence[ValidatedSensor | NotValidated],
-) -> PlaceOrVehicle | None:
-    """Return whether the place changed or the vehicle, where something did."""
+) -> tuple[PlaceOrVehicle | None, list[ValidatedSensor | NotValidated]]:
+    """Return whether the place changed or the vehicle, and what is found if the place did."""
     pairs = zip(known, found, strict=True)
-    sound = [(one, each) for one, each in pairs if isinstance(each, ValidatedSensor)]
-    wrong = [
-        each
-        for _, each in sound
-        if each.changes or each.rejected > REJECTED * (each.readings + each.rejected)
-    ]
-    if not wrong:
-        return None
-    parameters = sum(width(change.part) for _, each in sound for change in each.changes)
-    kept = [one for one, _ in sound]
-    names = tuple(each.sensor for each in kept)
-    parts = [drive_of(test.readings, test.recording, each).at(offset_s(each)) for each in kept]
-    calibrations = [_known(test.recording, each) for each in kept]
+    kept = [one for one, each in pairs if isinstance(each, ValidatedSensor)]
+    if not kept:
+        return None, []
+    readings, estimate = _of_all(test, kept)
+    shown = shown_sources(readings, test.field_map, estimate, test.options.changes)
+    if shown is None:
+        return None, []
+    changed = replace(test, field_map=ChangedMap(test.field_map, shown.found))
+    beside = [_tested(changed, sensor) for sensor in known]
+    covariances = np.array([finite(joint_covariance(each), test.options.solve) for each in kept])
+    alone, besides = (
+        [parts_of(each) for one, each in zip(known, which, strict=True) if one in kept]
+        for which in (found, beside)
+    )
+    return shown.judged(covariances, alone, besides), beside
+
+
+def parts_of(found: ValidatedSensor | NotValidated) -> tuple[CalibrationPart, ...]:
+    """Return the parts of a sensor that have changed."""
+    return tuple(e.part for e in found.changes) if isinstance(found, ValidatedSensor) else ()
+
+
+def _of_all(test: _Test, known: Sequence[SensorCalibration]) -> tuple[Readings, Estimate]:
+    """Return the readings of sensors inside the map, and their calibrations."""
+    names = tuple(each.sensor for each in known)
+    parts = [drive_of(test.readings, test.recording, each).at(offset_s(each)) for each in known]
+    calibrations = [_known(test.recording, each) for each in known]
     vectors = np.array([each.vector for each in calibrations])
     estimate = Estimate(
         t=vectors[:, :3],
         distortion=vectors[:, 3:15],
         noise=np.array([each.noise for each in calibrations]),
-        ridge=np.zeros(len(kept)),
+        ridge=np.zeros(len(known)),
         offset=vectors[:, 15],
     )
     readings = together(parts, names)
     inside = test.field_map.query(places_of(readings, estimate.t)).inside
-    options = test.options
-    covariances = np.array([finite(joint_covariance(each), options.solve) for each in kept])
-    return place_or_vehicle(
-        readings.select(inside), test.field_map, estimate, covariances, parameters, options.changes
-    )
+    return readings.select(inside), estimate
 
 
 def _tested(test: _Test, sensor: SensorCalibration) -> ValidatedSensor | NotValidated:

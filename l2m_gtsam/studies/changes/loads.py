@@ -1,0 +1,135 @@
+"""Loads of a hall: steel that stands there when it is surveyed, and when it is driven through.
+
+Loads stand on the timber structures, which vehicles keep away from, and outside of the area.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.maps.build import build_map
+from l2m_gtsam.simulate.brought_steel import brought_steel
+from l2m_gtsam.simulate.hall_drives import calibration_drive, survey
+from l2m_gtsam.simulate.steel_hall import (
+    HALF_AREA,
+    CloudVariant,
+    SteelHall,
+    hall_cloud,
+    steel_hall,
+)
+from l2m_gtsam.simulate.world import SteelWorld
+from l2m_gtsam.studies.changes.options import ChangesStudyOptions
+from l2m_gtsam.studies.validation.drives import direction
+
+# Of the loads on timber, those that stand there when the hall is surveyed.
+STANDING = (1, 2, 4)
+# What happens to loads before each path: comes, goes, is moved outside, comes outside.
+STEPS = ((0, 1, 2), (3, 4, 1))
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Steel that comes and goes: places in metres, (K, 3), and moments in A m^2, (K, 3)."""
+
+    positions: FloatArray
+    moments: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def steel(self, options: ChangesStudyOptions) -> SteelWorld:
+        """Return it as bodies."""
+        return brought_steel(self.positions, self.moments, np.array(options.edges))
+
+
+@dataclass(frozen=True)
+class LoadedHall:
+    """A hall with loads, mapped, and a vehicle.
+
+    Attributes
+    ----------
+    hall
+        With the loads that stood there when it was surveyed.
+    seed
+        Of it.
+    field_map
+        Of its survey.
+    sensors
+        The vehicle's.
+    changes
+        For each path: sources that came, those that went with the opposite of their moment.
+    """
+
+    hall: SteelHall
+    seed: int
+    field_map: QueryableMap
+    sensors: tuple[KnownSensor, ...]
+    changes: tuple[Loads, ...]
+
+
+def loaded_hall(options: ChangesStudyOptions, number: int) -> LoadedHall:
+    """Return a hall by its number."""
+    seed = options.seed + number
+    rng, bare = np.random.default_rng([seed, 31]), steel_hall(seed)
+    timber = np.array([each.centre for each in bare.timber])
+    height = rng.uniform(*options.heights_of_steel, len(timber))
+    inside = Loads(np.column_stack([timber, height]), drawn(options, len(timber), rng))
+    standing = list(STANDING)
+    stood = Loads(inside.positions[standing], inside.moments[standing]).steel(options)
+    hall = replace(bare, world=joined(bare.world, stood))
+    read = survey(hall, seed, options.heights, options.noise, options.survey_readings)
+    cloud = hall_cloud(bare, CloudVariant.ACCURATE, seed)
+    learnt = build_map(read.points, read.field, options.map, cloud)
+    span = min(options.heights), max(options.heights)
+    return LoadedHall(
+        hall,
+        seed,
+        learnt.compile() if isinstance(learnt, Compilable) else learnt,
+        calibration_drive(hall, seed, span, options.noise, options.sensors, 30).sensors,
+        tuple(five_changes(options, inside, *STEPS[path], rng) for path in range(options.paths)),
+    )
+
+
+def five_changes(
+    options: ChangesStudyOptions,
+    loads: Loads,
+    comes: int,
+    goes: int,
+    moves: int,
+    rng: np.random.Generator,
+) -> Loads:
+    """Return five sources: a load that comes, one that goes, one that moves out, one outside."""
+    out = np.array([outside(options, rng) for _ in range(2)])
+    m = loads.moments
+    moments = [m[comes], -m[goes], -m[moves], m[moves], *drawn(options, 1, rng)]
+    return Loads(np.concatenate([loads.positions[[comes, goes, moves]], out]), np.array(moments))
+
+
+def drawn(options: ChangesStudyOptions, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return moments of any direction, in A m^2, their logarithms evenly spread, (count, 3)."""
+    low, high = options.moment
+    size = np.exp(rng.uniform(np.log(low), np.log(high), count))
+    return np.array([each * direction(rng) for each in size])
+
+
+def outside(options: ChangesStudyOptions, rng: np.random.Generator) -> FloatArray:
+    """Return a place beyond the border of the area, metres, shape (3,)."""
+    along, side = rng.integers(2), rng.choice([-1.0, 1.0])
+    place: FloatArray = rng.uniform(-1, 1, 3) * np.append(HALF_AREA, 0.0)
+    place[along] = side * (HALF_AREA[along] + rng.uniform(*options.beyond))
+    place[2] = rng.uniform(*options.heights_of_steel)
+    return place
+
+
+def joined(world: SteelWorld, other: SteelWorld) -> SteelWorld:
+    """Return a world with the bodies of another, in the field of the first."""
+    return SteelWorld(
+        world.kinds + other.kinds,
+        np.concatenate([world.dimensions, other.dimensions]),
+        np.concatenate([world.centres, other.centres]),
+        np.concatenate([world.R_map_body, other.R_map_body]),
+        np.concatenate([world.polarisations, other.polarisations]),
+        world.earth,
+    )

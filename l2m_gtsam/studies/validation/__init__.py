@@ -1,0 +1,1 @@
+"""What validation says of drives after which the place changed, the vehicle, both or nothing."""

@@ -1,0 +1,149 @@
+"""The validation study: ``l2m study validation``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.studies.study import Study
+from l2m_gtsam.studies.validation.cells import NEAR_M, ValidationCell, cell_of
+from l2m_gtsam.studies.validation.drives import CalibratedHall, calibrated_hall
+from l2m_gtsam.studies.validation.options import Change, ValidationStudyOptions
+
+CASE, UNCHANGED = "case", "unchanged"
+
+
+@dataclass(frozen=True)
+class ChangeRow:
+    """What is said of all drives after one change.
+
+    Attributes
+    ----------
+    change
+        What is true.
+    drives, right, tied, failed
+        How many there are, of how many what changed is named and nothing else, of how many two
+        explanations are named, and how many are judged FAIL.
+    away_m
+        Largest distance from the steel to the source that is named; None without.
+    """
+
+    change: Change
+    drives: int
+    right: int
+    tied: int
+    failed: int
+    away_m: float | None
+
+
+@dataclass(frozen=True)
+class ValidationSummary:
+    """The cases change by change, the drives of unchanged ones, and every one that is wrong."""
+
+    options: ValidationStudyOptions
+    cases: tuple[ChangeRow, ...]
+    unchanged: ChangeRow
+    wrong: tuple[ValidationCell, ...]
+
+    @property
+    def drives(self) -> int:
+        """Number of cases."""
+        return sum(row.drives for row in self.cases)
+
+    @property
+    def right(self) -> int:
+        """Cases of which what is true is said."""
+        return sum(row.right for row in self.cases)
+
+
+class ValidationStudy(Study[ValidationStudyOptions, ValidationCell, ValidationSummary]):
+    """Place or vehicle; a cell is one drive."""
+
+    name = "validation"
+    title = "Whether the place changed or the vehicle"
+    size = frozenset({"halls"})
+    options = ValidationStudyOptions
+    cell = ValidationCell
+    summary = ValidationSummary
+
+    def keys(self, options: ValidationStudyOptions) -> tuple[str, ...]:
+        """Return the drives, hall by hall: cases first."""
+        kinds = [CASE] * options.cases + [UNCHANGED] * options.unchanged
+        return tuple(
+            f"hall-{hall:03d}-{kind}-{number:02d}"
+            for hall in range(options.halls)
+            for number, kind in enumerate(kinds, start=1)
+        )
+
+    def site(self, options: ValidationStudyOptions, key: str) -> str:
+        """Return the number of the hall."""
+        return key.split("-")[1]
+
+    def prepare(self, options: ValidationStudyOptions, site: str) -> CalibratedHall:
+        """Return a hall with its calibrated vehicle."""
+        return calibrated_hall(options, int(site))
+
+    def compute(
+        self, options: ValidationStudyOptions, key: str, shared: CalibratedHall
+    ) -> ValidationCell:
+        """Validate on one drive."""
+        return cell_of(options, shared, change_of(options, key), int(key.split("-")[3]))
+
+    def summarise(
+        self, options: ValidationStudyOptions, cells: Mapping[str, ValidationCell]
+    ) -> ValidationSummary:
+        """Count what is right."""
+        cases = [cell for key, cell in cells.items() if key.split("-")[2] == CASE]
+        rest = [cell for key, cell in cells.items() if key.split("-")[2] == UNCHANGED]
+        rows = [row_of(each, [cell for cell in cases if cell.change is each]) for each in Change]
+        return ValidationSummary(
+            options,
+            tuple(row for row in rows if row.drives),
+            row_of(Change.NOTHING, rest),
+            tuple(cell for cell in (*cases, *rest) if not cell.right),
+        )
+
+    def page_context(self, summary: ValidationSummary) -> dict[str, Any]:
+        """Return what the text compares with."""
+        return {"near": NEAR_M}
+
+    def figures(self, summary: ValidationSummary) -> dict[str, Figure]:
+        """Draw how many of each change are right."""
+        figure = Figure(figsize=(6.5, 2.8), layout="constrained", dpi=150)
+        axes, rows = figure.subplots(), (*summary.cases, summary.unchanged)
+        names = [row.change.value for row in summary.cases] + ["unchanged drives"]
+        at = np.arange(len(rows))[::-1]
+        share = [100 * row.right / max(row.drives, 1) for row in rows]
+        axes.barh(at, share, 0.6, color="#009e73")
+        axes.set_yticks(at, names)
+        axes.set_xlabel("what changed is named, and nothing else (%)")
+        axes.set_xlim(0, 100)
+        return {"validation": figure}
+
+
+def change_of(options: ValidationStudyOptions, key: str) -> Change:
+    """Return what changes on a drive: all changes take turns over the cases of all halls."""
+    _, hall, kind, number = key.split("-")
+    if kind == UNCHANGED:
+        return Change.NOTHING
+    every = list(Change)
+    return every[(int(hall) * options.cases + int(number) - 1) % len(every)]
+
+
+def row_of(change: Change, cells: list[ValidationCell]) -> ChangeRow:
+    """Return what is said of the drives after one change."""
+    away = [cell.away_m for cell in cells if cell.away_m is not None]
+    return ChangeRow(
+        change,
+        len(cells),
+        sum(cell.right for cell in cells),
+        sum(cell.tied for cell in cells),
+        sum(cell.level == Level.FAIL.value for cell in cells),
+        max(away, default=None),
+    )
+
+
+VALIDATION = ValidationStudy()
