@@ -1,5 +1,6 @@
 """What changed at the places that a drive came through, and what else would explain it."""
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -73,6 +74,12 @@ class ChangedSource:
     explanations: tuple[CauseGain, ...] = ()
 
     @property
+    def length_m(self) -> float:
+        """Of a bar, end to end; zero of one that is too short to be told from a dipole."""
+        whole = 2 * math.hypot(*self.half_axis)
+        return whole if whole > LONG_M else 0.0
+
+    @property
     def cause(self) -> Cause | None:
         """The cause that is clearly the best; none where two explain it about as well."""
         best, *others = self.explanations or (CauseGain(Cause.PLACE, 0.0, 0.0),)
@@ -80,4 +87,5 @@ class ChangedSource:
         return None if tied else best.cause
 
 
+LONG_M = 0.1  # shorter bars are told as points
 CLEAR = 6.0  # of a gain: twice the logarithm of 20 to 1

@@ -38,7 +38,6 @@ from l2m_gtsam.validation.innovation import KnownCalibration
 from l2m_gtsam.validation.notes import doubts_and_notes
 from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
-    capitalised,
     is_searched,
     shown_sources,
     together,
@@ -112,7 +111,7 @@ def validate(
         doubts = (judged.sentence, *doubts)
     elif is_searched(test.field_map, options.changes) and any(map(parts_of, found)):
         who = who_changed([each.sensor for each in known], [parts_of(each) for each in found])
-        notes = (f"{capitalised(who)} changed, not the place: {NO_STEEL}.", *notes)
+        notes = (f"What changed is of {who}, not of the place: {NO_STEEL}.", *notes)
     return DriveValidation(
         sensors=tuple(each for each in found if isinstance(each, ValidatedSensor)),
         missing=(*missing, *(each for each in found if isinstance(each, NotValidated))),

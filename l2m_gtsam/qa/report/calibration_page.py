@@ -15,6 +15,7 @@ from l2m_gtsam.qa.options import QaOptions, thresholds
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.figures import map as map_figures
 from l2m_gtsam.qa.report.figures import readings, statistics
+from l2m_gtsam.qa.report.figures.changes import changes_figure
 from l2m_gtsam.qa.report.figures.comparison import drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
@@ -97,6 +98,9 @@ def calibration_page(
             ),
             "map-sigma": map_figures.sigma_figure(metrics),
         }
+        if result.sources:
+            path = np.array(metrics.drive.path)
+            figures["changes"] = changes_figure(metrics.map, path, result.sources)
         for k, each in enumerate(result.sensors):
             tell(k + 1, steps)
             anchor, found = f"sensor-{k}", metrics.get(each.sensor)

@@ -9,10 +9,12 @@ from matplotlib.figure import Figure
 from l2m_gtsam.qa.report.drawing import Drawing
 from l2m_gtsam.qa.report.figures import map as map_figures
 from l2m_gtsam.qa.report.figures import readings
+from l2m_gtsam.qa.report.figures.changes import changes_figure
 from l2m_gtsam.qa.report.figures.comparison import field_errors_figure, nis_figure
 from l2m_gtsam.qa.report.figures.statistics import sigmas_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render
 from l2m_gtsam.qa.report.svg import SETTINGS
+from l2m_gtsam.qa.verdict.places import best_of, cause_sentence
 from l2m_gtsam.qa.verdict.validation import NAMES, amount
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.validation import (
@@ -65,6 +67,9 @@ def validation_page(found: Validation) -> str:
             pictures={} if found.drive is None else pictures(_figures(found.drive)),
             thresholds=found.thresholds,
             parameters=PARAMETERS,
+            length=np.linalg.norm,
+            what_else=best_of,
+            cause=cause_sentence,
         )
 
 
@@ -75,6 +80,9 @@ def _figures(drive: DriveValidation) -> dict[str, Figure | Drawing]:
         "map-strength": map_figures.strength_figure(metrics, ()),
         "map-sigma": map_figures.sigma_figure(metrics),
     }
+    if drive.sources:
+        path = np.array(drive.drive.path)
+        figures["changes"] = changes_figure(drive.picture, path, drive.sources)
     if drive.sensors:
         figures["field-errors"] = field_errors_figure(drive.sensors)
         figures["nis"] = nis_figure(drive.sensors)

@@ -7,7 +7,7 @@ import numpy as np
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.disturbances import disturbance_sentence
 from l2m_gtsam.qa.verdict.mounting import mounting
-from l2m_gtsam.qa.verdict.places import source_sentence
+from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.repeatability import repeat
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, misfit, precision
 from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
@@ -68,7 +68,7 @@ def _on_sensor(case: Case) -> SensorVerdict:
 def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[Reason]:
     """Return what speaks against map, place and drive."""
     reasons = [Reason(Level.WARN, f"Of the map: {doubt}.") for doubt in result.doubts]
-    reasons += [Reason(Level.WARN, source_sentence(each)) for each in result.sources]
+    reasons += source_reasons(result.sources)
     shared = [each for each in result.disagreements if _is_shared(each, result)]
     reasons += [Reason(Level.WARN, _changed(each, result)) for each in shared[:MANY]]
     if len(shared) > MANY:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
+from l2m_gtsam.records.verdict import Level, Reason
 
 CAUSES = {
     Cause.PLACE: "the place changed",
@@ -12,19 +13,18 @@ CAUSES = {
 }
 
 
-def source_sentence(source: ChangedSource) -> str:
+def source_sentence(number: int, source: ChangedSource) -> str:
     """Return where steel came, went or was moved, how large it is, and what else it may be."""
-    x, y, z = source.position
+    x, y, z = np.round(source.position, 1) + 0.0  # never minus zero
     spread = float(np.linalg.norm(source.position_sigma))
     moment, sigma = np.linalg.norm(source.moment), np.linalg.norm(source.moment_sigma)
-    half = float(np.linalg.norm(source.half_axis))
-    length = f", {2 * half:.1f} m long" if half else ""
-    return (
-        f"Steel came, went or was moved since the map was surveyed: at ({x:.1f}, {y:.1f}, {z:.1f}) "
-        f"± {spread:.2f} m on the map{length}, with a moment of {moment:.2g} ± {sigma:.1g} A m². "
-        f"It adds up to {source.strongest:.2g} µT to the readings, {source.nearest:.1f} m from the "
-        f"nearest. It is taken into account. {cause_sentence(source)}"
+    length = f", {source.length_m:.1f} m long" if source.length_m else ""
+    told = (
+        f"Steel {number} came, went or was moved since the map was surveyed: at "
+        f"({x:.1f}, {y:.1f}, {z:.1f}) ± {spread:.2f} m{length}, {moment:.2g} ± {sigma:.1g} A m², "
+        f"up to {source.strongest:.2g} µT at the readings. It is taken into account."
     )
+    return told if source.cause is Cause.PLACE else f"{told} {cause_sentence(source)}"
 
 
 def cause_sentence(source: ChangedSource) -> str:
@@ -40,3 +40,8 @@ def cause_sentence(source: ChangedSource) -> str:
 def best_of(explanations: tuple[CauseGain, ...]) -> str:
     """Return the causes with what they explain, the best first, as a phrase."""
     return ", ".join(f"{CAUSES[each.cause]} ({each.gain:.0f})" for each in explanations)
+
+
+def source_reasons(sources: tuple[ChangedSource, ...]) -> list[Reason]:
+    """Return a warning for each source; numbers are those of the report."""
+    return [Reason(Level.WARN, source_sentence(k, each)) for k, each in enumerate(sources, 1)]

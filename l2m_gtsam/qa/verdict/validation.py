@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
-from l2m_gtsam.qa.verdict.places import source_sentence
+from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, outside_map
 from l2m_gtsam.records.validation import (
     CalibrationComparison,
@@ -99,7 +99,7 @@ def _on_drive(drive: DriveValidation, options: QaOptions) -> list[Reason]:
         return [Reason(Level.FAIL, f"{WRONG_MAP} The calibration was not tested.")]
     return [
         *(Reason(Level.WARN, each) for each in drive.doubts),
-        *(Reason(Level.WARN, source_sentence(each)) for each in drive.sources),
+        *source_reasons(drive.sources),
         *(Reason(Level.PASS, each) for each in drive.notes),
     ]
 

@@ -57,19 +57,20 @@ def strength_figure(
             markeredgecolor=PAPER,
         )
     for number, source in enumerate(sources, start=1):
-        _source(axes, source, f"{number}: steel, {np.linalg.norm(source.moment):.2g} A m²")
+        draw_source(axes, source, str(number))
     return figure
 
 
-def _source(axes: Axes, source: ChangedSource, name: str) -> None:
+def draw_source(axes: Axes, source: ChangedSource, name: str) -> None:
     """Draw where a source is, how long it is, and how well its place is known."""
     x, y = source.position[:2]
     ends = np.array([source.position - source.half_axis, source.position + source.half_axis])
     axes.plot(*ends[:, :2].T, color=BAD, linewidth=4, solid_capstyle="round")
-    axes.plot(x, y, "*", color=BAD, markersize=16, markeredgecolor=PAPER)
     radius = 2 * float(np.max(source.position_sigma[:2]))
     axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=BAD, linewidth=1.2))
-    mark_name(axes, source.position[:2], name)
+    axes.plot(x, y, "o", color=BAD, markersize=15, markeredgecolor=PAPER)
+    style: Any = {"ha": "center", "va": "center", "fontsize": SMALL, "fontweight": "bold"}
+    axes.annotate(name, (x, y), color="white", **style)
 
 
 def sigma_figure(metrics: Metrics) -> Figure:

@@ -1,0 +1,85 @@
+"""What a report shows of steel that came, went or was moved: sentences, picture and tables."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+
+from l2m_gtsam.calibration.calibrate import calibrated
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.qa.evaluate import evaluate
+from l2m_gtsam.qa.options import QaOptions
+from l2m_gtsam.qa.report.calibration_page import calibration_page
+from l2m_gtsam.qa.report.figures.changes import added_field
+from l2m_gtsam.qa.verdict.places import source_sentence
+from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
+from tests.drives.verdict import changed_place
+
+PLACE, VEHICLE = CauseGain(Cause.PLACE, 90.0, 2.0), CauseGain(Cause.VEHICLE, 87.0, 2.0)
+
+
+def source(x: float, half: float = 0.0, *causes: CauseGain) -> ChangedSource:
+    return ChangedSource(
+        position=np.array([x, -0.01, 0.5]),
+        position_sigma=np.array([0.03, 0.04, 0.0]),
+        moment=np.array([0.0, 0.0, 12.0]),
+        moment_sigma=np.array([0.0, 0.0, 3.0]),
+        half_axis=np.array([0.0, 0.0, half]),
+        gain=100.0,
+        nearest=0.8,
+        strongest=4.7,
+        passages=2,
+        explanations=causes,
+    )
+
+
+FIRST, SECOND = source(1.0, 0.4, PLACE), source(-1.5, 0.01, PLACE, VEHICLE)
+
+
+def test_a_sentence_tells_where_and_how_much() -> None:
+    assert source_sentence(1, FIRST) == (
+        "Steel 1 came, went or was moved since the map was surveyed: at (1.0, 0.0, 0.5) ± 0.05 m, "
+        "0.8 m long, 12 ± 3 A m², up to 4.7 µT at the readings. It is taken into account."
+    )
+
+
+def test_a_tie_is_called_a_tie() -> None:
+    """And a bar of 2 cm is told as a point."""
+    told = source_sentence(2, SECOND)
+    assert "long" not in told
+    assert told.endswith(
+        "It cannot be told whether the place changed or something on the vehicle was switched or "
+        "moved."
+    )
+
+
+def test_a_drive_feels_what_a_dipole_adds() -> None:
+    """0.2 m / r^3 on its axis, 0.1 m / r^3 across it; and nothing between two drives."""
+    gap = np.full(3, np.nan)
+    path: FloatArray = np.array([[-1.5, -0.01, 2.5], gap, [0.5, -0.01, 0.5]])
+    dipole = replace(SECOND, half_axis=np.zeros(3))
+    np.testing.assert_allclose(added_field(path, [dipole]), [0.2 * 12 / 8, 0, 0.1 * 12 / 8])
+
+
+def pages() -> tuple[str, str]:
+    """The report of a drive without and with two changes."""
+    drive = changed_place()
+    found = calibrated(drive.recording, drive.field_map, drive.options)
+    metrics = evaluate(drive.recording, found, drive.options, QaOptions(halves=False))
+    changed = replace(found.result, sources=(FIRST, SECOND))
+    plain, shown = (
+        calibration_page(each, metrics, QaOptions()) for each in (found.result, changed)
+    )
+    return plain, shown
+
+
+def test_the_page_shows_what_changed_where() -> None:
+    plain, page = pages()
+    assert page.count('href="#changes"') == page.count('id="changes"') == 1
+    assert page.index('id="changes"') < page.index("Where the sensors are")
+    (picture,) = re.findall(r'aria-label="Steel that came, went or was moved: ([^"]*)"', page)
+    assert picture == "1 at (1.0, 0.0, 0.5) m, 2 at (-1.5, 0.0, 0.5) m."
+    assert "12 ± 3" in page
+    assert "Steel 2 came, went or was moved" in page
+    # And a page without changes does not speak of them.
+    assert "changes" not in re.findall(r'id="([^"]*)"', plain)
