@@ -1,9 +1,10 @@
-"""The demonstration on disk, made once for all tests of the command line."""
+"""The demonstration and a small fleet on disk, made once for all tests of the command line."""
 
 import json
 
 import pytest
 
+from tests.drives.fleet_runs import FleetRun, run_small_fleet
 from tests.support.command_line import Demo, l2m_process
 from tests.worlds.halls import SMALL_HALL
 
@@ -15,3 +16,9 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     options = folder / "hall.yaml"
     options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
     return Demo(folder, l2m_process("demo", "--options", options, "--out", folder).out)
+
+
+@pytest.fixture(scope="session")
+def fleet_run(tmp_path_factory: pytest.TempPathFactory) -> FleetRun:
+    """Run a small fleet; tests that spoil it copy it first."""
+    return run_small_fleet(tmp_path_factory.mktemp("fleet"))
