@@ -7,7 +7,7 @@ from importlib.metadata import version
 import numpy as np
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
-from l2m_gtsam.errors import L2MError, MapError
+from l2m_gtsam.errors import CalibrationError, L2MError, MapError
 from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_solver import SuiteSolution, SuiteStep, first_step, solve_suite
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -27,6 +27,7 @@ from l2m_gtsam.solve.rotation import polar_rotation
 REACH = 5.0  # standard deviations of a clock for which readings need poses around them
 NOTICED = 0.1  # share of the residuals' squares; sensors as assumed explain 16 S / 3 N of them
 UNDETERMINED = 0.5  # share of the prior sigma above which the drive does not determine a parameter
+FURTHEST = 6.0  # prior sigmas of a position; beyond, a rough field was taken for a sensor's
 TOGETHER = 1.5  # variance of a direction in sigmas; errors that are independent have one
 PARAMETERS = (
     *("t_lidar_mag x", "t_lidar_mag y", "t_lidar_mag z"),
@@ -77,7 +78,8 @@ def calibrate_suite(
     Raises
     ------
     CalibrationError
-        Drives do not go together, or an axis of a sensor looks flipped.
+        Drives do not go together, an axis of a sensor looks flipped, or the solve ended far from
+        all that is assumed.
     MapError
         A sensor is stuck on one value, or there are too few readings.
     SyncError
@@ -85,6 +87,7 @@ def calibrate_suite(
     """
     drive = suite_drive(recordings, assumed, options)
     solution = solve_suite(drive.at, drive.assumed, options, progress)
+    _check_ending(drive, solution, options)
     return _result(drive, solution, options)
 
 
@@ -156,6 +159,29 @@ def _parameters(sensor: KnownSensor) -> FloatArray:
     """Return (t, C row by row, H, time offset), shape (16,)."""
     offset = [sensor.time_offset]
     return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector(), offset])
+
+
+def _check_ending(
+    drive: SuiteDrive, solution: SuiteSolution, options: SuiteCalibrationOptions
+) -> None:
+    """Refuse sensors that only a solve that got lost can have.
+
+    Raises
+    ------
+    CalibrationError
+        A sensor is metres off, or mirrored by a solve that never settled.
+    """
+    names, sensors = drive.readings.sensors, solution.last.sensors
+    away = np.linalg.norm(sensors[:, :3] - drive.assumed[:, :3], axis=1)
+    mirrored = ~(np.linalg.det(sensors[:, 3:12].reshape(-1, 3, 3)) > 0) & (not solution.converged)
+    lost = mirrored | (away > FURTHEST * options.position_m)
+    if lost.any():
+        k = int(np.flatnonzero(lost)[0])
+        raise CalibrationError(
+            f"{names[k]}: the survey does not lead to this sensor: in {solution.rounds} rounds it "
+            f"came {away[k]:.2g} m from where it was assumed; give what is known of the sensors "
+            "with --suite, keep further from steel, or raise mapping.suite.modes"
+        )
 
 
 def _result(

@@ -18,20 +18,8 @@ from scipy.linalg import solve_triangular
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Evidence, evidence, normal_of
-from l2m_gtsam.maps.harmonic.furnish import basis_of
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
-from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.representatives import spread_tiles
-from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
-from l2m_gtsam.maps.harmonic.tiling import (
-    Tiling,
-    affordable,
-    resolution_of,
-    surveyed_area,
-    tiling_of,
-)
-from l2m_gtsam.maps.training import TrainingSet, merged, training_set
+from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 from l2m_gtsam.recording.sync import SyncOptions
 
@@ -65,6 +53,9 @@ class SuiteCalibrationOptions(Options):
     a planar robot settle slowly (about eight rounds): scale and depth of the field trade."""
     steps: int = Field(default=10, ge=1)
     """The most steps of the solve in one round."""
+    searches: int = Field(default=2, ge=0)
+    """How often steel beside the way is searched for where waves do not explain the survey, at the
+    most: after the rounds, and again with the sensors that this gave. 0 searches nothing."""
 
 
 @dataclass(frozen=True)
@@ -257,77 +248,3 @@ def _information(
         shared += basis.features(points[at]).reshape(-1, len(D)).T @ flat
     known = solve_triangular(found.factor, D[:, None] * shared / noise, lower=True)
     return np.asarray((own - known.T @ known) / noise**2)
-
-
-@dataclass(frozen=True)
-class SuiteWindows:
-    """Windows of a survey, each with readings of its own, and the prior of the field in them.
-
-    Attributes
-    ----------
-    parts
-        Windows.
-    rows
-        Which readings of the survey each has.
-    prior
-        Of the field, and the readings' noise.
-    """
-
-    parts: tuple[SuiteWindow, ...]
-    rows: tuple[IntArray, ...]
-    prior: Hyperparameters
-
-
-def windows_over(
-    readings: Readings, sensors: FloatArray, options: SuiteCalibrationOptions
-) -> SuiteWindows:
-    """Learn the prior of the field from sensors with these parameters, and choose windows.
-
-    Parameters
-    ----------
-    readings
-        Of the survey, at the sensors' clocks.
-    sensors
-        Parameters of S sensors, shape (S, 16).
-    options
-        How many windows.
-
-    Raises
-    ------
-    MapError
-        There are too few readings.
-    """
-    undone, defaults = undistorted(readings, sensors), HarmonicOptions()
-    raw = training_set(undone.points, undone.field)
-    survey = merged(raw, defaults.merge, defaults.independent)
-    learning = LearningOptions(windows=options.windows, rough=0, modes=options.modes)
-    share = defaults.mode_share
-    prior = learn(survey, NO_SOURCES, defaults.tiling, share, learning).hyperparameters
-    density = float(survey.weight.sum()) / surveyed_area(survey.points)
-    wanted = resolution_of(prior, density, share)
-    resolution = affordable(wanted, defaults.tiling, learning.modes)
-    tiling = tiling_of(survey.points, resolution, defaults.tiling, learning.modes, reach=0.0)
-    parts, of = [], []
-    for tile, rows in _dealt(tiling, undone.points, options):
-        own = TrainingSet(undone.points[rows], undone.field[rows], np.ones(len(rows)))
-        centre = tiling.grid.centres[tile]
-        basis = basis_of(own, centre, tiling.edge, resolution, [], np.empty(0))
-        parts.append(SuiteWindow(basis, own.points.mean(axis=0), readings[rows]))
-        of.append(rows)
-    return SuiteWindows(tuple(parts), tuple(of), prior)
-
-
-def _dealt(
-    tiling: Tiling, points: FloatArray, options: SuiteCalibrationOptions
-) -> list[tuple[int, IntArray]]:
-    """Return tiles spread over a survey, with readings of which none belongs to two of them."""
-    members = tiling.grid.members(points, tiling.overlap)
-    tiles = spread_tiles(tiling, [len(rows) for rows in members], options.windows)
-    away = np.abs(points[:, None, :2] - tiling.grid.centres[tiles]).max(axis=2)
-    nearest = np.argmin(away, axis=1)
-    dealt = []
-    for number, tile in enumerate(tiles):
-        rows = members[tile][nearest[members[tile]] == number]
-        some = np.linspace(0, len(rows) - 1, min(len(rows), options.readings)).astype(np.int64)
-        dealt.append((tile, rows[some]))
-    return [(tile, rows) for tile, rows in dealt if len(rows)]

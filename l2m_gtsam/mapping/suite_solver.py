@@ -3,7 +3,8 @@
 The drive's poses are known, the field is not. With a wrong position or distortion a sensor measures
 two fields at one place under two headings, and over the drive a field that no sources could make:
 both are unlikely. The likelihood is maximised by Fisher scoring; strength and depth of the sources
-are learnt again in each round.
+are learnt again in each round. Where waves from below and above do not explain the readings, steel
+beside the way is searched for with the sensors that were found, and the rounds go on with it.
 """
 
 from collections.abc import Callable
@@ -20,10 +21,10 @@ from l2m_gtsam.mapping.suite_likelihood import (
     C,
     SuiteCalibrationOptions,
     SuiteLikelihood,
-    SuiteWindows,
     suite_likelihood,
-    windows_over,
 )
+from l2m_gtsam.mapping.suite_windows import SuiteWindows, sources_in, windows_over
+from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, Sources
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.solve.model_comparison import correlation_of
 
@@ -128,16 +129,21 @@ def solve_suite(
         There are too few readings.
     """
     problem = SuiteProblem(readings_at, assumed, options)
-    sensors, moved = assumed, np.inf
+    sensors, sources, searches = assumed, NO_SOURCES, options.searches
     for round_ in range(options.rounds):
         progress("calibrating the suite", round_ / options.rounds)
-        found = problem.solved(sensors)
-        sensors, moved = found.sensors, found.moved(sensors)
-        if moved < SETTLED:
+        found = problem.solved(sensors, sources)
+        sensors, settled = found.sensors, found.moved(sensors) < SETTLED
+        # A field that is not explained may be why nothing settles.
+        if searches and (settled or round_ + 1 == options.rounds // 2):
+            steel = sources_in(found.windows, sensors, options)
+            searches = searches - 1 if len(steel) else 0
+            if len(steel):
+                sources, settled = steel, False
+        if settled:
             break
     progress("calibrating the suite", 1.0)
-    converged = bool(moved < SETTLED) and found.settled
-    return SuiteSolution(found, found.residuals(), converged, round_ + 1)
+    return SuiteSolution(found, found.residuals(), settled and found.settled, round_ + 1)
 
 
 @dataclass(frozen=True)
@@ -171,7 +177,9 @@ def first_step(
     """
     problem = SuiteProblem(readings_at, assumed, options)
     readings = readings_at(assumed[:, -1])
-    return problem.step(windows_over(readings, assumed, options), assumed, readings.sensors)
+    return problem.step(
+        windows_over(readings, assumed, NO_SOURCES, options), assumed, readings.sensors
+    )
 
 
 class SuiteProblem:
@@ -193,10 +201,18 @@ class SuiteProblem:
         self._readings_at, self._assumed, self._options = readings_at, assumed, options
         self._information = prior_information(len(assumed), options)
 
-    def solved(self, sensors: FloatArray) -> SuiteRound:
-        """Lay windows for these sensors and find those that make the readings most likely."""
+    def solved(self, sensors: FloatArray, sources: Sources) -> SuiteRound:
+        """Lay windows for these sensors and find those that make the readings most likely.
+
+        Parameters
+        ----------
+        sensors
+            To begin with, shape (S, 16).
+        sources
+            Of steel beside the way.
+        """
         readings = self._readings_at(sensors[:, -1])
-        windows = windows_over(readings, sensors, self._options)
+        windows = windows_over(readings, sensors, sources, self._options)
         score, settled = self._scored(windows, sensors), False
         for _ in range(self._options.steps):
             step = self._covariance(score, 1.0) @ score.slope
