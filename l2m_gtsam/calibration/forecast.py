@@ -13,7 +13,8 @@ from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_solutions
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
+from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
+from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
 from l2m_gtsam.calibration.view import QueryableMap, View, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.calibration import Uncertainty

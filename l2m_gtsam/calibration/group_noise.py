@@ -28,15 +28,28 @@ class GroupNoise:
         (3 n, 3 n).
     alone
         The same for each reading by itself, shape (N, 3, 3).
-    rest
-        Mean variance of each reading that map and poses leave beside the shared errors in uT^2,
-        shape (N,).
+    sensor, of_map, of_poses
+        Mean variance of each reading by its sensor alone, and what map and poses leave beside the
+        shared errors, uT^2, shapes (N,).
     """
 
     errors: tuple[tuple[SharedError, ...], ...]
     whitenings: tuple[FloatArray, ...]
     alone: FloatArray
-    rest: FloatArray
+    sensor: FloatArray
+    of_map: FloatArray
+    of_poses: FloatArray
+
+    @property
+    def rest(self) -> FloatArray:
+        """What map and poses leave together, uT^2, shape (N,)."""
+        return self.of_map + self.of_poses
+
+    @property
+    def shares(self) -> tuple[FloatArray, FloatArray]:
+        """Shares of map and of poses in the variance of each reading, shapes (N,)."""
+        whole = self.sensor + self.rest
+        return self.of_map / whole, self.of_poses / whole
 
 
 @dataclass(frozen=True)
@@ -97,6 +110,7 @@ def group_noise(
     readings, C = view.readings, estimate.C()[view.readings.sensor]
     share = map_covariance(C, readings.R_map_lidar, coverage.rest)
     own = reading_covariance(estimate.noise[readings.sensor], share, view.trust)
+    sensor = np.square(estimate.noise[readings.sensor])
     R_lidar_map = readings.R_map_lidar.transpose(0, 2, 1)
     q = readings.regressors
     of_suite = suite_share(readings, field_map, coverage, estimate)
@@ -116,7 +130,9 @@ def group_noise(
             errors=tuple(shared),
             whitenings=tuple(W[group.rows] for group in coverage.groups),
             alone=W,
-            rest=_mean_variance(share),
+            sensor=sensor,
+            of_map=_mean_variance(share),
+            of_poses=np.zeros(len(readings)),
         )
     left, whitenings = np.zeros_like(share), []
     for group in coverage.groups:
@@ -130,7 +146,9 @@ def group_noise(
         errors=tuple((*each, *pose.errors(group)) for each, group in pairs),
         whitenings=tuple(whitenings),
         alone=whitening(own + left),
-        rest=_mean_variance(share + left),
+        sensor=sensor,
+        of_map=_mean_variance(share),
+        of_poses=_mean_variance(left),
     )
 
 

@@ -1,6 +1,6 @@
 """The joint graph over ``T(i)``, ``D(i)`` and ``S(i)``: the finish of the solve, and how sure."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import gtsam
@@ -29,10 +29,12 @@ from l2m_gtsam.calibration.optimise import (
 from l2m_gtsam.calibration.pose_errors import error_of_poses
 from l2m_gtsam.calibration.priors import Contradiction, contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
+from l2m_gtsam.calibration.variance_parts import Parts
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.calibration import ResidualFigures
 from l2m_gtsam.records.disturbance import EXPLAINED, Unmodelled
+from l2m_gtsam.records.variance_shares import ErrorCause
 from l2m_gtsam.solve.noise import (
     HALF,
     estimate_noise,
@@ -77,6 +79,9 @@ class SensorSolution:
         of map and poses. Absent where errors are not shared.
     unmodelled
         How far the covariance exceeds that of the model.
+    variances
+        What each cause has of the variances of t, C and H, shape (3,); empty where errors are not
+        shared.
     """
 
     sensor: int
@@ -88,6 +93,7 @@ class SensorSolution:
     moving: Correction | None = None
     shared_root: FloatArray | None = None
     unmodelled: Unmodelled = EXPLAINED
+    variances: Parts = field(default_factory=dict)
 
     def widened(self, excess: Excess) -> "SensorSolution":
         """Return the same with larger covariances; correlations with other sensors stay."""
@@ -113,7 +119,10 @@ class SensorSolution:
             scale = np.ones(len(root))
             scale[at] = np.sqrt(np.diag(covariance)[at] / np.diag(self.joint_covariance)[at])
             root = scale[:, None] * root
-        return replace(self, joint_covariance=covariance, shared_root=root)
+        wander = self.variances.get(ErrorCause.WANDER, np.zeros(3)).copy()
+        wander[2] += np.trace(spread)
+        variances = {**self.variances, ErrorCause.WANDER: wander} if self.variances else {}
+        return replace(self, joint_covariance=covariance, shared_root=root, variances=variances)
 
     @property
     def covariance(self) -> FloatArray:

@@ -24,12 +24,8 @@ from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver
-from l2m_gtsam.calibration.uncertain_graph import (
-    NEAR_SIGMAS,
-    UncertainDrive,
-    UncertainProblem,
-    starting_values,
-)
+from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
+from l2m_gtsam.calibration.uncertain_graph import NEAR_SIGMAS, UncertainProblem
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.solve.rank import Determinacy
 
@@ -106,7 +102,7 @@ def solve_uncertain(
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
         )
     problem, joint = found.problem, found.joint
-    solved = problem.solutions(joint, found.values)
+    solved = problem.by_cause(joint, problem.solutions(joint, found.values))
     solved = problem.wandering(joint, found.values, problem.robust(joint, solved))
     progress(1.0)
     return UncertainSolution(found.estimate, solved, found.ending, found.settled, budget)

@@ -16,11 +16,10 @@ from l2m_factors import (
     uncertain_reading_factor,
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget, spread_of_H
+from l2m_gtsam.calibration.budget.found import Budget, spread_of_H
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces, processes
 from l2m_gtsam.calibration.budget.search import felt, search
 from l2m_gtsam.calibration.cluster_robust import unmodelled
-from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.joint import SensorSolution, with_infinities
@@ -31,7 +30,7 @@ from l2m_gtsam.calibration.joint_information import (
     joint_information,
     rows_of_factors,
 )
-from l2m_gtsam.calibration.moving_fields import Correction, moving_fields
+from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import (
     TOLERANCE,
     Ending,
@@ -43,7 +42,8 @@ from l2m_gtsam.calibration.optimise import (
 )
 from l2m_gtsam.calibration.priors import contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_of, keys_of
-from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.calibration.uncertain_drive import UncertainDrive
+from l2m_gtsam.calibration.variance_parts import PriorRows, variance_parts
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import HALF, estimate_noise, residual_figures
@@ -55,84 +55,6 @@ from l2m_gtsam.solve.rank import Determinacy
 NEAR_SIGMAS = 0.3
 NEARLY = 0.1  # smallest decrease of the error, as a share, after which a descent goes on to there
 POLISHING_STEPS = 2  # each shortens what remains fourfold at least
-
-
-def starting_values(estimate: Estimate, sensors: list[int], coverage: Coverage) -> gtsam.Values:
-    """Return all variables of the graph, with no error of map or poses."""
-    values = estimate.values(sensors)
-    for key, size in coverage.sizes.items():
-        values.insert(key, np.zeros(size))
-    return values
-
-
-@dataclass(frozen=True)
-class WeightsPrior:
-    """What is known of shared errors before any reading: the same in all rounds.
-
-    Attributes
-    ----------
-    coverage
-        The errors.
-    graph
-        Their prior as factors.
-    information
-        The same as a matrix, shape (K, K).
-    """
-
-    coverage: Coverage
-    graph: gtsam.NonlinearFactorGraph
-    information: FloatArray
-
-    @property
-    def sizes(self) -> dict[int, int]:
-        """Number of weights of each key."""
-        return self.coverage.sizes
-
-    @classmethod
-    def of(cls, coverage: Coverage) -> "WeightsPrior":
-        """Return the prior of the weights of a coverage."""
-        tiles = coverage.tile_information
-        information = np.zeros((sum(coverage.sizes.values()),) * 2)
-        information[: len(tiles), : len(tiles)] = tiles
-        if beside := list(coverage.sizes.items())[len(coverage.tiles) :]:
-            zero, ordering = gtsam.Values(), gtsam.Ordering()
-            for key, size in beside:
-                zero.insert(key, np.zeros(size))
-                ordering.push_back(key)
-            linear = coverage.prior_beside_tiles().linearize(zero)
-            information[len(tiles) :, len(tiles) :], _ = linear.hessian(ordering)
-        return cls(coverage, coverage.prior(), information)
-
-
-@dataclass(frozen=True)
-class UncertainDrive:
-    """What all rounds have in common: readings, the map, and the errors that readings share."""
-
-    view: View
-    field_map: QueryableMap
-    prior: WeightsPrior
-
-    @property
-    def budget(self) -> Budget:
-        """Processes that its graph has."""
-        return self.prior.coverage.budget
-
-    @classmethod
-    def of(
-        cls,
-        view: View,
-        field_map: QueryableMap,
-        errors: UncertainMap,
-        near: Estimate,
-        options: OneKeyOptions,
-        budget: Budget = NOTHING_FOUND,
-    ) -> "UncertainDrive":
-        """Return what readings share where an estimate puts them."""
-        view = replace(view, readings=budget.on(view.readings))
-        coverage = cover(view, errors, near, budget.lasting(options.pose_noise.correlation_s))
-        moving = moving_fields(view.readings, options.moving_field_ut)
-        coverage = replace(coverage, moving=moving, budget=budget)
-        return cls(view, field_map, WeightsPrior.of(coverage))
 
 
 @dataclass(frozen=True)
@@ -342,6 +264,15 @@ class UncertainProblem:
             excess = unmodelled(self._view.readings, rows, own, joint.every, len(solved), stated)
             widened.append(found.widened(excess))
         return tuple(widened)
+
+    def by_cause(
+        self, joint: JointInformation, solved: Sequence[SensorSolution]
+    ) -> tuple[SensorSolution, ...]:
+        """Return solutions with what each cause has of their variances."""
+        prior = PriorRows.of(self._prior.coverage.columns, self._prior.information)
+        parts = variance_parts(joint, prior, self._noise, [each.sensor for each in solved])
+        pairs = zip(solved, parts, strict=True)
+        return tuple(replace(each, variances=own) for each, own in pairs)
 
     def wandering(
         self, joint: JointInformation, values: gtsam.Values, solved: Sequence[SensorSolution]

@@ -11,6 +11,7 @@ from l2m_gtsam.calibration.moving_solve import MovingSolution
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.priors import Contradiction
+from l2m_gtsam.calibration.variance_parts import variance_shares
 from l2m_gtsam.data import Distortion, Readings, SyncCounts, Synchronised
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.records.calibration import FoundStart, SensorCalibration, SensorStatus, TimeOffset
@@ -219,6 +220,7 @@ def _solved(
         time_offset=_time_offset(explained, solution),
         from_priors=explained.from_priors,
         unmodelled=found.unmodelled,
+        variance_shares=variance_shares(found.covariance, found.variances),
     )
 
 

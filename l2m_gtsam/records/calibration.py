@@ -18,6 +18,7 @@ from l2m_gtsam.records.disturbance import EXPLAINED, Disturbance, Unmodelled
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
+from l2m_gtsam.records.variance_shares import VarianceShare
 from l2m_gtsam.records.verdict import Judgement
 
 
@@ -265,6 +266,8 @@ class SensorCalibration:
         Paths of those of several drives in which nothing usable was read.
     unmodelled
         How far the covariance exceeds what noise, map and poses explain.
+    variance_shares
+        What each cause has of the variances of t, C and H; empty where errors are not shared.
     common
         Of a suite that was calibrated from its own survey: what the errors of (t, C row by row, H,
         time offset) have in common with those of its other sensors. The covariance of two of them
@@ -293,6 +296,7 @@ class SensorCalibration:
     moving: Annotated[tuple[MovingField, ...], KeyedBy("name")] = ()
     missing_in: tuple[str, ...] = ()
     unmodelled: Unmodelled = EXPLAINED
+    variance_shares: tuple[VarianceShare, ...] = ()
     common: Annotated[FloatArray, InFile(Rows16, np.atleast_2d)] | None = None
 
     @property

@@ -31,8 +31,10 @@ class Disturbance:
         What it is.
     sizes
         Standard deviations by name and unit, along each axis: ``noise_ut`` (that lasts, 1/f) and
-        ``walk_ut`` (from the start to the end of a drive) of H or of a field; ``rotation_deg``,
-        ``position_m`` and for how long, ``lasting_s``; ``shift_m``, of the floor's axes.
+        ``walk_ut`` (from the start to the end of a drive) of H or of a field; of poses in the
+        lidar's frame ``tilt_deg`` and ``floor_m`` (along x and y), ``heading_deg`` and
+        ``height_m`` (along z); how long an error lasts, ``lasting_s``; ``shift_m``, of the
+        floor's axes.
     gain
         Twice the logarithm by which the drive is more likely with it.
     sensor

@@ -81,6 +81,10 @@ MODEL = {
         "how many times larger variances are than noise, map and poses explain, from the scatter "
         "of parts of the drive; covariance and sigmas hold it; absent where nothing is"
     ),
+    "variance_shares": (
+        "what each cause has of the variances of t, C and H, as shares of one: noise of the "
+        "readings, the map, the sensors of its survey, poses, processes of the drive, priors"
+    ),
     "common": (
         "of a suite calibrated from its own survey: rows for the parameters in covariance_order "
         "and the time offset; the covariance of two sensors i and j is common_i @ common_j.T"
@@ -103,7 +107,7 @@ SENSOR_KEYS = (
     *("R_lidar_mag", "rotation_sigma", "rotation_covariance", "transforms", "noise"),
     *("undetermined", "from_priors", "residuals", "readings", "outside_map", "rejected", "start"),
     *("time_offset", "moving", "models", "not_compared", "missing_in"),
-    *("unmodelled", "common", "covariance"),
+    *("unmodelled", "variance_shares", "common", "covariance"),
 )
 """In the order of the file; the matrix of 15 rows comes last, since it hides what follows it."""
 
@@ -228,8 +232,10 @@ def sensor_entry(sensor: SensorCalibration) -> dict[str, Any]:
     }
     if sensor.unmodelled == EXPLAINED:
         values["unmodelled"] = None
-    entry = _without_empty({key: values[key] for key in SENSOR_KEYS}, "missing_in")
-    return _without_empty(_without_empty(entry, "unmodelled"), "common")
+    entry = {key: values[key] for key in SENSOR_KEYS}
+    for name in ("missing_in", "unmodelled", "variance_shares", "common"):
+        entry = _without_empty(entry, name)
+    return entry
 
 
 def source_entries(result: CalibrationResult) -> dict[str, Any]:

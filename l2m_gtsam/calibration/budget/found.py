@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from l2m_factors import B, F, SharedError, W
-from l2m_gtsam.calibration.budget.processes import LASTING_S, POSE_MODES, WANDER_MODES
+from l2m_gtsam.calibration.budget.processes import LASTING_S, POSE_PARTS, WANDER_MODES
 from l2m_gtsam.calibration.budget.search import FoundProcess
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
@@ -51,7 +51,7 @@ class Budget:
         """Return readings whose poses are as wrong as was found."""
         if self.poses is None:
             return readings
-        root = np.diag(np.repeat(np.sqrt(self.poses.sizes), AXES))
+        root = np.diag(np.sqrt(self.poses.sizes @ np.array(list(POSE_PARTS.values()))))
         return replace(readings, pose_root=np.broadcast_to(root, (len(readings), 6, 6)))
 
     def errors(self, sensor: int, rows: IntArray) -> tuple[SharedError, ...]:
@@ -106,22 +106,10 @@ def _key(found: FoundProcess) -> int:
 
 
 def _record(found: FoundProcess, sensors: Sequence[str]) -> Disturbance:
-    kind, sensor = found.process.kind, found.process.sensor
-    sizes = np.sqrt(found.sizes)
-    if kind in (DisturbanceKind.WANDER, DisturbanceKind.FIELD):
-        count = WANDER_MODES if kind is DisturbanceKind.WANDER else POSE_MODES
-        whole = np.sqrt((1 / np.arange(1.0, count + 1)).sum())
-        named = {"noise_ut": sizes[0] * whole, "walk_ut": sizes[1]}
-    elif kind is DisturbanceKind.POSES:
-        named = {
-            "rotation_deg": np.rad2deg(sizes[0]),
-            "position_m": sizes[1],
-            "lasting_s": LASTING_S[found.form],
-        }
-    else:
-        named = {"shift_m": np.sqrt(found.sizes.sum())}
-    whose = None if sensor is None else sensors[sensor]
-    return Disturbance(kind, {k: float(v) for k, v in named.items()}, found.gain, whose)
+    process = found.process
+    whose = None if process.sensor is None else sensors[process.sensor]
+    named = process.named(found.form, found.sizes)
+    return Disturbance(process.kind, named, found.gain, whose)
 
 
 NOTHING_FOUND = Budget()

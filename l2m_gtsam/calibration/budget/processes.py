@@ -24,8 +24,17 @@ from l2m_gtsam.records.disturbance import DisturbanceKind
 from l2m_gtsam.solve.linear_algebra import right_divided
 
 WANDER_MODES = 24  # slower ones hold all but 2 % of a walk; faster ones of 1/f noise are noise
-POSE_MODES = 48  # of each of six errors, and of fields
-LASTING_S = (1.0, 2.0, 4.0, 8.0)  # how long errors of poses may last
+# Of each of six errors of poses, and of fields: what lasts a second is half a wave of 1.75 s and
+# more. With fewer modes than that, errors of poses look like fields.
+FINEST_S = 1.75
+FAST_MODES = (48, 96)  # at least and at most: a thousand weights take seconds
+LASTING_S = (1.0, 2.0, 4.0, 8.0)  # how long errors of poses and fields may last
+POSE_PARTS = {  # of rotation and translation along the axes of the lidar
+    "tilt": (1, 1, 0, 0, 0, 0),
+    "heading": (0, 0, 1, 0, 0, 0),
+    "floor": (0, 0, 0, 1, 1, 0),
+    "height": (0, 0, 0, 0, 0, 1),
+}
 WARP_M = (3.0, 8.0)  # lengths over which a frame may be bent
 BEYOND_M = 2.0  # cosines are level at their ends: these lie outside the drive
 FAINT = 0.01  # of the largest variance of a mode: what less have is left out
@@ -90,6 +99,9 @@ class Process(Protocol):
     def on(self, places: ReadingPlaces, /) -> "Process":
         """Return the same modes, weight by weight, in other readings."""
 
+    def named(self, form: int, sizes: FloatArray, /) -> dict[str, float]:
+        """Return the standard deviations of a form by name and unit, for variances of its parts."""
+
 
 @dataclass(frozen=True)
 class TimeModes:
@@ -146,6 +158,19 @@ class TimeModes:
         return values.reshape(len(rows), -1)
 
 
+def lasting(modes: TimeModes, seconds: float) -> FloatArray:
+    """Return the spectrum of errors of unit variance that last for a time, shape (D J,)."""
+    share = seconds / modes.duration
+    return np.asarray(2 * share / (1 + (np.pi * modes.frequency * share) ** 2))
+
+
+def named_noise_and_walk(modes: TimeModes, sizes: FloatArray) -> dict[str, float]:
+    """Return the names of the parts of ``pink_and_walk``."""
+    whole = np.sum(1 / np.arange(1.0, modes.count + 1))
+    noise, walk = np.sqrt(sizes * [whole, 1.0]).tolist()
+    return {"noise_ut": noise, "walk_ut": walk}
+
+
 def pink_and_walk(modes: TimeModes) -> FloatArray:
     """Return spectra of 1/f noise and of a random walk of a vector, shape (2, 3 D J)."""
     j = np.repeat(modes.frequency, 3)
@@ -181,10 +206,14 @@ class Wander:
         """Return the same modes in other readings."""
         return replace(self, places=places)
 
+    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
+        """Return noise and walk, uT."""
+        return named_noise_and_walk(self.modes, sizes)
+
 
 @dataclass(frozen=True)
 class PoseProcess:
-    """Errors of poses that last; rotation and translation have sizes of their own."""
+    """Errors of poses that last: tilt, heading, place on the floor and height have a size each."""
 
     places: ReadingPlaces
     modes: TimeModes
@@ -193,13 +222,9 @@ class PoseProcess:
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
-        """Of rotation (rad^2) and of translation (m^2), for each of ``LASTING_S``."""
-        turn, forms = np.repeat([1.0, 0.0], 3), []
-        for lasting in LASTING_S:
-            share = lasting / self.modes.duration
-            variance = 2 * share / (1 + (np.pi * self.modes.frequency * share) ** 2)
-            forms.append(np.stack([np.kron(variance, turn), np.kron(variance, 1 - turn)]))
-        return tuple(forms)
+        """Of ``POSE_PARTS`` in rad^2 and m^2, for each of ``LASTING_S``."""
+        parts = np.array(list(POSE_PARTS.values()))
+        return tuple(np.kron(lasting(self.modes, seconds), parts) for seconds in LASTING_S)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what rotations and translations make of the field, shape (n, 3, m)."""
@@ -211,6 +236,17 @@ class PoseProcess:
     def on(self, places: ReadingPlaces) -> "PoseProcess":
         """Return the same modes in other readings."""
         return replace(self, places=places)
+
+    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
+        """Return what each part is wrong by, and how long it lasts."""
+        tilt, heading, floor, height = np.sqrt(sizes).tolist()
+        return {
+            "tilt_deg": float(np.rad2deg(tilt)),
+            "heading_deg": float(np.rad2deg(heading)),
+            "floor_m": floor,
+            "height_m": height,
+            "lasting_s": LASTING_S[form],
+        }
 
 
 @dataclass(frozen=True)
@@ -224,8 +260,9 @@ class FieldProcess:
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
-        """Of 1/f noise and of a random walk together, uT^2."""
-        return (pink_and_walk(self.modes),)
+        """Of 1/f noise and of a random walk together, or lasting each of ``LASTING_S``, uT^2."""
+        short = (np.repeat(lasting(self.modes, seconds), 3)[None] for seconds in LASTING_S)
+        return (pink_and_walk(self.modes), *short)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what fields along the axes of the map are in the lidar frame, shape (n, 3, m)."""
@@ -236,6 +273,12 @@ class FieldProcess:
     def on(self, places: ReadingPlaces) -> "FieldProcess":
         """Return the same modes in other readings."""
         return replace(self, places=places)
+
+    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
+        """Return noise and walk, or noise and how long it lasts."""
+        if form == 0:
+            return named_noise_and_walk(self.modes, sizes)
+        return {"noise_ut": float(np.sqrt(sizes[0])), "lasting_s": LASTING_S[form - 1]}
 
 
 @dataclass(frozen=True)
@@ -307,12 +350,17 @@ class Warp:
         """Return the same modes in other readings."""
         return replace(self, places=places)
 
+    def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
+        """Return the shift of both lengths together."""
+        return {"shift_m": float(np.sqrt(sizes.sum()))}
+
 
 def processes(places: ReadingPlaces, sensors: Sequence[int]) -> tuple[Process, ...]:
     """Return all that is looked for; errors of poses only where none are stated."""
     slow = TimeModes.over(places.readings, WANDER_MODES)
     found: list[Process] = [Wander(places, sensor, slow) for sensor in sensors]
-    fast = TimeModes.over(places.readings, POSE_MODES)
+    count = int(np.clip(np.ceil(slow.duration.max() / FINEST_S), *FAST_MODES))
+    fast = TimeModes.over(places.readings, count)
     if len(sensors) > 1:  # of one sensor's wander it cannot be told
         found.append(FieldProcess(places, fast))
     if places.readings.pose_root is None:

@@ -31,7 +31,8 @@ class FoundProcess:
     sizes
         Variances of the parts of that form, shape (K,).
     gain
-        Twice the logarithm of the likelihood beyond that without it.
+        Twice the logarithm of the likelihood beyond that without it, less the price of having had
+        the choice of several forms.
     """
 
     process: Process
@@ -154,7 +155,12 @@ def _alone(process: Process, system: WeightSystem) -> FoundProcess:
         for spectra in process.forms
     ]
     form = int(np.argmax([fit.gain for fit in fits]))
-    return FoundProcess(process, form, fits[form].sizes, fits[form].gain)
+    return FoundProcess(process, form, fits[form].sizes, fits[form].gain - _price(process))
+
+
+def _price(process: Process) -> float:
+    """Return what the best of several forms has to gain, twice a logarithm: each is as likely."""
+    return 2 * float(np.log(len(process.forms)))
 
 
 def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess, ...]:
@@ -181,7 +187,8 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess
         here = np.searchsorted(at, own)
         left = system.beside(others).among(here)
         sizes = fit.sizes[of == k]
-        gain = 2 * left.posterior(sizes @ each.process.forms[each.form]).likelihood
+        likely = left.posterior(sizes @ each.process.forms[each.form]).likelihood
+        gain = 2 * likely - _price(each.process)
         if gain > LEAST_GAIN:
             kept.append(FoundProcess(each.process, each.form, sizes, gain))
     return tuple(kept)

@@ -23,6 +23,7 @@ from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.qa.verdict.measured import Measured, measured
 from l2m_gtsam.qa.verdict.places import best_of, cause_sentence
+from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
 from l2m_gtsam.records.verdict import Level, SensorVerdict, Verdict
@@ -121,6 +122,8 @@ def calibration_page(
             length=np.linalg.norm,
             what_else=best_of,
             cause=cause_sentence,
+            shares=shares_in_words,
+            what_helps=what_helps,
             strongest_correlation=statistics.strongest_correlation,
             thresholds=thresholds(options),
             parameters=PARAMETERS,

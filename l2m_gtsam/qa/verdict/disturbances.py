@@ -2,35 +2,56 @@
 
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
 
+# A file may lack some of these; what it has beside them is not shown.
+PARTS = {
+    "rotation_deg": (1.0, "{:.2f} degrees"),
+    "heading_deg": (1.0, "{:.2f} degrees of heading"),
+    "tilt_deg": (1.0, "{:.2f} degrees of tilt"),
+    "position_m": (1e3, "{:.1f} mm"),
+    "floor_m": (1e3, "{:.1f} mm on the floor"),
+    "height_m": (1e3, "{:.1f} mm of height"),
+    "shift_m": (1e3, "{:.1f} mm"),
+    "walk_ut": (1.0, "{:.2g} uT from the start of the drive to its end"),
+    "noise_ut": (1.0, "{:.2g} uT for a time"),
+}
+
 
 def disturbance_sentence(found: Disturbance) -> str:
     """Return what a process is, and its remedy."""
-    size = found.sizes
+    size = _sizes(found)
     match found.kind:
         case DisturbanceKind.WANDER:
             return (
-                f"H of {found.sensor} is not constant: it wanders by {size['walk_ut']:.2g} uT from "
-                f"the start of the drive to its end, beside noise of {size['noise_ut']:.2g} uT "
-                "that lasts. Its sigmas are those at any moment of the drive; let the sensor warm "
-                "up, and keep currents away from it."
+                f"H of {found.sensor} is not constant: it wanders by {size}. Its sigmas are those "
+                "at any moment of the drive; let the sensor warm up, and keep currents away from "
+                "it."
             )
         case DisturbanceKind.POSES:
             return (
-                f"Poses are wrong by about {1e3 * size['position_m']:.1f} mm and "
-                f"{size['rotation_deg']:.2f} degrees over {size['lasting_s']:g} s, by the readings "
-                "themselves. Sigmas hold it; state the errors of your poses "
-                "(calibration.solve.pose_noise), or use better ones."
+                f"Poses are wrong by about {size}, by the readings themselves. Sigmas hold it; "
+                "state the errors of your poses (calibration.solve.pose_noise), or use better "
+                "ones."
             )
         case DisturbanceKind.FIELD:
             return (
-                f"The field differs from the map's for a time, by {size['noise_ut']:.2g} uT and "
-                f"{size['walk_ut']:.2g} uT more by the end, for all sensors alike: steel or "
+                f"The field differs from the map's by {size}, for all sensors alike: steel or "
                 "currents near by changed, or the survey missed what is along the way. Sigmas "
                 "hold it; survey more densely, or again."
             )
         case DisturbanceKind.WARP:
             return (
-                f"The frame of the drive is bent against the map's by about "
-                f"{1e3 * size['shift_m']:.1f} mm. Sigmas hold it; use poses on the same "
-                "point cloud for survey and drive."
+                f"The frame of the drive is bent against the map's by about {size}. Sigmas hold "
+                "it; use poses on the same point cloud for survey and drive."
             )
+
+
+def _sizes(found: Disturbance) -> str:
+    """Return the sizes of a process that are above zero."""
+    parts = [
+        words.format(scale * found.sizes[name])
+        for name, (scale, words) in PARTS.items()
+        if found.sizes.get(name, 0.0) > 0
+    ]
+    listed = " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
+    lasting = f", over {found.sizes['lasting_s']:g} s" if "lasting_s" in found.sizes else ""
+    return listed + lasting

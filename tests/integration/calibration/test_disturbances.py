@@ -1,42 +1,17 @@
 """Errors that last are found on a drive, sized, and held by the sigmas: one hall, one each."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
-from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.qa.evaluate import evaluate
-from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
-from l2m_gtsam.records.verdict import Level, Verdict
-from l2m_gtsam.studies.troubles.drives import troubled_drive
-from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
-from l2m_gtsam.studies.troubles.surveys import TroubledHall, troubled_hall
+from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.studies.troubles.options import Trouble
+from tests.drives.troubled import OPTIONS, drive, hall
 
-OPTIONS = TroublesOptions(surveys=2, drives=1, survey_readings=900, readings=400)
-DRIVE = 1
 # Of 15 parameters of two sensors under one map; 1 of 1,000 each where sigmas are true.
 WITHIN = float(chi2.ppf(0.999, 15))
-
-
-@cache
-def hall(trouble: Trouble) -> TroubledHall:
-    return troubled_hall(OPTIONS, trouble, 0)
-
-
-@cache
-def drive(trouble: Trouble) -> tuple[Calibrated, tuple[KnownSensor, ...], Verdict]:
-    place = hall(Trouble.SUITE if trouble.wrong_suite else Trouble.CLEAN)
-    recording, truth = troubled_drive(OPTIONS, place, trouble, DRIVE)
-    found = calibrated(recording, place.field_map, CalibrationOptions())
-    metrics = evaluate(recording, found, CalibrationOptions(), QaOptions())
-    return found, truth, judge(found.result, metrics, QaOptions())
 
 
 def shown(trouble: Trouble, kind: DisturbanceKind) -> list[Disturbance]:
@@ -86,9 +61,10 @@ def test_a_wandering_offset_is_sized() -> None:
 def test_errors_of_poses_are_sized_and_no_longer_taken_for_exact() -> None:
     (found,) = shown(Trouble.POSES, DisturbanceKind.POSES)
     assert found.sensor is None
-    assert found.sizes["rotation_deg"] == pytest.approx(OPTIONS.pose_deg, rel=0.5)
     # Rotations are felt in tens of uT per radian everywhere, shifts where there is a gradient.
-    assert 0.3 < found.sizes["position_m"] / OPTIONS.pose_m < 3
+    for name in ("tilt_deg", "heading_deg"):
+        assert found.sizes[name] == pytest.approx(OPTIONS.pose_deg, rel=0.5)
+    assert 0.3 < found.sizes["floor_m"] / OPTIONS.pose_m < 3
     result, clean = drive(Trouble.POSES)[0].result, drive(Trouble.CLEAN)[0].result
     assert "the drive's poses" not in result.exact
     assert "the drive's poses" in clean.exact

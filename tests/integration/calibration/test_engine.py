@@ -20,7 +20,8 @@ from l2m_gtsam.calibration.optimise import (
     joint_covariance,
     polish,
 )
-from l2m_gtsam.calibration.uncertain_graph import UncertainDrive, UncertainProblem, starting_values
+from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
+from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
 from l2m_gtsam.calibration.view import View, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap

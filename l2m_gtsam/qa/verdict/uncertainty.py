@@ -1,0 +1,43 @@
+"""Where the uncertainty of a calibration comes from, and what would help."""
+
+from collections.abc import Sequence
+
+from l2m_gtsam.records.variance_shares import ErrorCause, VarianceShare
+
+NAMES = {
+    ErrorCause.NOISE: "noise",
+    ErrorCause.MAP: "map",
+    ErrorCause.SUITE: "the survey's sensors",
+    ErrorCause.POSES: "poses",
+    ErrorCause.WANDER: "wander of H",
+    ErrorCause.FIELD: "a field that changed",
+    ErrorCause.WARP: "a bent frame",
+    ErrorCause.CURRENTS: "recorded numbers",
+    ErrorCause.PRIORS: "priors",
+    ErrorCause.UNMODELLED: "not modelled",
+}
+REMEDIES = {
+    ErrorCause.NOISE: "a longer drive, through more places and headings",
+    ErrorCause.MAP: "a denser survey of where the vehicle drives",
+    ErrorCause.SUITE: "a survey with calibrated sensors (`l2m map suite`)",
+    ErrorCause.POSES: "better poses",
+    ErrorCause.WANDER: "a sensor that is warm, away from currents",
+    ErrorCause.FIELD: "a new survey, or a drive while nothing near by changes",
+    ErrorCause.WARP: "poses on the same point cloud for survey and drive",
+    ErrorCause.CURRENTS: "a drive on which the recorded numbers change more",
+    ErrorCause.PRIORS: "a drive that determines what now comes from priors",
+    ErrorCause.UNMODELLED: "stated errors of poses and of the survey's sensors",
+}
+LISTED = 0.01  # of a variance
+
+
+def shares_in_words(shares: Sequence[VarianceShare], of: str) -> str:
+    """Return the shares in the variance of ``t``, ``C`` or ``H``, the largest first."""
+    sizes = sorted(((getattr(each, of), NAMES[each.cause]) for each in shares), reverse=True)
+    return ", ".join(f"{name} {size:.0%}" for size, name in sizes if size >= LISTED)
+
+
+def what_helps(shares: Sequence[VarianceShare]) -> str:
+    """Return what would lower the variance of t most, or of H where t is not determined."""
+    of = "t" if any(each.t for each in shares) else "H"
+    return REMEDIES[max(shares, key=lambda each: float(getattr(each, of))).cause]
