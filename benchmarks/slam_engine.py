@@ -14,9 +14,9 @@ from rich.table import Table
 from benchmarks.timing import seconds
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
 from l2m_gtsam.slam.online.belief import kalman_gain
 from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt
-from l2m_gtsam.slam.unknown_field.field_memory import JointGaussian, prior_factors
 from tests.reference.dense_newton import newton
 
 STEPS = 3  # of a section's last stage, as measured

@@ -18,6 +18,7 @@ from l2m_gtsam.cli.terminal import (
     say,
     shown_progress,
 )
+from l2m_gtsam.errors import ConfigError
 
 
 def slam(
@@ -38,16 +39,27 @@ def slam(
     config: Annotated[
         Path | None, typer.Option("--config", help="YAML configuration; see `slam` in it.")
     ] = None,
+    online: Annotated[
+        bool,
+        typer.Option("--online", help="Message by message, as on a vehicle; its state is saved."),
+    ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="With --online: go on from the state in --out.")
+    ] = False,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
     strict: StrictOption = False,
     wide: WideOption = False,
 ) -> None:
     """Find where a drive went: in a magnetic map, or in the unknown field along its path."""
+    if resume and not online:
+        raise ConfigError("--resume goes on with a run of --online: give both")
     with shown_progress() as progress:
+        from l2m_gtsam.batch.online_slam import slam_online
         from l2m_gtsam.batch.slam import SlamInput, slam_bag
         from l2m_gtsam.cli.tables.slam import (
             drift_lines,
+            online_lines,
             scan_lines,
             slam_table,
             start_lines,
@@ -57,7 +69,13 @@ def slam(
 
         chosen = with_poses(load_config(config), [bag], poses or (), times)
         given = SlamInput(bag, map_path, calibration, truth)
-        done = slam_bag(given, chosen, out, progress)
+        if online:
+            followed = slam_online(given, chosen, out, progress, resume=resume)
+        else:
+            done = slam_bag(given, chosen, out, progress)
+    if online:
+        say(*online_lines(followed), *truth_lines(followed.truth), f"written: {out}")
+        return
     print_table(slam_table(done.result), wide)
     lines = (
         *start_lines(done.result.start),

@@ -13,6 +13,9 @@ from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import OdometrySteps, drift_covariance
 from l2m_gtsam.slam.options import DriftOptions
 
+# Of the first pose, rad^2 and m^2, where no start is given: it defines the frame of the poses.
+EXACT_START = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
+
 
 @dataclass(frozen=True)
 class KnownSensors:

@@ -11,7 +11,7 @@ from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import Explored, LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.scans import ScanEvidence
-from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.drive import EXACT_START, Drive
 from l2m_gtsam.slam.localisation import NO_SCANS, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
@@ -31,8 +31,6 @@ NO_FIELD = (
     "no field explains the readings at poses that odometry allows: is the calibration that of "
     "these sensors, and does the odometry jump?"
 )
-# Of the first pose, rad^2 and m^2, where no start is given: it defines the frame of the poses.
-EXACT_START = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
 
 
 @dataclass(frozen=True)

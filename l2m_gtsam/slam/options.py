@@ -192,6 +192,17 @@ class StartPoseOptions(Options):
         return self
 
 
+class OnlineOptions(Options):
+    """How data that come on line are taken."""
+
+    delay_s: float = Field(default=0.2, ge=0, le=10)
+    """A key pose is made so long after its time: readings that come later than that are refused."""
+    silent_s: float = Field(default=2.0, gt=0)
+    """A sensor without readings for so long is reported."""
+    save_every_s: float = Field(default=60.0, gt=0)
+    """The command saves its state so often, in the time of the recording."""
+
+
 class SlamOptions(Options):
     """How a drive is localised."""
 
@@ -217,5 +228,7 @@ class SlamOptions(Options):
     """How the field is described where there is no map."""
     whole_field: WholeFieldOptions = WholeFieldOptions()
     """How it is described there where the drive has one sensor."""
+    online: OnlineOptions = OnlineOptions()
+    """How data are taken on line."""
     max_iterations: int = Field(default=50, ge=1)
     """The most steps of the optimiser in each round."""

@@ -8,8 +8,8 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.exploration import EXACT_START, Exploration, explore
+from l2m_gtsam.slam.drive import EXACT_START, Drive
+from l2m_gtsam.slam.exploration import Exploration, explore
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.key_pose import key_poses_of

@@ -6,8 +6,7 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.solver import ordered
-from l2m_gtsam.slam.unknown_field.field_memory import (
+from l2m_gtsam.slam.joint_gaussian import (
     JointGaussian,
     columns_of,
     local,
@@ -15,6 +14,7 @@ from l2m_gtsam.slam.unknown_field.field_memory import (
     retracted,
     slices_of,
 )
+from l2m_gtsam.slam.solver import ordered
 
 STEPS = 30
 

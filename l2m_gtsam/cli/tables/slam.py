@@ -4,9 +4,12 @@ import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
+from l2m_gtsam.batch.online_slam import OnlineOutcome
 from l2m_gtsam.cli.tables import new_table
 from l2m_gtsam.records.localisation import LocalisationResult, ScanUse, StartSearch
 from l2m_gtsam.records.localisation_file import TruthRecord
+
+MOST_EVENTS = 20  # that are printed
 
 
 def slam_table(result: LocalisationResult) -> Table:
@@ -67,6 +70,27 @@ def scan_lines(scans: ScanUse | None) -> tuple[str, ...]:
         f"{scans.chi2_per_dof:.2f}), {scans.rejected} were rejected"
     )
     return (line,)
+
+
+def online_lines(done: OnlineOutcome) -> tuple[str, ...]:
+    """Return what came of a drive on line: key poses, time, memory, and the last events."""
+    cost = 1e3 * done.cost_s
+    events = [
+        f"{1e-9 * each.stamp_ns:.3f} {each.event[0]}: {each.event[1]}"
+        for each in done.events
+        if each.event is not None
+    ]
+    more = len(events) - MOST_EVENTS
+    left = (f"... and {more} more events before them, in online.jsonl",) if more > 0 else ()
+    if not len(cost):
+        return (*left, *events[-MOST_EVENTS:], "no key pose has a place: the start was not found")
+    summary = (
+        f"{len(done.trajectory)} key poses on line, {done.times_real:.1f} times real time; "
+        f"processor ms per key pose: {np.median(cost):.1f} in the middle, "
+        f"{np.quantile(cost, 0.99):.1f} at the 99th percentile, {cost.max():.0f} at most; at most "
+        f"{done.peak_mib:.0f} MiB"
+    )
+    return (*left, *events[-MOST_EVENTS:], summary)
 
 
 def truth_lines(truth: TruthRecord | None) -> tuple[str, ...]:

@@ -20,8 +20,10 @@ from scipy.linalg import block_diag
 
 from l2m_factors import D, KeyPoseReadings, MapBatch, StepError, T, Whitening, X, key_pose_factor
 from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.map_prediction import sensors_in
@@ -47,6 +49,7 @@ from l2m_gtsam.slam.pose_graph import (
 from l2m_gtsam.slam.solver import reported_ill_conditioning
 from l2m_gtsam.solve.robust import RobustOptions
 
+POSITION, DISTORTION = 3, 12  # components of a sensor's variables
 SECTION = 200  # key poses that are solved together
 GROUP = 10  # key poses that are added to iSAM2 together,
 EARLY = 30  # but the first ones one by one: readings are not linear in calibrations far off
@@ -89,6 +92,14 @@ class PendingKeyPoses:
     accepted: list[AcceptedReadings] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class LastBelief:
+    """The number of a key pose, and what is known of it and of the sensors."""
+
+    number: int
+    belief: Belief
+
+
 class Follower:
     """Localises a drive on line: its state after the key poses that were added so far.
 
@@ -124,13 +135,49 @@ class Follower:
         self._calibrations = [key for i in numbers for key in (T(i), D(i))]
         self._length, self._first, self._last = section, 0, -1
         self._past = gtsam.Values()
+        self.seen = self.used = 0  # readings so far
         self._section = Section(self._calibrations)
         self._belief, self._pending = self._prior(start), self._opening(start)
+
+    @classmethod
+    def resumed(
+        cls,
+        last: "LastBelief",
+        field_map: QueryableMap,
+        robust: RobustOptions,
+        *,
+        free: bool,
+        section: int = SECTION,
+    ) -> "Follower":
+        """Return a follower that goes on from what was known of a key pose."""
+        belief, number = last.belief, last.number
+        pose = belief.pose
+        T_map_lidar = RigidTransform(pose.rotation().matrix(), pose.translation())
+        start = StartPose(T_map_lidar, belief.pose_covariance)
+        own = cls(start, belief.sensors, field_map, robust, free=free, section=section)
+        values, sizes = gtsam.Values(), {X(number): POSE}
+        values.insert(X(number), pose)
+        if free:
+            values.insert(calibration_values(belief.sensors))
+            for i in range(len(belief.sensors.names)):
+                sizes |= {T(i): POSITION, D(i): DISTORTION}
+        prior = gtsam.NonlinearFactorGraph()
+        for factor in prior_factors(JointGaussian(values, sizes, belief.covariance)):
+            prior.add(factor)
+        own._belief, own._pending = belief, PendingKeyPoses()
+        own._first = own._last = number
+        own._section.add(prior, values, number, 0)
+        return own
 
     @property
     def belief(self) -> Belief:
         """The posterior of the last key pose."""
         return self._belief
+
+    @property
+    def last(self) -> "LastBelief":
+        """What is known of the last key pose, from which another follower can go on."""
+        return LastBelief(self._last, self._belief)
 
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
         """Add the next key pose, and return its posterior.
@@ -156,6 +203,11 @@ class Follower:
         if self._pending.values.size():
             self._update_section()
         return self._belief
+
+    def release(self) -> gtsam.Values:
+        """Return the key poses of sections that are closed, and forget them."""
+        past, self._past = self._past, gtsam.Values()
+        return past
 
     def values(self) -> gtsam.Values:
         """Return the estimates of all variables, by the section that each was solved in."""
@@ -203,6 +255,8 @@ class Follower:
         of_step = StepReadings(key_pose.readings, key_pose.step, key_pose.covariance)
         measurement = StepMeasurement(of_step, self._map)
         gated = gate(measurement, self._variance, belief, self._robust)
+        self.seen += len(key_pose.readings)
+        self.used += len(gated.rows)
         if not len(gated.rows):
             return belief
         updated = update(measurement.of(gated.rows), gated.own, belief)

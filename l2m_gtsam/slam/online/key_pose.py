@@ -5,7 +5,7 @@ drives (:mod:`.intake`). Readings between two key poses come with the second of 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -40,6 +40,8 @@ class ArrivedKeyPose:
         Their times, shape (n,).
     links
         Scan registrations of this key pose.
+    lost
+        Whether odometry has lost the motion to it.
     """
 
     number: int
@@ -50,6 +52,7 @@ class ArrivedKeyPose:
     readings: KeyPoseReadings
     reading_ns: IntArray
     links: Links
+    lost: bool = False
 
     @property
     def step(self) -> gtsam.Pose3:
@@ -113,3 +116,13 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
         reading_ns=np.concatenate([each.reading_ns for each in key_poses]),
         links=Links.joined([each.links for each in key_poses]),
     )
+
+
+def renumbered(key_pose: ArrivedKeyPose, by: int) -> ArrivedKeyPose:
+    """Return a key pose whose number, and those that its readings refer to, are less by this."""
+    if not by:
+        return key_pose
+    number = key_pose.number - by
+    readings = replace(key_pose.readings, key_pose=key_pose.readings.key_pose - by)
+    links = replace(key_pose.links, key_pose=key_pose.links.key_pose - by)
+    return replace(key_pose, number=number, readings=readings, links=links)

@@ -12,8 +12,11 @@ drift as odometry does, and the sigmas do not show it.
 from dataclasses import dataclass
 
 import gtsam
+import numpy as np
 from pydantic import Field
 
+from l2m_factors import M, X
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.options import Options
 from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_pose
@@ -45,6 +48,31 @@ class MarginalizedPose:
 
     anchor: int
     T_anchor_key: gtsam.Pose3
+
+
+@dataclass(frozen=True)
+class ExplorerState:
+    """What an explorer knows between two sections.
+
+    Attributes
+    ----------
+    prior
+        Of the field; None where it is not learnt yet.
+    memory
+        Of tiles, anchors and the last key pose.
+    past
+        Key poses that were marginalised.
+    waiting
+        Key poses so far where the field is not learnt.
+    last
+        Number of the last key pose.
+    """
+
+    prior: FieldPrior | None
+    memory: FieldMemory
+    past: tuple[MarginalizedPose, ...]
+    waiting: tuple[ArrivedKeyPose, ...]
+    last: int
 
 
 class Explorer:
@@ -85,7 +113,7 @@ class Explorer:
             )
         if options.drift.axes is StepAxes.FIXED:
             raise ConfigError("`slam.drift.axes: fixed` works off line; on line give `vehicle`")
-        self._start, self._sensors, self._options = start, sensors, options
+        self.start, self._sensors, self._options = start, sensors, options
         self._pace = ExploringOptions() if pace is None else pace
         self._memory = FieldMemory.at_start(start)
         self._waiting: list[ArrivedKeyPose] = []  # until they are solved
@@ -137,6 +165,38 @@ class Explorer:
             self._solve(self._section)
         return self._belief
 
+    @classmethod
+    def resumed(
+        cls,
+        state: "ExplorerState",
+        start: StartPose,
+        sensors: KnownSensors,
+        options: SlamOptions,
+        pace: ExploringOptions | None = None,
+    ) -> "Explorer":
+        """Return an explorer that goes on from a state; other parameters as of the class."""
+        own = cls(start, sensors, options, pace=pace)
+        if state.prior is None:
+            for each in state.waiting:
+                own.add(each)
+            return own
+        own._memory, own._past = state.memory, list(state.past)
+        own._first = own._solved = state.last
+        own._section = OpenSection(sensors, state.prior, options, state.memory, state.last)
+        known = state.memory.known.marginal([X(state.last)])
+        own._belief = Belief(known.values.atPose3(X(state.last)), sensors, known.covariance)
+        return own
+
+    def state(self) -> "ExplorerState":
+        """Solve for what is waiting, close the section, and return what is to be kept."""
+        section = self._section
+        if section is None:
+            return ExplorerState(None, self._memory, (), tuple(self._waiting), 0)
+        self.finish()
+        if self._solved > self._first:
+            self._hand_over(section, self._solved)
+        return ExplorerState(section.prior, self._memory, tuple(self._past), (), self._solved)
+
     def poses(self) -> list[gtsam.Pose3]:
         """Return all solved key poses, past ones relative to their anchors' current estimates."""
         if self._section is None:
@@ -145,16 +205,40 @@ class Explorer:
         past = [now.pose(each.anchor).compose(each.T_anchor_key) for each in self._past]
         return [*past, *(now.pose(k) for k in range(len(past), self._solved + 1))]
 
+    @property
+    def is_learnt(self) -> bool:
+        """Whether the prior of the field is learnt; until then poses are those of odometry."""
+        return self._section is not None
+
+    def field_along_path(self) -> tuple[FloatArray, FloatArray]:
+        """Return the key poses that are past, m, and the field there, uT, shapes (N, 3)."""
+        if self._section is None or not self._past:
+            return np.empty((0, 3)), np.empty((0, 3))
+        section = self._section
+        anchors = np.array([each.anchor for each in self._past])
+        points, field = np.empty((len(anchors), 3)), np.empty((len(anchors), 3))
+        for tile in self._memory.tiles:
+            rows = np.flatnonzero(anchors == tile.anchor)
+            if not len(rows):
+                continue
+            anchor = section.pose(tile.anchor)
+            own = np.stack([self._past[row].T_anchor_key.translation() for row in rows])
+            weights = self._memory.known.values.atVector(M(tile.number))
+            R, p = anchor.rotation().matrix(), anchor.translation()
+            points[rows] = own @ R.T + p
+            field[rows] = tile.field.field_and_gradient(own, weights)[0] @ R.T
+        return points, field
+
     def _prior(self) -> Belief:
-        start = as_pose(self._start.T_map_lidar)
-        return Belief(start, self._sensors, self._start.covariance)
+        start = as_pose(self.start.T_map_lidar)
+        return Belief(start, self._sensors, self.start.covariance)
 
     def _opened(self, prior: FieldPrior) -> OpenSection:
         return OpenSection(self._sensors, prior, self._options, self._memory, 0)
 
     def _learn(self) -> None:
         """Learn the prior at the poses of odometry, and solve for the key poses so far."""
-        part = drive_of(self._waiting, self._start, self._sensors)
+        part = drive_of(self._waiting, self.start, self._sensors)
         prior = drive_prior(part, part.dead_reckoning(), self._options.tiles)
         self._section = self._opened(prior)
         waiting, self._waiting = self._waiting, []

@@ -17,6 +17,7 @@ from l2m_factors import (
 )
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, part_of, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings
 from l2m_gtsam.slam.online.belief import POSE, Belief
@@ -25,14 +26,7 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import between_factor
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt
-from l2m_gtsam.slam.unknown_field.field_memory import (
-    FieldMemory,
-    JointGaussian,
-    RememberedTile,
-    part_of,
-    prior_factors,
-    tile_of,
-)
+from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile, tile_of
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
@@ -167,6 +161,11 @@ class OpenSection:
         self._counted: list[TileReadings] = []
         self._prior: gtsam.NonlinearFactorGraph | None = None
         self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
+
+    @property
+    def prior(self) -> FieldPrior:
+        """The prior of the field."""
+        return self._field_prior
 
     def extend(self, new: Sequence[ArrivedKeyPose]) -> Belief:
         """Add key poses, solve, and return the posterior of the last."""

@@ -13,25 +13,11 @@ from l2m_gtsam.records.localisation import LocalisationStatus, StartSearch, Star
 from l2m_gtsam.slam.localisation import localise, prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
-from tests.drives.slam import SlamDrive, calibrated, slam_drive
+from tests.drives.lost import lost_drive, searching
+from tests.drives.slam import SlamDrive, calibrated
 from tests.support.pose_errors import position_error
-from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors
-from tests.worlds.surveyed import SurveyedWorld, in_odometry, strange_hall, surveyed, wandering
-
-QUICK = {"readings": 40, "seeds": 60, "step_m": 0.25}  # small rooms, strong fields
-
-
-def searching(**search: object) -> SlamOptions:
-    return SlamOptions.model_validate({"start": {"anywhere": True, "search": QUICK | search}})
-
-
-def lost_drive(
-    world: DipoleWorld, seed: int, seconds: float = 20.0, sensors: int = 2
-) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
-    """Return a drive whose odometry is in a frame of its own."""
-    rng, known = np.random.default_rng(seed), random_sensors(seed, sensors)
-    drive = slam_drive(world, known, wandering(rng, seconds), rng)
-    return known, replace(drive, recording=in_odometry(drive.recording, rng))
+from tests.worlds.exact import DipoleWorld, dipole_world
+from tests.worlds.surveyed import SurveyedWorld, strange_hall, surveyed
 
 
 def searched(

@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt, ordered
-from l2m_gtsam.slam.unknown_field.field_memory import (
+from l2m_gtsam.slam.joint_gaussian import (
     JointGaussian,
     conditioned,
     local,
     prior_factors,
     retracted,
 )
+from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt, ordered
 from tests.reference.dense_newton import newton
 
 ROUNDING = 1e-8  # of matrices of condition 1e4, with 1e-12 added to correlations

@@ -1,0 +1,248 @@
+"""Joint Gaussians over variables of a graph: their marginals, updates, and factors.
+
+Weights are vectors, whose density stays the same wherever they are: a linear factor, which costs
+nothing to linearise. A perturbation of a pose elsewhere is another one; so the density of poses
+given the weights has their derivatives, in a factor of few rows. With all of it in such a factor a
+descent took twice the time; with all of it in a linear one poses ended 0.007 sigmas off.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.solve.linear_algebra import correlation_factor, triangular_information_root
+
+ROUNDING = 1e-12  # of a correlation
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """The other components of a Gaussian after some of them were updated.
+
+    Attributes
+    ----------
+    shift
+        Of the others' mean, shape (r,).
+    covariance
+        Of the others, shape (r, r).
+    cross
+        Covariance of the others with the updated components, shape (r, q).
+    """
+
+    shift: FloatArray
+    covariance: FloatArray
+    cross: FloatArray
+
+
+def conditioned(
+    P: FloatArray, s: IntArray, shift: FloatArray, after: FloatArray, cross: FloatArray
+) -> Conditioned:
+    """Propagate an update of k components of a Gaussian to the r others, in their order.
+
+    Given the first, the others are independent of the measurements: the conditional p(others |
+    first) stays, as in the Rauch-Tung-Striebel smoother.
+
+    Parameters
+    ----------
+    P
+        Covariance before, shape (k + r, k + r).
+    s
+        Updated components, shape (k,).
+    shift
+        Change of their mean, shape (k,).
+    after
+        Their covariance afterwards, shape (k, k).
+    cross
+        Their covariance with all that is estimated afterwards, shape (k, q).
+    """
+    r = np.setdiff1d(np.arange(len(P)), s)
+    sigma = np.sqrt(np.diag(P)[s])
+    lower = correlation_factor(P[np.ix_(s, s)], ROUNDING)
+
+    def whitened(rows: FloatArray) -> FloatArray:
+        scaled = rows / sigma[:, None]
+        return np.asarray(solve_triangular(lower, scaled, lower=True, check_finite=False))
+
+    B = whitened(P[np.ix_(s, r)])
+    less = np.eye(len(s)) - whitened(whitened(after).T)
+    left = P[np.ix_(r, r)] - B.T @ (0.5 * (less + less.T) @ B)
+    carried = B.T @ whitened(np.column_stack([shift, cross]))
+    return Conditioned(carried[:, 0], 0.5 * (left + left.T), carried[:, 1:])
+
+
+@dataclass(frozen=True)
+class JointGaussian:
+    """A joint Gaussian over variables of a graph.
+
+    Attributes
+    ----------
+    values
+        Mean.
+    sizes
+        Components of each variable, in order.
+    covariance
+        Of right perturbations of poses and of the components of vectors, shape (n, n).
+    """
+
+    values: gtsam.Values
+    sizes: Mapping[int, int]
+    covariance: FloatArray
+
+    @cached_property
+    def slices(self) -> dict[int, slice]:
+        """Components of each variable."""
+        return slices_of(self.sizes)
+
+    def columns(self, keys: Iterable[int]) -> IntArray:
+        """Return the components of some variables, one after the other."""
+        return columns_of(self.slices, keys)
+
+    def marginal(self, keys: Sequence[int]) -> "JointGaussian":
+        """Return the marginal of some variables, in this order."""
+        at, sizes = self.columns(keys), {key: self.sizes[key] for key in keys}
+        return JointGaussian(part_of(self.values, keys), sizes, self.covariance[np.ix_(at, at)])
+
+    def updated(self, after: "JointGaussian") -> "JointGaussian":
+        """Return the Gaussian after an update of some variables that adds others.
+
+        Parameters
+        ----------
+        after
+            Joint posterior of the updated and the new variables.
+        """
+        shared = {key: size for key, size in self.sizes.items() if key in after.sizes}
+        rest = {key: size for key, size in self.sizes.items() if key not in after.sizes}
+        s, now = self.columns(shared), after.columns(shared)
+        shift = local(part_of(self.values, list(shared)), after.values, shared)
+        # A right perturbation at the posterior pose, expressed at the prior pose.
+        was = gtsam.Pose3.LogmapDerivative
+        cross = turned(after.covariance[now], shared, shift, was)
+        own = turned(cross[:, now].T, shared, shift, was)
+        found = conditioned(self.covariance, s, shift, own, cross)
+        moves = gtsam.Pose3.ExpmapDerivative
+        left = turned(
+            turned(found.covariance, rest, found.shift, moves).T, rest, found.shift, moves
+        )
+        across = turned(found.cross, rest, found.shift, moves)
+        values = retracted(part_of(self.values, list(rest)), rest, found.shift)
+        values.insert(after.values)
+        covariance = np.block([[left, across], [across.T, after.covariance]])
+        return JointGaussian(values, {**rest, **after.sizes}, covariance)
+
+
+def slices_of(sizes: Mapping[int, int]) -> dict[int, slice]:
+    """Return each variable's components in a stacked vector."""
+    ends = np.cumsum(list(sizes.values())).tolist()
+    return {key: slice(end - sizes[key], end) for key, end in zip(sizes, ends, strict=True)}
+
+
+def columns_of(slices: Mapping[int, slice], keys: Iterable[int]) -> IntArray:
+    """Return the components of some variables, one after the other."""
+    own = [np.arange(slices[key].start, slices[key].stop) for key in keys]
+    return np.concatenate(own) if own else np.empty(0, dtype=np.int64)
+
+
+def part_of(values: gtsam.Values, keys: Sequence[int]) -> gtsam.Values:
+    """Return the values of some variables."""
+    return values.extract(list(keys)) if len(keys) else gtsam.Values()
+
+
+def local(origin: gtsam.Values, there: gtsam.Values, sizes: Mapping[int, int]) -> FloatArray:
+    """Return the local coordinates of one mean at another, shape (n,)."""
+    if not sizes:
+        return np.empty(0)
+    by_key = origin.localCoordinates(part_of(there, list(sizes)))
+    return np.concatenate([by_key.at(key) for key in sizes])
+
+
+def retracted(values: gtsam.Values, sizes: Mapping[int, int], step: FloatArray) -> gtsam.Values:
+    """Return values moved by a perturbation of these variables, shape (n,)."""
+    by_key = gtsam.VectorValues()
+    for key, own in slices_of(sizes).items():
+        by_key.insert(key, step[own])
+    return values.retract(by_key)
+
+
+def turned(
+    rows: FloatArray,
+    sizes: Mapping[int, int],
+    shift: FloatArray,
+    derivative: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Return rows (n, q) of n components; those of poses are multiplied by a derivative."""
+    found = rows.copy()
+    for own in poses_among(sizes):
+        found[own] = derivative(shift[own]) @ rows[own]
+    return found
+
+
+def poses_among(sizes: Mapping[int, int]) -> list[slice]:
+    """Return the components of each pose among variables."""
+    return [own for key, own in slices_of(sizes).items() if is_pose(key)]
+
+
+def is_pose(key: int) -> bool:
+    """Return whether a variable is a pose; the others are vectors."""
+    return bool(gtsam.symbolChr(key) == ord("X"))
+
+
+def prior_factors(known: JointGaussian) -> Iterator[gtsam.NonlinearFactor]:
+    """Yield the prior factors of a joint Gaussian.
+
+    Raises
+    ------
+    LinAlgError
+        The covariance is not positive.
+    """
+    weights = [key for key in known.sizes if not is_pose(key)]
+    poses = [key for key in known.sizes if is_pose(key)]
+    ordered = known.marginal([*weights, *poses])
+    W = triangular_information_root(ordered.covariance, ROUNDING)
+    count = sum(known.sizes[key] for key in weights)
+    if weights:
+        own = {key: known.sizes[key] for key in weights}
+        yield of_vectors(known.values, own, W[:count, :count].T @ W[:count, :count])
+    if poses:
+        yield whitened_difference(ordered, W[count:])
+
+
+def of_vectors(
+    mean: gtsam.Values, sizes: Mapping[int, int], information: FloatArray
+) -> gtsam.LinearContainerFactor:
+    """Return a Gaussian of vectors, with their information, shape (n, n), in this order."""
+    slices, keys = slices_of(sizes), list(sizes)
+    zero = {key: np.zeros(size) for key, size in sizes.items()}
+    empty = {key: np.zeros((size, size)) for key, size in sizes.items()}
+    parts = gtsam.GaussianFactorGraph()
+    for row, a in enumerate(keys):
+        parts.add(gtsam.HessianFactor(a, information[slices[a], slices[a]], zero[a], 0.0))
+        for b in keys[row + 1 :]:
+            both = information[slices[a], slices[b]]
+            parts.add(gtsam.HessianFactor(a, b, empty[a], both, zero[a], empty[b], zero[b], 0.0))
+    return gtsam.LinearContainerFactor(gtsam.HessianFactor(parts), mean.extract(keys))
+
+
+def whitened_difference(known: JointGaussian, W: FloatArray) -> gtsam.CustomFactor:
+    """Return the factor of the residual W d, W of shape (m, n), d leading from the mean."""
+    keys: Sequence[int] = list(known.sizes)
+    slices = slices_of(known.sizes)
+    blocks = [np.asfortranarray(W[:, slices[key]]) for key in keys]
+
+    def error(
+        _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        away = local(known.values, values, known.sizes)
+        if jacobians is not None:
+            for row, key in enumerate(keys):
+                block = blocks[row]
+                if is_pose(key):
+                    block = block @ gtsam.Pose3.LogmapDerivative(away[slices[key]])
+                jacobians[row] = block
+        return np.asarray(W @ away)
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(W)), keys, error)

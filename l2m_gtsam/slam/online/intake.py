@@ -1,0 +1,282 @@
+"""Odometry and readings as they come, made into key poses.
+
+A key pose is made as in a recording (:mod:`l2m_gtsam.slam.odometry`), from the poses and readings
+since the one before, after a delay in which late readings may come. What cannot be used is refused
+and reported. What waits is bounded: of a parked vehicle every other pose and reading is dropped.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
+from l2m_gtsam.recording.sync import has_pose, with_offsets
+from l2m_gtsam.slam.drive import KnownSensors
+from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
+from l2m_gtsam.slam.links import Links
+from l2m_gtsam.slam.odometry import odometry_steps
+from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep, suspect_step, velocity
+from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
+from l2m_gtsam.slam.options import SlamOptions
+
+MOST_POSES = 512  # that wait for a key pose
+AHEAD_S = 5.0  # a reading further ahead of odometry has a wrong stamp
+NS = 1e-9
+SENSOR_TEXTS = {
+    EventKind.OUT_OF_ORDER: "has readings that are older than those before them: they are left out",
+    EventKind.SENSOR_BACK: "has readings again",
+    EventKind.SENSOR_STUCK: "repeats one value while the vehicle moves: it is left out",
+    EventKind.SENSOR_SILENT: "sends nothing",
+}
+
+
+@dataclass
+class IntakeState:
+    """All that an intake remembers.
+
+    Attributes
+    ----------
+    poses
+        From the last key pose on.
+    sensors
+        One for each.
+    number
+        Of the next key pose.
+    suspect
+        Steps that are no usual motion, by the time of their end.
+    velocity
+        Of the last usual step, rad/s and m/s along the axes of the vehicle, (6,); NaN for none.
+    last_velocity
+        Of the last step, usual or not.
+    disordered
+        Whether poses out of order were reported and none has come in order since.
+    """
+
+    poses: list[OdometryPose] = field(default_factory=list)
+    sensors: list[SensorBuffer] = field(default_factory=list)
+    number: int = 0
+    suspect: dict[int, SuspectStep] = field(default_factory=dict)
+    velocity: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
+    last_velocity: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
+    disordered: bool = False
+
+
+class Intake:
+    """Makes key poses of what comes.
+
+    Parameters
+    ----------
+    sensors
+        Calibrated sensors.
+    options
+        Of a localisation.
+    """
+
+    def __init__(self, sensors: KnownSensors, options: SlamOptions) -> None:
+        self._known, self._options, self._online = sensors, options, options.online
+        self._index = {name: i for i, name in enumerate(sensors.names)}
+        self.state = IntakeState(sensors=[SensorBuffer() for _ in sensors.names])
+        self._looked_at = 1
+        self._strangers = set[str]()
+        self._wanted: list[int] = []
+        self._events: list[OnlineEvent] = []
+
+    def events(self) -> list[OnlineEvent]:
+        """Return what happened since the last call."""
+        found, self._events = self._events, []
+        return found
+
+    def resume(self, state: IntakeState) -> None:
+        """Go on from a state."""
+        self.state, self._looked_at = state, 1
+
+    def want_key_pose(self, stamp_ns: int) -> None:
+        """Have the first pose that is no earlier than this become a key pose."""
+        self._wanted.append(stamp_ns)
+
+    def add_odometry(self, pose: OdometryPose) -> None:
+        """Take a pose; one that is no pose, or not later than the last, is refused."""
+        state, poses = self.state, self.state.poses
+        if not pose.is_rigid:
+            text = "a pose of odometry is not finite, or its rotation is none: left out"
+            self._report(pose.stamp_ns, EventKind.UNUSABLE, text)
+            return
+        if poses and pose.stamp_ns <= poses[-1].stamp_ns:
+            if not state.disordered:
+                late = NS * (poses[-1].stamp_ns - pose.stamp_ns)
+                text = f"a pose of odometry is {late:.3f} s older than the one before: left out"
+                self._report(pose.stamp_ns, EventKind.OUT_OF_ORDER, text)
+            state.disordered = True
+            return
+        state.disordered = False
+        if poses:
+            self._check_step(poses[-1], pose)
+        poses.append(pose)
+        if len(poses) > MOST_POSES and not state.suspect:
+            del poses[1:-1:2]
+            self._looked_at = len(poses) - 1
+
+    def add_reading(self, stamp_ns: int, sensor: str, value: FloatArray) -> None:
+        """Take a reading in uT; one that is not finite, late, or of another sensor is left out."""
+        number = self._index.get(sensor)
+        if number is None:
+            self._meet_stranger(stamp_ns, sensor)
+            return
+        if not np.isfinite(value).all():
+            return
+        poses, buffer = self.state.poses, self.state.sensors[number]
+        if poses and stamp_ns > poses[-1].stamp_ns + AHEAD_S / NS:
+            ahead = NS * (stamp_ns - poses[-1].stamp_ns)
+            text = f"a reading of {sensor} is stamped {ahead:.1f} s ahead of odometry: left out"
+            self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
+            return
+        if self.state.number and stamp_ns <= poses[0].stamp_ns:
+            if not buffer.disordered:
+                text = f"{sensor} {SENSOR_TEXTS[EventKind.OUT_OF_ORDER]}"
+                self._report(stamp_ns, EventKind.OUT_OF_ORDER, text)
+            buffer.disordered = True
+            return
+        for kind in buffer.add(stamp_ns, np.asarray(value, dtype=np.float64)):
+            self._report(stamp_ns, kind, f"{sensor} {SENSOR_TEXTS[kind]}")
+
+    def key_poses(self, *, to_the_end: bool = False) -> Iterator[ArrivedKeyPose]:
+        """Yield the key poses that can be made by now; at the end of a drive all of them."""
+        while (row := self._next_row(to_the_end)) is not None:
+            yield self._made(row)
+
+    def _meet_stranger(self, stamp_ns: int, sensor: str) -> None:
+        if sensor not in self._strangers and len(self._strangers) < MOST_POSES:
+            self._strangers.add(sensor)
+            text = f"{sensor} is left out: it has no calibration that can be used"
+            self._report(stamp_ns, EventKind.UNUSABLE, text)
+
+    def _check_step(self, before: OdometryPose, pose: OdometryPose) -> None:
+        """Report a step over a gap, or one that the motion before does not explain."""
+        state = self.state
+        found = suspect_step(before, pose, state.velocity, self._options)
+        step = velocity(before, pose)
+        # A turn that goes on looks like a jump once: its next step is like the one before it.
+        again = found is not None and found.kind is EventKind.ODOMETRY_JUMP
+        if again and suspect_step(before, pose, state.last_velocity, self._options) is None:
+            found = None if np.isfinite(state.last_velocity).all() else found
+        state.last_velocity = step
+        if found is None:
+            state.velocity = step
+            return
+        state.suspect[pose.stamp_ns] = found
+        if found.kind is EventKind.ODOMETRY_GAP:
+            state.velocity = state.last_velocity = np.full(6, np.nan)
+        self._report(pose.stamp_ns, found.kind, found.text)
+
+    def _next_row(self, at_end: bool) -> int | None:
+        """Return the row among the waiting poses that is the next key pose, if it is time."""
+        poses, state = self.state.poses, self.state
+        if not poses:
+            return None
+        if state.number == 0:
+            return 0
+        delay = 0 if at_end else round(self._online.delay_s / NS)
+        for row in range(self._looked_at, len(poses)):
+            if self._is_key_pose(row):
+                self._looked_at = row
+                return row if poses[row].stamp_ns <= poses[-1].stamp_ns - delay else None
+        self._looked_at = max(len(poses) - 1, 1)
+        return len(poses) - 1 if at_end and len(poses) > 1 else None
+
+    def _is_key_pose(self, row: int) -> bool:
+        poses, options = self.state.poses, self._options.key_poses
+        first, T, stamp = poses[0].T, poses[row].T, poses[row].stamp_ns
+        turned = (np.sum(T.R * first.R) - 1) / 2 <= np.cos(np.deg2rad(options.angle_deg))
+        suspect = stamp in self.state.suspect
+        if row + 1 < len(poses):
+            suspect = suspect or poses[row + 1].stamp_ns in self.state.suspect
+        wanted = any(poses[row - 1].stamp_ns < each <= stamp for each in self._wanted)
+        moved = np.linalg.norm(T.t - first.t) >= options.distance_m
+        return bool(moved or turned or suspect or wanted)
+
+    def _made(self, row: int) -> ArrivedKeyPose:
+        """Make a key pose of a waiting pose, and drop what lies before it."""
+        state = self.state
+        poses, state.poses = state.poses, state.poses[row:]
+        stamp, number, state.number = poses[row].stamp_ns, state.number, state.number + 1
+        self._looked_at = 1
+        self._wanted = [each for each in self._wanted if each > stamp]
+        suspect = state.suspect.pop(stamp, None)
+        if number == 0:
+            for buffer in state.sensors:
+                buffer.take(stamp)
+            return ArrivedKeyPose.first(stamp, Links.none())
+        if suspect is not None:
+            moved = replace(poses[row], T=suspect.end)
+            poses = [*poses[:row], moved]
+        key_pose = self._between(poses, row, number)
+        if suspect is not None:
+            covariance = key_pose.covariance + suspect.covariance
+            key_pose = replace(key_pose, covariance=covariance, lost=suspect.lost)
+        self._check_sensors(stamp, moved=key_pose.length_m >= self._options.key_poses.distance_m)
+        return key_pose
+
+    def _between(self, poses: list[OdometryPose], row: int, number: int) -> ArrivedKeyPose:
+        """Return the key pose at a row of poses that begin at the one before."""
+        trajectory, rows = trajectory_of(poses), np.array([0, row])
+        options = self._options
+        taken = self._taken(trajectory, poses[row].stamp_ns)
+        readings = thinned_readings(taken, trajectory, rows, options.key_poses.readings)
+        steps = odometry_steps(trajectory, rows, options.drift).as_walk(options.drift.over_m)
+        of_key_pose = key_pose_readings(readings, trajectory, rows)
+        return ArrivedKeyPose(
+            number,
+            poses[row].stamp_ns,
+            steps.R[0],
+            steps.p[0],
+            steps.covariance[0],
+            replace(of_key_pose, key_pose=np.full(len(readings), number - 1)),
+            readings.stamp_ns,
+            Links.none(),
+        )
+
+    def _taken(self, trajectory: Trajectory, until_ns: int) -> Readings:
+        """Return the waiting readings up to a time, with poses of odometry that are no gap."""
+        parts = [buffer.take(until_ns) for buffer in self.state.sensors]
+        sensor = np.repeat(np.arange(len(parts)), [len(stamps) for stamps, _ in parts])
+        stamps = np.concatenate([stamps for stamps, _ in parts])
+        field = np.concatenate([values for _, values in parts])
+        offset, none = self._known.offset, np.empty((len(stamps), 3))
+        at = stamps + np.round(offset[sensor] / NS).astype(np.int64)
+        there = has_pose(trajectory, at, self._options.max_pose_gap_s)
+        bare = Readings(
+            self._known.names, sensor, stamps, np.empty((len(stamps), 3, 3)), none, field
+        )
+        return with_offsets(bare[np.flatnonzero(there)], trajectory, offset)
+
+    def _check_sensors(self, stamp_ns: int, *, moved: bool) -> None:
+        silent_ns = round((self._online.silent_s + self._online.delay_s) / NS)
+        for name, buffer in zip(self._known.names, self.state.sensors, strict=True):
+            for kind in buffer.check(stamp_ns, silent_ns, moved=moved):
+                self._report(stamp_ns, kind, f"{name} {SENSOR_TEXTS[kind]}")
+
+    def _report(self, stamp_ns: int, kind: EventKind, text: str) -> None:
+        self._events.append(OnlineEvent(stamp_ns, kind, text))
+
+
+def trajectory_of(poses: list[OdometryPose]) -> Trajectory:
+    """Return poses of odometry as a trajectory; with covariances if all of them state one."""
+    covariance = [each.covariance for each in poses if each.covariance is not None]
+    return Trajectory(
+        np.array([each.stamp_ns for each in poses], dtype=np.int64),
+        np.stack([each.T.R for each in poses]),
+        np.stack([each.T.t for each in poses]),
+        "odom",
+        "lidar",
+        np.stack(covariance) if len(covariance) == len(poses) else None,
+    )
+
+
+def pose_of(trajectory: Trajectory, row: int) -> OdometryPose:
+    """Return a pose of a recorded odometry."""
+    covariance = None if trajectory.covariance is None else trajectory.covariance[row]
+    T = RigidTransform(trajectory.R[row], trajectory.p[row])
+    return OdometryPose(int(trajectory.stamp_ns[row]), T, covariance)

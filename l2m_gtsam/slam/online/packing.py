@@ -1,0 +1,125 @@
+"""What estimators on line remember as plain arrays, and back."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from l2m_factors import KeyPoseReadings
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose
+from l2m_gtsam.slam.key_pose_readings import joined_readings
+from l2m_gtsam.slam.links import Links
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+
+Arrays = dict[str, npt.NDArray[Any]]
+LINKS = ("origin", "key_pose", "R", "p", "covariance")
+READINGS = ("key_pose", "sensor", "R_key_lidar", "p_key_lidar", "fraction", "field")
+
+
+def named(prefix: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Arrays:
+    """Return arrays with a prefix before their names."""
+    return {f"{prefix}.{name}": array for name, array in arrays.items()}
+
+
+def under(prefix: str, arrays: Mapping[str, npt.NDArray[Any]]) -> Arrays:
+    """Return the arrays whose names have a prefix, without it."""
+    begin = f"{prefix}."
+    return {
+        name.removeprefix(begin): array for name, array in arrays.items() if name.startswith(begin)
+    }
+
+
+def packed_poses(poses: Sequence[gtsam.Pose3]) -> Arrays:
+    """Return n poses as R (n, 3, 3) and p (n, 3)."""
+    return {
+        "R": np.reshape([pose.rotation().matrix() for pose in poses], (-1, 3, 3)),
+        "p": np.reshape([pose.translation() for pose in poses], (-1, 3)),
+    }
+
+
+def unpacked_poses(arrays: Arrays) -> list[gtsam.Pose3]:
+    """Return poses of ``packed_poses``."""
+    pairs = zip(arrays["R"], arrays["p"], strict=True)
+    return [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in pairs]
+
+
+def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
+    """Return key poses as arrays."""
+    readings = joined_readings([each.readings for each in key_poses])
+    links = Links.joined([Links.none(), *(each.links for each in key_poses)])
+    return {
+        "number": np.array([each.number for each in key_poses], dtype=np.int64),
+        "stamp_ns": np.array([each.stamp_ns for each in key_poses], dtype=np.int64),
+        "R": np.reshape([each.R for each in key_poses], (-1, 3, 3)),
+        "p": np.reshape([each.p for each in key_poses], (-1, 3)),
+        "covariance": np.reshape([each.covariance for each in key_poses], (-1, 6, 6)),
+        "count": np.array([len(each.readings) for each in key_poses], dtype=np.int64),
+        "reading_ns": np.concatenate(
+            [np.empty(0, dtype=np.int64), *(each.reading_ns for each in key_poses)]
+        ),
+        "links": np.array([len(each.links) for each in key_poses], dtype=np.int64),
+        **named("reading", {name: getattr(readings, name) for name in READINGS}),
+        **named("link", {name: getattr(links, name) for name in LINKS}),
+    }
+
+
+def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
+    """Return key poses of ``packed_key_poses``."""
+    columns = under("reading", arrays)
+    key, sensor, R, p, fraction, field = (columns[name] for name in READINGS)
+    readings = KeyPoseReadings(key, sensor, R, p, fraction, field)
+    of_links = under("link", arrays)
+    links = Links(*(of_links[name] for name in LINKS))
+    found, reading, link = [], 0, 0
+    for k in range(len(arrays["number"])):
+        rows = np.arange(reading, reading + int(arrays["count"][k]))
+        own = np.arange(link, link + int(arrays["links"][k]))
+        reading, link = reading + len(rows), link + len(own)
+        found.append(
+            ArrivedKeyPose(
+                int(arrays["number"][k]),
+                int(arrays["stamp_ns"][k]),
+                arrays["R"][k],
+                arrays["p"][k],
+                arrays["covariance"][k],
+                readings[rows],
+                arrays["reading_ns"][rows],
+                links[own],
+            )
+        )
+    return found
+
+
+def packed_gaussian(known: JointGaussian) -> Arrays:
+    """Return a joint Gaussian as arrays: keys, sizes, means one after the other, covariance."""
+    means: list[FloatArray] = [np.empty(0)]
+    for key, size in known.sizes.items():
+        if is_pose(key):
+            pose = known.values.atPose3(key)
+            means += [pose.rotation().matrix().ravel(), pose.translation()]
+        else:
+            means.append(known.values.atVector(key)[:size])
+    return {
+        "key": np.array(list(known.sizes), dtype=np.uint64),
+        "size": np.array(list(known.sizes.values()), dtype=np.int64),
+        "mean": np.concatenate(means),
+        "covariance": known.covariance,
+    }
+
+
+def unpacked_gaussian(arrays: Arrays) -> JointGaussian:
+    """Return a joint Gaussian of ``packed_gaussian``."""
+    values, at, mean = gtsam.Values(), 0, arrays["mean"]
+    sizes = dict(zip(arrays["key"].tolist(), arrays["size"].tolist(), strict=True))
+    for key, size in sizes.items():
+        if is_pose(key):
+            R, p = mean[at : at + 9].reshape(3, 3), mean[at + 9 : at + 12]
+            values.insert(key, gtsam.Pose3(gtsam.Rot3(R), p))
+            at += 12
+        else:
+            values.insert(key, mean[at : at + size])
+            at += size
+    return JointGaussian(values, sizes, arrays["covariance"])

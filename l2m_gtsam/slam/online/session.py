@@ -1,0 +1,317 @@
+"""A drive localised as it is driven: in a map, without one, or from a start that is to be found.
+
+Odometry, readings and scan registrations are given one by one; what is known of each key pose comes
+back when it is made. Nothing is kept that grows with the drive, but in an unknown field each past
+key pose relative to its tile.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
+from l2m_gtsam.errors import CalibrationError, ConfigError
+from l2m_gtsam.maps.field_map import Surveyed
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.progress import silent
+from l2m_gtsam.records.calibration import CalibrationResult
+from l2m_gtsam.records.localisation import StartVerdict
+from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose
+from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
+from l2m_gtsam.slam.online.belief import Belief
+from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
+from l2m_gtsam.slam.online.follower import Follower
+from l2m_gtsam.slam.online.intake import Intake, trajectory_of
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
+from l2m_gtsam.slam.online.odometry_check import OdometryPose
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
+from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
+from l2m_gtsam.slam.unknown_field.explorer import Explorer
+
+LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
+LEAST_READINGS = 40  # where these have so many
+REFUSED, FITS = 0.4, 0.6  # share that is explained, below which it is reported, and above again
+
+
+@dataclass(frozen=True)
+class OnlinePose:
+    """What is known of a key pose when it is made.
+
+    Attributes
+    ----------
+    stamp_ns
+        Its time.
+    T_map_lidar
+        Pose of the lidar.
+    covariance
+        Of a right perturbation of it, rotation (rad) before translation (m), shape (6, 6).
+    sensors
+        Calibrations as they are known by then.
+    """
+
+    stamp_ns: int
+    T_map_lidar: RigidTransform
+    covariance: FloatArray
+    sensors: KnownSensors
+
+    @classmethod
+    def of(cls, stamp_ns: int, belief: Belief) -> "OnlinePose":
+        """Return a belief as it is handed out."""
+        pose = belief.pose
+        T = RigidTransform(pose.rotation().matrix(), pose.translation())
+        return cls(stamp_ns, T, belief.pose_covariance, belief.sensors)
+
+
+@dataclass
+class StartSearchState:
+    """A drive whose start is searched for.
+
+    Attributes
+    ----------
+    first
+        Its first pose by odometry, of which the vertical counts.
+    waiting
+        Its key poses so far.
+    window_m
+        Path in metres of the next attempt.
+    """
+
+    first: StartPose
+    waiting: list[ArrivedKeyPose]
+    window_m: float
+
+
+class OnlineSlam:
+    """Localises a vehicle while it drives.
+
+    Parameters
+    ----------
+    calibration
+        Of its sensors.
+    options
+        As of a localisation off line. ``start.anywhere`` searches the map for the start.
+    field_map
+        Map; without one the field is found with the poses.
+
+    Raises
+    ------
+    CalibrationError
+        No sensor is calibrated.
+    ConfigError
+        An option works off line only, or needs a map.
+    """
+
+    def __init__(
+        self,
+        calibration: CalibrationResult,
+        options: SlamOptions,
+        field_map: QueryableMap | None = None,
+    ) -> None:
+        check_options(options, has_map=field_map is not None)
+        usable = tuple(each for each in calibration.sensors if is_determined(each))
+        usable = tuple(each for each in usable if not each.moving)
+        if not usable:
+            raise CalibrationError("no sensor has a calibration that can be used")
+        self.options, self.sensors = options, known_sensors(usable)
+        self._map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+        self.intake = Intake(self.sensors, options)
+        self.estimator: Follower | Explorer | None = None
+        self.search: StartSearchState | None = None
+        self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last
+        self._counts: deque[tuple[int, int]] = deque(maxlen=LAST_KEY_POSES)
+        self._refused = False
+        self._events: list[OnlineEvent] = []
+
+    @one_blas_thread()
+    def add_odometry(self, pose: OdometryPose) -> tuple[OnlinePose, ...]:
+        """Take a pose of odometry, and return the key poses that are made by it.
+
+        Raises
+        ------
+        CalibrationError
+            The system is too badly scaled to be solved.
+        MapError
+            There are too few readings to learn a prior of the field from.
+        """
+        self.intake.add_odometry(pose)
+        return tuple(self._advance(to_the_end=False))
+
+    def add_reading(self, stamp_ns: int, sensor: str, field_ut: FloatArray) -> None:
+        """Take a reading in uT, shape (3,)."""
+        self.intake.add_reading(stamp_ns, sensor, field_ut)
+
+    @one_blas_thread()
+    def finish(self) -> tuple[OnlinePose, ...]:
+        """Make key poses of all that is there, solve for them, and return the last anew.
+
+        Raises
+        ------
+        CalibrationError, MapError
+            As of ``add_odometry``.
+        """
+        found = [*self._advance(to_the_end=True)]
+        if self.estimator is None:
+            if self.search is not None:
+                found += self._searched(self.search, at_end=True)
+            if self.estimator is None:
+                return tuple(found)
+        last = OnlinePose.of(self.stamp_ns, self.estimator.finish())
+        return (*(each for each in found if each.stamp_ns < last.stamp_ns), last)
+
+    def events(self) -> tuple[OnlineEvent, ...]:
+        """Return what happened since the last call, in order."""
+        found, self._events = [*self.intake.events(), *self._events], []
+        return tuple(sorted(found, key=lambda each: each.stamp_ns))
+
+    def _advance(self, *, to_the_end: bool) -> Iterator[OnlinePose]:
+        for key_pose in self.intake.key_poses(to_the_end=to_the_end):
+            if self.estimator is None and self.search is None:
+                self._begin()
+            yield from self._added(renumbered(key_pose, self.base))
+
+    def _begin(self) -> None:
+        """Begin at the first key pose, which is the first that waits."""
+        start_options, first = self.options.start, trajectory_of(self.intake.state.poses[:1])
+        if start_options.anywhere:
+            self.search = self._search_from(first, [])
+            return
+        start = start_pose(first, start_options)
+        if self._map is None:
+            if start_options.position is None and start_options.quaternion_xyzw is None:
+                start = replace(start, covariance=EXACT_START)
+            self.estimator = Explorer(start, self.sensors, self.options)
+            return
+        self.estimator = self._follower(start)
+
+    def _search_from(self, first: Trajectory, waiting: list[ArrivedKeyPose]) -> StartSearchState:
+        window_m = self.options.start.search.window_m
+        return StartSearchState(start_pose(first, self.options.start), waiting, window_m)
+
+    def _follower(self, start: StartPose) -> Follower:
+        free, robust = self.options.calibration is CalibrationUse.REFINED, self.options.robust
+        return Follower(start, self.sensors, self.known_map(), robust, free=free)
+
+    def known_map(self) -> QueryableMap:
+        """Return the map.
+
+        Raises
+        ------
+        ConfigError
+            There is none.
+        """
+        if self._map is None:
+            raise ConfigError("a map is needed for this: give one with --map")
+        return self._map
+
+    def _added(self, key_pose: ArrivedKeyPose) -> Iterator[OnlinePose]:
+        """Yield the key poses that are known by a new one."""
+        following = isinstance(self.estimator, Follower)
+        if key_pose.lost and following and isinstance(self._map, Surveyed):
+            self._lose(key_pose)
+            return
+        if self.search is not None:
+            self.search.waiting.append(key_pose)
+            yield from self._searched(self.search, at_end=False)
+            return
+        yield self._estimated(key_pose)
+
+    def _lose(self, key_pose: ArrivedKeyPose) -> None:
+        """Search for the place of a key pose that odometry does not know, with what is known."""
+        if self.estimator is not None:
+            belief = self.estimator.finish()
+            self.sensors = replace(belief.sensors, covariance=belief.calibration_covariance)
+        self.estimator, self.stamp_ns = None, key_pose.stamp_ns
+        self._begin_search(key_pose)
+        text = "the place of the vehicle is lost with odometry: it is searched for in the map"
+        self._report(EventKind.START_OPEN, text)
+
+    def _begin_search(self, key_pose: ArrivedKeyPose) -> None:
+        """Search from a key pose on, which becomes the first."""
+        self.base += key_pose.number
+        links = renumbered(key_pose, key_pose.number).links
+        anew = ArrivedKeyPose.first(key_pose.stamp_ns, links)
+        self.search = self._search_from(trajectory_of(self.intake.state.poses[:1]), [anew])
+
+    def _estimated(self, key_pose: ArrivedKeyPose) -> OnlinePose:
+        estimator, self.stamp_ns = self.estimator, key_pose.stamp_ns
+        if isinstance(estimator, Explorer):
+            learnt = estimator.is_learnt
+            belief = estimator.add(key_pose)
+            if estimator.is_learnt and not learnt:
+                text = "strength and depth of the field's sources are learnt: poses are corrected"
+                self._report(EventKind.FIELD_LEARNT, text)
+            return OnlinePose.of(key_pose.stamp_ns, belief)
+        if estimator is None:
+            raise ConfigError("the drive has not begun")
+        seen, used = estimator.seen, estimator.used
+        belief = estimator.add(key_pose)
+        estimator.release()
+        self._count(estimator.seen - seen, estimator.used - used)
+        return OnlinePose.of(key_pose.stamp_ns, belief)
+
+    def _count(self, seen: int, used: int) -> None:
+        """Report when the map explains few of the last readings, and when it does again."""
+        self._counts.append((seen, used))
+        total, good = (sum(each) for each in zip(*self._counts, strict=True))
+        if total < LEAST_READINGS:
+            return
+        if good < REFUSED * total and not self._refused:
+            text = (
+                f"the map explains {good / total:.0%} of the last {total} readings: the vehicle is "
+                "elsewhere, or the place has changed; poses follow odometry"
+            )
+            self._report(EventKind.READINGS_REFUSED, text)
+            self._refused = True
+        elif good > FITS * total and self._refused:
+            self._report(EventKind.READINGS_FIT, "the map explains the readings again")
+            self._refused = False
+
+    def _searched(self, search: StartSearchState, *, at_end: bool) -> Iterator[OnlinePose]:
+        """Search for the start if the path is long enough; yield all key poses if it is found."""
+        waiting, options = search.waiting, self.options.start
+        path = sum(each.length_m for each in waiting)
+        if len(waiting) < 2 or (path < search.window_m and not at_end):
+            return
+        drive = drive_of(waiting, search.first, self.sensors)
+        found = find_start(drive, self.known_map(), self.options, silent)
+        self.stamp_ns = waiting[-1].stamp_ns
+        if found.verdict is StartVerdict.UNIQUE:
+            self.search, self.estimator = None, self._follower(start_found(found, options))
+            self._report(EventKind.START_FOUND, found.message)
+            for each in waiting:
+                yield self._estimated(each)
+            return
+        self._report(EventKind.START_OPEN, found.message)
+        search.window_m *= GROWTH
+        if search.window_m > options.search.longest_m:
+            # Odometry's errors would blur more: begin anew from here, which bounds the memory, too.
+            self._begin_search(waiting[-1])
+
+    def resume_report(self) -> None:
+        """Report that the drive was resumed."""
+        self._report(EventKind.RESUMED, "goes on from a saved state")
+
+    def _report(self, kind: EventKind, text: str) -> None:
+        self._events.append(OnlineEvent(self.stamp_ns, kind, text))
+
+
+def check_options(options: SlamOptions, *, has_map: bool) -> None:
+    """Refuse what works off line only.
+
+    Raises
+    ------
+    ConfigError
+        Odometry knows its steps along fixed axes; or, without a map, the start is to be searched
+        for or calibrations are to be refined.
+    """
+    if options.drift.axes is StepAxes.FIXED:
+        raise ConfigError("`slam.drift.axes: fixed` works off line; on line give `vehicle`")
+    if has_map:
+        return
+    if options.start.anywhere:
+        raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
+    if options.calibration is CalibrationUse.REFINED:
+        raise ConfigError(
+            "`slam.calibration: refined` works off line where there is no map; on line give `fixed`"
+        )

@@ -1,0 +1,330 @@
+"""Drives localised message by message, and what goes wrong on them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import FloatArray, KnownSensor, RigidTransform
+from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.slam.localisation import prepared
+from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
+from l2m_gtsam.slam.online.odometry_check import OdometryPose
+from l2m_gtsam.slam.online.replay import FieldReading, give
+from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
+from l2m_gtsam.slam.online.session import OnlineSlam
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.unknown_field.explorer import Explorer
+from l2m_gtsam.storage.online_state import SavedState, read_state, write_state
+from tests.drives.lost import QUICK, lost_drive, searching
+from tests.drives.online import OnlineRun, driven, messages, seconds_of, with_readings
+from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, slam_drive, small_hall
+from tests.worlds.exact import dipole_world, random_sensors
+from tests.worlds.surveyed import strange_hall, surveyed, wandering
+
+WORLD, OPTIONS = dipole_world(1), SlamOptions.model_validate({"key_poses": COARSE})
+SECONDS = 25.0
+GAP = (200, 260)  # rows of odometry
+
+
+@pytest.fixture(scope="module")
+def hall() -> tuple[tuple[KnownSensor, ...], SlamDrive]:
+    """Two sensors, 15 m, odometry that slips by 1 % of the path."""
+    return small_hall(21, seconds=SECONDS)
+
+
+@pytest.fixture(scope="module")
+def plain(hall: tuple[tuple[KnownSensor, ...], SlamDrive]) -> OnlineRun:
+    return driven(in_map(hall), messages(hall[1].recording))
+
+
+def in_map(hall: tuple[tuple[KnownSensor, ...], SlamDrive]) -> OnlineSlam:
+    return OnlineSlam(calibrated(hall[0]), OPTIONS, WORLD)
+
+
+def test_a_drive_is_localised_as_it_comes(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
+) -> None:
+    truth = hall[1].truth
+    assert np.sqrt(np.mean(plain.off(truth) ** 2)) < 0.06  # the start is known within 0.1 m
+    # Poses of one drive err together: no more than twice the six of one pose in the mean.
+    assert plain.nees(truth)[1:].mean() < 12
+    assert plain.events == ()
+    assert plain.trajectory().stamp_ns[-1] == truth.stamp_ns[-1]
+
+
+def test_key_poses_are_those_of_the_recording(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """What comes message by message is made into the same key poses as the drive off line."""
+    recording, slam = hall[1].recording, in_map(hall)
+    drive, _ = prepared(recording, calibrated(hall[0]), OPTIONS)
+    found = list[ArrivedKeyPose]()
+    for message in messages(recording):
+        if isinstance(message, OdometryPose):
+            slam.intake.add_odometry(message)
+            found += slam.intake.key_poses()
+        else:
+            slam.add_reading(message.stamp_ns, message.sensor, message.field)
+    found += slam.intake.key_poses(to_the_end=True)
+    expected = key_poses_of(drive.as_walk(OPTIONS.drift.over_m))
+    for one, other in zip(found, expected, strict=True):
+        assert (one.number, one.stamp_ns) == (other.number, other.stamp_ns)
+        np.testing.assert_array_equal(one.reading_ns, other.reading_ns)
+        for name in ("R", "p", "covariance"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-12)
+        for name in ("sensor", "key_pose", "R_key_lidar", "p_key_lidar", "fraction", "field"):
+            mine, theirs = (getattr(each.readings, name) for each in (one, other))
+            np.testing.assert_allclose(mine, theirs, atol=1e-9)
+
+
+def test_a_sensor_that_dies_and_returns_is_reported_and_does_no_harm(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """One sends nothing from 8 to 14 s, the other repeats a value from 16 to 20 s."""
+    sensors, drive = hall
+    held: list[FloatArray] = []
+
+    def failing(reading: FieldReading) -> FieldReading | None:
+        at = seconds_of(drive.recording, reading.stamp_ns)
+        if reading.sensor == sensors[0].sensor:
+            return None if 8 < at < 14 else reading
+        if 16 < at < 20:
+            held.append(reading.field)
+            return replace(reading, field=held[0])
+        return reading
+
+    run = driven(in_map(hall), with_readings(messages(drive.recording), failing))
+    kinds = [EventKind.SENSOR_SILENT, EventKind.SENSOR_BACK]
+    assert run.kinds == [*kinds, EventKind.SENSOR_STUCK, EventKind.SENSOR_BACK]
+    assert sensors[0].sensor in run.events[0].text
+    assert sensors[1].sensor in run.events[2].text
+    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.05
+    assert run.nees(drive.truth)[1:].mean() < 12
+
+
+def with_gap(drive: SlamDrive, goes_on: bool) -> list[OdometryPose | FieldReading]:
+    """Return a drive without odometry for three seconds, which has gone on, or has stood still."""
+    odometry, first, last = drive.recording.trajectory, *GAP
+    before, after = (RigidTransform(odometry.R[k], odometry.p[k]) for k in GAP)
+    found: list[OdometryPose | FieldReading] = []
+    for message in messages(drive.recording):
+        if not isinstance(message, OdometryPose):
+            found.append(message)
+            continue
+        row = int(np.searchsorted(odometry.stamp_ns, message.stamp_ns))
+        if first < row < last:
+            continue
+        T = message.T
+        if row >= last and not goes_on:  # all that follows continues from where it stood
+            R = before.R @ after.R.T
+            T = RigidTransform(R @ T.R, R @ (T.t - after.t) + before.t)
+        found.append(replace(message, T=T))
+    return found
+
+
+def test_a_gap_of_odometry_is_reported_and_its_sigma_says_so(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """Odometry has gone on meanwhile: the pose after it is as far off as its sigma says."""
+    run, truth = driven(in_map(hall), with_gap(hall[1], goes_on=True)), hall[1].truth
+    assert EventKind.ODOMETRY_GAP in run.kinds
+    at_end = int(np.searchsorted(run.trajectory().stamp_ns, truth.stamp_ns[GAP[1]]))
+    sigma = np.sqrt(np.trace(run.poses[at_end].covariance[3:, 3:]))
+    assert run.off(truth)[at_end] < 4 * sigma
+    assert run.nees(truth)[1:].mean() < 12
+    assert run.off(truth)[-10:].max() < 0.1
+
+
+def test_where_odometry_stood_still_over_a_gap_the_place_is_searched_for() -> None:
+    """The vehicle went on by 1.8 m, odometry did not: no pose comes out until its place is found.
+
+    With a prior as wide as what it may have driven a filter found a wrong place, and was sure.
+    """
+    world, rng = strange_hall(0), np.random.default_rng(0)
+    sensors = random_sensors(0, 2)
+    drive = slam_drive(world, sensors, wandering(rng, 40.0), rng)
+    options = SlamOptions.model_validate({"key_poses": COARSE, "start": {"search": QUICK}})
+    slam = OnlineSlam(calibrated(sensors), options, surveyed(world))
+    run, truth = driven(slam, with_gap(drive, goes_on=False)), drive.truth
+    gap = run.kinds.index(EventKind.ODOMETRY_GAP)
+    assert run.kinds[gap + 1 :][0] is EventKind.START_OPEN
+    assert run.kinds[-1] is EventKind.START_FOUND
+    assert run.nees(truth)[1:].mean() < 12
+    assert run.off(truth)[-10:].max() < 0.1
+    assert run.trajectory().stamp_ns[-1] == truth.stamp_ns[-1]
+
+
+def test_stamps_out_of_order_are_left_out(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun
+) -> None:
+    """Every fifth pose and reading comes a second time, a second later; one reading is of 2099."""
+    drive, old = hall[1], list[OdometryPose | FieldReading]()
+    given: list[OdometryPose | FieldReading] = []
+    for number, message in enumerate(messages(drive.recording)):
+        given.append(message)
+        if number % 5 == 0:
+            old.append(message)
+        if len(old) > 12:
+            given.append(old.pop(0))
+        if number == 900:
+            name = hall[0][0].sensor
+            given.append(FieldReading(4_070_908_800_000_000_000, name, np.zeros(3)))
+    run = driven(in_map(hall), given)
+    assert set(run.kinds) == {EventKind.OUT_OF_ORDER}
+    assert any("ahead of odometry" in each.text for each in run.events)
+    np.testing.assert_array_equal(run.trajectory().p, plain.trajectory().p)
+
+
+def test_a_slip_is_reported_and_what_is_no_pose_is_refused(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """The wheels slip by 20 cm at 10 s; a pose is NaN, a rotation is none."""
+    drive = hall[1]
+    odometry = drive.recording.trajectory
+    p = odometry.p.copy()
+    p[200:] += np.array([0.15, 0.13, 0.0])
+    given = list(messages(replace(drive.recording, trajectory=replace(odometry, p=p))))
+    bad = OdometryPose(int(odometry.stamp_ns[300]), RigidTransform(np.eye(3), np.full(3, np.nan)))
+    worse = replace(bad, T=RigidTransform(2 * np.eye(3), np.zeros(3)))
+    run = driven(in_map(hall), [*given[:600], bad, worse, *given[600:]])
+    assert run.kinds.count(EventKind.ODOMETRY_JUMP) == 1
+    assert run.kinds.count(EventKind.UNUSABLE) == 2
+    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.06  # as without
+    assert run.nees(drive.truth)[1:].mean() < 12
+
+
+def test_a_vehicle_in_another_place_is_reported(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    slam = OnlineSlam(calibrated(hall[0]), OPTIONS, dipole_world(7))
+    run = driven(slam, messages(hall[1].recording))
+    assert EventKind.READINGS_REFUSED in run.kinds
+
+
+def test_killed_and_resumed_it_goes_on(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun, tmp_path: Path
+) -> None:
+    """Killed at 12 s, resumed from its file: the poses after it are those of a run unbroken.
+
+    The open section is closed for the state, and stays linearised: by a tenth of a sigma.
+    """
+    sensors, drive = hall
+    given = list(messages(drive.recording))
+    slam, half = in_map(hall), len(given) // 2
+    before = [pose for message in given[:half] for pose in give(slam, message)]
+    path = tmp_path / "state.npz"
+    write_state(path, saved_state(slam))
+    again = resumed_slam(read_state(path), calibrated(sensors), OPTIONS, WORLD)
+    run = driven(again, given[half:])
+    assert run.kinds == [EventKind.RESUMED]
+    whole = OnlineRun((*before, *run.poses), run.events).trajectory()
+    expected = plain.trajectory()
+    np.testing.assert_array_equal(whole.stamp_ns, expected.stamp_ns)
+    assert expected.covariance is not None
+    sigma = np.sqrt(np.einsum("kii->ki", expected.covariance[:, 3:, 3:]))
+    assert (np.abs(whole.p - expected.p) / sigma).max() < 0.1
+
+
+def test_a_state_of_something_else_is_refused(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], tmp_path: Path
+) -> None:
+    sensors, drive = hall
+    slam = in_map(hall)
+    for message in list(messages(drive.recording))[:300]:
+        give(slam, message)
+    state = saved_state(slam)
+    with pytest.raises(ConfigError, match="another calibration"):
+        resumed_slam(state, calibrated(sensors[:1]), OPTIONS, WORLD)
+    other = OPTIONS.model_copy(update={"max_pose_gap_s": 0.4})
+    with pytest.raises(ConfigError, match="another calibration"):
+        resumed_slam(state, calibrated(sensors), other, WORLD)
+    for name in ("belief.R", "intake.stamp_ns", "base", "belief.covariance"):
+        less = SavedState({k: v for k, v in state.arrays.items() if k != name}, state.facts)
+        with pytest.raises(ConfigError, match="damaged"):
+            resumed_slam(less, calibrated(sensors), OPTIONS, WORLD)
+    path = tmp_path / "state.npz"
+    write_state(path, state)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match="damaged"):
+        read_state(path)
+    with pytest.raises(ConfigError, match="no such file"):
+        read_state(tmp_path / "none.npz")
+
+
+def test_a_start_is_searched_for_on_line() -> None:
+    """Odometry in a frame of its own; killed while the search waits for path, and resumed."""
+    world = strange_hall(0)
+    sensors, drive = lost_drive(world, 0)
+    options, field_map = searching(), surveyed(world)
+    given = list(messages(drive.recording))
+    slam = OnlineSlam(calibrated(sensors), options, field_map)
+    assert [pose for message in given[:300] for pose in give(slam, message)] == []
+    slam = resumed_slam(saved_state(slam), calibrated(sensors), options, field_map)
+    run = driven(slam, given[300:])
+    assert run.kinds[0] is EventKind.RESUMED
+    assert EventKind.START_FOUND in run.kinds
+    stamps = run.trajectory().stamp_ns
+    assert stamps[0] == drive.recording.trajectory.stamp_ns[0]
+    assert np.sqrt(np.mean(run.off(drive.truth) ** 2)) < 0.1
+    assert run.nees(drive.truth).mean() < 12
+
+
+def test_without_a_map_it_is_the_explorer_and_it_resumes() -> None:
+    """Two laps of 10 m: what comes out is what the same key poses give at once, resumed or not."""
+    options = SlamOptions.model_validate(
+        {
+            "key_poses": {"distance_m": 0.3, "readings": 2},
+            "tiles": {"modes": 60, "learn_over_m": 9.0},
+        }
+    )
+    sensors = random_sensors(2, 6)
+    recorded = slam_drive(dipole_world(2), sensors, laps(36, (1.9, 1.4)), np.random.default_rng(2))
+    given = list(messages(recorded.recording))
+    plain = OnlineSlam(calibrated(sensors), options)
+    whole = driven(plain, given)
+    assert whole.kinds == [EventKind.FIELD_LEARNT]
+    odometry = recorded.recording.trajectory
+    rows = np.searchsorted(odometry.stamp_ns, whole.trajectory().stamp_ns)
+    drift = np.linalg.norm(odometry.p[rows] - recorded.truth.p[rows], axis=1)
+    last = len(rows) // 3
+    off = whole.off(recorded.truth)
+    assert np.sqrt(np.mean(off[-last:] ** 2)) < 0.5 * np.sqrt(np.mean(drift[-last:] ** 2))
+    assert whole.nees(recorded.truth)[1:].mean() < 12
+    points, field = explored_field(plain)
+    truth = dipole_world(2).field_and_gradient(points)[0]
+    assert np.sqrt(np.mean((field - truth) ** 2)) < 1.0
+    for at in (len(given) // 5, 2 * len(given) // 3):  # before the field is learnt, and after
+        slam = OnlineSlam(calibrated(sensors), options)
+        for message in given[:at]:
+            give(slam, message)
+        slam = resumed_slam(saved_state(slam), calibrated(sensors), options)
+        run = driven(slam, given[at:])
+        rows = np.searchsorted(whole.trajectory().stamp_ns, run.trajectory().stamp_ns)
+        if EventKind.FIELD_LEARNT in run.kinds:
+            np.testing.assert_allclose(run.trajectory().p, whole.trajectory().p[rows], atol=1e-9)
+        # Sections begin elsewhere: poses stay linearised where these closed.
+        errors = (np.sqrt(np.mean(each**2)) for each in (run.off(recorded.truth), off[rows]))
+        assert next(errors) < 1.5 * next(errors)
+        assert run.nees(recorded.truth).mean() < 12
+
+
+def explored_field(slam: OnlineSlam) -> tuple[FloatArray, FloatArray]:
+    assert isinstance(slam.estimator, Explorer)
+    return slam.estimator.field_along_path()
+
+
+def test_options_that_work_off_line_only_are_refused(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    for chosen, text in (
+        ({"start": {"anywhere": True}}, "give one with --map"),
+        ({"calibration": "refined"}, "works off line"),
+        ({"drift": {"axes": "fixed"}}, "works off line"),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            OnlineSlam(calibrated(hall[0]), SlamOptions.model_validate(chosen))
