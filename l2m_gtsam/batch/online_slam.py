@@ -1,7 +1,7 @@
 """Recorded drives localised on line: message by message, as on a vehicle."""
 
 import resource
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
@@ -10,27 +10,32 @@ import numpy as np
 
 from l2m_gtsam.batch.files import SavedMap, ensure_folder
 from l2m_gtsam.batch.maps import write_map
-from l2m_gtsam.batch.scan_poses import read_drive_or_follow
+from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow
 from l2m_gtsam.batch.slam import MAP_FILE, TRAJECTORY_FILE, SlamInput
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray, Recording, RigidTransform, Trajectory
 from l2m_gtsam.errors import SyncError
 from l2m_gtsam.geometry import compose
+from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.progress import Progress
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.metrics.pose_errors import ComparedTrajectories, check_truth, truth_record
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import TruthRecord
+from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.online.events import OnlineEvent
-from l2m_gtsam.slam.online.replay import give, messages
+from l2m_gtsam.slam.online.replay import give, messages, with_scans
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
+from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.options import Usage
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.online_log import LogLine, OnlineLog, logged_trajectory, read_log
 from l2m_gtsam.storage.online_state import read_state, write_state
+from l2m_gtsam.storage.point_cloud2 import has_clouds
 from l2m_gtsam.storage.pose_files import read_tum
 from l2m_gtsam.storage.trajectory_files import write_tum
 
@@ -107,11 +112,13 @@ def slam_online(
     if truth is not None:
         check_truth(truth, recording.trajectory, config.slam.max_pose_gap_s, str(given.truth))
     field_map = None if saved is None else _opened(saved, recording, config, progress)
-    begun = _begun(calibration, config, field_map, out, resume=resume)
+    matcher = None if saved is None else _matcher(given.bag, saved, config)
+    begun = _begun(calibration, config, field_map, matcher, out, resume=resume)
     ensure_folder(out)
     with OnlineLog(out / LOG_FILE, begun.lines) as log:
         run = _Run(begun, log, out / STATE_FILE, config.slam.online.save_every_s)
-        run.drive(recording, progress)
+        scans = () if matcher is None else bag_scans(given.bag, config, silent)
+        run.drive(recording, scans, progress)
     trajectory = logged_trajectory(run.lines)
     write_tum(out / TRAJECTORY_FILE, trajectory)
     if saved is None:
@@ -140,14 +147,15 @@ def _begun(
     calibration: CalibrationResult,
     config: Config,
     field_map: FieldMap | None,
+    matcher: ScanMatcher | None,
     out: Path,
     *,
     resume: bool,
 ) -> _Begun:
     if not resume:
-        return _Begun(OnlineSlam(calibration, config.slam, field_map), (), -1)
+        return _Begun(OnlineSlam(calibration, config.slam, field_map, matcher), (), -1)
     state = read_state(out / STATE_FILE)
-    slam = resumed_slam(state, calibration, config.slam, field_map)
+    slam = resumed_slam(state, calibration, config.slam, field_map, matcher)
     after = max((each.stamp_ns for each in slam.intake.state.poses), default=-1)
     lines = tuple(each for each in read_log(out / LOG_FILE) if each.stamp_ns <= slam.stamp_ns)
     return _Begun(slam, lines, after)
@@ -159,6 +167,15 @@ def _opened(saved: SavedMap, recording: Recording, config: Config, progress: Pro
     return saved.open(progress, [] if start.anywhere or is_given else [recording])
 
 
+def _matcher(bag: Path, saved: SavedMap, config: Config) -> ScanMatcher | None:
+    """Return what registers the scans of a bag on the cloud of a map; None without one of both."""
+    mapped, options = saved.state.lidar, config.lidar.localisation
+    if mapped is None or config.slam.scans is Usage.IGNORED or not has_clouds(bag):
+        return None
+    edge = options.registration.edge
+    return ScanMatcher(Surface(mapped.points), options, edge, config.slam.drift)
+
+
 class _Run:
     """Gives a recording to a localisation, and writes what comes of it."""
 
@@ -167,12 +184,13 @@ class _Run:
         self._state, self._every_ns = state, round(save_every_s / NS)
         self.lines, self.cost_s = list(begun.lines), list[float]()
 
-    def drive(self, recording: Recording, progress: Progress) -> None:
+    def drive(self, recording: Recording, scans: Iterable[Scan], progress: Progress) -> None:
         """Give all messages that are later than those that it has had."""
         first, last = (int(each) for each in recording.trajectory.stamp_ns[[0, -1]])
         due = max(first, self._after_ns) + self._every_ns
         spent = 0.0
-        for message in messages(recording, self._after_ns):
+        later = (each for each in scans if each.stamp_ns > self._after_ns)
+        for message in with_scans(messages(recording, self._after_ns), later):
             begin = process_time()
             poses = give(self._slam, message)
             spent += process_time() - begin

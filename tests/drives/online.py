@@ -7,12 +7,11 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, Recording, Trajectory
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
-from l2m_gtsam.slam.online.odometry_check import OdometryPose
-from l2m_gtsam.slam.online.replay import FieldReading, give, messages
+from l2m_gtsam.slam.online.replay import FieldReading, Message, give
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from tests.support.pose_errors import pose_nees
 
-Messages = Iterable[OdometryPose | FieldReading]
+Messages = Iterable[Message]
 
 
 @dataclass(frozen=True)
@@ -62,10 +61,10 @@ def driven(slam: OnlineSlam, given: Messages) -> OnlineRun:
 
 def with_readings(
     given: Messages, change: Callable[[FieldReading], FieldReading | None]
-) -> Iterator[OdometryPose | FieldReading]:
+) -> Iterator[Message]:
     """Yield messages with readings changed, or left out where nothing is returned."""
     for message in given:
-        if isinstance(message, OdometryPose):
+        if not isinstance(message, FieldReading):
             yield message
         elif (changed := change(message)) is not None:
             yield changed
@@ -74,6 +73,3 @@ def with_readings(
 def seconds_of(recording: Recording, stamp_ns: int) -> float:
     """Return the time since the first pose of a drive."""
     return 1e-9 * (stamp_ns - int(recording.trajectory.stamp_ns[0]))
-
-
-__all__ = ["OnlineRun", "driven", "messages", "seconds_of", "with_readings"]

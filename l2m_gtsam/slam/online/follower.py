@@ -136,6 +136,7 @@ class Follower:
         self._length, self._first, self._last = section, 0, -1
         self._past = gtsam.Values()
         self.seen = self.used = 0  # readings so far
+        self.fixes_refused = 0
         self._section = Section(self._calibrations)
         self._belief, self._pending = self._prior(start), self._opening(start)
 
@@ -234,7 +235,9 @@ class Follower:
         for row in np.flatnonzero(links.in_map).tolist():
             covariance = self._belief.pose_covariance + links.covariance[row]
             off = gtsam.Pose3.Logmap(link_pose(links, row).between(self._belief.pose))
-            if off @ np.linalg.solve(covariance, off) <= most:
+            if off @ np.linalg.solve(covariance, off) > most:
+                self.fixes_refused += 1
+            else:
                 measure = partial(fix_measurement, link_pose(links, row), links.covariance[row])
                 self._belief = self._belief.updated(measure)
                 self._pending.graph.add(link_factor(links, row))

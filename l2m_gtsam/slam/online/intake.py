@@ -5,23 +5,26 @@ since the one before, after a delay in which late readings may come. What cannot
 and reported. What waits is bounded: of a parked vehicle every other pose and reading is dropped.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
-from l2m_gtsam.recording.sync import has_pose, with_offsets
+from l2m_gtsam.geometry import between
+from l2m_gtsam.recording.sync import has_pose, interpolated, twists, with_offsets
+from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import odometry_steps
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
-from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep, suspect_step, velocity
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
 from l2m_gtsam.slam.options import SlamOptions
 
+MOST_SCANS = 8
 MOST_POSES = 512  # that wait for a key pose
 AHEAD_S = 5.0  # a reading further ahead of odometry has a wrong stamp
 NS = 1e-9
@@ -81,7 +84,7 @@ class Intake:
         self.state = IntakeState(sensors=[SensorBuffer() for _ in sensors.names])
         self._looked_at = 1
         self._strangers = set[str]()
-        self._wanted: list[int] = []
+        self._scans: list[Scan] = []
         self._events: list[OnlineEvent] = []
 
     def events(self) -> list[OnlineEvent]:
@@ -93,9 +96,15 @@ class Intake:
         """Go on from a state."""
         self.state, self._looked_at = state, 1
 
-    def want_key_pose(self, stamp_ns: int) -> None:
-        """Have the first pose that is no earlier than this become a key pose."""
-        self._wanted.append(stamp_ns)
+    def add_scan(self, scan: Scan) -> None:
+        """Take a scan; the first pose that is no earlier becomes a key pose."""
+        poses = self.state.poses
+        late = self.state.number and scan.stamp_ns <= poses[0].stamp_ns
+        if late or len(self._scans) == MOST_SCANS:
+            text = "a scan comes later than its key pose, or too many wait for odometry: left out"
+            self._report(scan.stamp_ns, EventKind.SCAN_REFUSED, text)
+            return
+        self._scans.append(scan)
 
     def add_odometry(self, pose: OdometryPose) -> None:
         """Take a pose; one that is no pose, or not later than the last, is refused."""
@@ -193,7 +202,7 @@ class Intake:
         suspect = stamp in self.state.suspect
         if row + 1 < len(poses):
             suspect = suspect or poses[row + 1].stamp_ns in self.state.suspect
-        wanted = any(poses[row - 1].stamp_ns < each <= stamp for each in self._wanted)
+        wanted = any(poses[row - 1].stamp_ns < each.stamp_ns <= stamp for each in self._scans)
         moved = np.linalg.norm(T.t - first.t) >= options.distance_m
         return bool(moved or turned or suspect or wanted)
 
@@ -203,7 +212,8 @@ class Intake:
         poses, state.poses = state.poses, state.poses[row:]
         stamp, number, state.number = poses[row].stamp_ns, state.number, state.number + 1
         self._looked_at = 1
-        self._wanted = [each for each in self._wanted if each > stamp]
+        taken = [each for each in self._scans if each.stamp_ns <= stamp]
+        self._scans = [each for each in self._scans if each.stamp_ns > stamp]
         suspect = state.suspect.pop(stamp, None)
         if number == 0:
             for buffer in state.sensors:
@@ -216,6 +226,7 @@ class Intake:
         if suspect is not None:
             covariance = key_pose.covariance + suspect.covariance
             key_pose = replace(key_pose, covariance=covariance, lost=suspect.lost)
+        key_pose = replace(key_pose, scans=scans_at(taken, trajectory_of(poses), row))
         self._check_sensors(stamp, moved=key_pose.length_m >= self._options.key_poses.distance_m)
         return key_pose
 
@@ -260,6 +271,19 @@ class Intake:
 
     def _report(self, stamp_ns: int, kind: EventKind, text: str) -> None:
         self._events.append(OnlineEvent(stamp_ns, kind, text))
+
+
+def scans_at(scans: Sequence[Scan], trajectory: Trajectory, row: int) -> tuple[ScanAtKeyPose, ...]:
+    """Return scans as if taken at once, with their poses relative to that of a row."""
+    if not scans:
+        return ()
+    stamps = np.array([each.stamp_ns for each in scans], dtype=np.int64)
+    at, motion = interpolated(trajectory, stamps), twists(trajectory, stamps)
+    key = RigidTransform(trajectory.R[row], trajectory.p[row])
+    return tuple(
+        ScanAtKeyPose(taken_at_once(scan, twist), between(key, RigidTransform(at.R[k], at.p[k])))
+        for k, (scan, twist) in enumerate(zip(scans, motion, strict=True))
+    )
 
 
 def trajectory_of(poses: list[OdometryPose]) -> Trajectory:

@@ -11,13 +11,29 @@ import gtsam
 import numpy as np
 
 from l2m_factors import KeyPoseReadings
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray, RigidTransform
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.key_pose_readings import joined_readings, no_readings
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.odometry import OdometrySteps
 
 POSE = 6
+
+
+@dataclass(frozen=True)
+class ScanAtKeyPose:
+    """A scan that was taken since the key pose before.
+
+    Attributes
+    ----------
+    points
+        In metres in the lidar frame, as if taken at once, shape (N, 3).
+    T_key_scan
+        The lidar at the scan, by odometry in the frame of the key pose.
+    """
+
+    points: FloatArray
+    T_key_scan: RigidTransform
 
 
 @dataclass(frozen=True)
@@ -42,6 +58,8 @@ class ArrivedKeyPose:
         Scan registrations of this key pose.
     lost
         Whether odometry has lost the motion to it.
+    scans
+        That are not registered yet.
     """
 
     number: int
@@ -53,6 +71,7 @@ class ArrivedKeyPose:
     reading_ns: IntArray
     links: Links
     lost: bool = False
+    scans: tuple[ScanAtKeyPose, ...] = ()
 
     @property
     def step(self) -> gtsam.Pose3:

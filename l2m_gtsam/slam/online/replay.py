@@ -1,11 +1,14 @@
 """A recording as messages in order of time, as they would come on a vehicle."""
 
-from collections.abc import Iterator
+import heapq
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, Recording
+from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.online.intake import pose_of
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
@@ -18,6 +21,9 @@ class FieldReading:
     stamp_ns: int
     sensor: str
     field: FloatArray
+
+
+Message: TypeAlias = OdometryPose | FieldReading | Scan
 
 
 def messages(recording: Recording, after_ns: int = -1) -> Iterator[OdometryPose | FieldReading]:
@@ -43,9 +49,17 @@ def messages(recording: Recording, after_ns: int = -1) -> Iterator[OdometryPose 
         yield FieldReading(int(stamps[at]), own.sensor, own.field[row[at]])
 
 
-def give(slam: OnlineSlam, message: OdometryPose | FieldReading) -> tuple[OnlinePose, ...]:
+def with_scans(recorded: Iterable[Message], scans: Iterable[Scan]) -> Iterator[Message]:
+    """Yield messages and scans in order of their stamps; each of both comes in order."""
+    return heapq.merge(recorded, scans, key=lambda each: each.stamp_ns)
+
+
+def give(slam: OnlineSlam, message: Message) -> tuple[OnlinePose, ...]:
     """Give a message to a localisation, and return the key poses that it makes."""
     if isinstance(message, OdometryPose):
         return slam.add_odometry(message)
+    if isinstance(message, Scan):
+        slam.add_scan(message)
+        return ()
     slam.add_reading(message.stamp_ns, message.sensor, message.field)
     return ()

@@ -29,6 +29,7 @@ from l2m_gtsam.slam.online.packing import (
     unpacked_key_poses,
     unpacked_poses,
 )
+from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
 from l2m_gtsam.slam.online.session import OnlineSlam, StartSearchState
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
@@ -80,6 +81,7 @@ def resumed_slam(
     calibration: CalibrationResult,
     options: SlamOptions,
     field_map: QueryableMap | None = None,
+    matcher: ScanMatcher | None = None,
 ) -> OnlineSlam:
     """Return a localisation that goes on from a state.
 
@@ -87,7 +89,7 @@ def resumed_slam(
     ----------
     state
         As of ``saved_state``.
-    calibration, options, field_map
+    calibration, options, field_map, matcher
         As of ``OnlineSlam``; the same as before.
 
     Raises
@@ -95,7 +97,7 @@ def resumed_slam(
     ConfigError
         The state is of another calibration, map or configuration, or it is damaged.
     """
-    slam = OnlineSlam(calibration, options, field_map)
+    slam = OnlineSlam(calibration, options, field_map, matcher)
     names = "\n".join(slam.sensors.names).encode()
     if state.facts.get("options") != options.model_dump(mode="json"):
         raise ConfigError(OTHER)

@@ -12,12 +12,15 @@ from dataclasses import dataclass, replace
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, ConfigError
+from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.maps.field_map import Surveyed
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import StartVerdict
+from l2m_gtsam.records.scans import Scan
 from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose
+from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
@@ -25,6 +28,7 @@ from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.intake import Intake, trajectory_of
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
+from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
@@ -93,6 +97,8 @@ class OnlineSlam:
         As of a localisation off line. ``start.anywhere`` searches the map for the start.
     field_map
         Map; without one the field is found with the poses.
+    matcher
+        Registers scans on the cloud of the map; without it scans take no part.
 
     Raises
     ------
@@ -107,6 +113,7 @@ class OnlineSlam:
         calibration: CalibrationResult,
         options: SlamOptions,
         field_map: QueryableMap | None = None,
+        matcher: ScanMatcher | None = None,
     ) -> None:
         check_options(options, has_map=field_map is not None)
         usable = tuple(each for each in calibration.sensors if is_determined(each))
@@ -115,6 +122,7 @@ class OnlineSlam:
             raise CalibrationError("no sensor has a calibration that can be used")
         self.options, self.sensors = options, known_sensors(usable)
         self._map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+        self._matcher = matcher
         self.intake = Intake(self.sensors, options)
         self.estimator: Follower | Explorer | None = None
         self.search: StartSearchState | None = None
@@ -140,6 +148,11 @@ class OnlineSlam:
     def add_reading(self, stamp_ns: int, sensor: str, field_ut: FloatArray) -> None:
         """Take a reading in uT, shape (3,)."""
         self.intake.add_reading(stamp_ns, sensor, field_ut)
+
+    def add_scan(self, scan: Scan) -> None:
+        """Take a scan; it takes part where there is the cloud of a map."""
+        if self._matcher is not None:
+            self.intake.add_scan(scan)
 
     @one_blas_thread()
     def finish(self) -> tuple[OnlinePose, ...]:
@@ -244,11 +257,28 @@ class OnlineSlam:
             return OnlinePose.of(key_pose.stamp_ns, belief)
         if estimator is None:
             raise ConfigError("the drive has not begun")
-        seen, used = estimator.seen, estimator.used
+        seen, used, refused = estimator.seen, estimator.used, estimator.fixes_refused
+        key_pose = self._with_fixes(estimator.belief, key_pose)
         belief = estimator.add(key_pose)
         estimator.release()
+        if estimator.fixes_refused > refused:
+            text = "a scan is left out: it contradicts odometry and readings"
+            self._report(EventKind.SCAN_REFUSED, text)
         self._count(estimator.seen - seen, estimator.used - used)
         return OnlinePose.of(key_pose.stamp_ns, belief)
+
+    def _with_fixes(self, before: Belief, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
+        """Return a key pose with what its scans say of its place in the map."""
+        if self._matcher is None or not key_pose.scans:
+            return key_pose
+        predicted = before.predicted(key_pose.step, key_pose.covariance).marginalize_previous()
+        pose = predicted.pose
+        T = RigidTransform(pose.rotation().matrix(), pose.translation())
+        expected = PoseEstimate(T, predicted.pose_covariance)
+        found = self._matcher.fixes(key_pose.scans, key_pose.number, expected, key_pose.length_m)
+        for text in found.refused:
+            self._report(EventKind.SCAN_REFUSED, text)
+        return replace(key_pose, links=Links.joined([key_pose.links, found.links]), scans=())
 
     def _count(self, seen: int, used: int) -> None:
         """Report when the map explains few of the last readings, and when it does again."""

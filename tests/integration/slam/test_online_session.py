@@ -12,14 +12,14 @@ from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, key_poses_of
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
-from l2m_gtsam.slam.online.replay import FieldReading, give
+from l2m_gtsam.slam.online.replay import FieldReading, give, messages
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.storage.online_state import SavedState, read_state, write_state
 from tests.drives.lost import QUICK, lost_drive, searching
-from tests.drives.online import OnlineRun, driven, messages, seconds_of, with_readings
+from tests.drives.online import OnlineRun, driven, seconds_of, with_readings
 from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, slam_drive, small_hall
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.surveyed import strange_hall, surveyed, wandering

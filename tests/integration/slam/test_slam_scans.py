@@ -18,8 +18,13 @@ from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.odometry import scan_odometry
+from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.replay import messages, with_scans
+from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions, TileOptions
 from l2m_gtsam.storage.cloud import thinned_cloud
+from tests.drives.online import driven
 from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
@@ -153,3 +158,28 @@ def test_a_corridor_closes_no_loop() -> None:
     found = scans(CORRIDOR, replace(seen, p=seen.p * [1.0, 0.3, 1.0]), np.random.default_rng(7))
     steps = scan_odometry(found, mended(drive), 0.25, OPTIONS)
     assert find_loop_closures(steps, LoopOptions()).loops == ()
+
+
+def test_scans_are_fixes_on_line_and_one_that_lies_is_left_out(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """Every fourth scan is seen 1.2 m to the side, as by a wrong transform: none of them counts."""
+    known, drive = hall
+    rng, truth = np.random.default_rng(5), drive.truth
+    mapping, seen = rows(truth, range(0, len(truth), 100)), rows(truth, range(1, len(truth), EVERY))
+    points = [
+        scan.points @ mapping.R[k].T + mapping.p[k]
+        for k, scan in enumerate(scans(ROOM, mapping, rng))
+    ]
+    cloud = Surface(smoothed(thinned_cloud(np.concatenate(points), 0.1)))
+    matcher = ScanMatcher(cloud, ScanLocalisationOptions(), 0.25, OPTIONS.drift)
+    lying = [
+        replace(each, points=each.points + np.array([0.0, 1.2, 0.0])) if k % 4 == 3 else each
+        for k, each in enumerate(scans(ROOM, seen, rng))
+    ]
+    slam = OnlineSlam(calibrated(known), OPTIONS, dipole_world(1), matcher)
+    run = driven(slam, with_scans(messages(drive.recording), lying))
+    assert len(run.texts(EventKind.SCAN_REFUSED)) == len(lying) // 4
+    late = run.off(truth)[20:]
+    assert np.sqrt(np.mean(late**2)) < 0.03
+    assert run.nees(truth)[20:].mean() < 12
