@@ -14,8 +14,10 @@ from l2m_gtsam.simulate.brought_steel import brought_steel
 from l2m_gtsam.simulate.hall_drives import calibration_drive, survey
 from l2m_gtsam.simulate.steel_hall import (
     HALF_AREA,
+    Boxes,
     CloudVariant,
     SteelHall,
+    SteelStructure,
     hall_cloud,
     steel_hall,
 )
@@ -80,7 +82,8 @@ def loaded_hall(options: ChangesStudyOptions, number: int) -> LoadedHall:
     stood = Loads(inside.positions[standing], inside.moments[standing]).steel(options)
     hall = replace(bare, world=joined(bare.world, stood))
     read = survey(hall, seed, options.heights, options.noise, options.survey_readings)
-    cloud = hall_cloud(bare, CloudVariant.ACCURATE, seed)
+    seen = hall_cloud(bare, CloudVariant.ACCURATE, seed)
+    cloud = np.concatenate([seen, *(surface(options, at) for at in inside.positions[standing])])
     learnt = build_map(read.points, read.field, options.map, cloud)
     span = min(options.heights), max(options.heights)
     return LoadedHall(
@@ -105,6 +108,13 @@ def five_changes(
     m = loads.moments
     moments = [m[comes], -m[goes], -m[moves], m[moves], *drawn(options, 1, rng)]
     return Loads(np.concatenate([loads.positions[[comes, goes, moves]], out]), np.array(moments))
+
+
+def surface(options: ChangesStudyOptions, position: FloatArray) -> FloatArray:
+    """Return what a LiDAR sees of a load, metres, shape (P, 3)."""
+    edges = np.array(options.edges)
+    box = Boxes(("load",), edges[None], position[None], np.zeros(1), np.zeros(1))
+    return SteelStructure(box, position[:2], edges[:2] / 2).cloud(np.zeros(3))
 
 
 def drawn(options: ChangesStudyOptions, count: int, rng: np.random.Generator) -> FloatArray:
