@@ -77,22 +77,28 @@ def test_shelves_are_found_and_do_no_harm(
         away = [np.linalg.norm(each.position - shelf.position) for each in found.sources]
         source = found.sources[int(np.argmin(away))]
         assert min(away) < 0.3
-        moment = np.linalg.norm(shelf.moment)
-        # Wanted are 30 %. The others are seen from one side, at the edge of the map: their moments
-        # come out smaller by 33 and 36 %, one to two of their sigmas.
-        limit = 0.3 if shelf is UPRIGHT else 0.45
-        assert abs(np.linalg.norm(source.moment) / moment - 1) < limit
+        # Within 30 %, or where the pass does not determine it to that, within two of its sigmas: the
+        # two at the edge of the map are seen from one side, beside a field of 0.5 to 0.9 uT that
+        # the map misses on this pass without shelves, too.
+        size = float(np.linalg.norm(shelf.moment))
+        sigma = float(np.linalg.norm(source.moment_sigma * shelf.moment)) / size
+        off = abs(float(np.linalg.norm(source.moment)) - size)
+        assert off < max(0.3 * size, min(2 * sigma, 0.45 * size))
         assert source.cause in (Cause.PLACE, None)
-    off = {
-        name: [np.linalg.norm((each[name].t_lidar_mag - place)[:2]) for each in (clean, found)]
+    errors = {
+        name: [(each[name].t_lidar_mag - place)[:2] for each in (clean, found)]
         for name, place in zip(SENSORS, places, strict=True)
     }
-    rms = np.sqrt(np.mean(np.square(list(off.values())), axis=0))
-    assert rms[1] < 1.3 * max(rms[0], 0.004)
-    for name, place in zip(SENSORS, places, strict=True):
-        sensor = found[name]
-        error = (sensor.t_lidar_mag - place)[:2]
-        assert error @ np.linalg.solve(sensor.covariance[:2, :2], error) < 5.99  # 95 %
+    squares = [[float(e @ e) for e in pair] for pair in errors.values()]
+    before, after = np.sqrt(np.mean(squares, axis=0))
+    assert after < 1.3 * before
+    for name, pair in errors.items():
+        # One sensor is outside of its 95 % without shelves, too (11.8 for 5.99).
+        old, new = (
+            float(e @ np.linalg.solve(each[name].covariance[:2, :2], e))
+            for e, each in zip(pair, (clean, found), strict=True)
+        )
+        assert new < max(5.99, 1.3 * old)
 
 
 @pytest.mark.study
