@@ -77,9 +77,9 @@ def test_shelves_are_found_and_do_no_harm(
         away = [np.linalg.norm(each.position - shelf.position) for each in found.sources]
         source = found.sources[int(np.argmin(away))]
         assert min(away) < 0.3
-        # Within 30 %, or where the pass does not determine it to that, within two of its sigmas: the
-        # two at the edge of the map are seen from one side, beside a field of 0.5 to 0.9 uT that
-        # the map misses on this pass without shelves, too.
+        # Within 30 %, or two of its sigmas where the pass does not determine it to that: the two at
+        # the edge of the map are seen from one side, beside a field of 0.5 to 0.9 uT that the map
+        # misses on this pass without shelves, too.
         size = float(np.linalg.norm(shelf.moment))
         sigma = float(np.linalg.norm(source.moment_sigma * shelf.moment)) / size
         off = abs(float(np.linalg.norm(source.moment)) - size)
