@@ -88,4 +88,26 @@ class ChangedSource:
 
 
 LONG_M = 0.1  # shorter bars are told as points
+
+
+@dataclass(frozen=True)
+class WhatChanged:
+    """One explanation of all readings of a drive.
+
+    Attributes
+    ----------
+    words
+        What changed.
+    gain
+        Over that nothing did: twice the logarithm of the likelihood ratio, less what its
+        parameters cost (the BIC).
+    of_place
+        Whether the place has changed by it.
+    """
+
+    words: str
+    gain: float
+    of_place: bool
+
+
 CLEAR = 6.0  # of a gain: twice the logarithm of 20 to 1

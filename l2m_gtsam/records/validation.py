@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import AliasChoices, Field
 
 from l2m_gtsam.records.metrics import DriveMetrics, MapPicture, Row, Series
-from l2m_gtsam.records.places import ChangedSource
+from l2m_gtsam.records.places import ChangedSource, WhatChanged
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.verdict import Threshold, Verdict
 
@@ -219,6 +219,8 @@ class DriveValidation(Record):
         What speaks against the outcome, and what is worth knowing of it, a sentence each.
     sources
         What changed at the place since it was mapped.
+    explanations
+        What the readings say of place and vehicle, the best first; empty where no steel is seen.
     """
 
     sensors: tuple[ValidatedSensor, ...]
@@ -228,6 +230,7 @@ class DriveValidation(Record):
     doubts: tuple[str, ...]
     notes: tuple[str, ...]
     sources: tuple[ChangedSource, ...] = ()
+    explanations: tuple[WhatChanged, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import FoundSources, find_sources, price, refined
-from l2m_gtsam.records.places import CLEAR, ChangedSource
+from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 
@@ -39,26 +39,6 @@ ANYTHING = {
 
 
 @dataclass(frozen=True)
-class Explained:
-    """One explanation of readings.
-
-    Attributes
-    ----------
-    words
-        What changed.
-    gain
-        Over that nothing did: twice the logarithm of the likelihood ratio, less what its
-        parameters cost (the BIC).
-    of_place
-        Whether the place has changed by it.
-    """
-
-    words: str
-    gain: float
-    of_place: bool
-
-
-@dataclass(frozen=True)
 class PlaceOrVehicle:
     """What explains readings that neither map nor calibration explain.
 
@@ -70,12 +50,12 @@ class PlaceOrVehicle:
         What changed at the place, if it did.
     """
 
-    explanations: tuple[Explained, ...]
+    explanations: tuple[WhatChanged, ...]
     found: FoundSources
     sources: tuple[ChangedSource, ...]
 
     @property
-    def best(self) -> Explained:
+    def best(self) -> WhatChanged:
         """The explanation with the largest gain."""
         return self.explanations[0]
 
@@ -130,17 +110,17 @@ class ShownSources:
         at_place = refined(held, self.found.shapes)
         fits = [at_place]
         explained = [
-            Explained("the place changed, not the vehicle", before - at_place.left - steel, True)
+            WhatChanged("the place changed, not the vehicle", before - at_place.left - steel, True)
         ]
         if any(alone):
             fits.append(refined(self.opened(covariances, alone), ()))
             gain = before - fits[-1].left - self.cost(alone)
-            explained.append(Explained(f"{self.who(alone)} changed, not the place", gain, False))
+            explained.append(WhatChanged(f"{self.who(alone)} changed, not the place", gain, False))
         if any(beside):
             fits.append(refined(self.opened(covariances, beside), self.found.shapes))
             gain = before - fits[-1].left - steel - self.cost(beside)
             explained.append(
-                Explained(f"both the place and {self.who(beside)} changed", gain, True)
+                WhatChanged(f"both the place and {self.who(beside)} changed", gain, True)
             )
         order = sorted(range(len(fits)), key=lambda k: -explained[k].gain)
         found = fits[order[0]]

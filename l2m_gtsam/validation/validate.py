@@ -120,6 +120,7 @@ def validate(
         doubts=doubts,
         notes=notes,
         sources=() if judged is None else judged.sources,
+        explanations=() if judged is None else judged.explanations,
     )
 
 

@@ -21,7 +21,7 @@ STRENGTHS = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, np.inf)  # uT
 
 
 @dataclass(frozen=True)
-class Found:
+class ShareFound:
     """How many of some changes are found; and how well, None where none is.
 
     Attributes
@@ -58,10 +58,10 @@ class ChangesSummary:
     """
 
     options: ChangesStudyOptions
-    by_size: tuple[tuple[Found | None, ...], ...]
-    by_strength: tuple[Found | None, ...]
-    came: Found | None
-    went: Found | None
+    by_size: tuple[tuple[ShareFound | None, ...], ...]
+    by_strength: tuple[ShareFound | None, ...]
+    came: ShareFound | None
+    went: ShareFound | None
     false_with: int
     false_without: int
     hours: float
@@ -172,14 +172,14 @@ def interval(low: float, high: float) -> str:
     return f"over {low:g}" if np.isinf(high) else f"{low:g}-{high:g}"
 
 
-def found_of(changes: list[TrueChange]) -> Found | None:
+def found_of(changes: list[TrueChange]) -> ShareFound | None:
     """Return how many are found, and how well; None for no changes."""
     if not changes:
         return None
     found = [each for each in changes if each.away_m is not None]
     away = [each.away_m for each in found if each.away_m is not None]
     off = [abs(each.moment_ratio - 1) for each in found if each.moment_ratio is not None]
-    return Found(
+    return ShareFound(
         Share(len(found), len(changes)),
         float(np.median(away)) if away else None,
         float(np.median(off)) if off else None,

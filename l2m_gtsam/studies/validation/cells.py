@@ -9,17 +9,17 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation
 from l2m_gtsam.records.validation import CalibrationPart, DriveValidation
 from l2m_gtsam.studies.validation.drives import CalibratedHall, ChangedDrive, changed_drive
-from l2m_gtsam.studies.validation.options import Change, ValidationStudyOptions
+from l2m_gtsam.studies.validation.options import TrueCause, ValidationStudyOptions
 from l2m_gtsam.validation.places import TIE
 from l2m_gtsam.validation.validate import validate
 
 NEAR_M = 0.3  # of the steel that was brought: so near it has to be found
 # What has to be named of every sensor that changed, and nothing of the others.
 PARTS = {
-    Change.TURNED: CalibrationPart.ROTATION,
-    Change.IRON: CalibrationPart.OFFSET,
-    Change.BOTH: CalibrationPart.OFFSET,
-    Change.SENSOR: CalibrationPart.ROTATION,
+    TrueCause.TURNED: CalibrationPart.ROTATION,
+    TrueCause.IRON: CalibrationPart.OFFSET,
+    TrueCause.BOTH: CalibrationPart.OFFSET,
+    TrueCause.SENSOR: CalibrationPart.ROTATION,
 }
 
 
@@ -49,7 +49,7 @@ class ValidationCell:
         What is said of place and vehicle, empty for nothing.
     """
 
-    change: Change
+    change: TrueCause
     hall: int
     level: str
     right: bool
@@ -61,7 +61,7 @@ class ValidationCell:
 
 
 def cell_of(
-    options: ValidationStudyOptions, place: CalibratedHall, change: Change, number: int
+    options: ValidationStudyOptions, place: CalibratedHall, change: TrueCause, number: int
 ) -> ValidationCell:
     """Validate the calibration of a hall's vehicle on one drive."""
     drive = changed_drive(options, place, change, number)
@@ -84,7 +84,7 @@ def cell_of(
     )
 
 
-def is_right(change: Change, drive: ChangedDrive, found: DriveValidation) -> bool:
+def is_right(change: TrueCause, drive: ChangedDrive, found: DriveValidation) -> bool:
     """Return whether what changed is named, where it is, and nothing else.
 
     A mount that is turned moves its sensors, too, which may be named or too little to be.
@@ -95,11 +95,11 @@ def is_right(change: Change, drive: ChangedDrive, found: DriveValidation) -> boo
     if drive.steel is None and found.sources:
         return False
     parts = [{each.part for each in sensor.changes} for sensor in found.sensors]
-    if change in (Change.NOTHING, Change.PLACE):
+    if change in (TrueCause.NOTHING, TrueCause.PLACE):
         return not any(parts)
     wanted = {PARTS[change]}
-    also = {CalibrationPart.PLACE} if change is Change.TURNED else set[CalibrationPart]()
-    if change is Change.SENSOR:
+    also = {CalibrationPart.PLACE} if change is TrueCause.TURNED else set[CalibrationPart]()
+    if change is TrueCause.SENSOR:
         return not any(parts[:-1]) and parts[-1] == wanted
     return all(wanted <= each <= wanted | also for each in parts)
 

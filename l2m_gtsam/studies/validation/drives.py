@@ -24,7 +24,7 @@ from l2m_gtsam.simulate.hall_drives import CLEARANCE_M, calibration_drive, surve
 from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
 from l2m_gtsam.simulate.world import SteelWorld
 from l2m_gtsam.studies.honesty.drives import drive_seed
-from l2m_gtsam.studies.validation.options import Change, ValidationStudyOptions
+from l2m_gtsam.studies.validation.options import TrueCause, ValidationStudyOptions
 
 NO_STEEL = brought_steel(np.zeros((0, 3)), np.zeros((0, 3)), np.ones(3))
 
@@ -116,14 +116,14 @@ def recorded(
 
 
 def changed_drive(
-    options: ValidationStudyOptions, place: CalibratedHall, change: Change, number: int
+    options: ValidationStudyOptions, place: CalibratedHall, change: TrueCause, number: int
 ) -> ChangedDrive:
     """Return a drive by its number, from 1, after something changed."""
     seed = drive_seed(place.seed, number)
     path = path_of(options, place.hall, seed)
     rng, steel, at = np.random.default_rng([seed, 22]), NO_STEEL, None
     sensors = altered(options, place.sensors, change, rng)
-    if change in (Change.PLACE, Change.BOTH):
+    if change in (TrueCause.PLACE, TrueCause.BOTH):
         poses = path.trajectory
         x = poses.R @ np.mean([each.t_lidar_mag for each in sensors], axis=0) + poses.p
         free = x[place.hall.free(x, CLEARANCE_M)]
@@ -136,12 +136,12 @@ def changed_drive(
 def altered(
     options: ValidationStudyOptions,
     sensors: tuple[KnownSensor, ...],
-    change: Change,
+    change: TrueCause,
     rng: np.random.Generator,
 ) -> tuple[KnownSensor, ...]:
     """Return the sensors after a change of the vehicle, or of the last of them."""
     turn = np.deg2rad(rng.uniform(*options.turn_deg)) * direction(rng)
-    if change is Change.TURNED:
+    if change is TrueCause.TURNED:
         R = Rotation.from_rotvec(turn).as_matrix()
         middle = np.mean([each.t_lidar_mag for each in sensors], axis=0)
         places = [middle + R @ (each.t_lidar_mag - middle) for each in sensors]
@@ -149,10 +149,10 @@ def altered(
             replace(each, t_lidar_mag=t, distortion=_in(each, R))
             for each, t in zip(sensors, places, strict=True)
         )
-    if change is Change.SENSOR:
+    if change is TrueCause.SENSOR:
         R = Rotation.from_rotvec(turn).as_matrix()
         return (*sensors[:-1], replace(sensors[-1], distortion=_in(sensors[-1], R)))
-    if change in (Change.IRON, Change.BOTH):
+    if change in (TrueCause.IRON, TrueCause.BOTH):
         return tuple(
             replace(each, distortion=_offset(each, rng.uniform(*options.iron_ut) * direction(rng)))
             for each in sensors

@@ -8,7 +8,7 @@ from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.options import Options
 
 
-class Change(StrEnum):
+class TrueCause(StrEnum):
     """What changed since the calibration."""
 
     NOTHING = "nothing"

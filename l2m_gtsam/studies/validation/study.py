@@ -11,7 +11,7 @@ from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.study import Study
 from l2m_gtsam.studies.validation.cells import NEAR_M, ValidationCell, cell_of
 from l2m_gtsam.studies.validation.drives import CalibratedHall, calibrated_hall
-from l2m_gtsam.studies.validation.options import Change, ValidationStudyOptions
+from l2m_gtsam.studies.validation.options import TrueCause, ValidationStudyOptions
 
 CASE, UNCHANGED = "case", "unchanged"
 
@@ -31,7 +31,7 @@ class ChangeRow:
         Largest distance from the steel to the source that is named; None without.
     """
 
-    change: Change
+    change: TrueCause
     drives: int
     right: int
     tied: int
@@ -98,11 +98,11 @@ class ValidationStudy(Study[ValidationStudyOptions, ValidationCell, ValidationSu
         """Count what is right."""
         cases = [cell for key, cell in cells.items() if key.split("-")[2] == CASE]
         rest = [cell for key, cell in cells.items() if key.split("-")[2] == UNCHANGED]
-        rows = [row_of(each, [cell for cell in cases if cell.change is each]) for each in Change]
+        rows = [row_of(each, [cell for cell in cases if cell.change is each]) for each in TrueCause]
         return ValidationSummary(
             options,
             tuple(row for row in rows if row.drives),
-            row_of(Change.NOTHING, rest),
+            row_of(TrueCause.NOTHING, rest),
             tuple(cell for cell in (*cases, *rest) if not cell.right),
         )
 
@@ -124,16 +124,16 @@ class ValidationStudy(Study[ValidationStudyOptions, ValidationCell, ValidationSu
         return {"validation": figure}
 
 
-def change_of(options: ValidationStudyOptions, key: str) -> Change:
+def change_of(options: ValidationStudyOptions, key: str) -> TrueCause:
     """Return what changes on a drive: all changes take turns over the cases of all halls."""
     _, hall, kind, number = key.split("-")
     if kind == UNCHANGED:
-        return Change.NOTHING
-    every = list(Change)
+        return TrueCause.NOTHING
+    every = list(TrueCause)
     return every[(int(hall) * options.cases + int(number) - 1) % len(every)]
 
 
-def row_of(change: Change, cells: list[ValidationCell]) -> ChangeRow:
+def row_of(change: TrueCause, cells: list[ValidationCell]) -> ChangeRow:
     """Return what is said of the drives after one change."""
     away = [cell.away_m for cell in cells if cell.away_m is not None]
     return ChangeRow(

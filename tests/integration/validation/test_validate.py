@@ -18,6 +18,7 @@ from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation, validation_thresholds
 from l2m_gtsam.recording.drive_trace import trace_of
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus, TimeOffset
+from l2m_gtsam.records.places import ChangedSource, WhatChanged
 from l2m_gtsam.records.sensor_models import MovingField
 from l2m_gtsam.records.validation import CalibrationPart, DriveValidation, NamedSource, Validation
 from l2m_gtsam.records.verdict import Level, Verdict
@@ -361,6 +362,19 @@ def test_a_validation_comes_back_as_it_was(whole: Validation, tmp_path: Path) ->
     back = read_validation(tmp_path / "first.json")
     write_validation(tmp_path / "second.json", back)
     assert (tmp_path / "first.json").read_bytes() == (tmp_path / "second.json").read_bytes()
+
+
+def test_what_changed_at_the_place_comes_back(whole: Validation, tmp_path: Path) -> None:
+    a = np.arange(3.0)
+    source = ChangedSource(a, a + 1, a + 2, a + 3, a + 4, 100.0, 0.8, 4.7, 2)
+    told = (WhatChanged("the place changed", 90.0, True), WhatChanged("both", 80.0, True))
+    assert whole.drive is not None
+    drive = replace(whole.drive, sources=(source,), explanations=told)
+    write_validation(tmp_path / "first.json", replace(whole, drive=drive))
+    back = read_validation(tmp_path / "first.json").drive
+    assert back is not None
+    assert back.explanations == told
+    np.testing.assert_array_equal(back.sources[0].moment, source.moment)
 
 
 def test_keys_of_the_file_are_those_of_earlier_versions(whole: Validation, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from l2m_gtsam.simulate.hall_drives import calibration_drive
 from l2m_gtsam.simulate.steel_hall import steel_hall
 from l2m_gtsam.studies.validation.cells import ValidationCell, is_right
 from l2m_gtsam.studies.validation.drives import altered
-from l2m_gtsam.studies.validation.options import Change, ValidationStudyOptions
+from l2m_gtsam.studies.validation.options import TrueCause, ValidationStudyOptions
 from l2m_gtsam.studies.validation.study import VALIDATION, change_of
 
 OPTIONS = ValidationStudyOptions()
@@ -36,26 +36,26 @@ NONE: tuple[set[CalibrationPart], ...] = (set(), set())
 @pytest.mark.parametrize(
     ("change", "found", "right"),
     [
-        (Change.NOTHING, said(*NONE), True),
-        (Change.NOTHING, said(*NONE, sources=(0.1,)), False),
-        (Change.NOTHING, said({IRON}, set()), False),
-        (Change.PLACE, said(*NONE, sources=(0.9, 0.1)), True),
-        (Change.PLACE, said(*NONE, sources=(0.9,)), False),
-        (Change.PLACE, said(*NONE), False),
-        (Change.PLACE, said({IRON}, set(), sources=(0.1,)), False),
-        (Change.TURNED, said({TURN}, {TURN, MOVE}), True),
-        (Change.TURNED, said({TURN}, set()), False),
-        (Change.TURNED, said({TURN, IRON}, {TURN}), False),
-        (Change.IRON, said({IRON}, {IRON}), True),
-        (Change.IRON, said({IRON}, {IRON, MOVE}), False),
-        (Change.BOTH, said({IRON}, {IRON}, sources=(0.1,)), True),
-        (Change.BOTH, said({IRON}, {IRON}), False),
-        (Change.SENSOR, said(set(), {TURN}), True),
-        (Change.SENSOR, said({TURN}, {TURN}), False),
+        (TrueCause.NOTHING, said(*NONE), True),
+        (TrueCause.NOTHING, said(*NONE, sources=(0.1,)), False),
+        (TrueCause.NOTHING, said({IRON}, set()), False),
+        (TrueCause.PLACE, said(*NONE, sources=(0.9, 0.1)), True),
+        (TrueCause.PLACE, said(*NONE, sources=(0.9,)), False),
+        (TrueCause.PLACE, said(*NONE), False),
+        (TrueCause.PLACE, said({IRON}, set(), sources=(0.1,)), False),
+        (TrueCause.TURNED, said({TURN}, {TURN, MOVE}), True),
+        (TrueCause.TURNED, said({TURN}, set()), False),
+        (TrueCause.TURNED, said({TURN, IRON}, {TURN}), False),
+        (TrueCause.IRON, said({IRON}, {IRON}), True),
+        (TrueCause.IRON, said({IRON}, {IRON, MOVE}), False),
+        (TrueCause.BOTH, said({IRON}, {IRON}, sources=(0.1,)), True),
+        (TrueCause.BOTH, said({IRON}, {IRON}), False),
+        (TrueCause.SENSOR, said(set(), {TURN}), True),
+        (TrueCause.SENSOR, said({TURN}, {TURN}), False),
     ],
 )
-def test_right_is_what_changed_and_nothing_else(change: Change, found: Any, right: bool) -> None:
-    brought = change in (Change.PLACE, Change.BOTH)
+def test_right_is_what_changed_and_nothing_else(change: TrueCause, found: Any, right: bool) -> None:
+    brought = change in (TrueCause.PLACE, TrueCause.BOTH)
     drive: Any = SimpleNamespace(steel=STEEL if brought else None)
     assert is_right(change, drive, found) is right
 
@@ -63,8 +63,8 @@ def test_right_is_what_changed_and_nothing_else(change: Change, found: Any, righ
 def test_a_vehicle_changes_as_it_is_told() -> None:
     sensors = calibration_drive(steel_hall(1), 1, (0.4, 1.0), 0.2, 3, 30).sensors
     rng = np.random.default_rng(0)
-    assert altered(OPTIONS, sensors, Change.NOTHING, rng) == sensors
-    turned = altered(OPTIONS, sensors, Change.TURNED, rng)
+    assert altered(OPTIONS, sensors, TrueCause.NOTHING, rng) == sensors
+    turned = altered(OPTIONS, sensors, TrueCause.TURNED, rng)
     apart = [
         [np.linalg.norm(a.t_lidar_mag - b.t_lidar_mag) for a in each for b in each]
         for each in (sensors, turned)
@@ -75,10 +75,10 @@ def test_a_vehicle_changes_as_it_is_told() -> None:
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         angle = np.rad2deg(np.arccos((np.trace(R) - 1) / 2))
         assert OPTIONS.turn_deg[0] <= angle <= OPTIONS.turn_deg[1]
-    single = altered(OPTIONS, sensors, Change.SENSOR, rng)
+    single = altered(OPTIONS, sensors, TrueCause.SENSOR, rng)
     assert single[:-1] == sensors[:-1]
     np.testing.assert_array_equal(single[-1].t_lidar_mag, sensors[-1].t_lidar_mag)
-    for old, new in zip(sensors, altered(OPTIONS, sensors, Change.IRON, rng), strict=True):
+    for old, new in zip(sensors, altered(OPTIONS, sensors, TrueCause.IRON, rng), strict=True):
         size = np.linalg.norm(new.distortion.H - old.distortion.H)
         assert OPTIONS.iron_ut[0] <= size <= OPTIONS.iron_ut[1]
         np.testing.assert_array_equal(new.distortion.C, old.distortion.C)
@@ -88,16 +88,16 @@ def test_all_changes_take_turns() -> None:
     keys = VALIDATION.keys(OPTIONS)
     cases = [change_of(OPTIONS, key) for key in keys if "case" in key]
     assert len(cases) == 40
-    assert {cases.count(each) for each in Change} == {6, 7}
+    assert {cases.count(each) for each in TrueCause} == {6, 7}
     rest = [change_of(OPTIONS, key) for key in keys if "unchanged" in key]
-    assert rest == [Change.NOTHING] * 60
+    assert rest == [TrueCause.NOTHING] * 60
 
 
 def test_the_page_counts_what_is_right_and_tells_what_is_not() -> None:
     options = ValidationStudyOptions(halls=1, cases=2, unchanged=1)
-    good = ValidationCell(Change.NOTHING, 900, "pass", True, False, ((), ()), None, 0, "")
+    good = ValidationCell(TrueCause.NOTHING, 900, "pass", True, False, ((), ()), None, 0, "")
     bad = replace(
-        good, change=Change.PLACE, right=False, tied=True, level="warn", away_m=0.4, sources=1,
+        good, change=TrueCause.PLACE, right=False, tied=True, level="warn", away_m=0.4, sources=1,
         words="It cannot be told",
     )  # fmt: skip
     cells = dict(zip(VALIDATION.keys(options), (good, bad, good), strict=True))
