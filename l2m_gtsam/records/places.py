@@ -16,6 +16,9 @@ class Cause(StrEnum):
     SENSOR = "sensor"
 
 
+LARGEST = 1e6  # metres, A m^2
+
+
 @dataclass(frozen=True)
 class CauseGain:
     """How well a cause explains readings.
@@ -72,6 +75,12 @@ class ChangedSource:
     strongest: float
     passages: int
     explanations: tuple[CauseGain, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Raise a ValueError for steel that is nowhere: a file of others may hold anything."""
+        for name in ("position", "position_sigma", "moment", "moment_sigma", "half_axis"):
+            if not all(abs(float(each)) <= LARGEST for each in getattr(self, name)):
+                raise ValueError(f"{name} must be finite numbers of at most {LARGEST:g}")
 
     @property
     def length_m(self) -> float:

@@ -2,8 +2,10 @@
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.data import FloatArray
@@ -83,3 +85,12 @@ def test_the_page_shows_what_changed_where() -> None:
     assert "Steel 2 came, went or was moved" in page
     # And a page without changes does not speak of them.
     assert "changes" not in re.findall(r'id="([^"]*)"', plain)
+
+
+@pytest.mark.parametrize("name", ["position", "position_sigma", "moment", "half_axis"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e300])
+def test_steel_that_is_nowhere_is_refused(name: str, value: float) -> None:
+    """As a file of others may have it: it could not be drawn."""
+    changed: Any = {name: np.array([0.0, value, 0.0])}
+    with pytest.raises(ValueError, match=f"{name} must be finite numbers"):
+        replace(FIRST, **changed)
