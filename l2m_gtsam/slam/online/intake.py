@@ -26,6 +26,7 @@ from l2m_gtsam.slam.options import SlamOptions
 
 MOST_SCANS = 8
 MOST_POSES = 512  # that wait for a key pose
+FAR_AHEAD_S = 10.0  # a pose further ahead of the last counts when the next one is later still
 AHEAD_S = 5.0  # a reading further ahead of odometry has a wrong stamp
 NS = 1e-9
 SENSOR_TEXTS = {
@@ -85,6 +86,7 @@ class Intake:
         self._looked_at = 1
         self._strangers = set[str]()
         self._scans: list[Scan] = []
+        self._ahead: OdometryPose | None = None
         self._events: list[OnlineEvent] = []
 
     def events(self) -> list[OnlineEvent]:
@@ -120,7 +122,22 @@ class Intake:
                 self._report(pose.stamp_ns, EventKind.OUT_OF_ORDER, text)
             state.disordered = True
             return
+        ahead, self._ahead = self._ahead, None
+        if ahead is not None and pose.stamp_ns > ahead.stamp_ns:
+            self._append(ahead)
+        elif ahead is not None:
+            text = "a pose of odometry is stamped far ahead of those after it: left out"
+            self._report(pose.stamp_ns, EventKind.OUT_OF_ORDER, text)
+        elif poses and pose.stamp_ns > poses[-1].stamp_ns + FAR_AHEAD_S / NS:
+            self._ahead = pose  # a wrong stamp, or a long gap: the next pose decides
+            return
+        self._append(pose)
+
+    def _append(self, pose: OdometryPose) -> None:
+        state, poses = self.state, self.state.poses
         state.disordered = False
+        if pose.covariance is not None and not np.isfinite(pose.covariance).all():
+            pose = replace(pose, covariance=None)
         if poses:
             self._check_step(poses[-1], pose)
         poses.append(pose)

@@ -33,6 +33,7 @@ from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 
+MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
 LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
 LEAST_READINGS = 40  # where these have so many
 REFUSED, FITS = 0.4, 0.6  # share that is explained, below which it is reported, and above again
@@ -223,6 +224,9 @@ class OnlineSlam:
         if key_pose.lost and following and isinstance(self._map, Surveyed):
             self._lose(key_pose)
             return
+        if self.search is not None and key_pose.lost:
+            self._begin_search(key_pose)  # no pattern of readings reaches over it
+            return
         if self.search is not None:
             self.search.waiting.append(key_pose)
             yield from self._searched(self.search, at_end=False)
@@ -301,7 +305,8 @@ class OnlineSlam:
         """Search for the start if the path is long enough; yield all key poses if it is found."""
         waiting, options = search.waiting, self.options.start
         path = sum(each.length_m for each in waiting)
-        if len(waiting) < 2 or (path < search.window_m and not at_end):
+        full = path >= search.window_m or len(waiting) > MOST_WAITING
+        if len(waiting) < 2 or not (full or at_end):
             return
         drive = drive_of(waiting, search.first, self.sensors)
         found = find_start(drive, self.known_map(), self.options, silent)
@@ -314,7 +319,7 @@ class OnlineSlam:
             return
         self._report(EventKind.START_OPEN, found.message)
         search.window_m *= GROWTH
-        if search.window_m > options.search.longest_m:
+        if search.window_m > options.search.longest_m or len(waiting) > MOST_WAITING:
             # Odometry's errors would blur more: begin anew from here, which bounds the memory, too.
             self._begin_search(waiting[-1])
 

@@ -204,6 +204,45 @@ def test_a_vehicle_in_another_place_is_reported(
     assert EventKind.READINGS_REFUSED in run.kinds
 
 
+def spoilt(
+    given: list[OdometryPose | FieldReading], seed: int
+) -> list[OdometryPose | FieldReading]:
+    """Return messages of which some are lost, late, twice there, not finite, or of another year."""
+    rng, found = np.random.default_rng(seed), list[OdometryPose | FieldReading]()
+    for message in given:
+        change = rng.integers(0, 60)  # six kinds of faults
+        if change == 0:
+            continue
+        if change == 1 and found:
+            found.insert(max(len(found) - int(rng.integers(1, 40)), 0), message)
+            continue
+        if change == 2:
+            found.append(message)
+        if change == 3:
+            message = replace(message, stamp_ns=int(rng.integers(-(2**60), 2**62)))
+        if change == 4 and isinstance(message, FieldReading):
+            message = replace(message, field=message.field * rng.choice([np.nan, np.inf, 1e9, 0.0]))
+        if change == 5 and isinstance(message, OdometryPose):
+            message = replace(message, covariance=np.full((6, 6), np.nan))
+        found.append(message)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_comes_poses_are_finite_and_sigmas_hold(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive], seed: int
+) -> None:
+    """A tenth of all messages is spoilt; the first pose is right."""
+    first, *rest = list(messages(hall[1].recording))
+    run = driven(in_map(hall), [first, *spoilt(rest, seed)])
+    found = run.trajectory()
+    assert np.all(np.diff(found.stamp_ns) > 0)
+    assert found.covariance is not None
+    assert np.all(np.linalg.eigvalsh(found.covariance) > 0)
+    assert run.nees(hall[1].truth)[1:].mean() < 12
+    assert run.events
+
+
 def test_killed_and_resumed_it_goes_on(
     hall: tuple[tuple[KnownSensor, ...], SlamDrive], plain: OnlineRun, tmp_path: Path
 ) -> None:
@@ -328,3 +367,27 @@ def test_options_that_work_off_line_only_are_refused(
     ):
         with pytest.raises(ConfigError, match=text):
             OnlineSlam(calibrated(hall[0]), SlamOptions.model_validate(chosen))
+
+
+def test_what_is_kept_does_not_grow_with_the_drive(
+    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
+) -> None:
+    """In a map: the state after each quarter of the drive, and of a vehicle parked for half an hour."""
+    given, sizes = list(messages(hall[1].recording)), list[int]()
+    slam = in_map(hall)
+    for number, message in enumerate(given):
+        give(slam, message)
+        if (number + 1) % (len(given) // 4) == 0:
+            sizes.append(sum(each.nbytes for each in saved_state(slam).arrays.values()))
+    # Bytes: of what is known, and of poses and readings that wait for their key pose.
+    assert max(sizes) < 10_000
+    assert sizes[-1] < sizes[0]
+    last = hall[1].recording.trajectory
+    T, end = RigidTransform(last.R[-1], last.p[-1]), int(last.stamp_ns[-1])
+    for k in range(1, 4501):
+        stamp = end + k * 400_000_000
+        for sensor in hall[0]:
+            slam.add_reading(stamp, sensor.sensor, np.array([20.0, 0.0, -40.0]))
+        assert slam.add_odometry(OdometryPose(stamp + 1, T)) == () or k <= 1
+    assert len(slam.intake.state.poses) <= 513
+    assert max(len(each.stamp_ns) for each in slam.intake.state.sensors) <= 513
