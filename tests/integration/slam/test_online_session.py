@@ -372,7 +372,7 @@ def test_options_that_work_off_line_only_are_refused(
 def test_what_is_kept_does_not_grow_with_the_drive(
     hall: tuple[tuple[KnownSensor, ...], SlamDrive],
 ) -> None:
-    """In a map: the state after each quarter of the drive, and of a vehicle parked for half an hour."""
+    """In a map: the state after each quarter of a drive, and a vehicle parked for half an hour."""
     given, sizes = list(messages(hall[1].recording)), list[int]()
     slam = in_map(hall)
     for number, message in enumerate(given):
