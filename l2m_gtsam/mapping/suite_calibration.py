@@ -180,7 +180,7 @@ def _check_ending(
         raise CalibrationError(
             f"{names[k]}: the survey does not lead to this sensor: in {solution.rounds} rounds it "
             f"came {away[k]:.2g} m from where it was assumed; give what is known of the sensors "
-            "with --suite, keep further from steel, or raise mapping.suite.modes"
+            "with --suite (turned ones with `bag.axes`), or keep further from steel"
         )
 
 
