@@ -59,9 +59,10 @@ def test_a_walk_wanders_as_its_spectrum_says() -> None:
 @pytest.mark.parametrize("form", range(len(LASTING_S)))
 def test_errors_of_poses_have_unit_variance_and_last(form: int) -> None:
     modes = TimeModes.over(READINGS, 400)  # all that matter, unlike the fewer that are looked for
-    turn, shift = PoseProcess(PLACES, modes).forms[form]
-    assert not (turn * shift).any()
-    variance, values = turn[::6], modes.values(READINGS, ROWS)
+    tilt, heading, floor, height = PoseProcess(PLACES, modes).forms[form]
+    np.testing.assert_array_equal(tilt[::6], height[5::6])
+    np.testing.assert_array_equal(np.count_nonzero([tilt, heading, floor, height], axis=0), 1)
+    variance, values = tilt[::6], modes.values(READINGS, ROWS)
     like = (values[400] * variance) @ values.T
     lasting = LASTING_S[form]
     expected = np.exp(-np.abs(SECONDS - SECONDS[400]) / lasting)
