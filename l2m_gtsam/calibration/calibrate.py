@@ -154,6 +154,7 @@ def calibrated(
         traces=tuple(trace_of(drive.trajectory) for drive in recording.parts),
         exact=taken_for_exact(alive, field_map, solution.budget),
         disturbances=solution.budget.named(alive.sensors),
+        stated=solution.stated,
         sources=changed.records,
     )
     return Calibrated(result, solution, field_map, solver_map)

@@ -46,6 +46,7 @@ from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or
@@ -84,6 +85,8 @@ class OneKeySolution:
         How the map's errors were counted: full needs a map that knows them.
     budget
         Processes that were found beside noise and the map's errors, where these are counted.
+    stated
+        How large errors are whose sigmas were stated, where shared errors are counted.
     """
 
     readings: Readings
@@ -96,6 +99,7 @@ class OneKeySolution:
     settled: bool
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
     budget: Budget = NOTHING_FOUND
+    stated: tuple[StatedSize, ...] = ()
 
     @property
     def used(self) -> BoolArray:
@@ -231,6 +235,7 @@ def _solved(
         settled=joint.settled and full.settled,
         uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
         budget=full.budget,
+        stated=full.stated,
     )
 
 

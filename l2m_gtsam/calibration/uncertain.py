@@ -27,6 +27,7 @@ from l2m_gtsam.calibration.optimise import Ending, LinearSolver
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import NEAR_SIGMAS, UncertainProblem
 from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6
@@ -50,6 +51,8 @@ class UncertainSolution:
         Whether another round would repeat the last.
     budget
         Processes that were found in what noise and map leave.
+    stated
+        How large errors are whose sigmas were stated.
     """
 
     estimate: Estimate
@@ -57,6 +60,7 @@ class UncertainSolution:
     ending: Ending
     settled: bool
     budget: Budget = NOTHING_FOUND
+    stated: tuple[StatedSize, ...] = ()
 
 
 def solve_uncertain(
@@ -89,6 +93,8 @@ def solve_uncertain(
     drive = UncertainDrive.of(view, field_map, errors, near, options)
     found = settle_by_any(drive, near, tests, options, lambda done: progress(SEARCHED * done))
     budget = NOTHING_FOUND
+    # Processes would take up what is stated too small: it is judged without them.
+    stated = found.problem.stated(found.joint, found.values, options.sensor_noise_ut)
     # What a map leaves that does not know its own errors is no process of the drive.
     if found.ending is not Ending.SINGULAR and sigmas_hold(errors):
         budget = found.problem.searched(found.joint)
@@ -105,7 +111,7 @@ def solve_uncertain(
     solved = problem.by_cause(joint, problem.solutions(joint, found.values))
     solved = problem.wandering(joint, found.values, problem.robust(joint, solved))
     progress(1.0)
-    return UncertainSolution(found.estimate, solved, found.ending, found.settled, budget)
+    return UncertainSolution(found.estimate, solved, found.ending, found.settled, budget, stated)
 
 
 def settle_by_any(

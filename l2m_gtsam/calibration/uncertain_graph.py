@@ -42,9 +42,17 @@ from l2m_gtsam.calibration.optimise import (
 )
 from l2m_gtsam.calibration.priors import contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_of, keys_of
+from l2m_gtsam.calibration.stated_sizes import (
+    NoiseBesidePoses,
+    size_beside_noise,
+    size_of_noise,
+    size_of_shared,
+)
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive
 from l2m_gtsam.calibration.variance_parts import PriorRows, variance_parts
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.records.stated_size import StatedSize
+from l2m_gtsam.records.variance_shares import ErrorCause
 from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import HALF, estimate_noise, residual_figures
 from l2m_gtsam.solve.rank import Determinacy
@@ -264,6 +272,38 @@ class UncertainProblem:
             excess = unmodelled(self._view.readings, rows, own, joint.every, len(solved), stated)
             widened.append(found.widened(excess))
         return tuple(widened)
+
+    def stated(
+        self, joint: JointInformation, values: gtsam.Values, noise: float | None
+    ) -> tuple[StatedSize, ...]:
+        """Return how large errors are of which sigmas were stated: of poses, and noise in uT."""
+        names, found = self._view.readings.sensors, []
+        if noise is not None:
+            sizes = self.noise(joint, values, self._estimate)
+            for s in self._view.sensors:
+                freedom = 3 * len(self._batch.rows_of(s)) - self._taken(joint, s)
+                found.append(size_of_noise(names[s], noise, float(sizes[s]), freedom))
+        coverage = self._prior.coverage
+        if coverage.knots is not None and coverage.budget.poses is None:
+            found.append(self._stated_poses(joint, values))
+        return tuple(found)
+
+    def _stated_poses(self, joint: JointInformation, values: gtsam.Values) -> StatedSize:
+        """Return how large errors of poses are of which sigmas were stated."""
+        residual, sensors = self._residuals(values), []
+        for s in self._view.sensors:
+            rows = self._batch.rows_of(s)
+            left = float(self._noise.of_poses[rows].mean())
+            noise = float(self._estimate.noise[s])
+            counted = rows[self._view.trust[rows] > HALF]
+            sensors.append(NoiseBesidePoses(residual[counted], noise, left))
+        if size := size_beside_noise(sensors):
+            return size
+        keys = [key for key in self._prior.sizes if chr(gtsam.symbolChr(key)) == "P"]
+        at = columns_at(joint.columns, keys)
+        prior = self._prior.information[np.ix_(at, at)]
+        weights = np.concatenate([values.atVector(key) for key in keys])
+        return size_of_shared(ErrorCause.POSES, joint, at, prior, weights)
 
     def by_cause(
         self, joint: JointInformation, solved: Sequence[SensorSolution]

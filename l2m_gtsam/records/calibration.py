@@ -18,6 +18,7 @@ from l2m_gtsam.records.disturbance import EXPLAINED, Disturbance, Unmodelled
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
+from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.records.variance_shares import VarianceShare
 from l2m_gtsam.records.verdict import Judgement
 
@@ -358,6 +359,8 @@ class CalibrationResult:
         What counts as exact, for want of errors that are stated.
     disturbances
         What was found beside noise and the map's errors; sigmas hold it.
+    stated
+        How large errors are of which sigmas were stated, by the readings.
     sources
         Of field that came, went or were moved since the place was mapped; the solve knows them.
     """
@@ -378,6 +381,7 @@ class CalibrationResult:
     exact: tuple[str, ...] = ()
     disturbances: tuple[Disturbance, ...] = ()
     sources: tuple[ChangedSource, ...] = ()
+    stated: tuple[StatedSize, ...] = ()
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

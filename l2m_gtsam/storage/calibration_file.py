@@ -99,6 +99,10 @@ MODEL = {
         "errors of poses that last, a drive's frame that is bent against the map's; sizes are "
         "standard deviations, gain is twice a logarithm of likelihood"
     ),
+    "stated": (
+        "errors whose standard deviations were stated: ratio of what the readings show to what was "
+        "stated; gain: twice the logarithm by which the readings are more likely so"
+    ),
     "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
@@ -144,6 +148,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "notes": plain["notes"],
         "exact": plain["exact"],
         "disturbances": plain["disturbances"],
+        "stated": plain["stated"],
         "disagreements": disagreements,
         "sources": plain["sources"],
         **source_entries(result),
@@ -153,7 +158,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }
-    for name in ("notes", "exact", "disturbances", "traces", "sources"):
+    for name in ("notes", "exact", "disturbances", "stated", "traces", "sources"):
         content = _without_empty(content, name)
     write_yaml(path, content, HEADER)
 

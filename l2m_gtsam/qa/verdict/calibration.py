@@ -10,6 +10,7 @@ from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.repeatability import repeat
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, misfit, precision
+from l2m_gtsam.qa.verdict.uncertainty import stated_wrongly
 from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
 from l2m_gtsam.records.metrics import Metrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
@@ -76,6 +77,7 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
         reasons.append(Reason(Level.WARN, more))
     # A map of another place is no evidence on this one.
     reasons += [Reason(Level.WARN, disturbance_sentence(each)) for each in result.disturbances]
+    reasons += stated_wrongly(result.stated)
     return _wrong_map(cases) or [*_on_drive(cases), *reasons, *_exact(result)]
 
 

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 
+from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.records.variance_shares import ErrorCause, VarianceShare
+from l2m_gtsam.records.verdict import Level, Reason
 
 NAMES = {
     ErrorCause.NOISE: "noise",
@@ -29,6 +31,38 @@ REMEDIES = {
     ErrorCause.UNMODELLED: "stated errors of poses and of the survey's sensors",
 }
 LISTED = 0.01  # of a variance
+
+
+STATED = {
+    ErrorCause.NOISE: (
+        "sigmas stated of the noise of {sensor}",
+        "calibration.solve.sensor_noise_ut",
+    ),
+    ErrorCause.POSES: ("sigmas stated of the poses", "calibration.solve.pose_noise, or the bag"),
+}
+
+
+def stated_wrongly(stated: Sequence[StatedSize]) -> list[Reason]:
+    """Return what was stated that the readings speak against."""
+    return [
+        Reason(Level.WARN, _wrong(each))
+        for each in stated
+        if each.is_wrong and each.cause in STATED
+    ]
+
+
+def _wrong(found: StatedSize) -> str:
+    what, where = STATED[found.cause]
+    what = what.format(sensor=found.sensor)
+    if found.ratio > 1:
+        return (
+            f"The {what} are too small: the readings show {found.ratio:.1f} times as much, and "
+            f"sigmas are too small. Correct them ({where})."
+        )
+    return (
+        f"The {what} are too large: the readings show {found.ratio:.2f} times as much, and sigmas "
+        f"are too large. Correct them ({where})."
+    )
 
 
 def shares_in_words(shares: Sequence[VarianceShare], of: str) -> str:

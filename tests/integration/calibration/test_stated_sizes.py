@@ -1,0 +1,49 @@
+"""Sigmas of noise and poses that are stated wrongly are noticed, a third and thrice."""
+
+import pytest
+
+from l2m_gtsam.calibration.alternation import OneKeyOptions
+from l2m_gtsam.calibration.calibrate import calibrated
+from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.qa.verdict.uncertainty import stated_wrongly
+from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
+from l2m_gtsam.records.stated_size import StatedSize
+from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.studies.troubles.drives import troubled_drive
+from l2m_gtsam.studies.troubles.options import Trouble
+from tests.drives.troubled import DRIVE, OPTIONS, hall
+
+
+def found(times: float, cause: ErrorCause) -> list[StatedSize]:
+    """Return the sizes of a drive whose noise or poses are stated so many times too large."""
+    place = hall(Trouble.CLEAN)
+    if cause is ErrorCause.NOISE:
+        solve, trouble = OneKeyOptions(sensor_noise_ut=times * OPTIONS.noise), Trouble.CLEAN
+    else:
+        poses = PoseNoiseOptions(
+            position_m=times * OPTIONS.pose_m,
+            rotation_deg=times * OPTIONS.pose_deg,
+            correlation_s=OPTIONS.pose_s,
+        )
+        solve, trouble = OneKeyOptions(pose_noise=poses), Trouble.POSES
+    recording, _ = troubled_drive(OPTIONS, place, trouble, DRIVE)
+    options = CalibrationOptions(solve=solve)
+    result = calibrated(recording, place.field_map, options).result
+    return [each for each in result.stated if each.cause is cause]
+
+
+@pytest.mark.parametrize("cause", [ErrorCause.NOISE, ErrorCause.POSES])
+def test_what_is_stated_rightly_is_not_noted(cause: ErrorCause) -> None:
+    sizes = found(1.0, cause)
+    assert sizes
+    assert not stated_wrongly(sizes)
+
+
+@pytest.mark.parametrize("cause", [ErrorCause.NOISE, ErrorCause.POSES])
+@pytest.mark.parametrize(("times", "words"), [(3.0, "too large"), (1 / 3, "too small")])
+def test_what_is_stated_wrongly_is_noted(cause: ErrorCause, times: float, words: str) -> None:
+    sizes = found(times, cause)
+    assert sizes
+    notes = stated_wrongly(sizes)
+    assert len(notes) == len(sizes)
+    assert all(words in each.text for each in notes)
