@@ -31,7 +31,7 @@ BY_SYMBOL = {
     "B": ErrorCause.FIELD,
     "F": ErrorCause.WARP,
 }
-LEAST = 1e-4  # of a variance: less is not listed
+LEAST = 1e-3  # of a variance: less is not listed
 Parts = dict[ErrorCause, FloatArray]
 
 

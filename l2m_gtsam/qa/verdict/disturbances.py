@@ -11,8 +11,8 @@ PARTS = {
     "floor_m": (1e3, "{:.1f} mm on the floor"),
     "height_m": (1e3, "{:.1f} mm of height"),
     "shift_m": (1e3, "{:.1f} mm"),
-    "walk_ut": (1.0, "{:.2g} uT from the start of the drive to its end"),
-    "noise_ut": (1.0, "{:.2g} uT for a time"),
+    "walk_ut": (1.0, "{:.2g} µT from the start of the drive to its end"),
+    "noise_ut": (1.0, "{:.2g} µT for a time"),
 }
 
 

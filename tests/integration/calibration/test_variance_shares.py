@@ -19,8 +19,8 @@ def test_they_add_to_one(trouble: Trouble) -> None:
     for sensor in (0, 1):
         found = shares(trouble, sensor).values()
         for of in ("t", "C", "H"):
-            # Shares below 1e-4 are not listed.
-            assert sum(getattr(each, of) for each in found) == pytest.approx(1, abs=1e-3)
+            # Shares below 1e-3 are not listed, of up to four causes.
+            assert sum(getattr(each, of) for each in found) == pytest.approx(1, abs=4e-3)
         assert all(min(each.t, each.C, each.H) >= 0 for each in found)
 
 
