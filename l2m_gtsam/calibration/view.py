@@ -15,6 +15,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, Readings
+from l2m_gtsam.maps.field_map import optional_members
 
 
 class QueryableMap(Protocol):
@@ -135,6 +136,7 @@ class RememberedMap:
         self._rows: dict[bytes, int] = {}
         self._values = np.empty((0, VALUES))
         self._inside = np.empty(0, dtype=np.bool_)
+        vars(self).update(optional_members(field_map, self))
         self._own = local()  # what a thread asked last is no use to another, which would forget it
 
     def __getattr__(self, name: str) -> Any:

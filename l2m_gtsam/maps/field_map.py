@@ -38,6 +38,20 @@ class MapSummary:
     doubts: tuple[str, ...] = ()
 
 
+# What some maps have and others have not, by which protocols know them.
+OPTIONAL = ("errors_over", "sensors_uncertain", "sigmas_hold", "compile", "summary", "readings")
+
+
+def optional_members(field_map: object, wrapper: object) -> dict[str, Any]:
+    """Return what a map has that a wrapper of it has not, of what only some maps have.
+
+    ``isinstance`` with a protocol looks for members that are there, since Python 3.12 without
+    asking ``__getattr__``: a wrapper has to have what its map has.
+    """
+    missing = (name for name in OPTIONAL if not hasattr(type(wrapper), name))
+    return {name: getattr(field_map, name) for name in missing if hasattr(field_map, name)}
+
+
 @runtime_checkable
 class Summarised(Protocol):
     """A map that can summarise its quality."""

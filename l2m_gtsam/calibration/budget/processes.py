@@ -28,7 +28,7 @@ WANDER_MODES = 24  # slower ones hold all but 2 % of a walk; faster ones of 1/f 
 # more. With fewer modes than that, errors of poses look like fields.
 FINEST_S = 1.75
 FAST_MODES = (48, 96)  # at least and at most: a thousand weights take seconds
-LASTING_S = (1.0, 2.0, 4.0, 8.0)  # how long errors of poses and fields may last
+LASTING_S = (1.0, 2.0, 4.0, 8.0)  # how long errors of poses may last
 POSE_PARTS = {  # of rotation and translation along the axes of the lidar
     "tilt": (1, 1, 0, 0, 0, 0),
     "heading": (0, 0, 1, 0, 0, 0),
@@ -260,9 +260,8 @@ class FieldProcess:
 
     @cached_property
     def forms(self) -> tuple[FloatArray, ...]:
-        """Of 1/f noise and of a random walk together, or lasting each of ``LASTING_S``, uT^2."""
-        short = (np.repeat(lasting(self.modes, seconds), 3)[None] for seconds in LASTING_S)
-        return (pink_and_walk(self.modes), *short)
+        """Of 1/f noise and of a random walk together, uT^2."""
+        return (pink_and_walk(self.modes),)
 
     def features(self, rows: IntArray) -> FloatArray:
         """Return what fields along the axes of the map are in the lidar frame, shape (n, 3, m)."""
@@ -275,10 +274,8 @@ class FieldProcess:
         return replace(self, places=places)
 
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
-        """Return noise and walk, or noise and how long it lasts."""
-        if form == 0:
-            return named_noise_and_walk(self.modes, sizes)
-        return {"noise_ut": float(np.sqrt(sizes[0])), "lasting_s": LASTING_S[form - 1]}
+        """Return noise and walk, uT."""
+        return named_noise_and_walk(self.modes, sizes)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
+from l2m_gtsam.maps.field_map import optional_members
 from l2m_gtsam.maps.sources.search import FoundSources
 from l2m_gtsam.maps.sources.source import SourceShape
 
@@ -104,6 +105,7 @@ class ChangedMap:
     def __init__(self, field_map: SurveyedField, found: FoundSources) -> None:
         self._map: Any = field_map
         self._found = found
+        vars(self).update(optional_members(field_map, self))
 
     def __getattr__(self, name: str) -> Any:
         if name == "_map":  # before there is one, as when another process unpacks it

@@ -2,6 +2,7 @@
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from inspect import getattr_static
 
 import numpy as np
 import pytest
@@ -131,3 +132,22 @@ def test_it_goes_to_another_process_without_its_memory() -> None:
     remembered.query(np.ones((2, 3)))
     there = pickle.loads(pickle.dumps(remembered))  # noqa: S301  our own, a moment ago
     np.testing.assert_array_equal(there.query(np.ones((1, 3))).variance, np.ones((1, 3)))
+
+
+class Knowing(Counting):
+    """The same with what some maps know beside it."""
+
+    sigmas_hold = False
+
+    def errors_over(self, points: FloatArray, /) -> FloatArray:
+        return points
+
+
+def test_what_its_map_has_is_there_for_a_static_look() -> None:
+    """Since Python 3.12 ``isinstance`` with a protocol does not ask ``__getattr__``."""
+    for known, expected in ((Knowing(), True), (Counting(), False)):
+        remembered = RememberedMap(known)
+        for name in ("errors_over", "sigmas_hold"):
+            found = getattr_static(remembered, name, None)
+            assert (found is not None) is expected
+        assert isinstance(remembered, UncertainMap) is expected
