@@ -4,7 +4,7 @@ Passes 1 to 3 make the map by the robot's first magnetometer, which is calibrate
 is calibrated on it. The shelves' field is that of magpylib; all else is as it was recorded.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,14 @@ import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import Distortion, KnownSensor, Recording
+from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording
 from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.places import Cause
+from l2m_gtsam.records.places import Cause, ChangedSource
 from tests.drives.robot import SENSORS, assumed_sensors, robot_pass
 from tests.drives.shelves import Shelf, with_shelves
 
@@ -61,44 +61,72 @@ def clean(passes: dict[int, Recording], survey: FieldMap) -> CalibrationResult:
     return calibrate(passes[4], survey, CalibrationOptions())
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("shelves", [(UPRIGHT,), (UPRIGHT, *OTHERS)], ids=["one", "three"])
-def test_shelves_are_found_and_do_no_harm(
+@dataclass(frozen=True)
+class Shelved:
+    """Pass 4 with the field of shelves in its readings, calibrated."""
+
+    shelves: tuple[Shelf, ...]
+    places: FloatArray
+    result: CalibrationResult
+
+    def nearest(self, shelf: Shelf) -> ChangedSource:
+        """Return the source that is nearest to a shelf."""
+        away = [np.linalg.norm(each.position - shelf.position) for each in self.result.sources]
+        return self.result.sources[int(np.argmin(away))]
+
+    def errors(self, result: CalibrationResult) -> dict[str, FloatArray]:
+        """Return the errors of x and y of all sensors in a calibration, metres."""
+        pairs = zip(SENSORS, self.places, strict=True)
+        return {name: (result[name].t_lidar_mag - place)[:2] for name, place in pairs}
+
+
+@pytest.fixture(scope="module", params=[(UPRIGHT,), (UPRIGHT, *OTHERS)], ids=["one", "three"])
+def shelved(
+    request: pytest.FixtureRequest,
     shared_data: Path,
     passes: dict[int, Recording],
     survey: FieldMap,
     clean: CalibrationResult,
-    shelves: tuple[Shelf, ...],
-) -> None:
+) -> Shelved:
+    shelves: tuple[Shelf, ...] = request.param
     places = np.array([each.t_lidar_mag for each in assumed_sensors(shared_data).values()])
     changed = with_shelves(passes[4], shelves, places, clean)
-    found = calibrate(changed, survey, CalibrationOptions())
-    for shelf in shelves:
-        away = [np.linalg.norm(each.position - shelf.position) for each in found.sources]
-        source = found.sources[int(np.argmin(away))]
-        assert min(away) < 0.3
-        # Within 30 %, or two of its sigmas where the pass does not determine it to that: the two at
-        # the edge of the map are seen from one side, beside a field of 0.5 to 0.9 uT that the map
-        # misses on this pass without shelves, too.
-        size = float(np.linalg.norm(shelf.moment))
-        sigma = float(np.linalg.norm(source.moment_sigma * shelf.moment)) / size
-        off = abs(float(np.linalg.norm(source.moment)) - size)
-        assert off < max(0.3 * size, min(2 * sigma, 0.45 * size))
+    return Shelved(shelves, places, calibrate(changed, survey, CalibrationOptions()))
+
+
+@pytest.mark.study
+def test_shelves_are_found_and_do_no_harm(shelved: Shelved, clean: CalibrationResult) -> None:
+    for shelf in shelved.shelves:
+        source = shelved.nearest(shelf)
+        assert np.linalg.norm(source.position - shelf.position) < 0.3
         assert source.cause in (Cause.PLACE, None)
-    errors = {
-        name: [(each[name].t_lidar_mag - place)[:2] for each in (clean, found)]
-        for name, place in zip(SENSORS, places, strict=True)
-    }
-    squares = [[float(e @ e) for e in pair] for pair in errors.values()]
-    before, after = np.sqrt(np.mean(squares, axis=0))
+    before, after = (
+        np.sqrt(np.mean([e @ e for e in shelved.errors(each).values()]))
+        for each in (clean, shelved.result)
+    )
     assert after < 1.3 * before
-    for name, pair in errors.items():
-        # One sensor is outside of its 95 % without shelves, too (11.8 for 5.99).
-        old, new = (
-            float(e @ np.linalg.solve(each[name].covariance[:2, :2], e))
-            for e, each in zip(pair, (clean, found), strict=True)
-        )
-        assert new < max(5.99, 1.3 * old)
+
+
+@pytest.mark.study
+@pytest.mark.xfail(
+    reason="of three shelves two are seen from one side at the edge of the map, beside a field that "
+    "the map misses on this pass without shelves, too: -39 and -24 %, sigmas of 25 to 35 %"
+)
+def test_moments_are_known_to_thirty_percent(shelved: Shelved) -> None:
+    for shelf in shelved.shelves:
+        size = np.linalg.norm(shelf.moment)
+        assert abs(np.linalg.norm(shelved.nearest(shelf).moment) / size - 1) < 0.3
+
+
+@pytest.mark.study
+@pytest.mark.xfail(
+    reason="trivisio is outside without shelves, too: 11.8 where 5.99 is the limit, 13.4 and 9.7 "
+    "with one and three; what the map misses on this pass is not all in the sigmas"
+)
+def test_sensors_are_inside_their_ellipses(shelved: Shelved) -> None:
+    for name, e in shelved.errors(shelved.result).items():
+        covariance = shelved.result[name].covariance[:2, :2]
+        assert e @ np.linalg.solve(covariance, e) < 5.99  # 95 %
 
 
 @pytest.mark.study
