@@ -109,8 +109,8 @@ def test_shelves_are_found_and_do_no_harm(shelved: Shelved, clean: CalibrationRe
 
 @pytest.mark.study
 @pytest.mark.xfail(
-    reason="of three shelves two are seen from one side at the edge of the map, beside a field that "
-    "the map misses on this pass without shelves, too: -39 and -24 %, sigmas of 25 to 35 %"
+    reason="of three shelves two are seen from one side at the edge of the map, beside a field "
+    "that the map misses without shelves, too: -39 and -24 %, sigmas of 25 to 35 %"
 )
 def test_moments_are_known_to_thirty_percent(shelved: Shelved) -> None:
     for shelf in shelved.shelves:
