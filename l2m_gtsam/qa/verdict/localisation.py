@@ -237,7 +237,10 @@ def _sigmas(record: LocalisationRecord) -> list[Reason]:
         )
         reasons.append(Reason(Level.WARN, text))
     if not record.refined:
-        text = "The calibration counts as exact: its uncertainty is not in the sigmas of poses."
+        text = (
+            "The calibration is held as it is given: its own sigmas, stated or assumed, are not in "
+            "those of the poses (`slam.calibration`)."
+        )
         reasons.append(Reason(Level.PASS, text))
     return reasons
 
