@@ -180,5 +180,7 @@ def _studies(folder: Path) -> list[Sound]:
     for name, study in STUDIES.items():
         path = folder / f"{name}.yaml"
         path.write_text(json.dumps(study.options().model_dump(mode="json")))
-        found.append(Sound(f"options of {name}", path, PLAIN_YAML, ((READ, name, CASE),)))
+        found.append(
+            Sound(f"options of {name}", path, PLAIN_YAML, ((READ, f"study {name}", CASE),))
+        )
     return found

@@ -32,6 +32,9 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "scans": _scans,
     "outcome": read_outcome,
     "validation": read_validation,
-    **{name: partial(load_options, model=study.options) for name, study in STUDIES.items()},
+    **{
+        f"study {name}": partial(load_options, model=study.options)
+        for name, study in STUDIES.items()
+    },
     "scenario": lambda path: load_options(path, ScenarioOptions),
 }
