@@ -100,5 +100,7 @@ def test_what_runs_ends_when_a_task_ends_all(
         list(computed(Work(folder_of, as_it_is, written), keys, ClusterOptions(workers=1)))
     begun, ended = ({each.stem for each in tmp_path.glob(f"*.{how}")} for how in ("begun", "ended"))
     assert begun - ended == {"1"}
-    assert len(begun) < 6  # of twelve
+    # In whatever order they are begun: one may wait in the worker while the error travels.
+    when = {each.stem: each.stat().st_mtime_ns for each in tmp_path.glob("*.begun")}
+    assert sum(each > when["1"] for each in when.values()) <= 1
     assert capfd.readouterr().err == ""
