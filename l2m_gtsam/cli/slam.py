@@ -1,7 +1,7 @@
 """``l2m slam``: where the vehicle was."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -19,6 +19,10 @@ from l2m_gtsam.cli.terminal import (
     shown_progress,
 )
 from l2m_gtsam.errors import ConfigError
+
+if TYPE_CHECKING:
+    from l2m_gtsam.batch.online_slam import OnlineOutcome
+    from l2m_gtsam.batch.slam import SlamOutcome
 
 
 def slam(
@@ -57,14 +61,6 @@ def slam(
     with shown_progress() as progress:
         from l2m_gtsam.batch.online_slam import slam_online
         from l2m_gtsam.batch.slam import SlamInput, slam_bag
-        from l2m_gtsam.cli.tables.slam import (
-            drift_lines,
-            online_lines,
-            scan_lines,
-            slam_table,
-            start_lines,
-            truth_lines,
-        )
         from l2m_gtsam.config import load_config, with_poses
 
         chosen = with_poses(load_config(config), [bag], poses or (), times)
@@ -74,8 +70,27 @@ def slam(
         else:
             done = slam_bag(given, chosen, out, progress)
     if online:
-        say(*online_lines(followed), *truth_lines(followed.truth), f"written: {out}")
+        _print_online(followed, out)
         return
+    _print_off_line(done, out, wide)
+    end_with(done.verdict.level, strict)
+
+
+def _print_online(done: "OnlineOutcome", out: Path) -> None:
+    from l2m_gtsam.cli.tables.slam import online_lines, truth_lines
+
+    say(*online_lines(done), *truth_lines(done.truth), f"written: {out}")
+
+
+def _print_off_line(done: "SlamOutcome", out: Path, wide: bool) -> None:
+    from l2m_gtsam.cli.tables.slam import (
+        drift_lines,
+        scan_lines,
+        slam_table,
+        start_lines,
+        truth_lines,
+    )
+
     print_table(slam_table(done.result), wide)
     lines = (
         *start_lines(done.result.start),
@@ -86,4 +101,3 @@ def slam(
     say(*lines)
     print_verdict(done.verdict)
     say(f"written: {out}")
-    end_with(done.verdict.level, strict)

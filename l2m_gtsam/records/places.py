@@ -96,7 +96,7 @@ class ChangedSource:
         return None if tied else best.cause
 
 
-LONG_M = 0.1  # shorter bars are told as points
+LONG_M = 0.1  # shorter bars are reported as points
 
 
 @dataclass(frozen=True)

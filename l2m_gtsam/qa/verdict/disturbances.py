@@ -2,7 +2,8 @@
 
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
 
-# A file may lack some of these; what it has beside them is not shown.
+# Rotations and positions without parts are those of files of before. A file may lack some of these;
+# what it has beside them is not shown.
 PARTS = {
     "rotation_deg": (1.0, "{:.2f} degrees"),
     "heading_deg": (1.0, "{:.2f} degrees of heading"),

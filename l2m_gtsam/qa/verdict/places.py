@@ -19,12 +19,12 @@ def source_sentence(number: int, source: ChangedSource) -> str:
     spread = float(np.linalg.norm(source.position_sigma))
     moment, sigma = np.linalg.norm(source.moment), np.linalg.norm(source.moment_sigma)
     length = f", {source.length_m:.1f} m long" if source.length_m else ""
-    told = (
+    sentence = (
         f"Steel {number} came, went or was moved since the map was surveyed: at "
         f"({x:.1f}, {y:.1f}, {z:.1f}) ± {spread:.2f} m{length}, {moment:.2g} ± {sigma:.1g} A m², "
         f"up to {source.strongest:.2g} µT at the readings. It is taken into account."
     )
-    return told if source.cause is Cause.PLACE else f"{told} {cause_sentence(source)}"
+    return sentence if source.cause is Cause.PLACE else f"{sentence} {cause_sentence(source)}"
 
 
 def cause_sentence(source: ChangedSource) -> str:
