@@ -155,6 +155,7 @@ def calibrated(
         exact=taken_for_exact(alive, field_map, solution.budget),
         disturbances=solution.budget.named(alive.sensors),
         stated=solution.stated,
+        pose_duration=solution.pose_duration,
         sources=changed.records,
     )
     return Calibrated(result, solution, field_map, solver_map)

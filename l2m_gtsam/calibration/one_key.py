@@ -30,6 +30,7 @@ from l2m_gtsam.calibration.joint import (
     sensor_solutions,
 )
 from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.calibration.pose_durations import duration_of_poses
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
@@ -46,6 +47,7 @@ from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
+from l2m_gtsam.records.pose_duration import PoseDuration
 from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
@@ -87,6 +89,8 @@ class OneKeySolution:
         Processes that were found beside noise and the map's errors, where these are counted.
     stated
         How large errors are whose sigmas were stated, where shared errors are counted.
+    pose_duration
+        How long errors of poses last; none where these are taken for exact, or no map was asked.
     """
 
     readings: Readings
@@ -100,6 +104,7 @@ class OneKeySolution:
     uncertainty: Uncertainty = Uncertainty.INDEPENDENT
     budget: Budget = NOTHING_FOUND
     stated: tuple[StatedSize, ...] = ()
+    pose_duration: PoseDuration | None = None
 
     @property
     def used(self) -> BoolArray:
@@ -223,6 +228,9 @@ def _solved(
     errors = shared_errors(field_map, view.readings, options.uncertainty)
     if errors is None:
         return replace(outcome, solved=finish.independent(joint.problem, joint.estimate))
+    if duration := duration_of_poses(view, field_map, joint.estimate, options.pose_noise):
+        pose_noise = options.pose_noise.lasting(duration.seconds)
+        options = options.model_copy(update={"pose_noise": pose_noise})
     full = finish.shared(view, field_map, errors, joint.estimate, tests, options)
     if isinstance(field_map, RememberedMap):
         remember_near(field_map, joint, full.estimate)
@@ -236,6 +244,7 @@ def _solved(
         uncertainty=Uncertainty.INDEPENDENT if unshared else Uncertainty.FULL,
         budget=full.budget,
         stated=full.stated,
+        pose_duration=duration,
     )
 
 

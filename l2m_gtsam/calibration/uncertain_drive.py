@@ -86,7 +86,7 @@ class UncertainDrive:
     ) -> "UncertainDrive":
         """Return what readings share where an estimate puts them."""
         view = replace(view, readings=budget.on(view.readings))
-        coverage = cover(view, errors, near, budget.lasting(options.pose_noise.correlation_s))
+        coverage = cover(view, errors, near, budget.lasting(options.pose_noise.lasting_s))
         moving = moving_fields(view.readings, options.moving_field_ut)
         coverage = replace(coverage, moving=moving, budget=budget)
         return cls(view, field_map, WeightsPrior.of(coverage))

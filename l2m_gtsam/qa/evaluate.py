@@ -213,6 +213,9 @@ def _parts(
     """Return what some of the readings determine of each sensor that they are enough for."""
     few = spread(readings, max(most, options.solve.min_readings))
     near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
+    if duration := calibrated.solution.pose_duration:
+        lasting = near.pose_noise.lasting(duration.seconds)
+        near = near.model_copy(update={"pose_noise": lasting})
     solution = solve_part(few, calibrated.solver_map, t, near)
     return {
         found.sensor: PartialEstimate(

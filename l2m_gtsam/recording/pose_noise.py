@@ -6,6 +6,8 @@ from pydantic import Field
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
 from l2m_gtsam.options import Options
 
+ASSUMED_S = 1.0  # an error of a pose lasts so long where nothing is known of it
+
 
 class PoseNoiseOptions(Options):
     """How wrong the poses are; what is not given here is taken from the recording's covariances."""
@@ -16,9 +18,19 @@ class PoseNoiseOptions(Options):
     taken as exact; if only one is given and the recording states nothing, the other is 0."""
     rotation_deg: float | None = Field(default=None, ge=0, le=45)
     """Standard deviation of the rotation about each axis in degrees, in the same way."""
-    correlation_s: float = Field(default=1.0, ge=0)
+    correlation_s: float | None = Field(default=None, ge=0)
     """How long an error lasts in seconds: the correlation of two errors falls to 1/e over this
-    time. 0 means that every pose has an error of its own."""
+    time. 0 means that every pose has an error of its own. If it is not given, a calibration finds
+    it from what readings of different sensors share; where they do not tell, it is 1 second."""
+
+    @property
+    def lasting_s(self) -> float:
+        """How long an error is taken to last, if nothing else is known."""
+        return ASSUMED_S if self.correlation_s is None else self.correlation_s
+
+    def lasting(self, seconds: float) -> "PoseNoiseOptions":
+        """Return the same with errors that last so long."""
+        return self.model_copy(update={"correlation_s": seconds})
 
 
 def pose_roots(

@@ -16,6 +16,7 @@ from pydantic_core import CoreSchema, core_schema
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
 from l2m_gtsam.records.disturbance import EXPLAINED, Disturbance, Unmodelled
 from l2m_gtsam.records.places import ChangedSource
+from l2m_gtsam.records.pose_duration import PoseDuration
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.stated_size import StatedSize
@@ -361,6 +362,8 @@ class CalibrationResult:
         What was found beside noise and the map's errors; sigmas hold it.
     stated
         How large errors are of which sigmas were stated, by the readings.
+    pose_duration
+        How long errors of poses last; none where these are taken for exact.
     sources
         Of field that came, went or were moved since the place was mapped; the solve knows them.
     """
@@ -382,6 +385,7 @@ class CalibrationResult:
     disturbances: tuple[Disturbance, ...] = ()
     sources: tuple[ChangedSource, ...] = ()
     stated: tuple[StatedSize, ...] = ()
+    pose_duration: PoseDuration | None = None
 
     @property
     def drives(self) -> tuple[SourceFile, ...]:

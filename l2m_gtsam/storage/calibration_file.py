@@ -103,9 +103,14 @@ MODEL = {
         "errors whose standard deviations were stated: ratio of what the readings show to what was "
         "stated; gain: twice the logarithm by which the readings are more likely so"
     ),
+    "pose_duration": (
+        "how long errors of poses last, whose sizes were stated: the correlation of two falls to "
+        "1/e over this time; given, found in the readings, or assumed"
+    ),
     "traces": "some poses of each drive, by which validate recognises it whatever file it is in",
     "infinite": "a variance of .inf marks what this drive and map do not determine",
 }
+OPTIONAL = ("notes", "exact", "disturbances", "stated", "pose_duration", "traces", "sources")
 SENSOR_KEYS = (
     *("status", "message", "t_lidar_mag", "t_sigma", "C", "C_sigma", "H", "H_sigma"),
     *("R_lidar_mag", "rotation_sigma", "rotation_covariance", "transforms", "noise"),
@@ -149,6 +154,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "exact": plain["exact"],
         "disturbances": plain["disturbances"],
         "stated": plain["stated"],
+        "pose_duration": plain["pose_duration"],
         "disagreements": disagreements,
         "sources": plain["sources"],
         **source_entries(result),
@@ -158,7 +164,7 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
         "sensors": {sensor.sensor: sensor_entry(sensor) for sensor in result.sensors},
         "options": plain["options"],
     }
-    for name in ("notes", "exact", "disturbances", "stated", "traces", "sources"):
+    for name in OPTIONAL:
         content = _without_empty(content, name)
     write_yaml(path, content, HEADER)
 

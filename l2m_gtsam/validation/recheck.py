@@ -182,7 +182,7 @@ def _about(
 ) -> ChangeLikelihood:
     """Return the likelihood of a change of a calibration, linearised there."""
     readings = drive.at(float(here.vector[15])).select(used)
-    return change_likelihood(readings, field_map, here, options.pose_noise.correlation_s)
+    return change_likelihood(readings, field_map, here, options.pose_noise.lasting_s)
 
 
 def inside(drive: SensorDrive, field_map: QueryableMap, known: KnownCalibration) -> BoolArray:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.verdict.disturbances import disturbance_sentence
+from l2m_gtsam.qa.verdict.disturbances import disturbance_reasons
 from l2m_gtsam.qa.verdict.mounting import mounting
 from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.repeatability import repeat
@@ -13,6 +13,7 @@ from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, mis
 from l2m_gtsam.qa.verdict.uncertainty import stated_wrongly
 from l2m_gtsam.records.calibration import CalibrationResult, Disagreement, Return, SensorStatus
 from l2m_gtsam.records.metrics import Metrics
+from l2m_gtsam.records.pose_duration import DurationSource
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
 
 HEADS = {
@@ -76,16 +77,20 @@ def _shared_reasons(cases: tuple[Case, ...], result: CalibrationResult) -> list[
         more = f"The place differs from the map along {len(shared) - MANY} more stretches."
         reasons.append(Reason(Level.WARN, more))
     # A map of another place is no evidence on this one.
-    reasons += [Reason(Level.WARN, disturbance_sentence(each)) for each in result.disturbances]
+    reasons += disturbance_reasons(result)
     reasons += stated_wrongly(result.stated)
     return _wrong_map(cases) or [*_on_drive(cases), *reasons, *_exact(result)]
 
 
 def _exact(result: CalibrationResult) -> list[Reason]:
-    """Return what the sigmas know no errors of."""
-    if not result.exact:
-        return []
-    return [Reason(Level.PASS, f"Taken for exact: {', '.join(result.exact)}.")]
+    """Return what the sigmas know no errors of, and what they have from the readings alone."""
+    reasons = []
+    if (lasting := result.pose_duration) and lasting.source is DurationSource.FOUND:
+        text = f"Errors of poses last {lasting.seconds:.2g} s, by the readings."
+        reasons.append(Reason(Level.PASS, text))
+    if result.exact:
+        reasons.append(Reason(Level.PASS, f"Taken for exact: {', '.join(result.exact)}."))
+    return reasons
 
 
 def _wrong_map(cases: tuple[Case, ...]) -> list[Reason]:

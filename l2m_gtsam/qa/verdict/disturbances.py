@@ -1,6 +1,9 @@
 """What is said of a process that disturbed a drive."""
 
+from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
+from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.records.verdict import Level, Reason
 
 # Rotations and positions without parts are those of files of before. A file may lack some of these;
 # what it has beside them is not shown.
@@ -15,6 +18,40 @@ PARTS = {
     "walk_ut": (1.0, "{:.2g} µT from the start of the drive to its end"),
     "noise_ut": (1.0, "{:.2g} µT for a time"),
 }
+
+
+CAUSES = {
+    DisturbanceKind.WANDER: ErrorCause.WANDER,
+    DisturbanceKind.POSES: ErrorCause.POSES,
+    DisturbanceKind.FIELD: ErrorCause.FIELD,
+    DisturbanceKind.WARP: ErrorCause.WARP,
+}
+MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
+
+
+def disturbance_reasons(result: CalibrationResult) -> list[Reason]:
+    """Return what disturbed a drive: a warning where it has a share in what is not known."""
+    reasons = []
+    for found in result.disturbances:
+        level = Level.WARN if _share(found, result) > MATTERS else Level.PASS
+        reasons.append(Reason(level, disturbance_sentence(found)))
+    return reasons
+
+
+def _share(found: Disturbance, result: CalibrationResult) -> float:
+    """Return the largest share of a process in a variance of t, C or H; all, where none is told."""
+    sensors = [each for each in result.sensors if found.sensor in (None, each.sensor)]
+    if not any(each.variance_shares for each in sensors):
+        return 1.0
+    return max(
+        (
+            max(share.t, share.C, share.H)
+            for each in sensors
+            for share in each.variance_shares
+            if share.cause is CAUSES[found.kind]
+        ),
+        default=0.0,
+    )
 
 
 def disturbance_sentence(found: Disturbance) -> str:

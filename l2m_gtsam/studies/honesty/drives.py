@@ -182,7 +182,7 @@ def misplaced(drive: CalibrationDrive, seed: int) -> CalibrationDrive:
     """Return a drive whose poses are wrong by errors that last, as ``POSE_NOISE`` says."""
     true, rng = drive.trajectory, np.random.default_rng([seed, 8])
     seconds: FloatArray = 1e-9 * true.stamp_ns.astype(np.float64)
-    u = lasting(seconds, POSE_NOISE.correlation_s, rng)
+    u = lasting(seconds, POSE_NOISE.lasting_s, rng)
     sigmas = np.repeat([np.deg2rad(POSE_NOISE.rotation_deg or 0), POSE_NOISE.position_m or 0], 3)
     # true = measured Exp(error)
     turn, shift = np.split(u * sigmas, 2, axis=1)
