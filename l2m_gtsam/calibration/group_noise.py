@@ -77,12 +77,15 @@ class PoseShare:
     weights: FloatArray
     at_knots: FloatArray
 
-    def errors(self, group: Group) -> tuple[SharedError, SharedError]:
-        """Return what the readings of a group share: the knots before and after."""
-        weights = self.weights[group.rows][:, :, None, None]
+    def errors(self, group: Group) -> tuple[SharedError, ...]:
+        """Return what the readings of a group share: knots before and after, if these matter."""
+        weights = self.weights[group.rows]
         F, segment = self.features[group.rows], group.segment
-        before = SharedError(P(segment), weights[:, 0] * F)
-        return before, SharedError(P(segment + 1), weights[:, 1] * F)
+        return tuple(
+            SharedError(P(segment + each), weights[:, each, None, None] * F)
+            for each in range(weights.shape[1])
+            if weights[:, each].any()
+        )
 
     def bridge(self, group: Group) -> FloatArray:
         """Return the covariance of a group's readings that knots leave in uT^2, (3 n, 3 n)."""

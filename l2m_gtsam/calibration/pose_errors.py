@@ -8,6 +8,9 @@ independent Ornstein-Uhlenbeck processes of unit variance. At a sensor this chan
 
 Between two knots u is what they say plus a bridge, which is independent of all other bridges and
 whose covariance is exact here: the knots may be far apart.
+
+Knots much further apart than errors last say next to nothing of what sensors share between them.
+Then the variables are the means of u over the segments, which are as good as independent.
 """
 
 from dataclasses import dataclass
@@ -21,6 +24,7 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings
 
 SEGMENTS = 60  # of a drive, at most: six weights at each end of one
 SHORTEST_S = 1e-6  # stands for errors that do not last
+SHORT = 0.25  # of a segment: means over segments say more of errors that last no longer
 
 
 @dataclass(frozen=True)
@@ -42,9 +46,9 @@ class PoseKnots:
     correlation_s: float
     spacing: FloatArray
 
-    @classmethod
+    @staticmethod
     def over(
-        cls, seconds: FloatArray, correlation_s: float, drive: IntArray | None = None
+        seconds: FloatArray, correlation_s: float, drive: IntArray | None = None
     ) -> "PoseKnots":
         """Return knots for times, shape (N,): two for as long as an error lasts, if not fewer.
 
@@ -60,7 +64,10 @@ class PoseKnots:
             count = max(int(np.ceil((last - first) / between)) + 1, 2)
             knots.append(np.linspace(first, last, count))
             spacing += [float(knots[-1][1] - knots[-1][0])] * (count - 1) + [np.inf]
-        return cls(np.concatenate(knots), max(correlation_s, SHORTEST_S), np.array(spacing[:-1]))
+        spaced = np.array(spacing[:-1])
+        short = correlation_s < SHORT * float(np.median(spaced[np.isfinite(spaced)]))
+        kind = SegmentMeans if short else PoseKnots
+        return kind(np.concatenate(knots), max(correlation_s, SHORTEST_S), spaced)
 
     @property
     def correlation(self) -> FloatArray:
@@ -111,6 +118,31 @@ class PoseKnots:
 
     def _like(self, apart: FloatArray) -> FloatArray:
         return np.asarray(np.exp(-apart / self.correlation_s))
+
+
+@dataclass(frozen=True)
+class SegmentMeans(PoseKnots):
+    """Means of short errors over the segments between knots, each at the knot before, as variables.
+
+    What one mean has in common with the next is next to nothing; within a segment the covariance is
+    exact.
+    """
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Of one mean and the next, shape (K - 1,): none."""
+        return np.zeros(len(self.spacing))
+
+    def at_knots(self, seconds: FloatArray) -> FloatArray:
+        """Return the correlation of each time with its mean, and none with the next, (N, 2)."""
+        return self._weights(*self._between(seconds))
+
+    def _weights(self, after: FloatArray, spacing: FloatArray) -> FloatArray:
+        # Integrals of exp(-|tau| / T): over the segment from a time in it, and over both times.
+        T = self.correlation_s
+        whole = 2 * T * (spacing + T * np.expm1(-spacing / T))
+        own = -T * (np.expm1(-after / T) + np.expm1(-(spacing - after) / T))
+        return np.column_stack([own / np.sqrt(whole), np.zeros(len(after))])
 
 
 def error_of_poses(readings: Readings, field_map: QueryableMap, estimate: Estimate) -> FloatArray:

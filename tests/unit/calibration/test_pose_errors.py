@@ -4,12 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
-from l2m_gtsam.calibration.pose_errors import PoseKnots, error_of_poses
+from l2m_gtsam.calibration.pose_errors import (
+    SEGMENTS,
+    SHORT,
+    PoseKnots,
+    SegmentMeans,
+    error_of_poses,
+)
 from tests.worlds.exact import dipole_world, drive, random_sensors
 
 
@@ -22,6 +28,8 @@ def test_knots_and_bridges_are_the_process(seed: int, correlation: float, length
     """Their covariances add up to exp(-|dt| / T), within a segment and across; rounding."""
     rng = np.random.default_rng(seed)
     at = np.sort(rng.uniform(0, length, 40))
+    between = max(correlation / 2, np.ptp(at) / SEGMENTS)
+    assume(correlation > SHORT * between)
     knots = PoseKnots.over(at, correlation)
     apart = np.abs(knots.seconds[:, None] - knots.seconds)
     covariance = np.zeros((40, len(knots.seconds)))
@@ -46,8 +54,27 @@ def test_knots_stand_as_close_as_errors_last_but_are_not_too_many() -> None:
 def test_errors_that_do_not_last_are_independent() -> None:
     at = np.linspace(0, 10, 7)[1:-1] + 0.01
     knots = PoseKnots.over(np.linspace(0, 10, 100), 0.0)
-    np.testing.assert_allclose(knots.weights(at), 0, atol=1e-12)
-    np.testing.assert_allclose(knots.bridge(at), np.eye(5), atol=1e-12)
+    # A mean over a sixth of a second of errors that last a microsecond: 1e-5 of their variance.
+    np.testing.assert_allclose(knots.weights(at), 0, atol=1e-2)
+    np.testing.assert_allclose(knots.bridge(at), np.eye(5), atol=1e-4)
+
+
+@given(seed=st.integers(0, 1000), correlation=st.floats(0.03, 0.3))
+def test_means_of_short_errors_are_what_times_of_a_segment_share(
+    seed: int, correlation: float
+) -> None:
+    """With what is left they are the process; their own variance is that of many times' mean."""
+    knots = PoseKnots.over(np.array([0.0, 120.0]), correlation)
+    assert isinstance(knots, SegmentMeans)
+    at = 4.0 + np.sort(np.random.default_rng(seed).uniform(0.0, 2.0, 30))  # one segment
+    weights = knots.weights(at)
+    total = knots.bridge(at) + weights @ weights.T
+    np.testing.assert_allclose(total, np.exp(-np.abs(at[:, None] - at) / correlation), atol=1e-12)
+    assert np.linalg.eigvalsh(knots.bridge(at)).min() > -1e-12
+    fine = np.linspace(4.0, 6.0, 801)
+    mean = np.exp(-np.abs(fine[:, None] - fine) / correlation).mean()
+    # The mean over the weights is the deviation of the mean; sums stand for integrals.
+    assert knots.weights(fine)[:, 0].mean() == pytest.approx(np.sqrt(mean), rel=1e-2)
 
 
 def test_features_are_the_derivative_by_the_pose() -> None:
