@@ -79,6 +79,62 @@ class Excess:
 
 
 @dataclass(frozen=True)
+class ByParts:
+    """A sensor by the check alone: no process is in its graph, whatever the drive has.
+
+    Attributes
+    ----------
+    sensor
+        Index of the sensor.
+    vector
+        (t, C row by row, H) in m and uT, shape (15,).
+    covariance
+        Of noise, map and stated errors, shape (15, 15).
+    scatters
+        How its parameters scatter over parts of the drive: by time and by place, of two sizes.
+    """
+
+    sensor: int
+    vector: FloatArray
+    covariance: FloatArray
+    scatters: "tuple[Scatter, ...]"
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A variance found over that expected.
+
+    Attributes
+    ----------
+    value
+        Their ratio.
+    freedom
+        How well it is known: it is a mean square of so many errors (Satterthwaite).
+    """
+
+    value: float
+    freedom: float
+
+    def beyond_chance(self, false_alarms: float) -> float:
+        """Return the ratio, one where chance explains the excess."""
+        limit = float(quantile(1 - false_alarms, self.freedom)) / self.freedom
+        return self.value if self.value > limit else 1.0
+
+
+UNKNOWN = Ratio(1.0, np.inf)
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """The scatter of one division of a drive into parts: t, C, H and time offset."""
+
+    t: Ratio
+    C: Ratio
+    H: Ratio
+    offset: Ratio
+
+
+@dataclass(frozen=True)
 class Scores:
     """Scores of one sensor's parameters over the parts of a drive.
 
@@ -93,8 +149,8 @@ class Scores:
     found: FloatArray
     expected: FloatArray
 
-    def ratio(self, covariance: FloatArray, block: slice, false_alarms: float) -> float:
-        """Return the variance found over that expected, one where chance explains the excess.
+    def ratio(self, covariance: FloatArray, block: slice) -> Ratio:
+        """Return the variance found over that expected.
 
         Parameters
         ----------
@@ -102,8 +158,6 @@ class Scores:
             P of the sensor's parameters, shape (16, 16).
         block
             The parameters whose variances are taken together, each in its own sigmas.
-        false_alarms
-            Probability of an excess that is none.
         """
         sigma = np.sqrt(np.diag(covariance)[block])
         correlation = covariance[block, block] / np.outer(sigma, sigma)
@@ -115,11 +169,30 @@ class Scores:
         expected = float(np.trace(parts.sum(axis=0)))
         spread = float(2 * (parts * parts.transpose(0, 2, 1)).sum())  # variance of ``found``
         if not (expected > 0 and spread > 0):
-            return 1.0
-        freedom = 2 * expected**2 / spread  # Satterthwaite
-        limit = float(quantile(1 - false_alarms, freedom)) / freedom
-        ratio = found / expected
-        return ratio if ratio > limit else 1.0
+            return UNKNOWN
+        return Ratio(found / expected, 2 * expected**2 / spread)
+
+
+def scatters(
+    readings: Readings, rows: Sequence[Rows], own: IntArray, covariance: HalfCovariance
+) -> tuple[Scatter, ...]:
+    """Return the scatter of parts by time and by place, of two sizes; none of few readings.
+
+    Parameters are those of ``unmodelled``.
+    """
+    used = np.unique(np.concatenate([each.readings for each in rows])) if rows else np.empty(0)
+    if len(used) < 2**HALVINGS:
+        return ()
+    P, found = covariance.among(own), []
+    labels = np.full(len(readings), -1)
+    for axes in (readings.stamp_ns[used, None].astype(np.float64), readings.p_map_lidar[used]):
+        labels[used] = halved(axes, HALVINGS)
+        white = gathered(rows, labels, own, covariance)
+        for merged in (white, white.paired()):
+            scores = merged.scores(covariance)
+            ratios = {name: scores.ratio(P, block) for name, block in BLOCKS.items()}
+            found.append(Scatter(**ratios))
+    return tuple(found)
 
 
 def unmodelled(
@@ -147,19 +220,13 @@ def unmodelled(
     stated
         Where the errors of the survey's sensors stand, shape (s,).
     """
-    used = np.unique(np.concatenate([each.readings for each in rows])) if rows else np.empty(0)
-    if len(used) < 2**HALVINGS:
+    found = scatters(readings, rows, own, covariance)
+    if not found:
         return Excess()
     P, alarms = covariance.among(own), FALSE_ALARMS / (TESTS * tests)
-    labels = np.full(len(readings), -1)
-    largest = dict.fromkeys(BLOCKS, 1.0)
-    for axes in (readings.stamp_ns[used, None].astype(np.float64), readings.p_map_lidar[used]):
-        labels[used] = halved(axes, HALVINGS)
-        white = gathered(rows, labels, own, covariance)
-        for merged in (white, white.paired()):
-            scores = merged.scores(covariance)
-            for name, block in BLOCKS.items():
-                largest[name] = max(largest[name], scores.ratio(P, block, alarms))
+    largest = {
+        name: max(getattr(each, name).beyond_chance(alarms) for each in found) for name in BLOCKS
+    }
     across, theirs = covariance.columns(stated)[own], covariance.among(stated)
     return Excess(Unmodelled(**largest), P - across @ np.linalg.solve(theirs, across.T))
 

@@ -17,6 +17,7 @@ from l2m_gtsam.calibration.factor_graph import (
     reading_graph,
     whitened_jacobian,
 )
+from l2m_gtsam.calibration.half_difference import HalfDifference
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import (
@@ -82,6 +83,8 @@ class SensorSolution:
     variances
         What each cause has of the variances of t, C and H, shape (3,); empty where errors are not
         shared.
+    halves
+        By how much the halves of the drive differ; absent where errors are not shared.
     """
 
     sensor: int
@@ -94,6 +97,7 @@ class SensorSolution:
     shared_root: FloatArray | None = None
     unmodelled: Unmodelled = EXPLAINED
     variances: Parts = field(default_factory=dict)
+    halves: HalfDifference | None = None
 
     def widened(self, excess: Excess) -> "SensorSolution":
         """Return the same with larger covariances; correlations with other sensors stay."""

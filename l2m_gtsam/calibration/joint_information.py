@@ -108,6 +108,11 @@ class HalfCovariance:
         half = scaled.T @ self.half[np.ix_(at, at)] @ scaled
         return np.asarray(half + half.T)
 
+    def times(self, A: FloatArray) -> FloatArray:
+        """Return ``Sigma A`` for A of all variables, shape (n, m)."""
+        scaled = A * self.scale[:, None]
+        return np.asarray((self.half @ scaled + self.half.T @ scaled) * self.scale[:, None])
+
     def columns(self, at: IntArray) -> FloatArray:
         """Return the covariance of all variables with some, shape (n, k)."""
         half = self.half[:, at] + self.half[at].T

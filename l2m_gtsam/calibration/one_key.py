@@ -19,6 +19,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_estimate
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
+from l2m_gtsam.calibration.cluster_robust import ByParts
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import (
@@ -91,6 +92,8 @@ class OneKeySolution:
         How large errors are whose sigmas were stated, where shared errors are counted.
     pose_duration
         How long errors of poses last; none where these are taken for exact, or no map was asked.
+    by_parts
+        The sensors by the scatter of parts of the drive alone, where shared errors are counted.
     """
 
     readings: Readings
@@ -105,6 +108,7 @@ class OneKeySolution:
     budget: Budget = NOTHING_FOUND
     stated: tuple[StatedSize, ...] = ()
     pose_duration: PoseDuration | None = None
+    by_parts: tuple[ByParts, ...] = ()
 
     @property
     def used(self) -> BoolArray:
@@ -147,7 +151,11 @@ def solve_one_key(
 
 
 def solve_part(
-    readings: Readings, field_map: QueryableMap, t_start: FloatArray, options: OneKeyOptions
+    readings: Readings,
+    field_map: QueryableMap,
+    t_start: FloatArray,
+    options: OneKeyOptions,
+    budget: Budget = NOTHING_FOUND,
 ) -> OneKeySolution:
     """Calibrate all sensors on a part of what the whole was calibrated on.
 
@@ -160,8 +168,10 @@ def solve_part(
         As of ``solve_one_key``.
     t_start
         Where the whole was found, metres, shape (S, 3).
+    budget
+        Processes that the whole has.
     """
-    finish = Finish(sensor_solutions, step_uncertain)
+    finish = Finish(sensor_solutions, partial(step_uncertain, budget=budget))
     return _solved(readings, field_map, t_start, options, silent, None, NO_PRIORS, finish)
 
 
@@ -245,6 +255,7 @@ def _solved(
         budget=full.budget,
         stated=full.stated,
         pose_duration=duration,
+        by_parts=full.by_parts,
     )
 
 

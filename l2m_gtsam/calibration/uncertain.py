@@ -19,6 +19,8 @@ import gtsam
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
+from l2m_gtsam.calibration.budget.processes import ReadingPlaces
+from l2m_gtsam.calibration.cluster_robust import ByParts
 from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
@@ -53,6 +55,8 @@ class UncertainSolution:
         Processes that were found in what noise and map leave.
     stated
         How large errors are whose sigmas were stated.
+    by_parts
+        The sensors by the scatter of parts of the drive alone, without the processes.
     """
 
     estimate: Estimate
@@ -61,6 +65,7 @@ class UncertainSolution:
     settled: bool
     budget: Budget = NOTHING_FOUND
     stated: tuple[StatedSize, ...] = ()
+    by_parts: tuple[ByParts, ...] = ()
 
 
 def solve_uncertain(
@@ -98,6 +103,7 @@ def solve_uncertain(
     # What a map leaves that does not know its own errors is no process of the drive.
     if found.ending is not Ending.SINGULAR and sigmas_hold(errors):
         budget = found.problem.searched(found.joint)
+    by_parts = found.problem.by_parts(found.joint, found.estimate)
     if budget.found:
         with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
         found = settle_by_any(
@@ -110,8 +116,11 @@ def solve_uncertain(
     problem, joint = found.problem, found.joint
     solved = problem.by_cause(joint, problem.solutions(joint, found.values))
     solved = problem.wandering(joint, found.values, problem.robust(joint, solved))
+    solved = problem.halved(joint, solved)
     progress(1.0)
-    return UncertainSolution(found.estimate, solved, found.ending, found.settled, budget, stated)
+    return UncertainSolution(
+        found.estimate, solved, found.ending, found.settled, budget, stated, by_parts
+    )
 
 
 def settle_by_any(
@@ -137,13 +146,15 @@ def step_uncertain(
     near: Estimate,
     tests: Mapping[int, Determinacy],
     options: OneKeyOptions,
+    budget: Budget = NOTHING_FOUND,
 ) -> UncertainSolution:
     """Return the same after a single Gauss-Newton step, with the weights at its start.
 
     From the optimum with independent errors that is exact but for products of C and shared errors.
-    Parameters are those of ``solve_uncertain``.
+    Parameters are those of ``solve_uncertain``, and processes that are known beforehand.
     """
-    drive = UncertainDrive.of(view, field_map, errors, near, options)
+    places = ReadingPlaces.of(view.readings, field_map, near)
+    drive = UncertainDrive.of(view, field_map, errors, near, options, budget.at(places))
     problem = UncertainProblem(drive, near, tests, options.factors)
     values = starting_values(near, view.sensors, drive.prior.coverage)
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):

@@ -19,9 +19,16 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import Budget, spread_of_H
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces, processes
 from l2m_gtsam.calibration.budget.search import felt, search
-from l2m_gtsam.calibration.cluster_robust import unmodelled
+from l2m_gtsam.calibration.cluster_robust import ByParts, Excess, scatters, unmodelled
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
+from l2m_gtsam.calibration.half_difference import (
+    JUDGED,
+    HalvedSensor,
+    WhiteGroup,
+    half_differences,
+    second_half,
+)
 from l2m_gtsam.calibration.joint import SensorSolution, with_infinities
 from l2m_gtsam.calibration.joint_information import (
     JointInformation,
@@ -259,19 +266,44 @@ class UncertainProblem:
         self, joint: JointInformation, solved: Sequence[SensorSolution]
     ) -> tuple[SensorSolution, ...]:
         """Return solutions whose covariances hold what the scatter of parts of the drive shows."""
+        return tuple(each.widened(self._excess(joint, each.sensor)) for each in solved)
+
+    def by_parts(self, joint: JointInformation, estimate: Estimate) -> tuple[ByParts, ...]:
+        """Return what the scatter of parts of the drive says of each sensor of an estimate."""
+        found = []
+        for s in self._view.sensors:
+            rows, at = self._own_rows(joint, s), columns_at(joint.columns, keys_of(s))
+            scattered = scatters(self._view.readings, rows, at, joint.every)
+            covariance = joint.among((s,))[:-1, :-1]
+            found.append(ByParts(s, estimate.vector(s), covariance, scattered))
+        return tuple(found)
+
+    def _own_rows(self, joint: JointInformation, sensor: int) -> list[Rows]:
+        """Return the white rows of a sensor's readings at the optimum."""
+        own = [each for each in joint.rows if each.sensor == sensor and len(each.readings)]
+        return [joint.after_step(each) for each in own]
+
+    def _excess(self, joint: JointInformation, sensor: int) -> Excess:
+        """Return how far the scatter of parts exceeds what is modelled of a sensor."""
         stated = columns_at(joint.columns, [U()] if len(self._prior.coverage.spread) else [])
-        widened = []
-        for found in solved:
-            s = found.sensor
-            rows = [
-                joint.after_step(each)
-                for each in joint.rows
-                if each.sensor == s and len(each.readings)
-            ]
-            own = columns_at(joint.columns, keys_of(s))
-            excess = unmodelled(self._view.readings, rows, own, joint.every, len(solved), stated)
-            widened.append(found.widened(excess))
-        return tuple(widened)
+        rows = self._own_rows(joint, sensor)
+        at, together = columns_at(joint.columns, keys_of(sensor)), len(self._view.sensors)
+        return unmodelled(self._view.readings, rows, at, joint.every, together, stated)
+
+    def halved(
+        self, joint: JointInformation, solved: Sequence[SensorSolution]
+    ) -> tuple[SensorSolution, ...]:
+        """Return solutions with what the halves of the drive differ by."""
+        rows = [joint.after_step(each) for each in joint.rows if len(each.readings)]
+        pairs = zip(rows, self._noise.whitenings, strict=True)
+        groups = [WhiteGroup(each, whitening) for each, whitening in pairs]
+        later = second_half(self._view.readings)
+        halved = {
+            s: HalvedSensor(columns_at(joint.columns, keys_of(s))[:JUDGED], self._taken(joint, s))
+            for s in self._view.sensors
+        }
+        found = half_differences(groups, later, halved, joint.every, joint.loose)
+        return tuple(replace(each, halves=found[each.sensor]) for each in solved)
 
     def stated(
         self, joint: JointInformation, values: gtsam.Values, noise: float | None

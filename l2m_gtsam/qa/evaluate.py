@@ -4,11 +4,13 @@ Parts of what was driven are calibrated by themselves: of one drive both halves,
 drive.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import spread
+from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.calibrate import Calibrated
 from l2m_gtsam.calibration.one_key import solve_part
 from l2m_gtsam.calibration.options import CalibrationOptions
@@ -22,6 +24,7 @@ from l2m_gtsam.qa.metrics.repeatability import (
     PartialEstimate,
     compare_drives,
     compare_halves,
+    halves_of,
     no_halves,
 )
 from l2m_gtsam.qa.options import QaOptions
@@ -85,7 +88,7 @@ def repeats_of(
         drives = compared_drives(calibrated, recording, options, qa.half_readings)
         repeats = Repeats({}, drives)
     else:
-        repeats = Repeats(compared_halves(calibrated, options, qa.half_readings), {})
+        repeats = Repeats(compared_halves(calibrated, options, qa), {})
     progress(stage, 1.0)
     return repeats
 
@@ -103,13 +106,13 @@ def maps_of(calibrated: Calibrated) -> MapForms:
 
 @one_blas_thread()
 def compared_halves(
-    calibrated: Calibrated, options: CalibrationOptions, each_half: int
+    calibrated: Calibrated, options: CalibrationOptions, qa: QaOptions
 ) -> dict[str, Halves]:
-    """Calibrate the first and the second half of a drive, and compare them sensor by sensor.
+    """Compare what the first and the second half of a drive say of each sensor.
 
-    Each starts where the whole was found, with its time offsets and without priors: what a half
-    leaves open takes no part. Readings that the whole rejected are looked at again: of a sensor
-    that moved on the drive they are one half.
+    The graph of the whole tells it of all readings that counted. Where many were rejected, as those
+    of one half if a sensor moved, both halves are calibrated anew; and where errors of the map are
+    not known to be shared, on few readings, of which neighbours are not as alike.
 
     Parameters
     ----------
@@ -117,16 +120,38 @@ def compared_halves(
         The calibration of the whole drive.
     options
         That it was computed with.
-    each_half
-        Readings of each sensor that a half is calibrated on, at the most.
+    qa
+        How many rejected readings are many, and how many a half is calibrated on then.
+    """
+    solution, names = calibrated.solution, calibrated.result.sensors
+    inside = np.bincount(solution.readings.sensor[solution.inside], minlength=len(names))
+    rejected = np.bincount(solution.readings.sensor[solution.rejected], minlength=len(names))
+    many = rejected > qa.rejected.warn * inside
+    found, anew = {}, []
+    for each in solution.solved:
+        if each.halves is None or many[each.sensor]:
+            anew.append(each.sensor)
+            continue
+        middle = solution.estimate.vector(each.sensor)
+        found[names[each.sensor].sensor] = halves_of(middle, each.halves)
+    return found | (halves_anew(calibrated, options, qa.half_readings, anew) if anew else {})
+
+
+def halves_anew(
+    calibrated: Calibrated, options: CalibrationOptions, each_half: int, solved: Sequence[int]
+) -> dict[str, Halves]:
+    """Calibrate both halves of a drive by themselves, and compare them for some sensors.
+
+    Each starts where the whole was found, with its time offsets and processes and without priors:
+    what a half leaves open takes no part. Readings that the whole rejected are looked at again.
     """
     readings, t = _usable(calibrated), calibrated.solution.estimate.t
-    solved = [found.sensor for found in calibrated.solution.solved]
-    middle = np.median(readings.stamp_ns)
+    middle, budget = np.median(readings.stamp_ns), calibrated.solution.budget
     parts = (readings.stamp_ns < middle, readings.stamp_ns >= middle)
     try:
         first, second = in_threads(
-            lambda part: _parts(calibrated, readings.select(part), t, options, each_half), parts
+            lambda part: _parts(calibrated, readings.select(part), t, options, each_half, budget),
+            parts,
         )
     except (CalibrationError, np.linalg.LinAlgError) as error:
         # The whole is calibrated: that a half is not is no reason to lose it.
@@ -209,6 +234,7 @@ def _parts(
     t: FloatArray,
     options: CalibrationOptions,
     most: int,
+    budget: Budget = NOTHING_FOUND,
 ) -> dict[int, PartialEstimate]:
     """Return what some of the readings determine of each sensor that they are enough for."""
     few = spread(readings, max(most, options.solve.min_readings))
@@ -216,7 +242,7 @@ def _parts(
     if duration := calibrated.solution.pose_duration:
         lasting = near.pose_noise.lasting(duration.seconds)
         near = near.model_copy(update={"pose_noise": lasting})
-    solution = solve_part(few, calibrated.solver_map, t, near)
+    solution = solve_part(few, calibrated.solver_map, t, near, budget)
     return {
         found.sensor: PartialEstimate(
             solution.estimate.vector(found.sensor), found.covariance, found.shared_root

@@ -121,16 +121,18 @@ class QaOptions(Options):
     """Share of the readings inside the map that no distortion explains."""
     outside_map: Limit = Limit(warn=0.3, fail=0.9)
     """Share of the readings for which the map has no data."""
-    halves_sigmas: Limit = Limit(warn=2.0, fail=4.0)
-    """Distance of the calibrations of both halves of the drive, root mean square in sigmas; 1 is
-    consistent."""
+    halves_chance: float = Field(default=1e-3, gt=0, lt=0.1)
+    """Share of sound sensors whose halves of the drive may differ in t, C or H by chance."""
+    halves_apart: Limit = Limit(warn=1.0, fail=2.0)
+    """Distance of both halves of the drive in t, in C or in H, of all readings, over the one that
+    chance exceeds in `halves_chance` of all sensors."""
     halves_m: float = Field(default=0.003, ge=0)
-    """Halves that differ by less than this in position, and by less than `halves_deg` in rotation
-    and `halves_ut` in H, are alike whatever the sigmas, metres."""
+    """Halves that differ by less than this in position are alike in t whatever the sigmas,
+    metres."""
     halves_deg: float = Field(default=0.2, ge=0)
-    """See `halves_m`, degrees."""
+    """The same for rotation and for each entry of C, as an angle, in degrees."""
     halves_ut: float = Field(default=0.3, ge=0)
-    """See `halves_m`, microtesla."""
+    """The same for H, microtesla."""
     chi_square: Limit = Limit(warn=1.5, fail=4.0)
     """Mean square of the normalised residuals per degree of freedom; 1 is consistent."""
     autocorrelation: float = Field(default=0.5, gt=0, le=1)
@@ -163,7 +165,8 @@ class QaOptions(Options):
     halves: bool = True
     """Whether both halves of a drive are calibrated by themselves."""
     half_readings: int = Field(default=50, ge=30)
-    """Readings of each sensor that a half is calibrated on, spread evenly over it."""
+    """Readings of each sensor that a half is calibrated on, spread evenly over it, where more of
+    them were rejected than `rejected` allows, and that drives are compared with."""
     validation: ValidationOptions = ValidationOptions()
     """Thresholds of `l2m validate`."""
     slam: SlamQaOptions = SlamQaOptions()

@@ -18,6 +18,25 @@ FAR = 1e8  # metres: further than any place of the Earth from another
 
 
 @dataclass(frozen=True)
+class GroupDistance(Record):
+    """How far two parts are apart in t, in C or in H, whatever they are in the others.
+
+    Attributes
+    ----------
+    name
+        ``t``, ``C`` or ``H``; for all of them together ``t, C and H``.
+    chi_square
+        Squared distance in the covariance of the difference.
+    freedom
+        Number of directions that both parts determine.
+    """
+
+    name: str
+    chi_square: float
+    freedom: int
+
+
+@dataclass(frozen=True)
 class Halves(Record):
     """One sensor calibrated on two parts: halves of a drive, or the other drives and one drive.
 
@@ -36,6 +55,8 @@ class Halves(Record):
         Angle between the rotations.
     reason
         Why there is no comparison; empty if there is one.
+    groups
+        t, C and H apart, as far as both parts determine some of them. Empty in older files.
     """
 
     difference: Row
@@ -44,6 +65,14 @@ class Halves(Record):
     determined: int
     turned_deg: float
     reason: str = ""
+    groups: tuple[GroupDistance, ...] = ()
+
+    @property
+    def distances(self) -> tuple[GroupDistance, ...]:
+        """What is judged: t, C and H apart, or all together where only that is known."""
+        if self.groups or self.reason:
+            return self.groups
+        return (GroupDistance("t, C and H", self.determined * self.distance**2, self.determined),)
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,16 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
 from l2m_gtsam.records.verdict import Verdict
 from l2m_gtsam.studies.troubles.drives import troubled_drive
-from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
-from l2m_gtsam.studies.troubles.surveys import TroubledHall, troubled_hall
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
+from l2m_gtsam.studies.troubles.surveys import TroubledPlace, troubled_place
 
 OPTIONS = TroublesOptions(surveys=2, drives=1, survey_readings=900, readings=400)
 DRIVE = 1
 
 
 @cache
-def hall(trouble: Trouble) -> TroubledHall:
-    return troubled_hall(OPTIONS, trouble, 0)
+def hall(trouble: Trouble) -> TroubledPlace:
+    return troubled_place(OPTIONS, World.HALL, trouble, 0)
 
 
 @cache

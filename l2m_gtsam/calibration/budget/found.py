@@ -12,7 +12,12 @@ import gtsam
 import numpy as np
 
 from l2m_factors import B, F, SharedError, W
-from l2m_gtsam.calibration.budget.processes import LASTING_S, POSE_PARTS, WANDER_MODES
+from l2m_gtsam.calibration.budget.processes import (
+    LASTING_S,
+    POSE_PARTS,
+    WANDER_MODES,
+    ReadingPlaces,
+)
 from l2m_gtsam.calibration.budget.search import FoundProcess
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
@@ -53,6 +58,11 @@ class Budget:
             return readings
         root = np.diag(np.sqrt(self.poses.sizes @ np.array(list(POSE_PARTS.values()))))
         return replace(readings, pose_root=np.broadcast_to(root, (len(readings), 6, 6)))
+
+    def at(self, places: ReadingPlaces) -> "Budget":
+        """Return the same processes in other readings of the same drive."""
+        moved = (replace(each, process=each.process.on(places)) for each in self.found)
+        return Budget(tuple(moved))
 
     def errors(self, sensor: int, rows: IntArray) -> tuple[SharedError, ...]:
         """Return what some readings of a sensor share."""

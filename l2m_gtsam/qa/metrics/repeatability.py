@@ -6,14 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from l2m_gtsam.calibration.half_difference import HalfDifference
 from l2m_gtsam.data import BoolArray, Distortion, FloatArray, IntArray
 from l2m_gtsam.qa.metrics.plain import row
-from l2m_gtsam.records.metrics import DriveRepeat, Halves, Repeatability
+from l2m_gtsam.records.metrics import DriveRepeat, GroupDistance, Halves, Repeatability
 from l2m_gtsam.solve.chi_square import quantile
 
 TINY = 1e-12  # relative to the largest, of variances in units of useful sigmas
 BAND = 0.95
-GROUPS = (slice(0, 3), slice(3, 12), slice(12, 15))  # t, C, H
+GROUPS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15)}
 SEVERAL = "several drives are compared with each other instead of halves of one"
 NOT_DONE = "halves of the drive were not calibrated by themselves (`qa.halves`)"
 OPEN = "this drive and the others determine nothing of it that both do"
@@ -63,28 +64,58 @@ def compare_halves(first: PartialEstimate, second: PartialEstimate) -> Halves:
     shared. Else they count as if each had its own: the distance is then too small rather than too
     large.
     """
-    difference = second.vector - first.vector
     covariance = first.covariance + second.covariance
     # Cov(b - a) = Cov(a) + Cov(b) - Cov(a, b) - Cov(b, a).
     if first.shared_root is not None and second.shared_root is not None:
         covariance -= first.shared(second) + second.shared(first)
+    turned = _turned(first.vector, second.vector)
+    return _judged(second.vector - first.vector, covariance, turned)
+
+
+def halves_of(middle: FloatArray, found: HalfDifference) -> Halves:
+    """Return by how much the halves of a drive differ, by the solve of the whole.
+
+    Parameters
+    ----------
+    middle
+        (t, C row by row, H) of the whole drive, shape (15,).
+    found
+        What the halves differ by.
+    """
+    first, second = middle - found.vector / 2, middle + found.vector / 2
+    return _judged(found.vector, found.covariance, _turned(first, second))
+
+
+def _judged(difference: FloatArray, covariance: FloatArray, turned_deg: float) -> Halves:
+    """Return a difference in its covariance, (15,) and (15, 15), infinite where it is open."""
     known = np.isfinite(np.diag(covariance))
-    sigma = np.sqrt(np.diag(covariance))
     if not known.any():
         return no_halves("the halves of the drive determine nothing of it by themselves")
-    d, S = difference[known], covariance[np.ix_(known, known)]
+    squared, determined = _squared(difference, covariance, known)
+    groups = []
+    for name, at in GROUPS.items():
+        own = known & np.isin(np.arange(len(known)), np.arange(15)[at])
+        if own.any():
+            groups.append(GroupDistance(name, *_squared(difference, covariance, own)))
+    return Halves(
+        difference=row(difference),
+        sigma=row(np.sqrt(np.diag(covariance))),
+        distance=float(np.sqrt(squared / determined)),
+        determined=determined,
+        turned_deg=turned_deg,
+        groups=tuple(groups),
+    )
+
+
+def _squared(difference: FloatArray, covariance: FloatArray, taken: BoolArray) -> tuple[float, int]:
+    """Return the squared distance of some parameters in sigmas, and of how many directions."""
+    d, S = difference[taken], covariance[np.ix_(taken, taken)]
     # In units of sigmas, so that metres and microtesla are alike; along principal axes.
-    scale = sigma[known]
+    scale = np.sqrt(np.diag(S))
     values, axes = np.linalg.eigh(S / np.outer(scale, scale))
     sound = values > TINY * values[-1]
     along = (axes.T @ (d / scale))[sound] / np.sqrt(values[sound])
-    return Halves(
-        difference=row(difference),
-        sigma=row(sigma),
-        distance=float(np.sqrt(np.mean(along**2))),
-        determined=int(sound.sum()),
-        turned_deg=_turned(first.vector, second.vector),
-    )
+    return float(along @ along), int(sound.sum())
 
 
 def _turned(first: FloatArray, second: FloatArray) -> float:
@@ -212,4 +243,4 @@ def _largest(difference: Sequence[float], sigma: Sequence[float]) -> tuple[float
     d, s = np.abs(np.array(difference)), np.array(sigma)
     known = np.isfinite(s) & (s > 0) & np.isfinite(d)
     ratio = np.where(known, d / np.where(known, s, 1.0), np.nan)
-    return row([np.nanmax(ratio[at]) if known[at].any() else np.nan for at in GROUPS], 2)
+    return row([np.nanmax(ratio[at]) if known[at].any() else np.nan for at in GROUPS.values()], 2)

@@ -6,6 +6,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.options import Limit, QaOptions
+from l2m_gtsam.qa.verdict.repeatability import furthest
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.metrics import SensorMetrics
 from l2m_gtsam.records.verdict import Level
@@ -53,14 +54,13 @@ def measured(
     inside = used + sensor.rejected
     turned = np.rad2deg(np.sqrt(np.diag(sensor.rotation_covariance)))
     chi2 = np.nan if sensor.residuals is None else sensor.residuals.chi2_per_dof
-    halves = found.halves.distance if not found.halves.reason else np.nan
     every = (
         _in("sigma of t", "mm", _largest(sensor.t_sigma), options.position_sigma_m, 1e3),
         _in("sigma of rotation", "°", _largest(turned), options.rotation_sigma_deg),
         _in("sigma of H", "µT", _largest(sensor.H_sigma), options.hard_iron_sigma_ut),
         _in("unexplained by the map", "", found.fit.unexplained, options.unexplained),
         _in("chi-square", "", chi2, options.chi_square),
-        _in("halves apart", "sigmas", halves, options.halves_sigmas),
+        _in("halves apart", "", furthest(found.halves, options), options.halves_apart),
         _in("rejected", "%", _share(sensor.rejected, inside), options.rejected, 100),
         _in(
             "outside the map",

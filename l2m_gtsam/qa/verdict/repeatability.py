@@ -1,13 +1,21 @@
 """Rules on repeatability: halves of a drive, or several drives, calibrated by themselves."""
 
-from math import isfinite
+from collections.abc import Sequence
+from math import isfinite, radians
 from pathlib import Path
 
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.sensor import Case
 from l2m_gtsam.records.calibration import SensorStatus
-from l2m_gtsam.records.metrics import DriveRepeat, Halves, Repeatability, SensorMetrics
+from l2m_gtsam.records.metrics import (
+    DriveRepeat,
+    GroupDistance,
+    Halves,
+    Repeatability,
+    SensorMetrics,
+)
 from l2m_gtsam.records.verdict import Level, Reason
+from l2m_gtsam.solve.chi_square import quantile
 
 # After any other ending the halves do not test the mounting.
 JUDGED = (SensorStatus.SOLVED, SensorStatus.CONTRADICTED, SensorStatus.NOT_CONVERGED)
@@ -21,22 +29,51 @@ def repeat(case: Case) -> list[Reason]:
     halves = differing(case.metrics, case.options)
     if halves is None:
         return notes
-    level = case.options.halves_sigmas.level(halves.distance)
-    difference = _difference(halves, _where(case.metrics, case.options))
+    level = case.options.halves_apart.level(furthest(halves, case.options))
+    difference = _difference(halves, _where(case.metrics, case.options), case.options)
     return [Reason(*_meaning(case, level, difference)), *notes]
 
 
 def halves_agree(halves: Halves, options: QaOptions) -> bool:
     """Return whether two halves agree within their sigmas, or within what is negligible."""
-    if halves.reason or halves.distance <= options.halves_sigmas.warn:
-        return True
-    return _moved(halves, 0, 3) < options.halves_m and (
-        halves.turned_deg < options.halves_deg and _moved(halves, 12, 15) < options.halves_ut
-    )
+    return not furthest(halves, options) > options.halves_apart.warn
 
 
-def _moved(halves: Halves, first: int, end: int) -> float:
-    return float(sum(each**2 for each in halves.difference[first:end]) ** 0.5)
+def furthest(halves: Halves, options: QaOptions) -> float:
+    """Return how far halves are apart in t, C or H, over what chance allows; NaN without any.
+
+    What is negligible counts as nothing.
+    """
+    if not halves.distances:
+        return float("nan")
+    return max(_apart(each, halves, options) for each in halves.distances)
+
+
+def _apart(found: GroupDistance, halves: Halves, options: QaOptions) -> float:
+    if _negligible(found.name, halves, options):
+        return 0.0
+    return float((found.chi_square / limit_of(found, halves, options)) ** 0.5)
+
+
+def limit_of(found: GroupDistance, halves: Halves, options: QaOptions) -> float:
+    """Return the chi-square that chance exceeds so seldom: all of t, C and H have one chance."""
+    share = 1 - options.halves_chance / len(halves.distances)
+    return float(quantile(share, max(found.freedom, 1)))
+
+
+def _negligible(name: str, halves: Halves, options: QaOptions) -> bool:
+    """Return whether nobody minds what t, C, H, or all of them, differ by."""
+    small = {
+        "t": _length(halves.difference[:3]) < options.halves_m,
+        "C": halves.turned_deg < options.halves_deg
+        and max(map(abs, halves.difference[3:12])) < radians(options.halves_deg),
+        "H": _length(halves.difference[12:]) < options.halves_ut,
+    }
+    return small.get(name, all(small.values()))
+
+
+def _length(values: Sequence[float]) -> float:
+    return float(sum(each**2 for each in values) ** 0.5)
 
 
 def differing(metrics: SensorMetrics, options: QaOptions) -> Halves | None:
@@ -51,7 +88,9 @@ def _furthest(drives: Repeatability, options: QaOptions) -> DriveRepeat | None:
     """Return the drive that is furthest from the others; of two the later one."""
     off = [each for each in drives.compared if not halves_agree(each.others, options)]
     # Both of two drives are equally far from each other, to rounding.
-    return max(reversed(off), key=lambda each: round(each.others.distance, 6), default=None)
+    return max(
+        reversed(off), key=lambda each: round(furthest(each.others, options), 6), default=None
+    )
 
 
 def _compared(metrics: SensorMetrics) -> bool:
@@ -75,21 +114,36 @@ def _where(metrics: SensorMetrics, options: QaOptions) -> str:
     return f"calibrated on each drive by itself it differs in {name} from the other drives by"
 
 
-def _difference(halves: Halves, where: str) -> str:
+def _difference(halves: Halves, where: str, options: QaOptions) -> str:
     t = ", ".join(f"{1e3 * each:.0f}" for each in halves.difference[:3])
     H = ", ".join(f"{each:.1f}" for each in halves.difference[12:])
     return (
         f"{where} ({t}) mm in place, "
-        f"{halves.turned_deg:.1f}° in rotation and ({H}) µT in H: {halves.distance:.1f} times as "
-        "much as the sigmas allow"
+        f"{halves.turned_deg:.1f}° in rotation and ({H}) µT in H: {_beyond(halves, options)}"
     )
+
+
+def _beyond(halves: Halves, options: QaOptions) -> str:
+    """Return in which of t, C and H sigmas do not explain a difference, and by how much."""
+    worst = sorted(
+        (each for each in halves.distances if _apart(each, halves, options) > 1),
+        key=lambda each: -_apart(each, halves, options),
+    )
+    listed = ", ".join(
+        f"{each.name} (chi-square {each.chi_square:.0f} of {each.freedom}, limit "
+        f"{limit_of(each, halves, options):.0f})"
+        for each in worst
+    )
+    return f"more than sigmas explain in {listed}"
 
 
 def _meaning(case: Case, level: Level, difference: str) -> tuple[Level, str]:
     """Return what it means: other sensors saw the same map from the same poses."""
     others = [each for each in case.others if _compared(each)]
     same = [differing(each, case.options) is None for each in others]
-    disturbed = any(case.sensor.sensor in each.sensors for each in case.result.disagreements)
+    used = 0 if case.sensor.residuals is None else case.sensor.residuals.readings
+    # A reading or two say nothing about the others: as many as are worth a warning by themselves.
+    disturbed = case.sensor.rejected > case.options.rejected.warn * (used + case.sensor.rejected)
     if same and sum(same) > len(same) / 2 and level is Level.FAIL:
         return level, (
             f"It does not hold still: {difference}, while other sensors repeat. It moved on its "

@@ -1,13 +1,14 @@
-"""The drives through one hall under one condition: errors, covariances and verdicts."""
+"""The drives through one place under one condition: errors, covariances and verdicts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrated
+from l2m_gtsam.calibration.cluster_robust import ByParts
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
@@ -16,8 +17,32 @@ from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import SensorCalibration
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.troubles.drives import troubled_drive
-from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
-from l2m_gtsam.studies.troubles.surveys import TroubledHall
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
+from l2m_gtsam.studies.troubles.surveys import TroubledPlace
+
+BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15)}
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the check on parts of the drive says of t, of C or of H, and what is true.
+
+    Attributes
+    ----------
+    name
+        ``t``, ``C`` or ``H``.
+    distance
+        Squared distance from the truth in the covariance of noise and map.
+    ratios
+        Variances found over those expected: of 16 and 8 parts by time, and as many by place.
+    freedom
+        How well each is known.
+    """
+
+    name: str
+    distance: float
+    ratios: tuple[float, ...]
+    freedom: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -35,6 +60,9 @@ class JudgedSensor:
         Length of the error of t, and the root of the trace of its covariance.
     unmodelled
         The largest factor of the check on parts of the drive.
+    alone
+        What the check on parts says alone, without the processes that were found; none where
+        errors are not shared.
     """
 
     level: str
@@ -43,29 +71,33 @@ class JudgedSensor:
     error_m: float | None
     sigma_m: float | None
     unmodelled: float
+    alone: tuple[Checked, ...] = ()
 
 
 @dataclass(frozen=True)
 class TroublesCell:
-    """What came of the drives through one hall under one condition."""
+    """What came of the drives through one place under one condition."""
 
+    world: World
     trouble: Trouble
     survey: int
     sensors: tuple[JudgedSensor, ...]
 
 
-def cell_of(options: TroublesOptions, place: TroubledHall, trouble: Trouble) -> TroublesCell:
-    """Calibrate and judge all drives through a hall."""
+def cell_of(
+    options: TroublesOptions, world: World, place: TroubledPlace, trouble: Trouble
+) -> TroublesCell:
+    """Calibrate and judge all drives through a place."""
     found = [
         each
         for number in range(options.drives)
         for each in judged_drive(options, place, trouble, number)
     ]
-    return TroublesCell(trouble, place.seed, tuple(found))
+    return TroublesCell(world, trouble, place.truth.seed, tuple(found))
 
 
 def judged_drive(
-    options: TroublesOptions, place: TroubledHall, trouble: Trouble, number: int
+    options: TroublesOptions, place: TroubledPlace, trouble: Trouble, number: int
 ) -> list[JudgedSensor]:
     """Return what the calibration of a drive says of each sensor; FAIL where there is none."""
     recording, truth = troubled_drive(options, place, trouble, number)
@@ -82,10 +114,13 @@ def judged_drive(
     except L2MError:
         return [JudgedSensor(Level.FAIL.value, None, None, None, None, 1.0)] * len(truth)
     verdict = judge(found.result, metrics, QaOptions())
-    return [
+    judged = [
         judged_sensor(each, known, verdict.level)
         for each, known in zip(found.result.sensors, truth, strict=True)
     ]
+    for each in found.solution.by_parts:
+        judged[each.sensor] = with_check(judged[each.sensor], each, truth[each.sensor])
+    return judged
 
 
 def judged_sensor(found: SensorCalibration, truth: KnownSensor, level: Level) -> JudgedSensor:
@@ -94,7 +129,7 @@ def judged_sensor(found: SensorCalibration, truth: KnownSensor, level: Level) ->
     covariance = found.covariance
     if not (np.isfinite(covariance).all() and np.isfinite(found.t_lidar_mag).all()):
         return JudgedSensor(level.value, None, None, None, None, excess)
-    true = np.concatenate([truth.t_lidar_mag, truth.distortion.vector()])
+    true = vector_of(truth)
     e = np.concatenate([found.t_lidar_mag, found.distortion.vector()]) - true
     return JudgedSensor(
         level=level.value,
@@ -104,3 +139,22 @@ def judged_sensor(found: SensorCalibration, truth: KnownSensor, level: Level) ->
         sigma_m=float(np.sqrt(np.trace(covariance[:3, :3]))),
         unmodelled=excess,
     )
+
+
+def with_check(judged: JudgedSensor, alone: ByParts, truth: KnownSensor) -> JudgedSensor:
+    """Return what is said of a sensor, with what the check on parts says alone."""
+    if judged.distance is None:
+        return judged
+    e, P = alone.vector - vector_of(truth), alone.covariance
+    checked = []
+    for name, at in BLOCKS.items():
+        found = [getattr(each, name) for each in alone.scatters]
+        distance = float(e[at] @ np.linalg.solve(P[at, at], e[at]))
+        ratios, freedom = tuple(r.value for r in found), tuple(r.freedom for r in found)
+        checked.append(Checked(name, distance, ratios, freedom))
+    return replace(judged, alone=tuple(checked))
+
+
+def vector_of(sensor: KnownSensor) -> FloatArray:
+    """Return (t, C row by row, H), shape (15,)."""
+    return np.concatenate([sensor.t_lidar_mag, sensor.distortion.vector()])

@@ -1,4 +1,4 @@
-"""Drives through a hall on which one thing, or everything, is not as assumed."""
+"""Drives through a place on which one thing, or everything, is not as assumed."""
 
 from dataclasses import replace
 
@@ -6,30 +6,25 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
-from l2m_gtsam.simulate.hall_drives import calibration_drive
 from l2m_gtsam.studies.honesty.drives import drive_seed, driven, lasting
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
-from l2m_gtsam.studies.troubles.surveys import TroubledHall
+from l2m_gtsam.studies.troubles.surveys import TroubledPlace
 
-SENSORS = 2
 STRONG_UT = 50.0  # field of the Earth, at which a scale that is not linear is stated
 
 
 def troubled_drive(
-    options: TroublesOptions, place: TroubledHall, trouble: Trouble, number: int
+    options: TroublesOptions, place: TroubledPlace, trouble: Trouble, number: int
 ) -> tuple[Recording, tuple[KnownSensor, ...]]:
     """Return a drive by its number as it was recorded, and the truth about its sensors.
 
     All conditions have the same path, sensors and white noise.
     """
-    seed = drive_seed(place.seed, number)
-    span = (min(options.heights), max(options.heights))
-    drive = driven(
-        calibration_drive(place.hall, seed, span, options.noise, SENSORS, options.readings)
-    )
+    seed = drive_seed(place.truth.seed, number)
+    drive = driven(place.truth.drive(options, seed))
     rng, readings = np.random.default_rng([seed, 12]), drive.readings
     change, truth = np.zeros_like(readings.field), list(drive.sensors)
-    for index in range(SENSORS):
+    for index in range(len(drive.sensors)):
         rows = readings.rows_of(index)
         seconds = 1e-9 * (readings.stamp_ns[rows] - readings.stamp_ns[rows.start])
         change[rows] = disturbance(options, trouble, readings.field[rows], seconds, rng)
@@ -52,7 +47,7 @@ def troubled_drive(
         )
         for index, sensor in enumerate(drive.sensors)
     )
-    source = SourceFile(f"hall-{place.seed}-drive-{number}", "")
+    source = SourceFile(f"place-{place.truth.seed}-drive-{number}", "")
     return Recording(trajectory, series, source), tuple(truth)
 
 

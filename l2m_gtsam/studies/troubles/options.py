@@ -44,13 +44,24 @@ class Trouble(StrEnum):
         return self in (other, Trouble.ALL)
 
 
+class World(StrEnum):
+    """What kind of places are surveyed; their fields share no code."""
+
+    HALL = "hall"
+    """Halls of magnetised cuboids, with posts and racks."""
+    OFFICE = "office"
+    """Corridors with door frames, a lift, radiators and cable trays, of rods and sheets."""
+
+
 class TroublesOptions(Options):
     """Size and conditions of the study."""
 
     seed: int = Field(default=700, ge=0)
-    """Of the first hall; the others follow it one by one."""
+    """Of the first place; the others follow it one by one."""
+    worlds: tuple[World, ...] = Field(default=(World.HALL, World.OFFICE), min_length=1)
+    """Kinds of places."""
     surveys: int = Field(default=10, ge=2)
-    """Halls, each with its surveys and maps: what is independent."""
+    """Places of each kind, each with its surveys and maps: what is independent."""
     drives: int = Field(default=4, ge=1)
     """On each map, each with two sensors of random place and distortion."""
     noise: float = Field(default=0.2, gt=0)

@@ -1,31 +1,34 @@
 """The troubles study: ``l2m study troubles``."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import chi2
+from scipy.stats import chi2, f
 
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.statistics import LEVEL, Share
 from l2m_gtsam.studies.study import Study
 from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell, cell_of
-from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
-from l2m_gtsam.studies.troubles.surveys import TroubledHall, troubled_hall
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
+from l2m_gtsam.studies.troubles.surveys import TroubledPlace, troubled_place
 
 TARGET = 0.93  # of the PASS whose 95 % ellipsoid should hold the truth
-DOF_T, DOF = 3, 15
+DOF_T, DOF_C, DOF_H, DOF = 3, 9, 3, 15
+BY_TIME = 1  # of the divisions of a drive: eight parts, the longest
 COLOURS = {Level.PASS: "#009e73", Level.WARN: "#e69f00", Level.FAIL: "#d55e00"}
 
 
 @dataclass(frozen=True)
 class TroubleRow:
-    """What came of one condition.
+    """What came of one condition in one kind of places.
 
     Attributes
     ----------
+    world
+        The kind of places.
     trouble
         The condition.
     levels
@@ -40,10 +43,14 @@ class TroubleRow:
         Of those judged PASS, whose ellipsoid of t, and of all fifteen, holds it; None without any.
     flagged
         Those whose parts scatter more than modelled.
+    alone_t, alone_C, alone_H
+        Sensors whose 95 % ellipsoid by the check on parts alone, without any process, holds t, C
+        and H.
     error_m, sigma_m
         Root mean squares of the error of t and of its stated sigma.
     """
 
+    world: World
     trouble: Trouble
     levels: tuple[int, int, int]
     determined: int
@@ -53,13 +60,16 @@ class TroubleRow:
     passed_t: Share | None
     passed: Share | None
     flagged: int
+    alone_t: Share | None
+    alone_C: Share | None
+    alone_H: Share | None
     error_m: float | None
     sigma_m: float | None
 
 
 @dataclass(frozen=True)
 class TroublesSummary:
-    """All conditions, in the order of ``Trouble``."""
+    """All conditions in each kind of places, in the order of ``Trouble``."""
 
     options: TroublesOptions
     rows: tuple[TroubleRow, ...]
@@ -70,7 +80,7 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
 
     name = "troubles"
     title = "What a PASS is worth"
-    size = frozenset({"surveys"})
+    size = frozenset({"surveys", "worlds"})
     options = TroublesOptions
     cell = TroublesCell
     summary = TroublesSummary
@@ -79,33 +89,37 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
         """Return a cell for each survey and condition, those of one map together."""
         ordered = sorted(Trouble, key=lambda each: (kind(each), list(Trouble).index(each)))
         return tuple(
-            f"survey-{number:03d}-{each.value}"
+            str(CellName(world, number, each))
             for number in range(options.surveys)
+            for world in options.worlds
             for each in ordered
         )
 
     def site(self, options: TroublesOptions, key: str) -> str:
         """Return survey and kind of map: most conditions have the same."""
-        number, trouble = split(key)
-        return f"{number}-{kind(trouble).value}"
+        cell = CellName.of(key)
+        return str(replace(cell, trouble=kind(cell.trouble)))
 
-    def prepare(self, options: TroublesOptions, site: str) -> TroubledHall:
-        """Return a hall with its map."""
-        number, _, trouble = site.partition("-")
-        return troubled_hall(options, Trouble(trouble), int(number))
+    def prepare(self, options: TroublesOptions, site: str) -> TroubledPlace:
+        """Return a place with its map."""
+        name = CellName.of(site)
+        return troubled_place(options, name.world, name.trouble, name.survey)
 
-    def compute(self, options: TroublesOptions, key: str, shared: TroubledHall) -> TroublesCell:
-        """Calibrate and judge all drives through a hall."""
-        return cell_of(options, shared, split(key)[1])
+    def compute(self, options: TroublesOptions, key: str, shared: TroubledPlace) -> TroublesCell:
+        """Calibrate and judge all drives through a place."""
+        name = CellName.of(key)
+        return cell_of(options, name.world, shared, name.trouble)
 
     def summarise(
         self, options: TroublesOptions, cells: Mapping[str, TroublesCell]
     ) -> TroublesSummary:
-        """Return a row for each condition."""
-        by_trouble: dict[Trouble, list[JudgedSensor]] = {each: [] for each in Trouble}
+        """Return a row for each condition in each kind of places."""
+        gathered: dict[tuple[World, Trouble], list[JudgedSensor]] = {
+            (world, trouble): [] for world in World for trouble in Trouble
+        }
         for cell in cells.values():
-            by_trouble[cell.trouble] += cell.sensors
-        rows = tuple(row_of(each, found) for each, found in by_trouble.items() if found)
+            gathered[cell.world, cell.trouble] += cell.sensors
+        rows = tuple(row_of(*each, found) for each, found in gathered.items() if found)
         return TroublesSummary(options, rows)
 
     def page_context(self, summary: TroublesSummary) -> dict[str, Any]:
@@ -114,7 +128,9 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
 
     def figures(self, summary: TroublesSummary) -> dict[str, Figure]:
         """Draw the verdicts of each condition, and how many hold the truth."""
-        figure = Figure(figsize=(8.0, 3.8), layout="constrained", dpi=150)
+        figure = Figure(
+            figsize=(8.0, 1.0 + 0.28 * len(summary.rows)), layout="constrained", dpi=150
+        )
         axes, other = figure.subplots(1, 2, sharey=True)
         at, left = np.arange(len(summary.rows))[::-1], np.zeros(len(summary.rows))
         total = np.array([sum(row.levels) for row in summary.rows])
@@ -122,7 +138,8 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
             share = 100 * np.array([row.levels[index] for row in summary.rows]) / total
             axes.barh(at, share, 0.7, left, color=COLOURS[level], label=level.value.upper())
             left = left + share
-        axes.set_yticks(at, [row.trouble.value for row in summary.rows])
+        names = [f"{row.trouble.value}, {row.world.value}" for row in summary.rows]
+        axes.set_yticks(at, names, fontsize=8)
         axes.set_xlabel("verdicts (%)")
         for shift, name, colour in ((0.13, "passed", "#009e73"), (-0.13, "held", "#0072b2")):
             shares = [getattr(row, name) for row in summary.rows]
@@ -140,10 +157,22 @@ class TroublesStudy(Study[TroublesOptions, TroublesCell, TroublesSummary]):
         return {"troubles": figure}
 
 
-def split(key: str) -> tuple[int, Trouble]:
-    """Return number of the survey and condition of a cell."""
-    _, number, trouble = key.split("-", 2)
-    return int(number), Trouble(trouble)
+@dataclass(frozen=True)
+class CellName:
+    """The kind of places, the number of the survey and the condition of a cell."""
+
+    world: World
+    survey: int
+    trouble: Trouble
+
+    @classmethod
+    def of(cls, key: str) -> "CellName":
+        """Return what a key names."""
+        world, number, trouble = key.split("-", 2)
+        return cls(World(world), int(number), Trouble(trouble))
+
+    def __str__(self) -> str:
+        return f"{self.world.value}-{self.survey:03d}-{self.trouble.value}"
 
 
 def kind(trouble: Trouble) -> Trouble:
@@ -153,11 +182,12 @@ def kind(trouble: Trouble) -> Trouble:
     return Trouble.SUITE if trouble.wrong_suite else Trouble.CLEAN
 
 
-def row_of(trouble: Trouble, found: list[JudgedSensor]) -> TroubleRow:
+def row_of(world: World, trouble: Trouble, found: list[JudgedSensor]) -> TroubleRow:
     """Return what came of a condition."""
     known = [each for each in found if each.distance is not None]
     passed = [each for each in known if each.level == Level.PASS.value]
     return TroubleRow(
+        world=world,
         trouble=trouble,
         levels=(count(found, Level.PASS), count(found, Level.WARN), count(found, Level.FAIL)),
         determined=len(known),
@@ -167,6 +197,9 @@ def row_of(trouble: Trouble, found: list[JudgedSensor]) -> TroubleRow:
         passed_t=within([each.distance_t for each in passed], DOF_T),
         passed=within([each.distance for each in passed], DOF),
         flagged=sum(each.unmodelled > 1 for each in found),
+        alone_t=by_check(known, "t", DOF_T),
+        alone_C=by_check(known, "C", DOF_C),
+        alone_H=by_check(known, "H", DOF_H),
         error_m=rms([each.error_m for each in known]),
         sigma_m=rms([each.sigma_m for each in known]),
     )
@@ -193,6 +226,21 @@ def within(distances: list[Any], dof: int) -> Share | None:
         return None
     inside = int(np.count_nonzero(np.array(distances) <= chi2.ppf(LEVEL, dof)))
     return Share(inside, len(distances))
+
+
+def by_check(known: list[JudgedSensor], name: str, dof: int) -> Share | None:
+    """Return how many 95 % ellipsoids of the check alone hold the truth in t, C or H.
+
+    The variance is that of the parts: where it is known by few of them, Fisher's distribution.
+    """
+    found = [each for sensor in known for each in sensor.alone if each.name == name]
+    if not found:
+        return None
+    inside = [
+        each.distance / each.ratios[BY_TIME] <= dof * f.ppf(LEVEL, dof, each.freedom[BY_TIME])
+        for each in found
+    ]
+    return Share(sum(map(bool, inside)), len(inside))
 
 
 TROUBLES = TroublesStudy()

@@ -1,4 +1,4 @@
-"""Surveys of a hall by a suite that is, or is not, what its file says."""
+"""Surveys of a place by a suite that is, or is not, what its file says."""
 
 from dataclasses import dataclass, replace
 
@@ -17,35 +17,35 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
-from l2m_gtsam.simulate.hall_drives import LIDAR_M, STEP_NS, survey
-from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
-from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
+from l2m_gtsam.simulate.hall_drives import LIDAR_M, STEP_NS
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
+from l2m_gtsam.studies.troubles.places import Place, place_of
 
 ASIDE_M = 0.25  # of the suite's sensors from the middle of the vehicle
 
 
 @dataclass(frozen=True)
-class TroubledHall:
-    """A hall and the map of its survey under one condition."""
+class TroubledPlace:
+    """A place and the map of its survey under one condition."""
 
-    hall: SteelHall
-    seed: int
+    truth: Place
     field_map: QueryableMap
 
 
-def troubled_hall(options: TroublesOptions, trouble: Trouble, number: int) -> TroubledHall:
-    """Return a hall by its number, surveyed as a condition has it."""
-    seed = options.seed + number
-    hall = steel_hall(seed)
-    read = survey_of(hall, seed, options)
+def troubled_place(
+    options: TroublesOptions, world: World, trouble: Trouble, number: int
+) -> TroubledPlace:
+    """Return a place of a kind by its number, surveyed as a condition has it."""
+    truth = place_of(world, options.seed + number)
+    read = survey_of(truth, options)
     suite = known_suite(options)
-    recording = read.recorded(suite, hall, options, off=trouble.wrong_suite)
+    recording = read.recorded(suite, truth, options, off=trouble.wrong_suite)
     if trouble is not Trouble.SUITE_STATED:
         suite = {name: replace(each, covariance=None) for name, each in suite.items()}
-    cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
-    learnt = map_recordings([recording], suite, MappingOptions(model=options.map), cloud)
+    chosen = MappingOptions(model=options.map)
+    learnt = map_recordings([recording], suite, chosen, truth.cloud())
     compiled = learnt.compile() if isinstance(learnt, Compilable) else learnt
-    return TroubledHall(hall, seed, compiled)
+    return TroubledPlace(truth, compiled)
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class SurveyDrive:
     noise: float
 
     def recorded(
-        self, suite: dict[str, KnownSensor], hall: SteelHall, options: TroublesOptions, *, off: bool
+        self, suite: dict[str, KnownSensor], truth: Place, options: TroublesOptions, *, off: bool
     ) -> Recording:
         """Return what a suite reads; the vehicle's clocks are right.
 
@@ -83,7 +83,7 @@ class SurveyDrive:
         series = []
         for index, (known, draw) in enumerate(zip(suite.values(), draws, strict=True)):
             true, own = _off(known, draw) if off else known, self.sensor == index
-            B = hall.world.field(self.R[own] @ true.t_lidar_mag + self.p[own])
+            B = truth.field(self.R[own] @ true.t_lidar_mag + self.p[own])
             field = true.distortion.apply(np.einsum("nji,nj->ni", self.R[own], B)) + noise[own]
             name = known.sensor
             series.append(FieldSeries(name, f"/{name}", name, stamps[own], field))
@@ -91,18 +91,18 @@ class SurveyDrive:
         return Recording(trajectory, tuple(series), SourceFile(f"survey-{self.seed}", ""))
 
 
-def survey_of(hall: SteelHall, seed: int, options: TroublesOptions) -> SurveyDrive:
+def survey_of(truth: Place, options: TroublesOptions) -> SurveyDrive:
     """Return the poses of a survey: every sensor of the suite goes over the whole floor."""
-    points = survey(hall, seed, options.heights, options.noise, options.survey_readings).points
+    points = truth.survey_way(options)
     # A lane's direction is that to the next point; the first and last of a lane turn.
     ahead = np.gradient(points[:, :2], axis=0)
     yaw = np.arctan2(ahead[:, 1], ahead[:, 0])
     R = Rotation.from_euler("Z", yaw[:, None]).as_matrix()
     height = np.array(options.heights)
-    floor = hall.floor.height(points[:, :2])
+    floor = truth.floor(points[:, :2])
     sensor = np.abs((points[:, 2] - floor)[:, None] - height).argmin(axis=1)
     t = np.stack([each.t_lidar_mag for each in known_suite(options).values()])[sensor]
-    return SurveyDrive(seed, sensor, R, points - np.einsum("nij,nj->ni", R, t), options.noise)
+    return SurveyDrive(truth.seed, sensor, R, points - np.einsum("nij,nj->ni", R, t), options.noise)
 
 
 def known_suite(options: TroublesOptions) -> dict[str, KnownSensor]:

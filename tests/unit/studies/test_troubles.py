@@ -7,11 +7,11 @@ import pytest
 
 from l2m_gtsam.data import Distortion, KnownSensor, Trajectory
 from l2m_gtsam.records.verdict import Level
-from l2m_gtsam.simulate.steel_hall import steel_hall
 from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell
 from l2m_gtsam.studies.troubles.drives import bent, disturbance, linear_over, not_linear, pink
-from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions
-from l2m_gtsam.studies.troubles.study import TROUBLES, kind, split
+from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
+from l2m_gtsam.studies.troubles.places import place_of
+from l2m_gtsam.studies.troubles.study import TROUBLES, CellName, kind
 from l2m_gtsam.studies.troubles.surveys import known_suite, survey_of
 
 OPTIONS = TroublesOptions(surveys=2, drives=1)
@@ -71,15 +71,16 @@ def test_a_bent_frame_moves_places_and_turns_nothing() -> None:
     assert 0 < np.abs(shift).max() <= OPTIONS.warp_m
 
 
-def test_a_survey_reads_where_its_suite_is() -> None:
-    hall = steel_hall(OPTIONS.seed)
-    survey, suite = survey_of(hall, OPTIONS.seed, OPTIONS), known_suite(OPTIONS)
-    recording = survey.recorded(suite, hall, OPTIONS, off=False)
-    wrong = survey.recorded(suite, hall, OPTIONS, off=True)
+@pytest.mark.parametrize("world", list(World))
+def test_a_survey_reads_where_its_suite_is(world: World) -> None:
+    place = place_of(world, OPTIONS.seed)
+    survey, suite = survey_of(place, OPTIONS), known_suite(OPTIONS)
+    recording = survey.recorded(suite, place, OPTIONS, off=False)
+    wrong = survey.recorded(suite, place, OPTIONS, off=True)
     for index, (name, known) in enumerate(suite.items()):
         own = survey.sensor == index
         R, field = survey.R[own], recording.series[index].field
-        expected = hall.world.field(R @ known.t_lidar_mag + survey.p[own])
+        expected = place.field(R @ known.t_lidar_mag + survey.p[own])
         read = np.einsum("nij,nj->ni", R, field)
         assert recording.series[index].sensor == name
         # Readings of 0.2 uT of noise and no other error.
@@ -96,14 +97,16 @@ def judged(level: Level, distance: float | None) -> JudgedSensor:
 def test_conditions_are_counted() -> None:
     cells = {
         key: TroublesCell(
-            split(key)[1],
-            split(key)[0],
+            CellName.of(key).world,
+            CellName.of(key).trouble,
+            CellName.of(key).survey,
             (judged(Level.PASS, 10.0), judged(Level.WARN, 1000.0), judged(Level.FAIL, None)),
         )
         for key in TROUBLES.keys(OPTIONS)
     }
     summary = TROUBLES.summarise(OPTIONS, cells)
-    assert [row.trouble for row in summary.rows] == list(Trouble)
+    assert [row.trouble for row in summary.rows] == 2 * list(Trouble)
+    assert [row.world for row in summary.rows] == [each for each in World for _ in Trouble]
     for row in summary.rows:
         assert row.levels == (2, 2, 2)
         assert row.determined == 4
