@@ -56,7 +56,7 @@ class Halves(Record):
     reason
         Why there is no comparison; empty if there is one.
     groups
-        t, C and H apart, as far as both parts determine some of them. Empty in older files.
+        t, C and H apart, as far as both parts determine some of them. Absent in older files.
     """
 
     difference: Row
@@ -65,13 +65,15 @@ class Halves(Record):
     determined: int
     turned_deg: float
     reason: str = ""
-    groups: tuple[GroupDistance, ...] = ()
+    groups: tuple[GroupDistance, ...] | None = None
 
     @property
     def distances(self) -> tuple[GroupDistance, ...]:
         """What is judged: t, C and H apart, or all together where only that is known."""
-        if self.groups or self.reason:
+        if self.groups is not None:
             return self.groups
+        if self.reason:
+            return ()
         return (GroupDistance("t, C and H", self.determined * self.distance**2, self.determined),)
 
 

@@ -32,7 +32,7 @@ ROBOT = '<robot name="r">\n  <link name="lidar"/>\n</robot>\n'
 LOOSE, TIGHT, NEVER = ({"warn": limit, "fail": limit} for limit in (1e6, 1e-9, 1e-9))
 LIMITS = (
     *("position_sigma_m", "rotation_sigma_deg", "hard_iron_sigma_ut", "unexplained", "rejected"),
-    *("outside_map", "halves_sigmas", "chi_square", "time_offset_s", "scale", "skew_deg"),
+    *("outside_map", "halves_apart", "chi_square", "time_offset_s", "scale", "skew_deg"),
 )
 LAX = dict.fromkeys(LIMITS, LOOSE)
 THRESHOLDS: dict[str, dict[str, Any]] = {

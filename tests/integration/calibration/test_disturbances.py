@@ -48,6 +48,9 @@ def test_sigmas_hold_what_lasts_and_the_verdict_says_so(trouble: Trouble, words:
     verdict = drive(trouble)[2]
     assert verdict.level is Level.WARN
     assert any(words in reason.text for reason in verdict.reasons)
+    # Both halves have the process: that they differ by it is no second fault.
+    own = [reason.text for sensor in verdict.sensors for reason in sensor.reasons]
+    assert not any("does not repeat" in text for text in own)
 
 
 def test_a_wandering_offset_is_sized() -> None:

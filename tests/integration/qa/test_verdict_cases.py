@@ -13,6 +13,8 @@ from l2m_gtsam.errors import UnitsError
 from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import Nominal, QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
+from l2m_gtsam.qa.verdict.repeatability import repeat
+from l2m_gtsam.qa.verdict.sensor import Case
 from l2m_gtsam.records.verdict import Level, Verdict
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.bag_options import BagOptions
@@ -169,6 +171,23 @@ def test_a_loose_sensor_is_not_blamed_on_the_map() -> None:
         assert "hold still" in verdict["mag_1"].reasons[0].text
         assert not any("right map" in each.text for each in verdict["mag_1"].reasons)
         assert all(each.level is PASS for each in verdict.reasons)
+
+
+def test_one_rejected_reading_excuses_no_sensor() -> None:
+    """A FAIL is a WARN only where as many were rejected as are worth a warning by themselves."""
+    whole, options = loose(), QaOptions()
+    found = calibrated(whole.recording, whole.field_map, whole.options)
+    metrics = evaluate(whole.recording, found, whole.options, options)
+    alone = replace(metrics, sensors=(metrics.sensors[1],))
+    sensor = found.result.sensors[1]
+    assert sensor.residuals is not None
+    for rejected, level in ((0, FAIL), (1, FAIL), (sensor.residuals.readings // 40, WARN)):
+        case = Case(
+            replace(sensor, rejected=rejected), alone.sensors[0], found.result, alone, options
+        )
+        (reason,) = repeat(case)
+        assert reason.level is level
+        assert "in C (chi-square" in reason.text
 
 
 def loosened_late() -> Drive:

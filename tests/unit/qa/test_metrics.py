@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.qa.metrics.coverage import sphere
@@ -16,7 +17,7 @@ from l2m_gtsam.qa.metrics.mounting import axis_order, gains, skews_deg
 from l2m_gtsam.qa.metrics.plain import evenly
 from l2m_gtsam.qa.metrics.repeatability import PartialEstimate, compare_halves, no_halves
 from l2m_gtsam.qa.options import QaOptions
-from l2m_gtsam.qa.verdict.repeatability import halves_agree
+from l2m_gtsam.qa.verdict.repeatability import furthest, halves_agree
 from l2m_gtsam.records.metrics import Halves
 from l2m_gtsam.storage.record_files import read_metrics
 
@@ -158,6 +159,34 @@ def test_halves_that_differ_by_what_nobody_minds_agree() -> None:
         compare_halves(PartialEstimate(vector, S), PartialEstimate(far, S)), options
     )
     assert halves_agree(no_halves("not looked at"), options)
+
+
+@pytest.mark.parametrize(("name", "at", "by"), [("t", 1, 0.05), ("C", 4, 0.02), ("H", 14, 1.5)])
+def test_t_c_and_h_are_judged_apart(name: str, at: int, by: float) -> None:
+    """What differs in one of them by ten sigmas is within chance for all fifteen together."""
+    vector = np.concatenate([[0.0, 0, 0], np.eye(3).ravel(), [0.0, 0, 0]])
+    sigma, options = np.ones(15), QaOptions(halves_chance=1e-6)
+    sigma[at] = by / 10
+    sigma[[k for k in range(15) if k != at]] = 1e-3
+    other = vector.copy()
+    other[at] += by
+    S = np.diag(sigma**2) / 2  # of each half
+    found = compare_halves(PartialEstimate(vector, S), PartialEstimate(other, S))
+    groups = {each.name: each for each in found.distances}
+    assert {each: groups[each].freedom for each in groups} == {"t": 3, "C": 9, "H": 3}
+    for each, distance in groups.items():
+        assert distance.chi_square == pytest.approx(100 * (each == name), abs=1e-9)
+    limit = chi2.ppf(1 - 1e-6 / 3, groups[name].freedom)
+    assert furthest(found, options) == pytest.approx(np.sqrt(100 / limit))
+    assert not halves_agree(found, options)
+
+
+def test_halves_of_an_older_file_are_judged_together() -> None:
+    """Distances of t, C and H apart are not in it."""
+    nothing = (0.1,) * 15
+    for distance, agree in ((1.5, True), (2.0, False)):  # 34 and 60 of 15: 38 is the limit
+        found = Halves(nothing, nothing, distance, 15, 5.0)
+        assert halves_agree(found, QaOptions()) is agree
 
 
 def test_a_turn_between_halves_is_its_angle() -> None:
