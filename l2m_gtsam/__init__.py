@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from l2m_gtsam.api.arrays import drive, known_sensor
-    from l2m_gtsam.api.calls import build_map, calibrate, localise
+    from l2m_gtsam.api.calls import build_map, calibrate, keep_map_up, localise
     from l2m_gtsam.api.files import load_map, read_bag, read_calibration, read_suite, save_map
 
     __version__: str
@@ -18,6 +18,7 @@ __all__ = [
     "build_map",
     "calibrate",
     "drive",
+    "keep_map_up",
     "known_sensor",
     "load_map",
     "localise",
@@ -32,6 +33,7 @@ _WHERE = {
     "known_sensor": "arrays",
     "build_map": "calls",
     "calibrate": "calls",
+    "keep_map_up": "calls",
     "localise": "calls",
     "load_map": "files",
     "read_bag": "files",

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from l2m_gtsam.api.options import options_of
 from l2m_gtsam.api.results import JudgedCalibration, LocalisedDrive
 from l2m_gtsam.calibration.calibrate import calibrated
+from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.config import Config
@@ -29,6 +30,7 @@ from l2m_gtsam.slam.localisation import localise as localise_recording
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.storage.cloud import read_cloud, thinned_cloud
 from l2m_gtsam.storage.known_sensors import read_known_sensors
+from l2m_gtsam.upkeep.kept_map import kept_up
 
 Values = Mapping[str, Any]
 Structure = npt.ArrayLike | str | Path | None
@@ -65,6 +67,46 @@ def build_map(
     if structure is not None:
         refuse_structure(chosen.model.kind)
     return map_recordings(drives, _sensors(suite), chosen, _cloud(structure, chosen))
+
+
+def keep_map_up(
+    field_map: FieldMap,
+    drives: Recording | Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | Sequence[KnownSensor] | str | Path,
+    *,
+    options: MappingOptions | Values | None = None,
+    changes: ChangesOptions | Values | None = None,
+) -> FieldMap:
+    """Return a map after drives of a calibrated vehicle through a place that may have changed.
+
+    What came, went or was moved, and where earlier readings count less, is in its ``diary``.
+
+    Parameters
+    ----------
+    field_map
+        Of kind harmonic, in the frame of the drives' poses.
+    drives
+        Later than all that the map has been given.
+    suite
+        The vehicle's sensors as they are calibrated, or their file.
+    options
+        As under `mapping` in a configuration.
+    changes
+        As under `calibration.changes`.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    every = [drives] if isinstance(drives, Recording) else list(drives)
+    return kept_up(
+        field_map,
+        every,
+        _sensors(suite) or {},
+        options_of(MappingOptions, options, "mapping"),
+        options_of(ChangesOptions, changes, "calibration.changes"),
+    )
 
 
 def _sensors(

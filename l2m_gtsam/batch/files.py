@@ -15,6 +15,7 @@ from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.options import Options, first_fault
 from l2m_gtsam.progress import Count, Progress, counter
+from l2m_gtsam.records.map_diary import UNDATED, MapDrive
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_recording
 from l2m_gtsam.storage.files import source_file, unwritten
@@ -143,6 +144,15 @@ class SavedMap:
     def updates(self) -> list[Any]:
         """What the file says of the updates that it went through."""
         return self._list_of("updates")
+
+    @property
+    def surveyed(self) -> MapDrive:
+        """When the map was surveyed; undated if its file does not say, or nonsense."""
+        dates = self.state.provenance.get("surveyed")
+        try:
+            return MapDrive(**dates) if isinstance(dates, dict) else UNDATED
+        except (TypeError, ValueError):
+            return UNDATED
 
     @property
     def doubts(self) -> tuple[str, ...]:

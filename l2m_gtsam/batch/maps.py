@@ -7,18 +7,21 @@ from pathlib import Path
 from typing import Any
 
 from l2m_gtsam.batch.files import SavedMap, check_outputs, ensure_folder, used_file
-from l2m_gtsam.batch.survey import read_survey, scanned_place
+from l2m_gtsam.batch.survey import MappingDrives, read_survey, scanned_place
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import LidarMap, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import compare_recordings, map_recordings, update_map
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.compare import MapComparison
-from l2m_gtsam.maps.field_map import FieldMap, MapSummary
+from l2m_gtsam.maps.field_map import FieldMap, MapSummary, Remembering
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.report.figures.map import map_figure
 from l2m_gtsam.qa.report.svg import save_figure
+from l2m_gtsam.recording.drive_dates import drive_dates
+from l2m_gtsam.records.map_diary import MapDiary
 from l2m_gtsam.storage.map_file import save_map
+from l2m_gtsam.upkeep.kept_map import kept_up
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,13 @@ class MapDescription:
 
     summary: MapSummary
     provenance: dict[str, Any]
+    diary: MapDiary | None = None
+
+    @classmethod
+    def of(cls, field_map: FieldMap, provenance: dict[str, Any]) -> "MapDescription":
+        """Return what a map says of itself, and its file."""
+        diary = field_map.diary if isinstance(field_map, Remembering) else None
+        return cls(field_map.summary, provenance, diary)
 
 
 @dataclass(frozen=True)
@@ -85,6 +95,7 @@ def build_map_file(
         "structure": None if survey.structure is None else survey.structure.provenance,
         "lidar": None if scanned is None else scanned.provenance,
         "frame": survey.recordings[0].trajectory.frame,
+        "surveyed": vars(drive_dates(*survey.recordings)),
         "config": config.model_dump(mode="json", include={"bag", "mapping"}),
         "version": version("l2m-gtsam"),
     }
@@ -122,29 +133,115 @@ def update_map_file(
         Whatever is wrong with the input, in one line.
     """
     check_outputs(out, suffix=".npz")
+    drives = _added(map_path, bags, config, suite, progress)
+    progress("updating the map", 0.0)
+    updated = update_map(drives.field_map, drives.recordings, drives.survey.suite, config.mapping)
+    progress("updating the map", 1.0)
+    return drives.write(out, updated, config)
+
+
+def keep_map_file_up(
+    map_path: Path,
+    bags: Sequence[Path],
+    out: Path,
+    config: Config,
+    suite: Path | None,
+    progress: Progress,
+) -> BuiltMap:
+    """Add drives of a calibrated vehicle to a map, and tell what has changed since.
+
+    Parameters
+    ----------
+    map_path
+        Map file; it stays as it is unless it is also `out`, and until all is done.
+    bags
+        One or several drives, later than all that the map has been given, in its frame.
+    out
+        Map file to write (`.npz`).
+    config
+        Configuration, of which what is read and synchronised counts, and how changes are looked
+        for (`calibration.changes`).
+    suite
+        File with the calibration of the vehicle's sensors.
+    progress
+        Called with a stage and the fraction of it that is done.
+
+    Raises
+    ------
+    L2MError
+        Whatever is wrong with the input, in one line.
+    """
+    check_outputs(out, suffix=".npz")
+    if suite is None:
+        raise MapError(
+            "--changes needs to know the vehicle: a sensor that is not calibrated cannot tell what "
+            "changed; give its calibration with --suite"
+        )
+    drives = _added(map_path, bags, config, suite, progress)
+    progress("looking for what changed", 0.0)
+    kept = kept_up(
+        drives.field_map,
+        drives.recordings,
+        drives.survey.suite or {},
+        config.mapping,
+        config.calibration.changes,
+        drives.saved.surveyed,
+    )
+    progress("looking for what changed", 1.0)
+    return drives.write(out, kept, config)
+
+
+@dataclass(frozen=True)
+class _AddedDrives:
+    """A map, and drives that it is to be given.
+
+    Attributes
+    ----------
+    saved, field_map
+        The file, and the map in it.
+    survey
+        The drives.
+    suite
+        File of their sensors' calibrations.
+    """
+
+    saved: SavedMap
+    field_map: FieldMap
+    survey: MappingDrives
+    suite: Path | None
+
+    @property
+    def recordings(self) -> list[Recording]:
+        return self.survey.recordings
+
+    def write(self, out: Path, updated: FieldMap, config: Config) -> BuiltMap:
+        """Write the map with these drives."""
+        added = [vars(recording.source) for recording in self.recordings]
+        update = {
+            "bags": added,
+            "suite": None if self.suite is None else used_file(self.suite, self.survey.suite_level),
+            "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
+            "version": version("l2m-gtsam"),
+        }
+        provenance = {
+            **self.saved.state.provenance,
+            **updated.to_state().provenance,
+            "bags": [*self.saved.bags, *added],
+            "updates": [*self.saved.updates, update],
+            "frame": self.recordings[0].trajectory.frame,
+        }
+        return write_map(out, updated, provenance, self.saved.state.lidar)
+
+
+def _added(
+    map_path: Path, bags: Sequence[Path], config: Config, suite: Path | None, progress: Progress
+) -> _AddedDrives:
+    """Return a map with the drives that it is to be given, none of which it has."""
     saved = SavedMap.read(map_path)
     known = saved.bags
     survey = read_survey(bags, config, suite, None, progress)
     _check_new(map_path, known, survey.recordings)
-    field_map = saved.open(progress, survey.recordings)
-    progress("updating the map", 0.0)
-    updated = update_map(field_map, survey.recordings, survey.suite, config.mapping)
-    progress("updating the map", 1.0)
-    added = [vars(recording.source) for recording in survey.recordings]
-    update = {
-        "bags": added,
-        "suite": None if suite is None else used_file(suite, survey.suite_level),
-        "config": config.model_dump(mode="json", include={"bag": True, "mapping": {"sync"}}),
-        "version": version("l2m-gtsam"),
-    }
-    provenance = {
-        **saved.state.provenance,
-        **updated.to_state().provenance,
-        "bags": [*known, *added],
-        "updates": [*saved.updates, update],
-        "frame": survey.recordings[0].trajectory.frame,
-    }
-    return write_map(out, updated, provenance, saved.state.lidar)
+    return _AddedDrives(saved, saved.open(progress, survey.recordings), survey, suite)
 
 
 def compare_map_kinds(
@@ -177,7 +274,7 @@ def compare_map_kinds(
 def describe_map_file(path: Path, progress: Progress) -> MapDescription:
     """Return what a map file holds and where it came from."""
     saved = SavedMap.read(path)
-    return MapDescription(saved.open(progress).summary, saved.state.provenance)
+    return MapDescription.of(saved.open(progress), saved.state.provenance)
 
 
 def plot_map_file(path: Path, out: Path, height: float | None, progress: Progress) -> None:
@@ -196,7 +293,7 @@ def write_map(
     state = replace(state, provenance={**state.provenance, **provenance}, lidar=lidar)
     ensure_folder(out.parent)
     save_map(out, state)
-    return BuiltMap(field_map, MapDescription(field_map.summary, state.provenance))
+    return BuiltMap(field_map, MapDescription.of(field_map, state.provenance))
 
 
 def _check_new(

@@ -357,6 +357,21 @@ def sensor_shares(
     return np.asarray(right_divided(own.R_map_lidar, estimate.C()[sensor]) @ J)
 
 
+def with_calibration(rows: MarginalRows, covariances: FloatArray) -> MarginalRows:
+    """Return rows whose sensors are as calibrated, to its covariances, shape (S, 16, 16)."""
+    prior = rows.prior.copy()
+    first = len(prior) - SENSOR * len(covariances)
+    for k, covariance in enumerate(covariances):
+        own = slice(first + SENSOR * k, first + SENSOR * (k + 1))
+        sigma = np.sqrt(np.diag(covariance))
+        scaled = covariance / np.outer(sigma, sigma)
+        # Nearly singular where a calibration holds directions: as exact as a millionth of a sigma.
+        values, axes = np.linalg.eigh(scaled)
+        root = axes / np.sqrt(np.maximum(values, 1e-12))
+        prior[own, own] = (root @ root.T) / np.outer(sigma, sigma)
+    return replace(rows, prior=prior)
+
+
 class _Sparse:
     """Entries of a matrix of three rows for each reading."""
 

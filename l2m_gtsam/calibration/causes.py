@@ -122,8 +122,15 @@ def offset_gain(rows: MarginalRows, drive: AveragedDrive) -> float:
     Something on the vehicle that is switched does that, alike at all places.
     """
     on = drive.averages.counted < REJECTED
-    if not on.any():
-        return 0.0
+    return _offsets_explain(rows, drive, on) if on.any() else 0.0
+
+
+def vehicle_gain(rows: MarginalRows, drive: AveragedDrive) -> float:
+    """Return what offsets of the sensors explain that are on all along a drive (a BIC)."""
+    return _offsets_explain(rows, drive, np.ones(len(rows), dtype=np.bool_))
+
+
+def _offsets_explain(rows: MarginalRows, drive: AveragedDrive, on: BoolArray) -> float:
     features = sensor_offsets(drive) * on[:, None, None]
     pulled, _ = rows.pull(rows.residual)
     width = features.shape[2]

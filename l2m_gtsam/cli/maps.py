@@ -127,6 +127,14 @@ def map_update(
     out: MapFileOption,
     config: ConfigOption = None,
     suite: SuiteOption = None,
+    changes: Annotated[
+        bool,
+        typer.Option(
+            "--changes",
+            help="The place may have changed: tell what came, went or was moved, between which "
+            "dates, and forget what is no longer true. Needs a calibrated vehicle (--suite).",
+        ),
+    ] = False,
     tiles: TilesOption = True,
     poses: PosesOption = None,
     times: PoseTimesOption = None,
@@ -137,15 +145,20 @@ def map_update(
     """
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import make_tiles
-        from l2m_gtsam.batch.maps import update_map_file
+        from l2m_gtsam.batch.maps import keep_map_file_up, update_map_file
+        from l2m_gtsam.cli.tables.map_changes import changes_table, faded_lines
         from l2m_gtsam.cli.tables.maps import map_table
         from l2m_gtsam.config import load_config, with_poses
 
         chosen = with_poses(load_config(config), bags, poses or (), times)
-        updated = update_map_file(map_path, bags, out, chosen, suite, progress)
+        update = keep_map_file_up if changes else update_map_file
+        updated = update(map_path, bags, out, chosen, suite, progress)
         if tiles:
             make_tiles(updated.field_map, out, progress)
     print_table(map_table(updated.description))
+    if (diary := updated.description.diary) is not None:
+        print_table(changes_table(diary))
+        say(*faded_lines(diary))
     warn(updated.description.summary.doubts)
     say(f"written: {out}")
 
@@ -177,10 +190,14 @@ def map_info(map_path: MapArgument) -> None:
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import doubts_of_origin
         from l2m_gtsam.batch.maps import describe_map_file
+        from l2m_gtsam.cli.tables.map_changes import changes_table, faded_lines
         from l2m_gtsam.cli.tables.maps import map_table
 
         description = describe_map_file(map_path, progress)
     print_table(map_table(description))
+    if (diary := description.diary) is not None:
+        print_table(changes_table(diary))
+        say(*faded_lines(diary))
     warn([*description.summary.doubts, *doubts_of_origin(description.provenance)])
 
 
@@ -192,7 +209,7 @@ def map_plot(
         float | None, typer.Option(help="Height in metres; the middle of the readings if absent.")
     ] = None,
 ) -> None:
-    """Draw strength and uncertainty of a map at one height."""
+    """Draw strength and uncertainty of a map at one height, and what changed."""
     with shown_progress() as progress:
         from l2m_gtsam.batch.maps import plot_map_file
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import FieldSample, FloatArray, MapState
 from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.records.map_diary import MapDiary
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,15 @@ class MapSummary:
 
 
 # What some maps have and others have not, by which protocols know them.
-OPTIONAL = ("errors_over", "sensors_uncertain", "sigmas_hold", "compile", "summary", "readings")
+OPTIONAL = (
+    "errors_over",
+    "sensors_uncertain",
+    "sigmas_hold",
+    "compile",
+    "summary",
+    "readings",
+    "diary",
+)
 
 
 def optional_members(field_map: object, wrapper: object) -> dict[str, Any]:
@@ -68,6 +77,15 @@ class Surveyed(Protocol):
     @property
     def readings(self) -> TrainingSet:
         """Readings in the map frame, thinned or averaged."""
+
+
+@runtime_checkable
+class Remembering(Protocol):
+    """A map that may know what it went through since its survey."""
+
+    @property
+    def diary(self) -> MapDiary | None:
+        """Drives and what changed between them; None where it was not kept up."""
 
 
 class FieldMap(Protocol):

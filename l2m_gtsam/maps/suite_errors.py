@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 
 SIZE = 16  # errors of a sensor: t, C row by row, H, time offset
 SHIFT = 6  # of a reading: its position, then its field
@@ -66,6 +66,16 @@ class SuiteErrors:
         np.add.at(shift, at, self.shift * share[:, None, None])
         reading, sensor = np.divmod(pairs, len(self.sensors))
         return replace(self, reading=reading, sensor=sensor, shift=shift)
+
+    def only(self, keep: BoolArray) -> "SuiteErrors":
+        """Return the errors of some of N readings, (N,)."""
+        number, own = np.cumsum(keep) - 1, keep[self.reading]
+        return replace(
+            self,
+            reading=number[self.reading[own]],
+            sensor=self.sensor[own],
+            shift=self.shift[own],
+        )
 
     def as_sure_as(self, other: "SuiteErrors") -> "SuiteErrors | None":
         """Return the same with the covariance of others; None unless they are the same sensors."""

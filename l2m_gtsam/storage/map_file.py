@@ -23,7 +23,8 @@ from l2m_gtsam.storage.bounded_zip import open_archive, read_stored_array
 from l2m_gtsam.storage.files import atomic_path
 
 FORMAT = "l2m-map"
-VERSION = 2
+VERSION = 3
+READ = (2, VERSION)  # of version 2 are maps that were not kept up
 HEADER, CHECKSUM, ARRAYS = "header.npy", "checksum.npy", "arrays/"
 LIDAR = "lidar/"
 LIDAR_SHAPES = {"points": (3,), "R": (3, 3), "p": (3,)}
@@ -148,10 +149,11 @@ def _decode_header(path: Path, header: npt.NDArray[Any]) -> dict[str, Any]:
     content = json.loads(header.tobytes())
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise MapError(_foreign(path))
-    if content.get("version") != VERSION:
+    if content.get("version") not in READ:
         raise MapError(
             f"{path}: map version {content.get('version')!r}, this program reads version "
-            f"{VERSION}; build the map again or use the program that wrote it"
+            f"{' and '.join(str(each) for each in READ)}; build the map again or use the program "
+            "that wrote it"
         )
     parts = {"kind": str, "options": dict, "provenance": dict}
     if not all(isinstance(content.get(key), kind) for key, kind in parts.items()):

@@ -10,13 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged
+from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged, with_calibration
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
 from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.maps.sources.marginal import MarginalRows
@@ -227,18 +226,3 @@ def together(parts: Sequence[Readings], names: tuple[str, ...]) -> Readings:
         motion=motion,
         pose_root=joined([each.pose_root for each in parts]),
     )
-
-
-def with_calibration(rows: MarginalRows, covariances: FloatArray) -> MarginalRows:
-    """Return rows whose sensors are as calibrated, to its covariances, shape (S, 16, 16)."""
-    prior = rows.prior.copy()
-    first = len(prior) - SENSOR * len(covariances)
-    for k, covariance in enumerate(covariances):
-        own = slice(first + SENSOR * k, first + SENSOR * (k + 1))
-        sigma = np.sqrt(np.diag(covariance))
-        scaled = covariance / np.outer(sigma, sigma)
-        # Nearly singular where a calibration holds directions: as exact as a millionth of a sigma.
-        values, axes = np.linalg.eigh(scaled)
-        root = axes / np.sqrt(np.maximum(values, 1e-12))
-        prior[own, own] = (root @ root.T) / np.outer(sigma, sigma)
-    return replace(rows, prior=prior)

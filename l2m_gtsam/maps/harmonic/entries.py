@@ -18,9 +18,10 @@ ALGORITHM = 2
 
 def solved_entry(learnt: Learnt, index: int) -> Entry:
     """Return what a solved tile is kept as: it follows from readings, sources, prior and box."""
-    readings = learnt.readings[learnt.members[index]]
+    rows = learnt.members[index]
+    readings, history = learnt.readings[rows], learnt.history
     structures, strengths = learnt.structures(index)
-    facts = {
+    facts: dict[str, object] = {
         "algorithm": ALGORITHM,
         "versions": _versions(),
         "hyperparameters": learnt.hyperparameters.model_dump(mode="json"),
@@ -29,6 +30,12 @@ def solved_entry(learnt: Learnt, index: int) -> Entry:
         "edge": learnt.tiling.edge,
         "sources": [len(each) for each in structures],
     }
+    if history is not None:
+        facts["drives"] = history.drive[rows].tolist()
+        steps = history.steps_of(learnt.tiling.grid.cells[index])
+        facts["steps"] = [[each.share, each.depth] for each in steps]
+        near = learnt.structure_numbers(index)
+        facts["freed"] = [history.freed_before(k, near) for k in range(history.drives)]
     fingerprint = _digest(
         facts,
         learnt.tiling.grid.centres[index],

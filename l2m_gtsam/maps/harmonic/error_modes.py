@@ -31,6 +31,7 @@ from l2m_gtsam.maps.grid import Grid
 from l2m_gtsam.maps.harmonic.basis import batches
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, Learnt
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tile_sums import tile_pull
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
@@ -236,11 +237,7 @@ def moved_weights(
     readings = learnt.readings[rows]
     _, gradient = tile.field_and_gradient(readings.points)
     wrong = suite.of_field(rows, gradient) + gradient @ shift
-    wrong *= readings.weight[:, None, None]
-    pulled = np.zeros((len(tile.basis), wrong.shape[2]))
-    for at in batches(len(rows)):
-        F = tile.basis.features(readings.points[at])
-        pulled += F.reshape(-1, len(pulled)).T @ wrong[at].reshape(-1, wrong.shape[2])
+    pulled = tile_pull(learnt, index, tile.basis, wrong)
     # L L^T by the factor: neither covariance nor inverse is formed.
     white = np.ascontiguousarray(pulled * tile.weights.prior_sigma[:, None])
     tile.weights.factor.solve_rows(white)
@@ -277,7 +274,8 @@ def joint_covariance(learnt: Learnt, tiles: dict[int, TileModes]) -> FloatArray:
     readings = learnt.readings
     scale = np.sqrt(readings.weight) / learnt.hyperparameters.noise
     indices = list(tiles)
-    rows, pairs = shared_readings([learnt.members[index] for index in indices], len(readings))
+    # What a step of the field lies between is left to each tile.
+    rows, pairs = shared_readings([learnt.present(index) for index in indices], len(readings))
 
     def seen(k: int) -> FloatArray:
         return tiles[indices[k]].rows(readings.points[rows[k]]) * scale[rows[k]]

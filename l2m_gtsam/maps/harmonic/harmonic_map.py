@@ -29,6 +29,7 @@ from l2m_gtsam.maps.training import (
 )
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count
+from l2m_gtsam.records.map_diary import MapDiary
 
 EXACT = 1e-9  # share of the variance between points that may be left out
 
@@ -199,6 +200,11 @@ class HarmonicMap:
     def readings(self) -> TrainingSet:
         """Readings in the map frame, merged."""
         return self.learnt.readings
+
+    @property
+    def diary(self) -> MapDiary | None:
+        """Drives and what changed between them; None where it was not kept up."""
+        return None if self.learnt.history is None else self.learnt.history.diary
 
     @property
     def sensors_uncertain(self) -> bool:

@@ -3,14 +3,16 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 from pydantic import Field, TypeAdapter
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.grid import grid_from
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.explanation import UNJUDGED, Explanation
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
+from l2m_gtsam.maps.harmonic.history import History
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
 from l2m_gtsam.maps.harmonic.local import LocalOptions
@@ -30,6 +32,7 @@ from l2m_gtsam.maps.suite_errors import SuiteErrors, errors_together
 from l2m_gtsam.maps.survey import survey_doubts
 from l2m_gtsam.maps.training import TrainingSet, cubes_of, joined, merged
 from l2m_gtsam.options import Options
+from l2m_gtsam.records.map_diary import UNDATED, MapDrive
 
 KNOWN = 0.5  # of the readings' variance: a map that explains less is no better than their mean
 
@@ -136,6 +139,9 @@ class Learnt:
     suite
         What errors of the sensors that surveyed do to the readings; absent where they count as
         exact.
+    history
+        Which drive each reading is of, and how far the field moved between drives; absent where all
+        are of one field.
     """
 
     readings: TrainingSet
@@ -147,6 +153,7 @@ class Learnt:
     local: LocalOptions
     origin: Origin
     suite: SuiteErrors | None = None
+    history: History | None = None
 
     @cached_property
     def members(self) -> list[IntArray]:
@@ -174,9 +181,27 @@ class Learnt:
 
     def structures(self, tile: int) -> tuple[list[Sources], FloatArray]:
         """Return the structures in or near a tile that have a field, and their strengths, (S,)."""
-        near = self.sources.within(self.tiling.grid.centres[tile], self.tiling.edge)
-        strong = [s for s in near if self.strengths[s] > 0]
+        strong = self.structure_numbers(tile)
         return [self.sources.pieces[s] for s in strong], self.strengths[strong]
+
+    def present(self, tile: int) -> IntArray:
+        """Return the rows of a tile's readings since which its field has not moved."""
+        rows = self.members[tile]
+        if self.history is None:
+            return rows
+        steps = self.history.steps_of(self.tiling.grid.cells[tile])
+        near = self.structure_numbers(tile)
+        moved = [
+            k
+            for k, step in enumerate(steps)
+            if step.share > 0 or any(self.history.freed_before(k, near))
+        ]
+        return rows[self.history.drive[rows] >= (moved[-1] if moved else 0)]
+
+    def structure_numbers(self, tile: int) -> list[int]:
+        """Return the numbers of the structures in or near a tile that have a field."""
+        near = self.sources.within(self.tiling.grid.centres[tile], self.tiling.edge)
+        return [s for s in near if self.strengths[s] > 0]
 
     def extended(
         self, new: TrainingSet, options: HarmonicOptions, suite: SuiteErrors | None = None
@@ -185,20 +210,71 @@ class Learnt:
 
         ``suite`` is what errors of their sensors do to the new readings.
         """
+        if self.history is not None:  # readings of two drives are not averaged: see ``followed_by``
+            return self.followed_by(new, options, suite, UNDATED)
         together = joined(self.readings, new)
         owner = cubes_of(together.points, options.merge)
         errors = errors_together(self.suite, suite, len(self.readings))
-        survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(together))))
+        errors = None if errors is None else errors.averaged(owner, together.weight)
         readings = merged(together, options.merge, options.independent)
+        return self._of(readings, errors, together, len(new), options)
+
+    def followed_by(
+        self,
+        new: TrainingSet,
+        options: HarmonicOptions,
+        suite: SuiteErrors | None,
+        drive: MapDrive,
+    ) -> "Learnt":
+        """Return the same with the readings of a new drive, which stay apart from earlier ones.
+
+        Parameters
+        ----------
+        new
+            Its readings.
+        options
+            Of the map.
+        suite
+            What errors of their sensors do to them.
+        drive
+            When it was.
+        """
+        history = self.history or History.of_survey(len(self.readings), UNDATED)
+        owner = cubes_of(new.points, options.merge)
+        own = None if suite is None else suite.averaged(owner, new.weight)
+        errors = errors_together(self.suite, own, len(self.readings))
+        added = merged(new, options.merge, options.independent)
+        together = joined(self.readings, added)
+        # Steel that came between two drives is no fault of a survey: each is doubted by itself.
+        learnt = self._of(together, errors, new, len(new), options)
+        return replace(learnt, history=history.followed_by(len(added), drive))
+
+    def only(self, keep: BoolArray, options: HarmonicOptions) -> "Learnt":
+        """Return the same with some of the readings, (N,), and the tiles that they need."""
+        rows = np.flatnonzero(keep)
+        suite = None if self.suite is None else self.suite.only(keep)
+        history = None if self.history is None else self.history.only(keep)
+        readings = self.readings[rows]
+        return replace(self._of(readings, suite, readings, 0, options), history=history)
+
+    def _of(
+        self,
+        readings: TrainingSet,
+        suite: SuiteErrors | None,
+        seen: TrainingSet,
+        added: int,
+        options: HarmonicOptions,
+    ) -> "Learnt":
+        """Return the same prior over other readings, with their tiles; see ``extended``."""
+        survey = tuple(dict.fromkeys((*self.origin.survey, *survey_doubts(seen))))
         grid = self.tiling.grid
-        reach = reach_of(grid.size, options)
-        wider = grid_from(grid.origin, readings.points, grid.size, reach)
+        wider = grid_from(grid.origin, readings.points, grid.size, reach_of(grid.size, options))
         return replace(
             self,
             readings=readings,
             tiling=replace(self.tiling, grid=wider),
-            origin=replace(self.origin, readings=self.origin.readings + len(new), survey=survey),
-            suite=None if errors is None else errors.averaged(owner, together.weight),
+            origin=replace(self.origin, readings=self.origin.readings + added, survey=survey),
+            suite=suite,
         )
 
 

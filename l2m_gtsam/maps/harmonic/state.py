@@ -4,11 +4,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.grid import grid_from
+from l2m_gtsam.maps.harmonic.history import History
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import ORIGIN, HarmonicOptions, Learnt, reach_of
 from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources
@@ -16,12 +17,15 @@ from l2m_gtsam.maps.harmonic.tiling import LEAST_CORE, Resolution, Tiling, blend
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
 from l2m_gtsam.maps.training import FURTHEST, TrainingSet, training_set
+from l2m_gtsam.records.map_diary import MapDiary
 
 SAFE = 1.5  # times the modes that a tile of a file may have
 LEAST_SIZE = 0.4 * LEAST_CORE  # equal tiles over an extent may be half as large as the least core
 # Given hyperparameters may lie outside the bounds of learning; powers and squares of these are
 # still far from the ends of float64.
 LEAST, MOST = 1e-9, 1e9
+MOST_CELL = 2**31  # tiles along an axis
+DIARY = TypeAdapter(MapDiary)
 ROUNDING = 1e-9  # of a covariance's largest entry
 
 
@@ -48,6 +52,14 @@ def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapS
             "suite_shift": suite.shift.astype(np.float32),
         }
         origin |= {"suite_sensors": list(suite.sensors)}
+    if (history := learnt.history) is not None:
+        arrays |= {
+            "drive": history.drive,
+            "step_cells": history.cells,
+            "steps": np.stack([history.shares, history.depths]),
+            "freed": history.freed,
+        }
+        origin |= {"diary": DIARY.dump_python(history.diary, mode="json")}
     return MapState(kind, arrays, options.model_dump(mode="json"), origin)
 
 
@@ -72,7 +84,16 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
     local = options.effective_local
     suite = suite_from_state(state, len(readings))
     learnt = Learnt(
-        readings, hyperparameters, sources, strengths, tiling, resolution, local, origin, suite
+        readings,
+        hyperparameters,
+        sources,
+        strengths,
+        tiling,
+        resolution,
+        local,
+        origin,
+        suite,
+        history_from_state(state, len(readings), len(strengths)),
     )
     return learnt, options
 
@@ -172,3 +193,37 @@ def suite_from_state(state: MapState, count: int) -> SuiteErrors | None:
     if np.linalg.eigvalsh(covariance).min() < -ROUNDING * np.abs(covariance).max():
         raise damaged("suite is", "its covariance has a negative direction")
     return SuiteErrors(tuple(names), covariance, numbers[0], numbers[1], shift)
+
+
+def history_from_state(state: MapState, count: int, structures: int) -> History | None:
+    """Return what so many readings went through, after checks; none in most maps."""
+    if "drive" not in state.arrays:
+        return None
+    try:
+        diary = DIARY.validate_python(state.provenance.get("diary"))
+    except ValidationError as error:
+        raise damaged("diary is", first_complaint(error)) from None
+    drive, cells, steps, freed = (
+        state_array(state, name) for name in ("drive", "step_cells", "steps", "freed")
+    )
+    drives = len(diary.drives)
+    if (
+        drive.shape != (count,)
+        or cells.shape[1:] != (2,)
+        or freed.shape[1:] != (2,)
+        or steps.shape != (2, len(cells), drives)
+    ):
+        raise damaged("history is", "its arrays do not have the shapes needed")
+    if not ((drive >= 0) & (drive < drives)).all():
+        raise damaged("history is", "a reading is of a drive that there was not")
+    if not ((freed >= 0) & (freed < [structures, drives])).all():
+        raise damaged("history is", "a structure or a drive that changed is none of the map's")
+    shares, depths = steps
+    if not (
+        (np.abs(cells) <= MOST_CELL).all()
+        and ((shares >= 0) & (shares <= 1)).all()
+        and ((depths >= 0) & (depths <= MOST)).all()
+    ):
+        raise damaged("history is", "a step is none, or of a tile that is nowhere")
+    whole = [each.astype(np.int64) for each in (drive, cells, freed)]
+    return History(whole[0], whole[1], shares, depths, whole[2], diary)

@@ -85,7 +85,7 @@ def learn_once(readings: TrainingSet, sources: Sources, options: HarmonicOptions
 
 def explained(learnt: Learnt, options: HarmonicOptions) -> Learnt:
     """Return the same with a verdict from a few of its tiles."""
-    members = learnt.members
+    members = [learnt.present(tile) for tile in range(len(learnt.tiling))]
     works = []
     spread = spread_tiles(learnt.tiling, [len(rows) for rows in members], JUDGED)
     for tile in spread + rough_tiles(learnt.readings, members, JUDGED_ROUGH, spread):

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.entries import solved_entry
-from l2m_gtsam.maps.harmonic.evidence import Weights, condition, normal_of
+from l2m_gtsam.maps.harmonic.evidence import Weights, condition
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.furnish import basis_with
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
@@ -19,6 +19,7 @@ from l2m_gtsam.maps.harmonic.kept_arrays import finite
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.local import local_hyperparameters
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tile_sums import tile_normal
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor, count
 from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, TileStore
 from l2m_gtsam.maps.trained import first_complaint
@@ -103,9 +104,8 @@ class Tiles:
 
 def solved_tile(learnt: Learnt, index: int) -> Tile:
     """Return a tile with the posterior of its weights."""
-    rows = learnt.members[index]
-    basis = learnt.basis(index, rows)
-    normal = normal_of(basis, learnt.readings[rows])
+    basis = learnt.basis(index, learnt.members[index])
+    normal = tile_normal(learnt, index, basis)
     own = local_hyperparameters(basis, normal, learnt.hyperparameters, learnt.local)
     weights = condition(normal, basis.prior(own).log_variance, own.noise)
     return Tile(basis, weights, own, learnt.resolution)

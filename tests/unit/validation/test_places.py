@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import csr_array
 
+from l2m_gtsam.calibration.averaged_rows import with_calibration
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import nothing_found
@@ -17,7 +18,6 @@ from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
     spread,
     who_changed,
-    with_calibration,
 )
 
 SEEDS = st.integers(0, 10_000)

@@ -10,7 +10,7 @@ from matplotlib.patches import Circle
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.field_map import FieldMap, Remembering
 from l2m_gtsam.qa.metrics.assemble import MapSlice, slice_map
 from l2m_gtsam.qa.report.drawing import (
     COLOURS,
@@ -30,6 +30,7 @@ from l2m_gtsam.qa.report.drawing import (
     shades,
     spread,
 )
+from l2m_gtsam.qa.report.figures.map_changes import draw_changes, list_changes
 from l2m_gtsam.qa.report.hover import axes_image, places, some_and_marked
 from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL, WIDTH, new_figure
 from l2m_gtsam.records.calibration import Disagreement
@@ -238,10 +239,17 @@ def map_figure(field_map: FieldMap, height: float | None) -> Figure:
             f"{upper[2]:.2f} m"
         )
         raise MapError(msg)
-    figure = Figure(figsize=(12, 5), layout="constrained", dpi=130)
-    above, below = figure.subplots(1, 2, sharex=True, sharey=True)
-    _draw_slice(figure, above, cut, cut.strength, "field strength (uT)", "viridis")
-    _draw_slice(figure, below, cut, cut.sigma, "standard deviation per axis (uT)", "cividis")
+    diary = field_map.diary if isinstance(field_map, Remembering) else None
+    wide_enough = 12 if diary is None else 17
+    figure = Figure(figsize=(wide_enough, 5), layout="constrained", dpi=130)
+    columns = figure.add_gridspec(1, 2 if diary is None else 3)
+    strength = figure.add_subplot(columns[0])
+    sigma = figure.add_subplot(columns[1], sharex=strength, sharey=strength)
+    _draw_slice(figure, strength, cut, cut.strength, "field strength (uT)", "viridis")
+    _draw_slice(figure, sigma, cut, cut.sigma, "standard deviation per axis (uT)", "cividis")
+    if diary is not None:
+        draw_changes(strength, diary)
+        list_changes(figure.add_subplot(columns[2]), diary)
     figure.suptitle(f"Magnetic map at z = {level:.2f} m")
     return figure
 

@@ -1,0 +1,1 @@
+"""Maps kept up: what changed at a place, drive by drive."""

@@ -1,0 +1,129 @@
+"""A map kept up by drives of a calibrated vehicle through a place that changes."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from l2m_gtsam.calibration.changed_places import ChangesOptions
+from l2m_gtsam.data import KnownSensor, Recording
+from l2m_gtsam.errors import MapError
+from l2m_gtsam.mapping.map_building import MappingOptions, SurveyReadings, suite_readings
+from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed
+from l2m_gtsam.maps.training import additional_set
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.recording.drive_dates import drive_dates
+from l2m_gtsam.recording.sync import synchronise, with_offsets
+from l2m_gtsam.records.map_diary import UNDATED, MapDiary, MapDrive
+from l2m_gtsam.records.places import CLEAR
+from l2m_gtsam.upkeep.dated_changes import dated_changes
+from l2m_gtsam.upkeep.known_drive import seen_sources
+
+
+@one_blas_thread()
+def kept_up(
+    field_map: FieldMap,
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor],
+    options: MappingOptions,
+    changes: ChangesOptions,
+    survey: MapDrive = UNDATED,
+) -> HarmonicMap:
+    """Return a map after drives, each of which may have found steel that came or went.
+
+    Parameters
+    ----------
+    field_map
+        In the frame of the recordings' poses.
+    recordings
+        Drives, later than all that the map has been given.
+    suite
+        The calibrated sensors by name.
+    options
+        Which readings enter.
+    changes
+        How sources are looked for.
+    survey
+        When the map was surveyed, if it does not know of it.
+
+    Raises
+    ------
+    MapError
+        The kind of map keeps no steel, a drive has no date or is earlier than the map, or its
+        sensors are not as they are calibrated.
+    SyncError
+        Readings and poses of a recording do not overlap.
+    """
+    if not isinstance(field_map, HarmonicMap):
+        raise MapError(
+            f"a map of kind {field_map.kind} does not know what of it can change; --changes needs "
+            "one of kind harmonic"
+        )
+    drives = [(dated(each), each) for each in recordings]
+    for drive, recording in sorted(drives, key=lambda each: str(each[0].begun)):
+        field_map = after_drive(field_map, recording, drive, suite, options, changes, survey)
+    return field_map
+
+
+def after_drive(
+    field_map: HarmonicMap,
+    recording: Recording,
+    drive: MapDrive,
+    suite: Mapping[str, KnownSensor],
+    options: MappingOptions,
+    changes: ChangesOptions,
+    survey: MapDrive,
+) -> HarmonicMap:
+    """Return a map after one drive; see ``kept_up``."""
+    history = field_map.learnt.history
+    diary = MapDiary((survey,)) if history is None else history.diary
+    check_order(recording, drive, diary)
+    read = suite_readings([recording], suite, options.sync)
+    known = [suite[series.sensor] for series in recording.series]
+    offset = np.array([each.time_offset for each in known])
+    readings = synchronise(recording, options.sync, float(np.abs(offset).max())).readings
+    readings = with_offsets(readings, recording.trajectory, offset)
+    seen = seen_sources(readings, known, field_map.compile(), changes)
+    if seen.vehicle > max(seen.gain, 0.0) + CLEAR:
+        raise MapError(
+            f"{recording.source.path}: its sensors do not read as they are calibrated, wherever "
+            "they are; see `l2m validate`, and calibrate them anew"
+        )
+    found = dated_changes(field_map, seen.sources, diary)
+    return renewed(field_map, drive_readings(read, drive), found, survey)
+
+
+def drive_readings(read: SurveyReadings, drive: MapDrive) -> DriveReadings:
+    """Return readings of a suite as a map takes them."""
+    suite = read.suite if read.suite.stated else None
+    return DriveReadings(additional_set(read.points, read.field), suite, drive)
+
+
+def dated(recording: Recording) -> MapDrive:
+    """Return when a recording was made.
+
+    Raises
+    ------
+    MapError
+        Its stamps are no dates.
+    """
+    drive = drive_dates(recording)
+    if drive == UNDATED:
+        begun = int(recording.trajectory.stamp_ns.min()) // 10**9
+        raise MapError(
+            f"{recording.source.path}: its stamps begin at {begun} s, which is no date of this "
+            "century: --changes tells what changed between which dates; record with a clock that "
+            "is set, or leave --changes out"
+        )
+    return drive
+
+
+def check_order(recording: Recording, drive: MapDrive, diary: MapDiary) -> None:
+    """Raise a MapError for a drive before one that the map has been given."""
+    known = [each.ended for each in diary.drives if each.ended is not None]
+    if known and drive.begun is not None and drive.begun < max(known):
+        raise MapError(
+            f"{recording.source.path} was driven at {drive.begun}, the map is of {max(known)}: "
+            "what changed is told drive by drive; give drives in the order of their dates"
+        )
