@@ -81,16 +81,33 @@ def route(low: float, high: float) -> FloatArray:
     return np.column_stack([plane, 0.4 + 0.05 * np.sin(np.arange(len(plane)))])
 
 
-def survey(folder: Path, name: str, p: FloatArray, seed: int) -> Path:
-    """Write the bag of one drive."""
+def with_steel(position: FloatArray, moment: FloatArray) -> DipoleWorld:
+    """Return the yard with steel that was brought: metres and A m^2, shapes (3,)."""
+    yard = world()
+    return DipoleWorld(
+        yard.uniform,
+        np.vstack([yard.positions, position]),
+        np.vstack([yard.moments, moment]),
+    )
+
+
+def survey(
+    folder: Path,
+    name: str,
+    p: FloatArray,
+    seed: int,
+    place: DipoleWorld | None = None,
+    start: int = START,
+) -> Path:
+    """Write the bag of one drive, from a stamp in nanoseconds on, through a place as it is then."""
     make = ros("mcap")
     R = Rotation.from_rotvec(np.outer(np.linspace(0, 9, len(p)), [0, 0, 1]))
-    field, _ = world().field_and_gradient(p)
+    field, _ = (place or world()).field_and_gradient(p)
     noise = np.random.default_rng(seed).normal(0, NOISE, field.shape)
     reading = (R.inv().apply(field) + noise) * 1e-6
     entries = []
     for k, q in enumerate(R.as_quat()):
-        stamp = START + k * STEP
+        stamp = start + k * STEP
         pose = make.pose_stamped(stamp, p[k], q)
         entries.append(Entry("/pose", "geometry_msgs/PoseStamped", stamp, pose))
         magnetic = make.magnetic(stamp, reading[k])
@@ -98,8 +115,8 @@ def survey(folder: Path, name: str, p: FloatArray, seed: int) -> Path:
         if k % 50 == 0:
             seen = scan("mcap", stamp, R[k].inv().apply(post() - p[k]))
             entries.append(Entry("/points", "sensor_msgs/PointCloud2", stamp, seen))
-    early = scan("mcap", START - 10 * STEP, post())
-    entries.insert(0, Entry("/points", "sensor_msgs/PointCloud2", START, early))
+    early = scan("mcap", start - 10 * STEP, post())
+    entries.insert(0, Entry("/points", "sensor_msgs/PointCloud2", start, early))
     return write(folder, "mcap", entries, name)
 
 
