@@ -178,7 +178,16 @@ def scatters(
 ) -> tuple[Scatter, ...]:
     """Return the scatter of parts by time and by place, of two sizes; none of few readings.
 
-    Parameters are those of ``unmodelled``.
+    Parameters
+    ----------
+    readings
+        All that took part.
+    rows
+        White rows of the sensor's readings at the optimum.
+    own
+        Where its sixteen parameters stand among all n variables, shape (16,).
+    covariance
+        Of all n variables.
     """
     used = np.unique(np.concatenate([each.readings for each in rows])) if rows else np.empty(0)
     if len(used) < 2**HALVINGS:
@@ -196,8 +205,7 @@ def scatters(
 
 
 def unmodelled(
-    readings: Readings,
-    rows: Sequence[Rows],
+    found: Sequence[Scatter],
     own: IntArray,
     covariance: HalfCovariance,
     tests: int,
@@ -207,10 +215,8 @@ def unmodelled(
 
     Parameters
     ----------
-    readings
-        All that took part.
-    rows
-        White rows of the sensor's readings at the optimum.
+    found
+        The scatter of parts of the drive.
     own
         Where its sixteen parameters stand among all n variables, shape (16,).
     covariance
@@ -220,7 +226,6 @@ def unmodelled(
     stated
         Where the errors of the survey's sensors stand, shape (s,).
     """
-    found = scatters(readings, rows, own, covariance)
     if not found:
         return Excess()
     P, alarms = covariance.among(own), FALSE_ALARMS / (TESTS * tests)

@@ -8,7 +8,7 @@ import numpy as np
 
 from l2m_factors import BatchedReadings
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.cluster_robust import Excess, unmodelled
+from l2m_gtsam.calibration.cluster_robust import Excess, scatters, unmodelled
 from l2m_gtsam.calibration.determined import determinacies
 from l2m_gtsam.calibration.factor_graph import (
     Estimate,
@@ -272,7 +272,8 @@ def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
         white = (W[rows] @ residual[:, :, None]).ravel()
         own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
         covariance, together = HalfCovariance.of(among((s,))), len(problem.view.sensors)
-        excess = unmodelled(problem.view.readings, [own], OWN, covariance, together)
+        parts = scatters(problem.view.readings, [own], OWN, covariance)
+        excess = unmodelled(parts, OWN, covariance, together)
         widened.append(found.widened(excess))
     return tuple(widened)
 

@@ -103,7 +103,8 @@ def solve_uncertain(
     # What a map leaves that does not know its own errors is no process of the drive.
     if found.ending is not Ending.SINGULAR and sigmas_hold(errors):
         budget = found.problem.searched(found.joint)
-    by_parts = found.problem.by_parts(found.joint, found.estimate)
+    scattered = found.problem.scattered(found.joint)
+    by_parts = found.problem.by_parts(found.joint, found.estimate, scattered)
     if budget.found:
         with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
         found = settle_by_any(
@@ -113,9 +114,10 @@ def solve_uncertain(
             options,
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
         )
+        scattered = found.problem.scattered(found.joint)
     problem, joint = found.problem, found.joint
     solved = problem.by_cause(joint, problem.solutions(joint, found.values))
-    solved = problem.wandering(joint, found.values, problem.robust(joint, solved))
+    solved = problem.wandering(joint, found.values, problem.robust(joint, solved, scattered))
     solved = problem.halved(joint, solved)
     progress(1.0)
     return UncertainSolution(

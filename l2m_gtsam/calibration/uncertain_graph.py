@@ -19,7 +19,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import Budget, spread_of_H
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces, processes
 from l2m_gtsam.calibration.budget.search import felt, search
-from l2m_gtsam.calibration.cluster_robust import ByParts, Excess, scatters, unmodelled
+from l2m_gtsam.calibration.cluster_robust import ByParts, Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.half_difference import (
@@ -262,33 +262,46 @@ class UncertainProblem:
         known = felt(looked_for, joint, rows, self._noise.whitenings, places.C)
         return Budget(search(known))
 
-    def robust(
-        self, joint: JointInformation, solved: Sequence[SensorSolution]
-    ) -> tuple[SensorSolution, ...]:
-        """Return solutions whose covariances hold what the scatter of parts of the drive shows."""
-        return tuple(each.widened(self._excess(joint, each.sensor)) for each in solved)
-
-    def by_parts(self, joint: JointInformation, estimate: Estimate) -> tuple[ByParts, ...]:
-        """Return what the scatter of parts of the drive says of each sensor of an estimate."""
-        found = []
+    def scattered(self, joint: JointInformation) -> dict[int, tuple[Scatter, ...]]:
+        """Return how each sensor's parameters scatter over parts of the drive."""
+        found = {}
         for s in self._view.sensors:
             rows, at = self._own_rows(joint, s), columns_at(joint.columns, keys_of(s))
-            scattered = scatters(self._view.readings, rows, at, joint.every)
-            covariance = joint.among((s,))[:-1, :-1]
-            found.append(ByParts(s, estimate.vector(s), covariance, scattered))
-        return tuple(found)
+            found[s] = scatters(self._view.readings, rows, at, joint.every)
+        return found
+
+    def robust(
+        self,
+        joint: JointInformation,
+        solved: Sequence[SensorSolution],
+        scattered: Mapping[int, tuple[Scatter, ...]],
+    ) -> tuple[SensorSolution, ...]:
+        """Return solutions whose covariances hold what the scatter of parts of the drive shows."""
+        stated = columns_at(joint.columns, [U()] if len(self._prior.coverage.spread) else [])
+        widened = []
+        for each in solved:
+            at = columns_at(joint.columns, keys_of(each.sensor))
+            found = scattered[each.sensor]
+            excess = unmodelled(found, at, joint.every, len(self._view.sensors), stated)
+            widened.append(each.widened(excess))
+        return tuple(widened)
+
+    def by_parts(
+        self,
+        joint: JointInformation,
+        estimate: Estimate,
+        scattered: Mapping[int, tuple[Scatter, ...]],
+    ) -> tuple[ByParts, ...]:
+        """Return what the scatter of parts of the drive says of each sensor of an estimate."""
+        return tuple(
+            ByParts(s, estimate.vector(s), joint.among((s,))[:-1, :-1], found)
+            for s, found in scattered.items()
+        )
 
     def _own_rows(self, joint: JointInformation, sensor: int) -> list[Rows]:
         """Return the white rows of a sensor's readings at the optimum."""
         own = [each for each in joint.rows if each.sensor == sensor and len(each.readings)]
         return [joint.after_step(each) for each in own]
-
-    def _excess(self, joint: JointInformation, sensor: int) -> Excess:
-        """Return how far the scatter of parts exceeds what is modelled of a sensor."""
-        stated = columns_at(joint.columns, [U()] if len(self._prior.coverage.spread) else [])
-        rows = self._own_rows(joint, sensor)
-        at, together = columns_at(joint.columns, keys_of(sensor)), len(self._view.sensors)
-        return unmodelled(self._view.readings, rows, at, joint.every, together, stated)
 
     def halved(
         self, joint: JointInformation, solved: Sequence[SensorSolution]

@@ -1,6 +1,6 @@
 """Which processes a drive has, and how large: by the likelihood of what all else leaves."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,6 +15,7 @@ from l2m_gtsam.solve.variance_components import VarianceComponents, WeightSystem
 # Twice a logarithm of likelihood. Where a process is not there, half of all drives give zero, and
 # 0.7 % more than this (a mixture of chi-square distributions, Self and Liang, JASA 82, 1987).
 LEAST_GAIN = 6.0
+BATCH = 4000  # readings whose processes are held at once: 30 MB
 HARDLY = 1.5  # standard deviations of a score: no more is not worth a likelihood
 
 
@@ -95,15 +96,21 @@ def felt(
     count = int(ends[-1])
     own, pull = np.zeros((count, count)), np.zeros(count)
     across = np.zeros((len(joint.every), count))
-    for each, W in zip(rows, whitened, strict=True):
-        here = [k for k, one in enumerate(processes) if one.sensor in (None, each.sensor)]
+    # One product for many groups of a sensor: sums of one for each group are mostly indexing.
+    for groups in batches(rows, whitened):
+        sensor = groups[0][0].sensor
+        here = [k for k, one in enumerate(processes) if one.sensor in (None, sensor)]
         at = np.concatenate([columns[k] for k in here])
-        F = np.concatenate([processes[k].features(each.readings) for k in here], axis=2)
-        Z = C[each.readings] @ F
-        Z = (W @ Z).reshape(len(each.residual), -1) if W.ndim == 3 else W @ Z.reshape(len(W), -1)
+        readings = np.concatenate([each.readings for each, _ in groups])
+        F = np.concatenate([processes[k].features(readings) for k in here], axis=2)
+        Z, first = (C[readings] @ F).reshape(3 * len(readings), -1), 0
+        for each, W in groups:
+            white = slice(first, first + len(each.residual))
+            Z[white] = _times(W, Z[white])
+            across[np.ix_(each.columns, at)] += each.jacobian.T @ Z[white]
+            first = white.stop
         own[np.ix_(at, at)] += Z.T @ Z
-        pull[at] -= Z.T @ each.residual
-        across[np.ix_(each.columns, at)] += each.jacobian.T @ Z
+        pull[at] -= Z.T @ np.concatenate([each.residual for each, _ in groups])
     everything = np.arange(len(across))
     # The residuals are those of the system itself, which holds the survey's sensors tighter.
     loose = joint.loose.T @ across
@@ -111,6 +118,30 @@ def felt(
     system = WeightSystem(0.5 * (information + information.T), pull)
     squares = sum(float(each.residual @ each.residual) for each in rows)
     return Felt(processes, columns, system, squares)
+
+
+def batches(
+    rows: Sequence[Rows], whitened: Sequence[FloatArray]
+) -> Iterator[list[tuple[Rows, FloatArray]]]:
+    """Return groups of one sensor each with what makes them white, up to so many readings."""
+    pairs = sorted(zip(rows, whitened, strict=True), key=lambda pair: pair[0].sensor)
+    batch: list[tuple[Rows, FloatArray]] = []
+    count = 0
+    for each, W in pairs:
+        if batch and (each.sensor != batch[0][0].sensor or count > BATCH):
+            yield batch
+            batch, count = [], 0
+        batch.append((each, W))
+        count += len(each.readings)
+    if batch:
+        yield batch
+
+
+def _times(W: FloatArray, Z: FloatArray) -> FloatArray:
+    """Return W Z, shape (3 n, m), with a matrix for each of n readings or one for all."""
+    if W.ndim == 2:
+        return W @ Z
+    return np.asarray((W @ Z.reshape(len(W), 3, -1)).reshape(Z.shape))
 
 
 def search(known: Felt) -> tuple[FoundProcess, ...]:

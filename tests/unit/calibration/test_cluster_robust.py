@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from l2m_gtsam.calibration.cluster_robust import BLOCKS, Excess, gathered, halved, unmodelled
+from l2m_gtsam.calibration.cluster_robust import (
+    BLOCKS,
+    Excess,
+    gathered,
+    halved,
+    scatters,
+    unmodelled,
+)
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, Readings
@@ -34,7 +41,7 @@ class Fitted:
         return HalfCovariance.of(self.covariance)
 
     def unmodelled(self) -> Excess:
-        return unmodelled(self.readings, self.rows, OWN, self.half, 1)
+        return unmodelled(scatters(self.readings, self.rows, OWN, self.half), OWN, self.half, 1)
 
 
 def fitted(rng: np.random.Generator, lasting: float = 0.0) -> Fitted:
@@ -151,7 +158,8 @@ def test_a_wider_covariance_lies_between_the_models_and_its_largest_multiple(
 def test_few_readings_tell_nothing() -> None:
     one = fitted(np.random.default_rng(5), lasting=5.0)
     few = [Rows(0, r.columns, r.jacobian[:3], r.residual[:3], r.readings[:1]) for r in one.rows]
-    assert unmodelled(one.readings, few, OWN, one.half, 1).factors == EXPLAINED
+    assert not scatters(one.readings, few, OWN, one.half)
+    assert unmodelled((), OWN, one.half, 1).factors == EXPLAINED
 
 
 @given(
