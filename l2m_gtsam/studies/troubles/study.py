@@ -11,13 +11,13 @@ from scipy.stats import chi2, f
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.statistics import LEVEL, Share
 from l2m_gtsam.studies.study import Study
-from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell, cell_of
+from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell, cell_of
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.surveys import TroubledPlace, troubled_place
 
 TARGET = 0.93  # of the PASS whose 95 % ellipsoid should hold the truth
 DOF_T, DOF_C, DOF_H, DOF = 3, 9, 3, 15
-BY_TIME = 1  # of the divisions of a drive: eight parts, the longest
+EIGHT_PARTS = (1, 3)  # of the divisions of a drive: the longest parts by time, and by place
 COLOURS = {Level.PASS: "#009e73", Level.WARN: "#e69f00", Level.FAIL: "#d55e00"}
 
 
@@ -231,16 +231,20 @@ def within(distances: list[Any], dof: int) -> Share | None:
 def by_check(known: list[JudgedSensor], name: str, dof: int) -> Share | None:
     """Return how many 95 % ellipsoids of the check alone hold the truth in t, C or H.
 
-    The variance is that of the parts: where it is known by few of them, Fisher's distribution.
+    The variance is that of eight parts by time or by place, whichever scatter more, as errors
+    last in one or the other; it is known by few parts, whence Fisher's distribution.
     """
     found = [each for sensor in known for each in sensor.alone if each.name == name]
     if not found:
         return None
-    inside = [
-        each.distance / each.ratios[BY_TIME] <= dof * f.ppf(LEVEL, dof, each.freedom[BY_TIME])
-        for each in found
-    ]
-    return Share(sum(map(bool, inside)), len(inside))
+    return Share(sum(inside(each, dof) for each in found), len(found))
+
+
+def inside(found: Checked, dof: int) -> bool:
+    """Return whether the 95 % ellipsoid of the check alone holds the truth."""
+    scattered = [(found.ratios[k], found.freedom[k]) for k in EIGHT_PARTS]
+    ratio, freedom = max(scattered)
+    return bool(found.distance / ratio <= dof * f.ppf(LEVEL, dof, freedom))
 
 
 TROUBLES = TroublesStudy()

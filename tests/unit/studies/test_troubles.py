@@ -1,5 +1,6 @@
 """What is wrong on the drives of the troubles study, and what its summary counts."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -7,11 +8,11 @@ import pytest
 
 from l2m_gtsam.data import Distortion, KnownSensor, Trajectory
 from l2m_gtsam.records.verdict import Level
-from l2m_gtsam.studies.troubles.cells import JudgedSensor, TroublesCell
+from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell
 from l2m_gtsam.studies.troubles.drives import bent, disturbance, linear_over, not_linear, pink
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.places import place_of
-from l2m_gtsam.studies.troubles.study import TROUBLES, CellName, kind
+from l2m_gtsam.studies.troubles.study import TROUBLES, CellName, inside, kind, row_of
 from l2m_gtsam.studies.troubles.surveys import known_suite, survey_of
 
 OPTIONS = TroublesOptions(surveys=2, drives=1)
@@ -92,6 +93,24 @@ def test_a_survey_reads_where_its_suite_is(world: World) -> None:
 def judged(level: Level, distance: float | None) -> JudgedSensor:
     known = None if distance is None else 0.01
     return JudgedSensor(level.value, distance, distance, known, known, 1.0)
+
+
+def test_the_check_alone_takes_the_larger_scatter() -> None:
+    """Of eight parts by time or by place; with 16 degrees of freedom the limit is 3 * 3.24."""
+    by_time = (1.0, 2.0, 1.0, 1.5)
+    for distance, holds in ((2 * 3 * 3.23, True), (2 * 3 * 3.25, False)):
+        assert inside(Checked("t", distance, by_time, (32.0, 16.0, 32.0, 8.0)), 3) is holds
+    row = row_of(
+        World.HALL,
+        Trouble.CLEAN,
+        [
+            replace(judged(Level.PASS, 3.0), alone=(Checked("t", d, by_time, (9.0,) * 4),))
+            for d in (1.0, 100.0)
+        ],
+    )
+    assert row.alone_t is not None
+    assert (row.alone_t.successes, row.alone_t.trials) == (1, 2)
+    assert row.alone_C is None
 
 
 def test_conditions_are_counted() -> None:

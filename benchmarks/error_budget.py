@@ -1,0 +1,109 @@
+"""The last graph of 12 sensors with the error budget and without.
+
+Processor seconds, one BLAS thread. *Without*: the rounds of the graph until its weights settle, and
+its covariances. *With*: the same, then the search for processes, the rounds with those that were
+found, the checks on parts and halves of the drive and on stated sizes, and variances by cause.
+"""
+
+from dataclasses import dataclass, replace
+from time import process_time
+
+import numpy as np
+
+from benchmarks.last_stage import laps
+from benchmarks.one_key import NOISE, hall, survey
+from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
+from l2m_gtsam.calibration.joint import joint_problem
+from l2m_gtsam.calibration.one_key import settle
+from l2m_gtsam.calibration.uncertain import settle_by_any, solve_uncertain
+from l2m_gtsam.calibration.uncertain_drive import UncertainDrive
+from l2m_gtsam.calibration.view import RememberedMap
+from l2m_gtsam.data import FloatArray, Readings
+from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
+from l2m_gtsam.parallel.threads import one_blas_thread
+from l2m_gtsam.progress import silent
+from tests.worlds.exact import random_sensors
+
+OPTIONS = OneKeyOptions()
+SENSORS, EACH = 12, 600
+WALK_UT, POSE_M, POSE_S = 0.3, 0.007, 2.0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Processor seconds, and the processes that were found."""
+
+    without: float
+    whole: float
+    kinds: tuple[str, ...]
+
+
+def nothing(readings: Readings) -> Readings:
+    """Return a drive as it is."""
+    return readings
+
+
+def wandering(readings: Readings) -> Readings:
+    """Return a drive on which H of each sensor walks."""
+    rng = np.random.default_rng(5)
+    steps = rng.normal(0, WALK_UT / np.sqrt(EACH), (SENSORS, EACH, 3))
+    return replace(readings, field=readings.field + np.cumsum(steps, axis=1).reshape(-1, 3))
+
+
+def misplaced(readings: Readings) -> Readings:
+    """Return a drive whose positions are wrong for a while, for all sensors alike."""
+    rng = np.random.default_rng(6)
+    seconds: FloatArray = 1e-9 * readings.stamp_ns[:EACH].astype(np.float64)
+    error = rng.standard_normal((EACH, 3))
+    for k, like in enumerate(np.exp(-np.diff(seconds) / POSE_S), start=1):
+        error[k] = like * error[k - 1] + np.sqrt(1 - like**2) * error[k]
+    shift = POSE_M * np.tile(error, (SENSORS, 1))
+    return replace(readings, p_map_lidar=readings.p_map_lidar + shift)
+
+
+def cost(field_map: CompiledMap, readings: Readings) -> Cost:
+    """Return what the last graph costs."""
+    sensors = random_sensors(1, SENSORS)
+    start = start_estimate(np.stack([s.t_lidar_mag for s in sensors]), OPTIONS)
+    start = replace(
+        start,
+        distortion=np.stack([s.distortion.vector() for s in sensors]),
+        noise=np.full(SENSORS, NOISE),
+    )
+    asked = RememberedMap(field_map)
+    joint = settle(readings, asked, start, OPTIONS, silent, None)
+    if joint.problem is None:
+        raise RuntimeError("no sensor has enough readings")
+    view = joint.problem.view
+    tests = joint_problem(view, asked, joint.estimate, OPTIONS).determinacies
+    given = (view, asked, asked, joint.estimate)
+    drive = UncertainDrive.of(*given, OPTIONS)
+    settle_by_any(drive, joint.estimate, tests, OPTIONS, lambda _: None)  # tiles are compiled
+    began = process_time()
+    drive = UncertainDrive.of(*given, OPTIONS)
+    found = settle_by_any(drive, joint.estimate, tests, OPTIONS, lambda _: None)
+    found.problem.solutions(found.joint, found.values)
+    between = process_time()
+    whole = solve_uncertain(*given, tests, OPTIONS, lambda _: None)
+    kinds = sorted({each.process.kind.value for each in whole.budget.found})
+    return Cost(between - began, process_time() - between, tuple(kinds))
+
+
+@one_blas_thread()
+def main() -> None:
+    """Print a line for each drive."""
+    data = survey(hall(1), 8000)
+    field_map = HarmonicMap.fit(data.points, data.field).compile()
+    clean = laps(random_sensors(1, SENSORS), hall(1), EACH)
+    print(f"{SENSORS} x {EACH}   without (s)  with (s)  ratio  found")
+    for change in (nothing, wandering, misplaced):
+        found = cost(field_map, change(clean))
+        print(
+            f"{change.__name__:>10} {found.without:11.2f} {found.whole:9.2f} "
+            f"{found.whole / found.without:6.2f}  {', '.join(found.kinds) or 'nothing'}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
