@@ -27,11 +27,14 @@ def troubled_drive(
     for index in range(len(drive.sensors)):
         rows = readings.rows_of(index)
         seconds = 1e-9 * (readings.stamp_ns[rows] - readings.stamp_ns[rows.start])
-        change[rows] = disturbance(options, trouble, readings.field[rows], seconds, rng)
+        walked = walk(options, trouble, seconds, rng)
+        change[rows] = walked + noise_that_lasts(options, trouble, len(seconds), rng)
         if trouble.has(Trouble.NONLINEAR):
             bent_scale = not_linear(options, readings.field[rows], rng)
             change[rows] += bent_scale
             truth[index] = linear_over(truth[index], readings.field[rows], bent_scale)
+        moment = np.random.default_rng([seed, 13, index]).integers(len(walked))
+        truth[index] = with_offset(truth[index], walked[moment])
     trajectory = drive.trajectory
     if trouble.has(Trouble.WARP):
         trajectory = bent(trajectory, options, rng)
@@ -51,21 +54,33 @@ def troubled_drive(
     return Recording(trajectory, series, source), tuple(truth)
 
 
-def disturbance(
-    options: TroublesOptions,
-    trouble: Trouble,
-    field: FloatArray,
-    seconds: FloatArray,
-    rng: np.random.Generator,
+def walk(
+    options: TroublesOptions, trouble: Trouble, seconds: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return what is added to a sensor's readings in uT, shape (N, 3)."""
-    change = np.zeros_like(field)
-    if trouble.has(Trouble.DRIFT):
-        step = np.sqrt(np.diff(seconds, prepend=0.0) / seconds[-1])[:, None]
-        change += options.drift_ut * np.cumsum(step * rng.standard_normal(field.shape), axis=0)
-    if trouble.has(Trouble.PINK):
-        change += options.pink_ut * pink(len(field), rng)
-    return change
+    """Return by how much H of a sensor has wandered at each reading, uT, shape (N, 3)."""
+    if not trouble.has(Trouble.DRIFT):
+        return np.zeros((len(seconds), 3))
+    step = np.sqrt(np.diff(seconds, prepend=0.0) / seconds[-1])[:, None]
+    steps = step * rng.standard_normal((len(seconds), 3))
+    return np.asarray(options.drift_ut * np.cumsum(steps, axis=0))
+
+
+def noise_that_lasts(
+    options: TroublesOptions, trouble: Trouble, count: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return what is added to a sensor's readings beside white noise, uT, shape (N, 3)."""
+    if not trouble.has(Trouble.PINK):
+        return np.zeros((count, 3))
+    return options.pink_ut * pink(count, rng)
+
+
+def with_offset(sensor: KnownSensor, change: FloatArray) -> KnownSensor:
+    """Return the sensor at one moment of a drive on which H wanders, as sigmas of H mean it.
+
+    At its beginning and end a walk is twice as far from its mean as on average, in squares.
+    """
+    distortion = replace(sensor.distortion, H=sensor.distortion.H + change)
+    return replace(sensor, distortion=distortion)
 
 
 def not_linear(options: TroublesOptions, field: FloatArray, rng: np.random.Generator) -> FloatArray:

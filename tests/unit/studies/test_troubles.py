@@ -9,7 +9,14 @@ import pytest
 from l2m_gtsam.data import Distortion, KnownSensor, Trajectory
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.troubles.cells import Checked, JudgedSensor, TroublesCell
-from l2m_gtsam.studies.troubles.drives import bent, disturbance, linear_over, not_linear, pink
+from l2m_gtsam.studies.troubles.drives import (
+    bent,
+    linear_over,
+    noise_that_lasts,
+    not_linear,
+    pink,
+    walk,
+)
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.places import place_of
 from l2m_gtsam.studies.troubles.study import TROUBLES, CellName, inside, kind, row_of
@@ -32,7 +39,12 @@ def test_each_trouble_is_of_the_size_that_is_told() -> None:
     field, seconds = rng.normal(0, 30, (count, 3)), np.linspace(0, 60, count)
     size = {
         trouble: np.concatenate(
-            [disturbance(OPTIONS, trouble, field, seconds, rng) for _ in range(40)], axis=1
+            [
+                walk(OPTIONS, trouble, seconds, rng)
+                + noise_that_lasts(OPTIONS, trouble, count, rng)
+                for _ in range(40)
+            ],
+            axis=1,
         )
         for trouble in Trouble
     }
