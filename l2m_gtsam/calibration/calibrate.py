@@ -165,9 +165,10 @@ def taken_for_exact(readings: Readings, field_map: QueryableMap, budget: Budget)
     """Return what sigmas know no errors of, for want of stated or found ones."""
     known = readings.pose_root is not None or budget.poses is not None
     drive = () if known else ("the drive's poses",)
-    sensors = isinstance(field_map, KnowsSurvey) and field_map.sensors_uncertain
-    survey = () if sensors else ("the survey's sensors",)
-    return (*drive, *survey, "the survey's poses")
+    survey = field_map if isinstance(field_map, KnowsSurvey) else None
+    sensors = () if survey and survey.sensors_uncertain else ("the survey's sensors",)
+    poses = () if survey and survey.poses_uncertain else ("the survey's poses",)
+    return (*drive, *sensors, *poses)
 
 
 def _starts(

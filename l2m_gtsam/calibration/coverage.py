@@ -62,11 +62,15 @@ class UncertainMap(Protocol):
 
 @runtime_checkable
 class KnowsSurvey(Protocol):
-    """A map that knows how well the sensors that surveyed were known."""
+    """A map that knows how well sensors and poses of its survey were known."""
 
     @property
     def sensors_uncertain(self) -> bool:
         """Whether errors of the sensors are stated."""
+
+    @property
+    def poses_uncertain(self) -> bool:
+        """Whether errors of the poses are stated, or were found."""
 
 
 @runtime_checkable

@@ -8,6 +8,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.mapping.pose_shifts import survey_poses
 from l2m_gtsam.mapping.suite_calibration import suite_doubts
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_shifts import suite_errors
@@ -16,10 +17,12 @@ from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.suite_errors import SuiteErrors
+from l2m_gtsam.maps.survey_poses import SurveyPoses, poses_together
 from l2m_gtsam.maps.training import checked_readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
+from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.recording.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
 from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
 
@@ -29,6 +32,9 @@ class MappingOptions(Options):
 
     sync: SyncOptions = SyncOptions(thin_distance_m=0.05, thin_angle_deg=10.0)
     """Which readings enter; a map needs its readings spread in space, not in heading."""
+    pose_noise: PoseNoiseOptions = PoseNoiseOptions()
+    """How wrong the survey's poses are. Where neither this nor the recording says so, a harmonic
+    map looks for it in its readings; with both sigmas 0 poses count as exact."""
     model: MapOptions = MapOptions()
     """The kind of map and its options."""
     structure: CloudTopicOptions = CloudTopicOptions(edge=0.05)
@@ -51,11 +57,14 @@ class SurveyReadings:
         Where, in metres, and what, in uT, shapes (N, 3).
     suite
         What errors of the sensors do to that.
+    poses
+        What errors of the poses do to that; absent where they count as exact.
     """
 
     points: FloatArray
     field: FloatArray
     suite: SuiteErrors
+    poses: SurveyPoses | None = None
 
     def followed_by(self, other: "SurveyReadings") -> "SurveyReadings":
         """Return these readings and others."""
@@ -63,6 +72,7 @@ class SurveyReadings:
             np.concatenate([self.points, other.points]),
             np.concatenate([self.field, other.field]),
             self.suite.followed_by(other.suite, len(self.points)),
+            poses_together(self.poses, other.poses, len(self.points)),
         )
 
 
@@ -95,8 +105,8 @@ def map_recordings(
     SyncError
         Readings and poses of a recording do not overlap.
     """
-    read = suite_readings(recordings, suite, options.sync)
-    field_map = build_map(read.points, read.field, options.model, cloud, read.suite)
+    read = suite_readings(recordings, suite, options.sync, options.pose_noise)
+    field_map = build_map(read.points, read.field, options.model, cloud, read.suite, read.poses)
     # Errors that are stated or found are counted; sensors that count as exact have to look like it.
     if isinstance(field_map, HarmonicMap) and field_map.learnt.suite is None:
         return field_map.doubted(suite_doubts(recordings, suite, options.suite))
@@ -126,9 +136,9 @@ def update_map(
     MapError, SyncError
         As in ``map_recordings``.
     """
-    read = suite_readings(recordings, suite, options.sync)
+    read = suite_readings(recordings, suite, options.sync, options.pose_noise)
     if isinstance(field_map, HarmonicMap):
-        return field_map.updated(read.points, read.field, read.suite)
+        return field_map.updated(read.points, read.field, read.suite, read.poses)
     return field_map.updated(read.points, read.field)
 
 
@@ -158,7 +168,7 @@ def compare_recordings(
     MapError, SyncError
         As in ``map_recordings``, or the readings fill too few patches.
     """
-    read = suite_readings(recordings, suite, options.sync)
+    read = suite_readings(recordings, suite, options.sync, options.pose_noise)
     built = dict.fromkeys(options.compare.kinds, 0)
 
     def build(points: FloatArray, field: FloatArray, kind: str) -> FieldMap:
@@ -175,7 +185,10 @@ def compare_recordings(
 
 @one_blas_thread()
 def suite_readings(
-    recordings: Sequence[Recording], suite: Mapping[str, KnownSensor] | None, sync: SyncOptions
+    recordings: Sequence[Recording],
+    suite: Mapping[str, KnownSensor] | None,
+    sync: SyncOptions,
+    pose_noise: PoseNoiseOptions | None = None,
 ) -> SurveyReadings:
     """Return what a suite read, in the map frame; see ``map_recordings``."""
     frames = sorted({recording.trajectory.frame for recording in recordings})
@@ -191,7 +204,8 @@ def suite_readings(
         _refuse_stuck(readings, recording)
         readings = with_offsets(readings, recording.trajectory, offset)
         points, field = sensor_positions(readings, known), map_fields(readings, known)
-        drives.append(SurveyReadings(points, field, suite_errors(readings, known)))
+        poses = survey_poses(recording.trajectory, readings, points, field, pose_noise)
+        drives.append(SurveyReadings(points, field, suite_errors(readings, known), poses))
     read = reduce(SurveyReadings.followed_by, drives)
     checked_readings(read.points, read.field)
     return read

@@ -15,6 +15,7 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from l2m_gtsam.maps.suite_errors import SuiteErrors
+from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.options import Options
 
 
@@ -62,7 +63,15 @@ class MapKind:
     """
 
     fit: Callable[
-        [FloatArray, FloatArray, MapOptions, FloatArray | None, SuiteErrors | None], FieldMap
+        [
+            FloatArray,
+            FloatArray,
+            MapOptions,
+            FloatArray | None,
+            SuiteErrors | None,
+            SurveyPoses | None,
+        ],
+        FieldMap,
     ]
     load: Callable[[MapState], FieldMap]
     uses_structure: bool = False
@@ -70,7 +79,7 @@ class MapKind:
 
 KINDS = {
     "harmonic": MapKind(
-        lambda p, b, o, cloud, suite: HarmonicMap.fit(p, b, o.harmonic, cloud, suite),
+        lambda p, b, o, *survey: HarmonicMap.fit(p, b, o.harmonic, *survey),
         HarmonicMap.from_state,
         uses_structure=True,
     ),
@@ -102,6 +111,7 @@ def build_map(
     options: MapOptions | None = None,
     cloud: FloatArray | None = None,
     suite: SuiteErrors | None = None,
+    poses: SurveyPoses | None = None,
 ) -> FieldMap:
     """Return a map of readings.
 
@@ -117,6 +127,8 @@ def build_map(
         Structure that a LiDAR saw: points of the map frame in metres, shape (M, 3).
     suite
         What errors of the sensors do to the readings; absent where they count as exact.
+    poses
+        The same for the errors of the poses.
 
     Raises
     ------
@@ -126,7 +138,7 @@ def build_map(
     options = MapOptions() if options is None else options
     if cloud is not None:
         refuse_structure(options.kind)
-    return KINDS[options.kind].fit(points, field, options, cloud, suite)
+    return KINDS[options.kind].fit(points, field, options, cloud, suite, poses)
 
 
 def map_from_state(state: MapState) -> FieldMap:

@@ -17,15 +17,20 @@ JCGS 28, 2019), each of which raises it and keeps all sizes positive:
     M = (1 + I S)^{-1} I, \quad q = (1 + I S)^{-1} u
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray, IntArray
 
 MOST_UPDATES = 200
 ENOUGH = 0.02  # of a logarithm of likelihood: less than that in an update is no progress
+LARGEST = 1e6  # of the size of a process that says as much as a single reading
+STEPS = 12  # of a climb over the logarithms of all sizes
 ROUNDS = 3  # of sizes and noise; they settle in two
 LEAST_NOISE = 0.05  # of its variance
 NEGLIGIBLE = 1e-3  # of a single weight's information: what a process says that is nothing
@@ -158,3 +163,78 @@ class WeightSystem:
             explained = self.pull @ (variances * system.posterior(variances).rest)
             noise = max(1 - float(explained) / squares, LEAST_NOISE)
         return found
+
+
+def shared_components(
+    systems: Sequence[WeightSystem], spectra: Sequence[FloatArray], squares: float | None
+) -> VarianceComponents:
+    """Return the most likely sizes of K processes that several systems have, each with own weights.
+
+    Climbs with all of them at once (L-BFGS), for hundreds of weights in few steps.
+
+    Parameters
+    ----------
+    systems
+        Of weights that are independent from one to the next.
+    spectra
+        Of the processes in each, shapes (K, m).
+    squares
+        As in ``WeightSystem.components_and_noise``; where absent, the noise is known.
+    """
+    felt = sum(d @ np.diag(each.information) for each, d in zip(systems, spectra, strict=True))
+    count = sum(np.count_nonzero(d, axis=1) for d in spectra)
+    unit = np.log(np.maximum(count, 1) / np.where(felt > 0, felt, 1.0))
+    bounds = Bounds(unit + np.log(NEGLIGIBLE), unit + np.log(LARGEST))
+    start, noise = unit, 1.0
+    for _ in range(ROUNDS):
+        white = [each.whiter(noise) for each in systems]
+        end = minimize(
+            partial(_cost, white, spectra),
+            start,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=bounds,
+            options={"maxiter": STEPS, "ftol": 1e-4},
+        )
+        start = end.x
+        sizes = np.where(start > unit + np.log(2 * NEGLIGIBLE), np.exp(start), 0.0)
+        found = VarianceComponents(sizes, -2 * float(end.fun), noise)
+        if squares is None:
+            break
+        noise = noise_left(systems, [sizes @ d for d in spectra], squares)
+    return found
+
+
+def noise_left(
+    systems: Sequence[WeightSystem], variances: Sequence[FloatArray], squares: float
+) -> float:
+    """Return the share of the noise's variance that weights of known variances leave.
+
+    Parameters
+    ----------
+    systems, squares
+        As in ``shared_components``.
+    variances
+        Of the weights in each, shapes (m,).
+    """
+    noise = 1.0
+    for _ in range(ROUNDS):
+        explained = sum(
+            float(own.pull @ (d * own.whiter(noise).posterior(d).rest))
+            for own, d in zip(systems, variances, strict=True)
+        )
+        noise = max(1 - explained / squares, LEAST_NOISE)
+    return noise
+
+
+def _cost(
+    systems: Sequence[WeightSystem], spectra: Sequence[FloatArray], x: FloatArray
+) -> tuple[float, FloatArray]:
+    """Return the negative log likelihood of the logarithms of all sizes, and its slope, (K,)."""
+    sizes, value, slope = np.exp(x), 0.0, np.zeros(len(x))
+    for each, d in zip(systems, spectra, strict=True):
+        found = each.posterior(sizes @ d)
+        known = np.diag(each.information) - np.einsum("ij,ij->j", found.root, found.root)
+        value += found.likelihood
+        slope += 0.5 * sizes * (d @ (found.rest**2 - known))
+    return -value, -slope

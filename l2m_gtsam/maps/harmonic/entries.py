@@ -44,8 +44,21 @@ def solved_entry(learnt: Learnt, index: int) -> Entry:
         readings.weight,
         strengths,
         *(each.positions for each in structures),
+        *_of_poses(learnt, index),
     )
     return Entry(f"{_cell(learnt, index)}.solved", fingerprint)
+
+
+def _of_poses(learnt: Learnt, index: int) -> list[FloatArray]:
+    """Return what a tile hangs on of the errors of poses; nothing if they count as exact."""
+    poses, rows = learnt.poses, learnt.members[index]
+    if poses is None:
+        return []
+    mine = np.flatnonzero(np.isin(poses.reading, rows))
+    at = np.searchsorted(rows, poses.reading[mine])
+    when = np.column_stack([at, poses.drive[mine], poses.seconds[mine]])
+    sizes = np.ones(6) if poses.sizes is None else poses.sizes
+    return [np.array([poses.lasting_s]), sizes, when, poses.shift[mine]]
 
 
 def compiled_entry(learnt: Learnt, index: int, places: Places) -> Entry:

@@ -30,10 +30,12 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid
 from l2m_gtsam.maps.harmonic.basis import batches
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, Learnt
+from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_sums import tile_pull
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SuiteErrors
+from l2m_gtsam.maps.survey_poses import Knots
 from l2m_gtsam.parallel.threads import in_threads
 
 NEGLIGIBLE = 1e-15  # share of the variance at places
@@ -202,9 +204,7 @@ def suite_modes(
     if learnt.suite is None or not tiles:
         return SuiteModes({}, np.empty((3, 0)), np.empty(0))
     suite, weight = learnt.suite, learnt.readings.weight
-    # The covariance may be singular, where errors are known or the same.
-    squares, turned = np.linalg.eigh(suite.covariance)
-    root = turned * np.sqrt(np.maximum(squares, 0.0))
+    root = suite_root(suite)
     shift = suite.mean_shift(weight)
 
     def moved(index: int) -> FloatArray:
@@ -226,6 +226,13 @@ def suite_modes(
     return every.among(turned[:, squares > least])
 
 
+def suite_root(suite: SuiteErrors) -> FloatArray:
+    """Return a root of the covariance of the sensors' errors, shape (16 S, 16 S)."""
+    # It may be singular, where errors are known or the same.
+    squares, turned = np.linalg.eigh(suite.covariance)
+    return np.asarray(turned * np.sqrt(np.maximum(squares, 0.0)))
+
+
 def moved_weights(
     learnt: Learnt, suite: SuiteErrors, index: int, tile: Tile, shift: FloatArray
 ) -> FloatArray:
@@ -237,7 +244,7 @@ def moved_weights(
     readings = learnt.readings[rows]
     _, gradient = tile.field_and_gradient(readings.points)
     wrong = suite.of_field(rows, gradient) + gradient @ shift
-    pulled = tile_pull(learnt, index, tile.basis, wrong)
+    pulled = tile_pull(learnt, index, tile.basis, wrong, gradient)
     # L L^T by the factor: neither covariance nor inverse is formed.
     white = np.ascontiguousarray(pulled * tile.weights.prior_sigma[:, None])
     tile.weights.factor.solve_rows(white)
@@ -270,26 +277,95 @@ def leading(root: FloatArray, rest: float) -> FloatArray:
 
 
 def joint_covariance(learnt: Learnt, tiles: dict[int, TileModes]) -> FloatArray:
-    """Return the covariance of all beta: one in each tile, and what shared readings correlate."""
-    readings = learnt.readings
-    scale = np.sqrt(readings.weight) / learnt.hyperparameters.noise
+    """Return the covariance of all beta: one in each tile, and what shared noise correlates."""
     indices = list(tiles)
     # What a step of the field lies between is left to each tile.
-    rows, pairs = shared_readings([learnt.present(index) for index in indices], len(readings))
+    rows, pairs = shared_readings(
+        [learnt.present(index) for index in indices], len(learnt.readings)
+    )
 
-    def seen(k: int) -> FloatArray:
-        return tiles[indices[k]].rows(readings.points[rows[k]]) * scale[rows[k]]
+    def seen(k: int) -> Seen:
+        return seen_noise(learnt, tiles[indices[k]], indices[k], rows[k])
 
-    whitened = in_threads(seen, range(len(indices)))
+    noises = in_threads(seen, range(len(indices)))
     starts = np.cumsum([0, *(len(modes) for modes in tiles.values())])
     covariance = np.eye(int(starts[-1]))
     for i, j in pairs:
-        _, in_a, in_b = np.intersect1d(rows[i], rows[j], assume_unique=True, return_indices=True)
-        a, b = whitened[i][:, :, in_a], whitened[j][:, :, in_b]
-        shared = a.reshape(len(a), 3 * len(in_a)) @ b.reshape(len(b), 3 * len(in_b)).T
+        shared = noises[i].together(noises[j])
         covariance[starts[i] : starts[i + 1], starts[j] : starts[j + 1]] = shared
         covariance[starts[j] : starts[j + 1], starts[i] : starts[i + 1]] = shared.T
     return covariance
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the survey's noise makes of r beta of a tile.
+
+    Attributes
+    ----------
+    rows
+        Readings that other tiles have, too, shape (n,).
+    white
+        Beta by a unit of the noise of each of them alone, shape (r, 3, n).
+    poses
+        What errors of the poses make of them; absent where poses are exact.
+    """
+
+    rows: IntArray
+    white: FloatArray
+    poses: "SeenPoses | None" = None
+
+    def together(self, other: "Seen") -> FloatArray:
+        """Return the covariance with another tile's beta, shape (r, r')."""
+        _, mine, theirs = np.intersect1d(
+            self.rows, other.rows, assume_unique=True, return_indices=True
+        )
+        a, b = self.white[:, :, mine], other.white[:, :, theirs]
+        shared = a.reshape(len(a), 3 * len(mine)) @ b.reshape(len(b), 3 * len(theirs)).T
+        if self.poses is None or other.poses is None:
+            return np.asarray(shared)
+        return np.asarray(shared + self.poses.together(other.poses))
+
+
+@dataclass(frozen=True)
+class SeenPoses:
+    """What errors of the survey's poses make of r beta of a tile.
+
+    Attributes
+    ----------
+    knots
+        Q times at which they are numbers of their own.
+    beta
+        By a unit of each of c errors there, shape (r, Q, c).
+    """
+
+    knots: Knots
+    beta: FloatArray
+
+    def together(self, other: "SeenPoses") -> FloatArray:
+        """Return the covariance with another tile's beta, shape (r, r')."""
+        correlation = self.knots.correlation(other.knots)
+        return np.asarray(
+            np.einsum("rqc,qp,spc->rs", self.beta, correlation, other.beta, optimize=True)
+        )
+
+
+def seen_noise(learnt: Learnt, modes: TileModes, index: int, shared: IntArray) -> Seen:
+    """Return what the survey's noise makes of the beta of a tile; ``shared`` as ``Seen.rows``."""
+    readings, noise = learnt.readings, learnt.hyperparameters.noise
+    if learnt.poses is None:
+        scale = np.sqrt(readings.weight[shared]) / noise
+        return Seen(shared, modes.rows(readings.points[shared]) * scale)
+    rows = learnt.present(index)
+    points = readings.points[rows]
+    _, gradient = modes.tile.field_and_gradient(points)
+    effects = learnt.poses.knots(rows, gradient)
+    weight = readings.weight[rows]
+    pulled = SharedNoise(effects.white, weight, noise).given(modes.features(points)) / noise**2
+    at = np.searchsorted(rows, shared)
+    white = pulled[at].transpose(2, 1, 0) * (noise / np.sqrt(weight[at]))
+    at_knots = np.einsum("nir,niqc->rqc", pulled, effects.effect, optimize=True)
+    return Seen(shared, white, SeenPoses(effects.knots, at_knots))
 
 
 def shared_readings(

@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
+from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 from l2m_gtsam.maps.training import TrainingSet
 
@@ -67,10 +68,14 @@ class Normal:
         )
 
 
-def normal_of(basis: Basis, readings: TrainingSet) -> Normal:
-    """Return the sums over readings, batch by batch."""
+def normal_of(basis: Basis, readings: TrainingSet, shared: SharedNoise | None = None) -> Normal:
+    """Return the sums over readings, batch by batch.
+
+    What they share of their noise is taken out: the sums are then those for its noise alone.
+    """
     m = len(basis)
     FF, Fy, yy = np.zeros((m, m)), np.zeros(m), 0.0
+    crossed = None if shared is None else np.zeros((shared.errors.shape[2], m + 1))
     for at in batches(len(readings)):
         root = np.sqrt(readings.weight[at])
         F = basis.features(readings.points[at])
@@ -80,7 +85,15 @@ def normal_of(basis: Basis, readings: TrainingSet) -> Normal:
         FF += F.T @ F
         Fy += F.T @ y
         yy += float(y @ y)
+        if shared is not None and crossed is not None:
+            white = np.column_stack([F, y]) * np.repeat(root, 3)[:, None]
+            crossed += shared.rows(at, white)
     log_weight = 3 * float(np.log(readings.weight).sum())
+    if shared is not None and crossed is not None:
+        taken = shared.taken(crossed)
+        lost = taken.T @ taken
+        FF, Fy, yy = FF - lost[:-1, :-1], Fy - lost[:-1, -1], yy - float(lost[-1, -1])
+        log_weight -= shared.log_determinant
     return Normal(FF, Fy, yy, 3 * len(readings), log_weight)
 
 

@@ -11,6 +11,7 @@ from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
+from l2m_gtsam.maps.harmonic.pose_learning import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.suite_sizes import sized, suite_sizes
@@ -19,6 +20,7 @@ from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.harmonic.visits import Blend, Visit
 from l2m_gtsam.maps.suite_errors import SuiteErrors
+from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.maps.tile_store import TileStore
 from l2m_gtsam.maps.training import (
     TrainingSet,
@@ -83,6 +85,7 @@ class HarmonicMap:
         options: HarmonicOptions | None = None,
         cloud: FloatArray | None = None,
         suite: SuiteErrors | None = None,
+        poses: SurveyPoses | None = None,
     ) -> "HarmonicMap":
         """Return the map of readings.
 
@@ -99,6 +102,8 @@ class HarmonicMap:
         suite
             What errors of the sensors do to the readings. Where none are stated they are looked
             for in the readings; without this the sensors count as exact.
+        poses
+            The same for the errors of the poses.
 
         Raises
         ------
@@ -110,10 +115,12 @@ class HarmonicMap:
         if cloud is not None:
             sources = candidate_sources(checked_points(cloud), readings.points, options.structure)
         learnt = learn_map(readings, sources, options)
-        if suite is not None:
-            owner = cubes_of(readings.points, options.merge)
-            return cls.surveyed_by(learnt, options, suite.averaged(owner, readings.weight))
-        return cls.condition(learnt, options)
+        owner = cubes_of(readings.points, options.merge)
+        if suite is None:
+            ours = cls.condition(learnt, options)
+        else:
+            ours = cls.surveyed_by(learnt, options, suite.averaged(owner, readings.weight))
+        return ours if poses is None else ours.posed(poses.averaged(owner, readings.weight))
 
     @classmethod
     def surveyed_by(
@@ -131,6 +138,11 @@ class HarmonicMap:
         found = cls(learnt, options, Tiles(learnt, exact.tiles.solved))
         return found.doubted((sizes.doubt,))
 
+    def posed(self, poses: SurveyPoses) -> "HarmonicMap":
+        """Return the map with the errors of its poses: stated, or as the survey shows them."""
+        learnt = with_pose_errors(self.learnt, self.tiles, poses, self.options)
+        return self if learnt is None else self.condition(learnt, self.options)
+
     @classmethod
     def condition(cls, learnt: Learnt, options: HarmonicOptions) -> "HarmonicMap":
         """Return the map whose prior is known."""
@@ -142,7 +154,12 @@ class HarmonicMap:
         return error_modes(self.learnt, self.tiles, points, options)
 
     def updated(
-        self, points: FloatArray, field: FloatArray, suite: SuiteErrors | None = None, /
+        self,
+        points: FloatArray,
+        field: FloatArray,
+        suite: SuiteErrors | None = None,
+        poses: SurveyPoses | None = None,
+        /,
     ) -> "HarmonicMap":
         """Return the map with more readings and the same prior of the whole; see ``FieldMap``.
 
@@ -152,7 +169,8 @@ class HarmonicMap:
         new, old_suite = additional_set(points, field), self.learnt.suite
         if suite is not None and not suite.stated:  # as exact as before
             suite = None if old_suite is None else suite.as_sure_as(old_suite)
-        learnt = explained(self.learnt.extended(new, self.options, suite), self.options)
+        poses = None if poses is None else poses.like(self.learnt.poses)
+        learnt = explained(self.learnt.extended(new, self.options, suite, poses), self.options)
         # A new reading may have moved an old one that it was merged with.
         box = 0.5 * learnt.tiling.grid.size + learnt.tiling.overlap + self.options.merge
         away, _ = cKDTree(new.points[:, :2]).query(learnt.tiling.grid.centres, p=np.inf)
@@ -210,6 +228,11 @@ class HarmonicMap:
     def sensors_uncertain(self) -> bool:
         """Whether errors of the sensors that surveyed are stated."""
         return self.learnt.suite is not None
+
+    @property
+    def poses_uncertain(self) -> bool:
+        """Whether errors of the poses that surveyed are stated, or were found."""
+        return self.learnt.poses is not None
 
     @property
     def sigmas_hold(self) -> bool:
@@ -345,10 +368,15 @@ class CompiledMap(HarmonicMap):
         return field, gradient
 
     def updated(
-        self, points: FloatArray, field: FloatArray, suite: SuiteErrors | None = None, /
+        self,
+        points: FloatArray,
+        field: FloatArray,
+        suite: SuiteErrors | None = None,
+        poses: SurveyPoses | None = None,
+        /,
     ) -> "CompiledMap":
         """Return the map with more readings; see ``FieldMap``."""
-        return super().updated(points, field, suite).compile()
+        return super().updated(points, field, suite, poses).compile()
 
 
 def by_place(points: FloatArray) -> IntArray:

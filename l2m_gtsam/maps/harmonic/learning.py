@@ -184,9 +184,11 @@ def window_of(
     return Window(basis, normal_of(basis, readings))
 
 
-def maximise(windows: Sequence[Window], start: Hyperparameters) -> LearningEnd:
-    """Return the maximum of the windows' summed likelihood, from a start."""
-    names = learnable(windows)
+def maximise(
+    windows: Sequence[Window], start: Hyperparameters, held: Sequence[str] = ()
+) -> LearningEnd:
+    """Return the maximum of the windows' summed likelihood, from a start; some may be held."""
+    names = [name for name in learnable(windows) if name not in held]
     # Logarithms: all are positive and act by their ratio.
     x0 = np.log([getattr(start, name) for name in names])
     low, high = np.log([BOUNDS[name] for name in names]).T

@@ -30,6 +30,7 @@ from l2m_gtsam.maps.harmonic.tiling import (
 )
 from l2m_gtsam.maps.suite_errors import SuiteErrors, errors_together
 from l2m_gtsam.maps.survey import survey_doubts
+from l2m_gtsam.maps.survey_poses import SurveyPoses, poses_together
 from l2m_gtsam.maps.training import TrainingSet, cubes_of, joined, merged
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.map_diary import UNDATED, MapDrive
@@ -142,6 +143,8 @@ class Learnt:
     history
         Which drive each reading is of, and how far the field moved between drives; absent where all
         are of one field.
+    poses
+        What errors of the poses do to the readings; absent where they count as exact.
     """
 
     readings: TrainingSet
@@ -154,6 +157,7 @@ class Learnt:
     origin: Origin
     suite: SuiteErrors | None = None
     history: History | None = None
+    poses: SurveyPoses | None = None
 
     @cached_property
     def members(self) -> list[IntArray]:
@@ -204,11 +208,15 @@ class Learnt:
         return [s for s in near if self.strengths[s] > 0]
 
     def extended(
-        self, new: TrainingSet, options: HarmonicOptions, suite: SuiteErrors | None = None
+        self,
+        new: TrainingSet,
+        options: HarmonicOptions,
+        suite: SuiteErrors | None = None,
+        poses: SurveyPoses | None = None,
     ) -> "Learnt":
         """Return the same prior and tiles, with more readings and the tiles that they need.
 
-        ``suite`` is what errors of their sensors do to the new readings.
+        ``suite`` and ``poses`` are what errors of their sensors and poses do to the new readings.
         """
         if self.history is not None:  # readings of two drives are not averaged: see ``followed_by``
             return self.followed_by(new, options, suite, UNDATED)
@@ -216,8 +224,12 @@ class Learnt:
         owner = cubes_of(together.points, options.merge)
         errors = errors_together(self.suite, suite, len(self.readings))
         errors = None if errors is None else errors.averaged(owner, together.weight)
+        wrong_poses = poses_together(self.poses, poses, len(self.readings))
+        if wrong_poses is not None:
+            wrong_poses = wrong_poses.averaged(owner, together.weight)
         readings = merged(together, options.merge, options.independent)
-        return self._of(readings, errors, together, len(new), options)
+        learnt = self._of(readings, errors, together, len(new), options)
+        return replace(learnt, poses=wrong_poses)
 
     def followed_by(
         self,
@@ -253,9 +265,11 @@ class Learnt:
         """Return the same with some of the readings, (N,), and the tiles that they need."""
         rows = np.flatnonzero(keep)
         suite = None if self.suite is None else self.suite.only(keep)
+        poses = None if self.poses is None else self.poses.only(keep)
         history = None if self.history is None else self.history.only(keep)
         readings = self.readings[rows]
-        return replace(self._of(readings, suite, readings, 0, options), history=history)
+        learnt = self._of(readings, suite, readings, 0, options)
+        return replace(learnt, history=history, poses=poses)
 
     def _of(
         self,

@@ -1,5 +1,6 @@
 """What a harmonic map was learnt from as plain arrays, and back with checks."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from l2m_gtsam.maps.harmonic.learnt import ORIGIN, HarmonicOptions, Learnt, reac
 from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources
 from l2m_gtsam.maps.harmonic.tiling import LEAST_CORE, Resolution, Tiling, blend_of
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
+from l2m_gtsam.maps.survey_poses import POSE, SurveyPoses
 from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
 from l2m_gtsam.maps.training import FURTHEST, TrainingSet, training_set
 from l2m_gtsam.records.map_diary import MapDiary
@@ -26,6 +28,7 @@ LEAST_SIZE = 0.4 * LEAST_CORE  # equal tiles over an extent may be half as large
 LEAST, MOST = 1e-9, 1e9
 MOST_CELL = 2**31  # tiles along an axis
 DIARY = TypeAdapter(MapDiary)
+SHORTEST, LONGEST = 1e-3, 1e9  # seconds that an error of a pose lasts, and that a drive takes
 ROUNDING = 1e-9  # of a covariance's largest entry
 
 
@@ -60,6 +63,8 @@ def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapS
             "freed": history.freed,
         }
         origin |= {"diary": DIARY.dump_python(history.diary, mode="json")}
+    if learnt.poses is not None:
+        arrays |= poses_to_arrays(learnt.poses)
     return MapState(kind, arrays, options.model_dump(mode="json"), origin)
 
 
@@ -95,7 +100,7 @@ def learnt_from_state(state: MapState) -> tuple[Learnt, HarmonicOptions]:
         suite,
         history_from_state(state, len(readings), len(strengths)),
     )
-    return learnt, options
+    return replace(learnt, poses=poses_from_state(state, len(readings))), options
 
 
 def damaged(what: str, complaint: str) -> MapError:
@@ -227,3 +232,48 @@ def history_from_state(state: MapState, count: int, structures: int) -> History 
         raise damaged("history is", "a step is none, or of a tile that is nowhere")
     whole = [each.astype(np.int64) for each in (drive, cells, freed)]
     return History(whole[0], whole[1], shares, depths, whole[2], diary)
+
+
+def poses_to_arrays(poses: SurveyPoses) -> dict[str, npt.NDArray[Any]]:
+    """Return errors of poses as arrays, in units of their standard deviations."""
+    sizes = np.ones(POSE) if poses.sizes is None else poses.sizes
+    return {
+        "pose_pairs": np.stack([poses.reading, poses.drive]),
+        "pose_seconds": poses.seconds,
+        "pose_shift": poses.shift.astype(np.float32),
+        "pose_lasting": np.array([poses.lasting_s]),
+        "pose_stated": np.array([int(poses.stated)]),
+        "pose_sizes": sizes,
+    }
+
+
+def poses_from_state(state: MapState, count: int) -> SurveyPoses | None:
+    """Return what errors of poses do to so many readings, after checks; none in older maps."""
+    if "pose_pairs" not in state.arrays:
+        return None
+    pairs, seconds, shift, lasting, stated, sizes = (
+        state_array(state, f"pose_{name}")
+        for name in ("pairs", "seconds", "shift", "lasting", "stated", "sizes")
+    )
+    if (
+        pairs.ndim != 2
+        or len(pairs) != 2
+        or seconds.shape != pairs.shape[1:]
+        or shift.shape != (*seconds.shape, SHIFT, POSE)
+        or lasting.shape != (1,)
+        or stated.shape != (1,)
+        or sizes.shape != (POSE,)
+    ):
+        raise damaged("poses are", "their arrays do not have the shapes needed")
+    numbers = pairs.astype(np.int64)
+    fits = (numbers >= 0).all() and (numbers[0] < count).all() and (numbers == pairs).all()
+    if not (fits and (numbers[1] <= len(seconds)).all()):
+        raise damaged("poses are", "their readings or drives do not exist")
+    if not (np.isfinite(shift).all() and (np.abs(seconds) <= LONGEST).all()):
+        raise damaged("poses are", "an effect or a time is not finite")
+    if not (SHORTEST <= lasting[0] <= LONGEST and ((sizes >= 0) & (sizes <= MOST)).all()):
+        raise damaged("poses are", "their sizes make no sense")
+    known = bool(stated[0])
+    return SurveyPoses(
+        numbers[0], numbers[1], seconds, shift, float(lasting[0]), known, None if known else sizes
+    )

@@ -30,6 +30,7 @@ def summary_of(kind: str, learnt: Learnt) -> MapSummary:
             "shortest wave (m)": float(2 * np.pi / learnt.resolution.floor),
             "sources": described(learnt),
             "survey's sensors": IN_SIGMAS if learnt.suite else "taken for exact",
+            "survey's poses": IN_SIGMAS if learnt.poses else "taken for exact",
             "field": judged(learnt.origin.explanation),
             "tiles": len(learnt.tiling),
             "tile (m)": float(learnt.tiling.grid.size),

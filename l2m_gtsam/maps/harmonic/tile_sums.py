@@ -15,6 +15,7 @@ from l2m_gtsam.maps.harmonic.family import UniformField
 from l2m_gtsam.maps.harmonic.history import STILL, Step
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.modes import Modes
+from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 
 # Shares that a field may have moved by, and depths of what moved: steps of two and more.
 SHARES = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -24,7 +25,13 @@ PAST = 3.0  # in nats, below the best: larger steps are not tried
 INFORMATIVE = 0.3  # of a weight's information over that of its prior: others hardly matter
 
 
-def tile_normal(learnt: Learnt, index: int, basis: Basis, rows: IntArray | None = None) -> Normal:
+def tile_normal(
+    learnt: Learnt,
+    index: int,
+    basis: Basis,
+    rows: IntArray | None = None,
+    gradient: FloatArray | None = None,
+) -> Normal:
     """Return the sums over a tile's readings for its weights as they are now.
 
     Parameters
@@ -35,15 +42,26 @@ def tile_normal(learnt: Learnt, index: int, basis: Basis, rows: IntArray | None 
         Of the tile, m weights.
     rows
         Of which readings; all of the tile's if absent.
+    gradient
+        Of the field at these in uT/m, shape (n, 3, 3), to count errors of their poses, if they have
+        any; absent, poses count as exact.
     """
     rows = learnt.members[index] if rows is None else rows
     parts = by_drive(learnt, index, rows)
-    normals = [normal_of(basis, learnt.readings[own]) for _, own in parts]
+    normals = []
+    for _, own in parts:
+        slope = None if gradient is None else gradient[np.searchsorted(rows, own)]
+        normals.append(normal_of(basis, learnt.readings[own], shared_noise(learnt, own, slope)))
     return carried_here(learnt, index, basis, [number for number, _ in parts], normals)
 
 
-def tile_pull(learnt: Learnt, index: int, basis: Basis, columns: FloatArray) -> FloatArray:
+def tile_pull(
+    learnt: Learnt, index: int, basis: Basis, columns: FloatArray, gradient: FloatArray
+) -> FloatArray:
     """Return ``F^T W`` times columns for a tile's readings, shape (n, 3, k), as far as they count.
+
+    What readings share of the errors of their poses is taken out of ``W``, with the ``gradient`` of
+    the field at them, shape (n, 3, 3).
 
     Returns
     -------
@@ -53,23 +71,36 @@ def tile_pull(learnt: Learnt, index: int, basis: Basis, columns: FloatArray) -> 
     rows = learnt.members[index]
     parts = by_drive(learnt, index, rows)
     if len(parts) < 2:
-        return pull(basis, learnt, rows, columns)
+        return pull(basis, learnt, rows, columns, gradient)
     normals = []
     for _, own in parts:
-        pulled = pull(basis, learnt, own, columns[np.searchsorted(rows, own)])
-        normals.append(replace(normal_of(basis, learnt.readings[own]), Fy=pulled))
+        at = np.searchsorted(rows, own)
+        pulled = pull(basis, learnt, own, columns[at], gradient[at])
+        shared = shared_noise(learnt, own, gradient[at])
+        normals.append(replace(normal_of(basis, learnt.readings[own], shared), Fy=pulled))
     return carried_here(learnt, index, basis, [number for number, _ in parts], normals).Fy
 
 
-def pull(basis: Basis, learnt: Learnt, rows: IntArray, columns: FloatArray) -> FloatArray:
+def pull(
+    basis: Basis, learnt: Learnt, rows: IntArray, columns: FloatArray, gradient: FloatArray
+) -> FloatArray:
     """Return ``F^T W`` times columns of these readings, shape (n, 3, k): (m, k)."""
     readings = learnt.readings[rows]
-    wrong = columns * readings.weight[:, None, None]
+    shared = shared_noise(learnt, rows, gradient)
+    wrong = columns * readings.weight[:, None, None] if shared is None else shared.given(columns)
     pulled = np.zeros((len(basis), columns.shape[2]))
     for at in batches(len(rows)):
         F = basis.features(readings.points[at])
         pulled += F.reshape(-1, len(pulled)).T @ wrong[at].reshape(-1, wrong.shape[2])
     return pulled
+
+
+def shared_noise(learnt: Learnt, rows: IntArray, gradient: FloatArray | None) -> SharedNoise | None:
+    """Return what readings share of their noise, for the field's gradient there, (n, 3, 3)."""
+    if learnt.poses is None or gradient is None:
+        return None
+    effects = learnt.poses.knots(rows, gradient)
+    return SharedNoise(effects.white, learnt.readings.weight[rows], learnt.hyperparameters.noise)
 
 
 def carried_here(

@@ -104,8 +104,14 @@ class Tiles:
 
 def solved_tile(learnt: Learnt, index: int) -> Tile:
     """Return a tile with the posterior of its weights."""
-    basis = learnt.basis(index, learnt.members[index])
+    rows = learnt.members[index]
+    basis, given = learnt.basis(index, rows), learnt.hyperparameters
     normal = tile_normal(learnt, index, basis)
+    if learnt.poses is not None:
+        # How far an error of position matters is seen where poses count as exact.
+        plain = condition(normal, basis.prior(given).log_variance, given.noise)
+        _, gradient = basis.field_and_gradient(learnt.readings[rows].points, plain.mean)
+        normal = tile_normal(learnt, index, basis, gradient=gradient)
     own = local_hyperparameters(basis, normal, learnt.hyperparameters, learnt.local)
     weights = condition(normal, basis.prior(own).log_variance, own.noise)
     return Tile(basis, weights, own, learnt.resolution)

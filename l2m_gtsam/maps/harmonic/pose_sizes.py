@@ -1,0 +1,185 @@
+r"""How wrong the poses of a survey are, as the survey itself tells, where nobody stated it.
+
+Passes that cross read one field. Where they differ by more than the noise of a reading, and for
+longer than a moment, poses were wrong. With r the residuals of a tile's posterior mean, and E what
+a unit of each error at a knot does to the readings,
+
+.. math::
+    I = E^T W (E - F \delta w) / \sigma^2, \qquad u = E^T W r / \sigma^2
+
+are information and pull with the field taken out, and with it the errors of the survey's sensors as
+far as these are known. Tilt, heading, place on the floor and height have a size each, the most
+likely one for a few tiles together; how long errors last is one of a few times.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.harmonic.error_modes import suite_root
+from l2m_gtsam.maps.harmonic.learnt import Learnt
+from l2m_gtsam.maps.harmonic.representatives import spread_tiles
+from l2m_gtsam.maps.harmonic.tiles import Tiles
+from l2m_gtsam.maps.survey_poses import SurveyPoses
+from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.solve.variance_components import (
+    VarianceComponents,
+    WeightSystem,
+    noise_left,
+    shared_components,
+)
+
+MOST_TILES = 4  # of the survey, spread over it
+MOST_READINGS = 150  # of a tile, those nearest to its middle
+PARTS = np.array([0, 0, 1, 2, 2, 3])  # tilt, heading, floor, height: of each of the six errors
+LASTING_S = (2.0, 1.0, 4.0)  # the first tells which parts there are
+LEAST_GAIN = 16.0  # twice a logarithm of likelihood, as for the survey's sensors
+LEAST_SHARE = 0.03  # of the noise's variance: what does less to a reading is not worth a column
+
+
+@dataclass(frozen=True)
+class FoundPoses:
+    """Errors of the poses of a survey, and the noise beside them.
+
+    Attributes
+    ----------
+    sizes
+        Standard deviations of the six errors in rad and m, shape (6,).
+    lasting_s
+        How long they last.
+    noise
+        Share of the noise's variance that is left beside them.
+    gain
+        Twice the logarithm of the likelihood beyond that of exact poses.
+    """
+
+    sizes: FloatArray
+    lasting_s: float
+    noise: float
+    gain: float
+
+    @property
+    def doubt(self) -> str:
+        """What that says of the survey."""
+        tilt, heading = np.rad2deg(self.sizes[[0, 2]]).tolist()
+        floor, height = (1e3 * self.sizes[[3, 5]]).tolist()
+        return (
+            f"the survey's poses are off by about {tilt:.2g} deg of tilt, {heading:.2g} deg of "
+            f"heading, {floor:.2g} mm on the floor and {height:.2g} mm of height for "
+            f"{self.lasting_s:g} s, by the survey itself: sigmas hold that; state how wrong they "
+            "are if it is known (mapping.pose_noise)"
+        )
+
+
+@dataclass(frozen=True)
+class PoseView:
+    """What some readings of a tile say of the poses' errors.
+
+    Attributes
+    ----------
+    system
+        Information and pull of the errors at all knots.
+    part
+        Which of ``PARTS`` each is, shape (q,).
+    squares
+        Sum of squares of the residuals, white by the map's noise.
+    felt
+        Mean variance of a reading by a unit of each part, uT^2, shape (4,).
+    """
+
+    system: WeightSystem
+    part: IntArray
+    squares: float
+    felt: FloatArray
+
+    def among(self, parts: IntArray) -> "PoseView":
+        """Return the same for some parts, the others being zero."""
+        at = np.flatnonzero(np.isin(self.part, parts))
+        return replace(self, system=self.system.among(at), part=self.part[at])
+
+
+def pose_sizes(
+    learnt: Learnt, tiles: Tiles, poses: SurveyPoses, *, noise_known: bool = False
+) -> FoundPoses | None:
+    """Return how wrong the poses are; None where the survey shows nothing of it.
+
+    Parameters
+    ----------
+    learnt, tiles
+        Readings and prior of the map, and its tiles, for exact poses.
+    poses
+        What a unit of each error does to the readings.
+    noise_known
+        Whether the map's noise is that of readings beside these errors; else it has them in it.
+    """
+    some = spread_tiles(learnt.tiling, [len(rows) for rows in learnt.members], MOST_TILES)
+    parts = np.unique(PARTS)
+    found: list[FoundPoses] = []
+    for lasting in LASTING_S:
+        lasted = partial(pose_view, learnt, tiles, replace(poses, lasting_s=lasting))
+        seen = in_threads(lasted, some)
+        if not found:  # of these parts, those that matter
+            sizes = likely(seen, parts, known=noise_known).sizes
+            felt = np.mean([each.felt for each in seen], axis=0) * sizes
+            parts = np.flatnonzero(felt > LEAST_SHARE * learnt.hyperparameters.noise**2)
+            if not len(parts):
+                return None
+        fit = likely([each.among(parts) for each in seen], parts, known=noise_known)
+        found.append(FoundPoses(np.sqrt(fit.sizes)[PARTS], lasting, fit.noise, fit.gain))
+    best = max(found, key=lambda each: each.gain)
+    return best if best.gain > LEAST_GAIN else None
+
+
+def noise_beside(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> float:
+    """Return the share of the noise's variance that is left beside errors of stated sizes."""
+    some = spread_tiles(learnt.tiling, [len(rows) for rows in learnt.members], MOST_TILES)
+    seen = in_threads(partial(pose_view, learnt, tiles, poses), some)
+    return noise_left(
+        [each.system for each in seen],
+        [np.ones(len(each.part)) for each in seen],
+        sum(each.squares for each in seen),
+    )
+
+
+def likely(views: Sequence[PoseView], parts: IntArray, *, known: bool) -> VarianceComponents:
+    """Return the most likely variances of all parts, of which only some may differ from zero."""
+    spectra = [np.array([each.part == part for part in parts], dtype=float) for each in views]
+    squares = None if known else sum(each.squares for each in views)
+    found = shared_components([each.system for each in views], spectra, squares)
+    sizes = np.zeros(PARTS.max() + 1)
+    sizes[parts] = found.sizes
+    return replace(found, sizes=sizes)
+
+
+def pose_view(learnt: Learnt, tiles: Tiles, poses: SurveyPoses, index: int) -> PoseView:
+    """Return what the readings in the middle of a tile say."""
+    tile, rows = tiles[index], learnt.members[index]
+    away = np.linalg.norm(
+        learnt.readings.points[rows, :2] - learnt.tiling.grid.centres[index], axis=1
+    )
+    rows = np.sort(rows[np.argsort(away)[:MOST_READINGS]])
+    readings = learnt.readings[rows]
+    field, gradient = tile.field_and_gradient(readings.points)
+    effects = poses.knots(rows, gradient)
+    errors, part = effects.white, PARTS[effects.part]
+    count = errors.shape[2]
+    if learnt.suite is not None:  # those of the sensors explain what they can
+        root = suite_root(learnt.suite)
+        errors = np.concatenate([errors, learnt.suite.of_field(rows, gradient) @ root], axis=2)
+    root_weight = np.sqrt(readings.weight)[:, None, None] / tile.hyperparameters.noise
+    E = (errors * root_weight).reshape(-1, errors.shape[2])
+    F = (tile.basis.features(readings.points) * root_weight).reshape(len(E), -1)
+    r = ((readings.field - field)[:, :, None] * root_weight).ravel()
+    white = np.ascontiguousarray((F.T @ E) * tile.weights.prior_sigma[:, None])
+    tile.weights.factor.solve_rows(white)
+    information = E.T @ E - white.T @ white
+    system = WeightSystem(0.5 * (information + information.T), E.T @ r)
+    beside = np.arange(len(information)) >= count
+    if beside.any():
+        system = system.beside(beside.astype(float)).among(np.arange(count))
+    felt = np.square(errors[:, :, :count]).mean(axis=(0, 1))
+    by_part = np.array([felt[part == each].sum() for each in np.unique(PARTS)])
+    return PoseView(system, part, float(r @ r), by_part)
