@@ -36,6 +36,8 @@ def with_pose_errors(
     if poses.stated:
         share = noise_beside(learnt, tiles, poses)
         return relearnt(replace(quieter(learnt, share), poses=poses), options)
+    if options.hyperparameters is not None:  # with the noise that is given there is nothing to find
+        return None
     found, current = pose_sizes(learnt, tiles, poses), learnt
     if found is None:
         return None

@@ -26,6 +26,7 @@ from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.solve.variance_components import (
+    LEAST_NOISE,
     VarianceComponents,
     WeightSystem,
     noise_left,
@@ -37,6 +38,8 @@ MOST_READINGS = 150  # of a tile, those nearest to its middle
 PARTS = np.array([0, 0, 1, 2, 2, 3])  # tilt, heading, floor, height: of each of the six errors
 LASTING_S = (2.0, 1.0, 4.0)  # the first tells which parts there are
 LEAST_GAIN = 16.0  # twice a logarithm of likelihood, as for the survey's sensors
+# Of rotations in rad and translations in m. A map of steel that it does not know of asks for more.
+MOST = np.repeat([np.deg2rad(5.0), 0.1], 3)
 LEAST_SHARE = 0.03  # of the noise's variance: what does less to a reading is not worth a column
 
 
@@ -60,6 +63,11 @@ class FoundPoses:
     lasting_s: float
     noise: float
     gain: float
+
+    @property
+    def credible(self) -> bool:
+        """Whether poses can be as wrong as that; else a field that no wave makes looks like it."""
+        return bool((self.sizes < MOST).all()) and self.noise > LEAST_NOISE
 
     @property
     def doubt(self) -> str:
@@ -130,7 +138,7 @@ def pose_sizes(
         fit = likely([each.among(parts) for each in seen], parts, known=noise_known)
         found.append(FoundPoses(np.sqrt(fit.sizes)[PARTS], lasting, fit.noise, fit.gain))
     best = max(found, key=lambda each: each.gain)
-    return best if best.gain > LEAST_GAIN else None
+    return best if best.gain > LEAST_GAIN and best.credible else None
 
 
 def noise_beside(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> float:

@@ -28,7 +28,7 @@ def given(R: FloatArray, p: FloatArray) -> FloatArray:
 
 def readings(way: Trajectory) -> Readings:
     one = np.zeros(COUNT, dtype=np.int64)
-    return Readings(("mag",), one, way.stamp_ns, b, way.R, way.p)
+    return Readings(("mag",), one, way.stamp_ns, way.R, way.p, b)
 
 
 def shifts(way: Trajectory, options: PoseNoiseOptions) -> FloatArray:
