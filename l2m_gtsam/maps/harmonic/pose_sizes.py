@@ -26,7 +26,6 @@ from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.solve.variance_components import (
-    LEAST_NOISE,
     VarianceComponents,
     WeightSystem,
     noise_left,
@@ -67,7 +66,7 @@ class FoundPoses:
     @property
     def credible(self) -> bool:
         """Whether poses can be as wrong as that; else a field that no wave makes looks like it."""
-        return bool((self.sizes < MOST).all()) and self.noise > LEAST_NOISE
+        return bool((self.sizes < MOST).all())
 
     @property
     def doubt(self) -> str:
