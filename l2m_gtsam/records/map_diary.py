@@ -132,9 +132,8 @@ def words_of(diary: MapDiary, number: int) -> str:
     change = diary.changes[number]
     if change.what is Happening.WENT:
         goes = [k for k, each in enumerate(diary.changes) if taken_from(each) == number]
-        if goes:
-            return f"moved to {goes[0] + 1}"
-        return "went" if change.other is None else f"went (was {change.other + 1})"
+        how = f"moved to {goes[0] + 1}" if goes else "went"
+        return how if change.other is None else f"{how} (was {change.other + 1})"
     return "came" if change.other is None else f"moved from {change.other + 1}"
 
 

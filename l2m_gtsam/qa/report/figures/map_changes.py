@@ -6,12 +6,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
-from l2m_gtsam.qa.report.svg import BAD, PAPER, SMALL
+from l2m_gtsam.qa.report.svg import SMALL
 from l2m_gtsam.records.map_diary import DatedChange, Happening, MapDiary, between, words_of
 
-GONE = "#0072b2"  # of steel that is no longer there
+# Of steel that came, and of steel that is no longer there: seen on the map's colours by all.
+HERE, GONE = "#d55e00", "#56b4e9"
+ONE_PLACE_M = 0.3  # so near, changes are marked together
 MOST_LINES = 14  # of the list beside the picture
 FADED: Any = {"fill": False, "hatch": "////", "linewidth": 0.0, "alpha": 0.35}
+ARROW: Any = {"arrowstyle": "-|>", "color": HERE, "linewidth": 1.6, "shrinkA": 9, "shrinkB": 9}
 
 
 def draw_changes(axes: Axes, diary: MapDiary) -> None:
@@ -21,27 +24,46 @@ def draw_changes(axes: Axes, diary: MapDiary) -> None:
         axes.add_patch(
             Rectangle(tuple(corner), stretch.edge, stretch.edge, edgecolor="0.2", **FADED)
         )
-    for number, change in enumerate(diary.changes):
+    for change in diary.changes:
         if change.what is Happening.CAME and change.other is not None:
             start = diary.changes[change.other].source.position[:2]
-            arrow: Any = {"arrowstyle": "->", "color": BAD, "linewidth": 1.4}
-            axes.annotate("", tuple(change.source.position[:2]), tuple(start), arrowprops=arrow)
-        draw_change(axes, change, str(number + 1))
+            axes.annotate("", tuple(change.source.position[:2]), tuple(start), arrowprops=ARROW)
+    for numbers in together(diary):
+        name = ", ".join(str(number + 1) for number in numbers)
+        draw_change(axes, diary.changes[numbers[-1]], name)
+
+
+def together(diary: MapDiary) -> list[list[int]]:
+    """Return the indices of changes place by place, each place's in order of time."""
+    places: list[list[int]] = []
+    for number, change in enumerate(diary.changes):
+        at = change.source.position[:2]
+        for place in places:
+            first = diary.changes[place[0]].source.position[:2]
+            if np.linalg.norm(at - first) < ONE_PLACE_M:
+                place.append(number)
+                break
+        else:
+            places.append([number])
+    return places
 
 
 def draw_change(axes: Axes, change: DatedChange, name: str) -> None:
     """Draw a source: filled where it came, empty where it went, with two sigmas around it."""
     source, came = change.source, change.what is Happening.CAME
-    colour = BAD if came else GONE
+    colour = HERE if came else GONE
     x, y = source.position[:2]
     ends = np.array([source.position - source.half_axis, source.position + source.half_axis])
     axes.plot(*ends[:, :2].T, color=colour, linewidth=4, solid_capstyle="round")
     radius = 2 * float(np.max(source.position_sigma[:2]))
     axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=colour, linewidth=1.0))
-    face = colour if came else PAPER
-    axes.plot(x, y, "o", color=face, markersize=14, markeredgecolor=colour, markeredgewidth=1.5)
-    style: Any = {"ha": "center", "va": "center", "fontsize": SMALL, "fontweight": "bold"}
-    axes.annotate(name, (x, y), color="white" if came else colour, **style)
+    face = colour if came else "none"
+    axes.plot(
+        x, y, "o", markerfacecolor=face, markersize=10, markeredgecolor=colour, markeredgewidth=2.5
+    )
+    style: Any = {"xytext": (8, 6), "textcoords": "offset points", "fontsize": SMALL + 1}
+    box: Any = {"facecolor": "white", "edgecolor": colour, "alpha": 0.9, "pad": 1.5}
+    axes.annotate(name, (x, y), color="black", bbox=box, **style)
 
 
 def list_changes(axes: Axes, diary: MapDiary) -> None:
@@ -56,8 +78,9 @@ def list_changes(axes: Axes, diary: MapDiary) -> None:
         lines.append(f"and {len(numbers) - MOST_LINES} earlier ones: see `l2m map info`")
     if not numbers:
         lines = ["nothing came or went that the drives noticed"]
+    lines += ["", "full: came; empty: went; arrow: moved"] if numbers else []
     if diary.faded:
-        lines += ["", "hatched: readings before a drive count less there"]
+        lines += ["hatched: readings before a drive count less there"]
     drives = len(diary.drives) - 1
     title = f"What changed in {drives} drives since {diary.drives[0].day}"
     if diary.drives[0].ended is None:
