@@ -4,7 +4,7 @@ Passes 1 to 3 make the map by the robot's first magnetometer, which is calibrate
 is calibrated on it. The shelves' field is that of magpylib; all else is as it was recorded.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,15 +12,11 @@ import pytest
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
-from l2m_gtsam.mapping.suite_calibration import calibrate_suite
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
+from l2m_gtsam.data import FloatArray, Recording
 from l2m_gtsam.maps.field_map import FieldMap
-from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.places import Cause, ChangedSource
-from tests.drives.robot import SENSORS, assumed_sensors, robot_pass
+from tests.drives.robot import SENSORS, assumed_sensors, map_by, robot_pass
 from tests.drives.shelves import Shelf, with_shelves
 
 FIRST = SENSORS[0]
@@ -29,21 +25,6 @@ OTHERS = (
     Shelf((4.3, -2.6, 0.4), (-15.0, 10.0, 0.0), (0.04, 1.0, 0.04)),
     Shelf((3.5, 0.3, 0.3), (0.0, 20.0, -20.0), (0.04, 0.04, 1.0)),
 )
-
-
-def map_by(passes: list[Recording]) -> FieldMap:
-    """Return the map of passes by their first sensor, which is calibrated from them."""
-    alone = [replace(each, series=each.series[:1]) for each in passes]
-    assumed = {FIRST: KnownSensor(FIRST, np.zeros(3), Distortion.identity())}
-    sensor = calibrate_suite(alone, assumed, SuiteCalibrationOptions(), silent).sensors[0]
-    covariance = np.zeros((16, 16))
-    covariance[:15, :15] = sensor.covariance
-    offset = sensor.time_offset
-    assert offset is not None
-    covariance[15, 15] = offset.sigma**2
-    covariance[:15, 15] = covariance[15, :15] = offset.cross_covariance
-    known = KnownSensor(FIRST, sensor.t_lidar_mag, sensor.distortion, offset.seconds, covariance)
-    return map_recordings(alone, {FIRST: known}, MappingOptions())
 
 
 @pytest.fixture(scope="module")
