@@ -27,7 +27,7 @@ from l2m_gtsam.storage.calibrated_topics import (
     check_units,
     sensor_topics,
 )
-from l2m_gtsam.storage.calibration_file import read_calibration, verdict_text
+from l2m_gtsam.storage.calibration_file import verdict_text
 from l2m_gtsam.storage.exports.export import (
     Export,
     check_lidar_frame,
@@ -39,6 +39,7 @@ from l2m_gtsam.storage.exports.export import (
 from l2m_gtsam.storage.exports.formats import FORMATS
 from l2m_gtsam.storage.exports.urdf import edited_urdf
 from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.open_bag import Bag, open_bag
 from l2m_gtsam.storage.regressors import read_scalars
 
@@ -141,7 +142,7 @@ def export_calibration(
     if into is not None and format_name != "urdf":
         raise ConfigError("--into: goes with --format urdf alone")
     _check_sources(out, calibration, into)
-    chosen, result = FORMATS[format_name], read_calibration(calibration)
+    chosen, result = FORMATS[format_name], read_sensors(calibration)
     judged = verdict_notes(calibration, result, despite_verdict)
     export = export_of(result, chosen.fault, names.lidar, names.sensors)
     content = chosen.text(export).encode() if into is None else _edited(export, into)
@@ -324,7 +325,7 @@ def apply_calibration(wanted: Application, progress: Progress) -> Applied:
     L2MError
         Whatever is wrong with the input, in one line; nothing is written then.
     """
-    result = read_calibration(wanted.calibration)
+    result = read_sensors(wanted.calibration)
     judged = verdict_notes(wanted.calibration, result, wanted.despite_verdict)
     if wanted.config is None:
         reading = Reading.of(result, wanted.calibration)

@@ -26,8 +26,8 @@ from l2m_gtsam.records.validation import (
     Validation,
 )
 from l2m_gtsam.storage.bag_options import BagOptions, PoseFileOptions
-from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.files import atomic_path, source_file
+from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.record_files import write_validation
 from l2m_gtsam.storage.result_set import published
 from l2m_gtsam.validation.validate import validate
@@ -127,7 +127,7 @@ def read_sound_calibration(path: Path) -> CalibrationResult:
     CalibrationError
         The file is missing or damaged, knows no sensor, or has a covariance that is none.
     """
-    result = read_calibration(path)
+    result = read_sensors(path)
     if not any(map(is_calibrated, result.sensors)):
         raise CalibrationError(f"{path}: none of its sensors is calibrated; nothing to validate")
     for sensor in filter(is_calibrated, result.sensors):

@@ -79,6 +79,34 @@ def test_the_commands_of_the_page_run(
     assert "<figure>" in Path("both/validation.html").read_text()
 
 
+def test_a_plain_list_is_validated_and_exported(
+    calibration: Path, field_map: Path, tmp_path: Path
+) -> None:
+    """With sigmas of its own and no verdict; a list that is wrong by far is found to be."""
+    (known,) = read_calibration(calibration).sensors
+    entry = {
+        "t_lidar_mag": known.t_lidar_mag.tolist(),
+        "C": known.distortion.C.tolist(),
+        "H": known.distortion.H.tolist(),
+        "t_sigma": 0.01,
+        "C_sigma": 0.02,
+        "H_sigma": 0.5,
+        "noise": NOISE,
+    }
+    listed, off = tmp_path / "list.yaml", tmp_path / "off.yaml"
+    write_yaml(listed, {"sensors": {"mag": entry}}, "")
+    wrong = (known.distortion.H + np.array([8.0, 0.0, 0.0])).tolist()
+    write_yaml(off, {"sensors": {"mag": entry | {"H": wrong}}}, "")
+    bag = written(tmp_path, "mcap", seed=8)
+    for path, failed in ((listed, False), (off, True)):
+        asked = ValidationRequest(path, bag, field_map, out=tmp_path / path.stem)
+        found = validate_calibration(asked, silent)
+        assert (found.verdict.level is Level.FAIL) == failed, path
+    urdf = tmp_path / "robot.urdf"
+    l2m("export", listed, "--format", "urdf", "--out", urdf)
+    assert "mag" in urdf.read_text()
+
+
 def test_a_magnet_on_the_vehicle_is_named(
     calibration: Path, field_map: Path, tmp_path: Path
 ) -> None:
