@@ -1,10 +1,11 @@
-r"""A step of odometry whose way is measured along fixed axes, whatever the heading is.
+r"""A step of odometry that is measured along fixed axes, whatever the attitude is.
 
-A vehicle that measures its way against fixed axes, such as a ship by a beacon, turns no step by an
-error of its heading. With the turn R and the way d along the axes of the frame of the poses
+A vehicle that measures its way and its turns against fixed axes, such as a ship by beacons, turns
+no step and no later turn by an error of its attitude. With the turn R and the way d along the axes
+of the frame of the poses
 
 .. math::
-    e = [Log(R^T R_k^T R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d)]
+    e = [Log(R_k^T R^T R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d)]
 """
 
 import gtsam
@@ -25,7 +26,7 @@ def fixed_axes_step_factor(
     key_pose
         Number k of the key pose before the step.
     turn
-        The next key pose's axes in its frame.
+        From one to the next about the axes that poses are in, ``R_{k+1} R_k^T``.
     way
         From one to the next along the axes that poses are in, metres, shape (3,).
     noise
@@ -45,13 +46,13 @@ def fixed_axes_residual(
     """Return e for the poses before and after a step; its derivatives go into ``jacobians``."""
     before, after = poses
     turned = before.rotation().between(after.rotation())
-    off = turn.between(turned)
+    off = turn.compose(before.rotation()).between(after.rotation())
     back = after.rotation().matrix().T
     apart = back @ (after.translation() - before.translation() - way)
     if jacobians is not None:
         by_turn = gtsam.Rot3.LogmapDerivative(gtsam.Rot3.Logmap(off))
         by_before, by_after = np.zeros((6, 6)), np.zeros((6, 6))
-        by_before[:3, :3] = -by_turn @ turned.matrix().T
+        by_before[:3, :3] = -by_turn @ off.matrix().T
         by_before[3:, 3:] = -turned.matrix().T
         by_after[:3, :3], by_after[3:, 3:] = by_turn, np.eye(3)
         by_after[3:, :3] = skew(apart[None])[0]

@@ -109,5 +109,13 @@ def slow_error_graph(key_pose_s: FloatArray, tau_s: float) -> gtsam.NonlinearFac
     for k, a in enumerate(decays.tolist()):
         root = np.eye(AXES) / np.sqrt(1 - a**2)
         linear = gtsam.JacobianFactor(N(k), -a * root, N(k + 1), root, np.zeros(AXES), unit)
-        graph.add(gtsam.LinearContainerFactor(linear))
+        graph.add(gtsam.LinearContainerFactor(linear, zero_errors((N(k), N(k + 1)))))
     return graph
+
+
+def zero_errors(keys: tuple[int, ...]) -> gtsam.Values:
+    """Return no errors: without them as its point a linear factor counts its values as zero."""
+    values = gtsam.Values()
+    for key in keys:
+        values.insert(key, np.zeros(AXES))
+    return values

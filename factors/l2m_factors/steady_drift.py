@@ -7,10 +7,10 @@ and the way p of a step along the axes of the vehicle
 .. math::
     e = Log(Z^{-1} X_k^{-1} X_{k+1}), \quad Z = (R, p - R_k^T W_k v)
 
-and with the way d along the axes of the frame of the poses
+and with the turn R and the way d along the axes of the frame of the poses
 
 .. math::
-    e = [Log(R^T R_k^T R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d + W_k v)]
+    e = [Log(R_k^T R^T R_{k+1}), R_{k+1}^T (p_{k+1} - p_k - d + W_k v)]
 """
 
 import gtsam

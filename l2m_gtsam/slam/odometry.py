@@ -6,6 +6,7 @@ Where a recording states covariances of its poses that accumulate as odometry's 
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -57,6 +58,15 @@ class OdometrySteps:
 
     def __len__(self) -> int:
         return len(self.p)
+
+    @cached_property
+    def fixed_turns(self) -> FloatArray:
+        """Turns about the axes of the first key pose, shape (K - 1, 3, 3)."""
+        axes = [np.eye(3)]
+        for turn in self.R:
+            axes.append(axes[-1] @ turn)
+        own = np.stack(axes)
+        return np.asarray(own[1:] @ own[:-1].transpose(0, 2, 1))
 
     @property
     def path(self) -> FloatArray:

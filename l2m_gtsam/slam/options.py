@@ -147,9 +147,10 @@ class DriftOptions(Options):
     beside the independent errors. `position_share` where that counts, if not given; 0 for none. Not
     with `scale`."""
     axes: StepAxes = StepAxes.VEHICLE
-    """Along which axes steps are known: `vehicle`, as by wheels or scans, where an error of the
-    heading turns all later steps; or `fixed`, as by beacons, where it turns none. The latter works
-    off line and without a map."""
+    """Along which axes steps and turns are known: `vehicle`, as by wheels or scans, where an error
+    of the heading turns all later steps; or `fixed`, as by beacons, where it turns none, and an
+    error of a tilt does not tilt the axis of later turns. The latter works off line and without a
+    map."""
     stated: Usage = Usage.USED
     """Whether covariances that a recording states of its odometry count instead, where they grow
     along the drive."""

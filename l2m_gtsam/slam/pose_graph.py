@@ -52,9 +52,8 @@ def step_factor(drive: Drive, number: int, scale_error: float = 0.0) -> gtsam.No
     """Return odometry's factor from a key pose to the next, its length corrected for an error."""
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     if drive.steps.fixed_axes is not None:
-        shift = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
-        turn = gtsam.Rot3(drive.steps.R[number])
-        return fixed_axes_step_factor(number, turn, (1 + scale_error) * shift, noise)
+        turn, way = fixed_axes_step(drive, number, drive.steps.fixed_axes)
+        return fixed_axes_step_factor(number, turn, (1 + scale_error) * way, noise)
     step = drive.step(number, scale_error)
     return between_factor(number, step, drive.steps.covariance[number])
 
@@ -70,9 +69,15 @@ def drifting_factor(drive: Drive, number: int, weights: FloatArray) -> gtsam.Non
     noise = gtsam.noiseModel.Gaussian.Covariance(drive.steps.covariance[number])
     if drive.steps.fixed_axes is None:
         return drifting_step_factor(number, drive.step(number), weights, noise)
-    shift = drive.start.T_map_lidar.R @ drive.steps.fixed_axes[number]
-    turn = gtsam.Rot3(drive.steps.R[number])
-    return drifting_fixed_axes_factor(number, turn, shift, weights, noise)
+    turn, way = fixed_axes_step(drive, number, drive.steps.fixed_axes)
+    return drifting_fixed_axes_factor(number, turn, way, weights, noise)
+
+
+def fixed_axes_step(drive: Drive, number: int, ways: FloatArray) -> tuple[gtsam.Rot3, FloatArray]:
+    """Return turn and way of a step along the axes of the map, of ways (K - 1, 3) by odometry."""
+    start = drive.start.T_map_lidar.R
+    turn = start @ drive.steps.fixed_turns[number] @ start.T
+    return gtsam.Rot3(turn), np.asarray(start @ ways[number])
 
 
 def link_pose(links: Links, number: int) -> gtsam.Pose3:

@@ -132,10 +132,11 @@ def _moved(
         after, F = pose.compose(step), step.inverse().AdjointMap()
         F[3:, :3] -= step.rotation().matrix().T @ skew(drift[None])[0]
     else:
-        turn = step.rotation()
+        turn = gtsam.Rot3(steps.fixed_turns[number])
         place = pose.translation() + steps.fixed_axes[number] - W @ steady
-        after = gtsam.Pose3(pose.rotation().compose(turn), place)
-        F[:3, :3] = F[3:, 3:] = turn.matrix().T
+        after = gtsam.Pose3(turn.compose(pose.rotation()), place)
+        F[:3, :3] = np.eye(3)
+        F[3:, 3:] = after.rotation().between(pose.rotation()).matrix()
     by_drift[3:] = -after.rotation().matrix().T @ W
     return after, F, by_drift
 

@@ -183,4 +183,6 @@ def test_steps_along_fixed_axes_are_those_of_the_first_pose() -> None:
     assert steps.fixed_axes is not None
     end = made.p[0] + made.R[0] @ steps.fixed_axes.sum(axis=0)
     np.testing.assert_allclose(end, made.p[-1], atol=1e-12)  # rounding
+    turns = made.R[0] @ steps.fixed_turns @ made.R[0].T
+    np.testing.assert_allclose(turns @ made.R[:-1], made.R[1:], atol=1e-12)
     assert steps.until(3).fixed_axes is not None

@@ -24,6 +24,21 @@ def test_the_chain_has_the_process_covariance() -> None:
     np.testing.assert_allclose(joint, np.kron(expected, np.eye(3)), atol=1e-9)
 
 
+def test_errors_cost_what_the_process_has_them_cost() -> None:
+    """Half of n^T K^-1 n along each axis, wherever the graph is linearised."""
+    tau, rng, values = 0.8, np.random.default_rng(2), gtsam.Values()
+    n = rng.normal(size=(len(TIMES), 3))
+    for k, own in enumerate(n):
+        values.insert(N(k), own)
+    graph = slow_error_graph(TIMES, tau)
+    K = np.exp(-np.abs(np.subtract.outer(TIMES, TIMES)) / tau)
+    cost = 0.5 * float(np.sum(n * np.linalg.solve(K, n)))
+    assert graph.error(values) == pytest.approx(cost, rel=1e-9)
+    best = values.retract(graph.linearize(values).optimize())
+    for k in range(len(TIMES)):
+        np.testing.assert_allclose(best.atVector(N(k)), 0.0, atol=1e-9)
+
+
 @given(
     st.lists(st.floats(0, 1), min_size=1, max_size=6),
     st.floats(1e-3, 1e3),
