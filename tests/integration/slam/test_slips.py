@@ -6,10 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
-from l2m_gtsam.mapping.suite_calibration import calibrate_suite
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
+from l2m_gtsam.data import Recording
 from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.odometry_jumps import JumpOptions, without_jumps
 from l2m_gtsam.slam.drive import Drive
@@ -18,7 +15,7 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.slips import judged
 from l2m_gtsam.slam.smoother import localise_drive
 from tests.drives.faults import jumped, shift
-from tests.drives.robot import assumed_sensors, robot_pass
+from tests.drives.robot import other_passes, robot_pass
 from tests.drives.slam import COARSE, calibrated, drifted, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
@@ -67,30 +64,8 @@ SMALL_SIGMAS = pytest.mark.xfail(reason="NEES 13.1, up to 12 wanted: noise that 
 @pytest.mark.parametrize("held_out", [1, pytest.param(2, marks=SMALL_SIGMAS), 3, 4])
 def test_slips_of_a_real_robot(shared_data: Path, held_out: int) -> None:
     """Ten slips of 10 cm and 5 degrees in a pass, in the map of the others; its pivots are real."""
-    others = [robot_pass(shared_data, run) for run in (1, 2, 3, 4) if run != held_out]
-    suite_options = SuiteCalibrationOptions.model_validate(
-        {
-            "position_m": 0.005,
-            "clock_s": 0.1,
-            "matrix": 0.03,
-            "offset_ut": 10.0,
-            "sync": {"thin_distance_m": 0.05},
-            "windows": 2,
-            "readings": 1500,
-            "modes": 250,
-        }
-    )
-    suite = calibrate_suite(others, assumed_sensors(shared_data), suite_options, silent)
-    known = {
-        each.sensor: KnownSensor(
-            each.sensor,
-            each.t_lidar_mag,
-            each.distortion,
-            0.0 if each.time_offset is None else each.time_offset.seconds,
-        )
-        for each in suite.sensors
-    }
-    field_map = map_recordings(others, known, MappingOptions())
+    passes = other_passes(shared_data, held_out)
+    suite, field_map = passes.suite, passes.field_map
     options = SlamOptions.model_validate(
         {"key_poses": {"distance_m": 0.1, "readings": 1}, "calibration": "refined"}
     )
