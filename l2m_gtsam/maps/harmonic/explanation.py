@@ -26,6 +26,8 @@ FEWEST_SCORES = 60
 FEWEST_PATCHES = 2 * FOLDS
 # Learnt noise over the sensor's own: what is not explained counts as noise.
 MOST_NOISE = 1.25
+FAR_NOISE = 3.0  # of the same: then it is hardly the field
+UNCALIBRATED = ": most likely the sensors are not calibrated (`l2m map suite`)"
 
 
 @dataclass(frozen=True)
@@ -73,8 +75,10 @@ class Explanation:
         if self.surprises > MOST_SURPRISES:
             reasons.append(f"{self.surprises:.1%} of them exceed three sigmas")
         if self.sensor_noise is not None and self.noise > MOST_NOISE * self.sensor_noise:
+            cause = UNCALIBRATED if self.noise > FAR_NOISE * self.sensor_noise else ""
             reasons.append(
                 f"the readings' noise is {self.noise:.2g} uT, the sensor's {self.sensor_noise:g}"
+                + cause
             )
         return reasons
 
