@@ -19,6 +19,7 @@ from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings, predict
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
+from l2m_gtsam.slam.unknown_field.changed_visits import CLEAR, LIKELY, Seen, change_gain
 from l2m_gtsam.slam.unknown_field.linear_field import AXES, LinearField
 from l2m_gtsam.slam.unknown_field.sensor_noise import SlowErrors
 from l2m_gtsam.slam.unknown_field.tiles import (
@@ -114,8 +115,10 @@ class TiledDrive:
         """Return the tiles of a drive at an estimate of its motions, key poses and sensors."""
         R = np.stack([pose.rotation().matrix() for pose in poses])
         p = np.stack([pose.translation() for pose in poses])
-        anchoring = anchor_tiles(R, p, prior.options.core)
         axes = level_axes(R)
+        anchoring = anchor_tiles(R, p, prior.options.core)
+        visits = RevisitedTiles(motions, poses, sensors, prior, axes)
+        anchoring = visits.renewed(anchoring)
         owner = anchoring.tile[motions.readings.key_pose]
         tiles = []
         for number, anchor in enumerate(anchoring.anchor.tolist()):
@@ -229,3 +232,88 @@ def relative_place(
     origin = poses[anchor]
     own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
     return place_readings(readings, own, sensors)
+
+
+KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged
+GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
+
+
+@dataclass(frozen=True)
+class DividedTiles:
+    """Tiles some of which changed, and between which key poses each did."""
+
+    anchoring: Anchoring
+    between: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class RevisitedTiles:
+    """Tiles at an estimate of poses, and whether later visits find the field of earlier ones.
+
+    Attributes
+    ----------
+    motions, poses, sensors, prior
+        As for ``TiledDrive.partition``.
+    axes
+        Level axes of the key poses in the map, shape (K, 3, 3).
+    """
+
+    motions: RelativeMotions
+    poses: list[gtsam.Pose3]
+    sensors: KnownSensors
+    prior: FieldPrior
+    axes: FloatArray
+
+    def renewed(self, anchoring: Anchoring) -> Anchoring:
+        """Return the same with a tile of its own from each visit on that found another field.
+
+        Steel that was moved is felt in other tiles, too: a visit between whose key poses and those
+        of the visit before a tile changed clearly needs little evidence.
+        """
+        # Sensors at places that are not known find other fields from visit to visit, too.
+        t = np.diagonal(self.sensors.covariance, axis1=-2, axis2=-1)[..., :3]
+        if np.sqrt(t.max()) > KNOWN_M:
+            return anchoring
+        sure = self._divided(anchoring, ())
+        return self._divided(anchoring, sure.between).anchoring if sure.between else anchoring
+
+    def _divided(self, anchoring: Anchoring, known: tuple[tuple[int, int], ...]) -> "DividedTiles":
+        anchors, tile = anchoring.anchor.tolist(), anchoring.tile.copy()
+        between = []
+        for number in range(len(anchoring)):
+            own = np.flatnonzero(tile == number)
+            visits = np.split(own, np.flatnonzero(np.diff(own) > GONE) + 1)
+            first = 0
+            for k in range(1, len(visits)):
+                last, start = int(visits[k - 1][-1]), int(visits[k][0])
+                alike = any(last < end and begin < start for begin, end in known)
+                earlier = np.concatenate(visits[first:k])
+                gain = self._gain(anchors[tile[earlier[0]]], earlier, visits[k])
+                if gain > (LIKELY if alike else CLEAR):
+                    later, first = np.concatenate(visits[k:]), k
+                    tile[later] = len(anchors)
+                    anchors.append(start)
+                    between.append((last, start))
+        return DividedTiles(Anchoring(np.array(anchors), tile), tuple(between))
+
+    def _gain(self, anchor: int, earlier: IntArray, visit: IntArray) -> float:
+        rows = [np.flatnonzero(np.isin(self._key_pose, each)) for each in (earlier, visit)]
+        if not all(len(each) for each in rows):
+            return 0.0
+        every = np.concatenate(rows)
+        where = relative_place(self.motions.readings[every], self.poses, anchor, self.sensors)
+        R = self.poses[anchor].rotation().matrix()
+        field = WaveTile.about(self.prior, R.T @ self.axes[anchor], where.x)
+        noise = self.sensors.noise[self.motions.readings.sensor[every], None]
+        variance = noise**2 + field.unresolved(where.x)
+        b, count = where.field(self.sensors), len(rows[0])
+        before, after = slice(0, count), slice(count, len(every))
+        return change_gain(
+            field,
+            Seen(where.x[before], b[before], variance[before]),
+            Seen(where.x[after], b[after], variance[after]),
+        )
+
+    @property
+    def _key_pose(self) -> IntArray:
+        return np.asarray(self.motions.readings.key_pose)
