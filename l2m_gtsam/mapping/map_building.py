@@ -34,7 +34,9 @@ class MappingOptions(Options):
     """Which readings enter; a map needs its readings spread in space, not in heading."""
     pose_noise: PoseNoiseOptions = PoseNoiseOptions()
     """How wrong the survey's poses are. Where neither this nor the recording says so, a harmonic
-    map looks for it in its readings; with both sigmas 0 poses count as exact."""
+    map looks for it in its readings; with both sigmas 0 poses count as exact. Where only sizes are
+    stated, and not how long errors last (`correlation_s`), they count if the readings of a pass have
+    them in common; else they are noise of each reading, which the map has learnt."""
     model: MapOptions = MapOptions()
     """The kind of map and its options."""
     structure: CloudTopicOptions = CloudTopicOptions(edge=0.05)

@@ -50,7 +50,15 @@ def survey_poses(
     seconds = 1e-9 * (readings.stamp_ns - trajectory.stamp_ns[0])
     lasting_s = max(options.lasting_s, SHORTEST_S)
     one_drive = np.zeros(N, dtype=np.int64)
-    return SurveyPoses(np.arange(N), one_drive, seconds, shift, lasting_s, roots is not None)
+    return SurveyPoses(
+        reading=np.arange(N),
+        drive=one_drive,
+        seconds=seconds,
+        shift=shift,
+        lasting_s=lasting_s,
+        stated=roots is not None,
+        duration_stated=options.correlation_s is not None,
+    )
 
 
 def crossing(vectors: FloatArray) -> FloatArray:

@@ -42,6 +42,8 @@ class SurveyPoses:
         Whether a unit is a standard deviation that was stated; else it is a radian or a metre.
     sizes
         Standard deviations that the survey showed, in rad and m, shape (6,); absent before.
+    duration_stated
+        Whether how long they last was stated, too. Else they may be noise of each reading.
     """
 
     reading: IntArray
@@ -51,6 +53,7 @@ class SurveyPoses:
     lasting_s: float
     stated: bool
     sizes: FloatArray | None = None
+    duration_stated: bool = True
 
     @property
     def known(self) -> bool:
@@ -64,7 +67,7 @@ class SurveyPoses:
     def like(self, other: "SurveyPoses | None") -> "SurveyPoses | None":
         """Return errors as large as those of another survey, where nothing is stated of these."""
         if self.stated:
-            return self
+            return self if self.duration_stated or other is not None else None
         if other is None or other.sizes is None:
             return None
         return self.sized(other.sizes, other.lasting_s)
@@ -80,7 +83,8 @@ class SurveyPoses:
             Of each reading, shape (N,).
         """
         share = (weight / np.bincount(owner, weight)[owner])[self.reading]
-        return replace(self, reading=owner[self.reading], shift=self.shift * share[:, None, None])
+        shift = rounded(self.shift * share[:, None, None])
+        return replace(self, reading=owner[self.reading], shift=shift)
 
     def only(self, keep: BoolArray) -> "SurveyPoses":
         """Return the errors of some of N readings, (N,)."""
@@ -110,7 +114,9 @@ class SurveyPoses:
 
     def in_units(self) -> "SurveyPoses":
         """Return the same where a unit is a standard deviation, if these were found."""
-        return self if self.sizes is None else replace(self, shift=self.shift * self.sizes)
+        if self.sizes is None:
+            return self
+        return replace(self, shift=rounded(self.shift * self.sizes))
 
     def knots(self, rows: IntArray, gradient: FloatArray) -> "KnotEffects":
         """Return what the errors at knots do to some readings.
@@ -138,6 +144,11 @@ class SurveyPoses:
             weighted = change * knots.weight[:, side, None, None]
             np.add.at(effect, (at, knots.index[:, side]), weighted)
         return KnotEffects(knots, felt, effect.transpose(0, 2, 1, 3))
+
+
+def rounded(shift: FloatArray) -> FloatArray:
+    """Return effects as files have them, in single precision: a map that is read is the same."""
+    return np.asarray(shift.astype(np.float32).astype(np.float64))
 
 
 @dataclass(frozen=True)

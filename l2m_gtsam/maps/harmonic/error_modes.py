@@ -35,11 +35,13 @@ from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_sums import tile_pull
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SuiteErrors
-from l2m_gtsam.maps.survey_poses import Knots
+from l2m_gtsam.maps.survey_poses import Knots, SurveyPoses
 from l2m_gtsam.parallel.threads import in_threads
 
 NEGLIGIBLE = 1e-15  # share of the variance at places
 LINEAR = 0.002  # metres over which a field that varies over decimetres is linear
+WHOLE = 1 - 1e-6  # of a variance: the survey's noise has no more of it
+APART = 6.0  # in durations: errors of poses so far apart have 0.25 % in common
 FELT = 0.01  # of the noise, root mean square over a drive: what matters to ten thousand readings
 
 
@@ -280,9 +282,8 @@ def joint_covariance(learnt: Learnt, tiles: dict[int, TileModes]) -> FloatArray:
     """Return the covariance of all beta: one in each tile, and what shared noise correlates."""
     indices = list(tiles)
     # What a step of the field lies between is left to each tile.
-    rows, pairs = shared_readings(
-        [learnt.present(index) for index in indices], len(learnt.readings)
-    )
+    present = [learnt.present(index) for index in indices]
+    rows, pairs = shared_readings(present, len(learnt.readings))
 
     def seen(k: int) -> Seen:
         return seen_noise(learnt, tiles[indices[k]], indices[k], rows[k])
@@ -290,6 +291,8 @@ def joint_covariance(learnt: Learnt, tiles: dict[int, TileModes]) -> FloatArray:
     noises = in_threads(seen, range(len(indices)))
     starts = np.cumsum([0, *(len(modes) for modes in tiles.values())])
     covariance = np.eye(int(starts[-1]))
+    if learnt.poses is not None:
+        pairs = sorted({*pairs, *shared_poses(present, learnt.poses)})
     for i, j in pairs:
         shared = noises[i].together(noises[j])
         covariance[starts[i] : starts[i + 1], starts[j] : starts[j + 1]] = shared
@@ -365,7 +368,45 @@ def seen_noise(learnt: Learnt, modes: TileModes, index: int, shared: IntArray) -
     at = np.searchsorted(rows, shared)
     white = pulled[at].transpose(2, 1, 0) * (noise / np.sqrt(weight[at]))
     at_knots = np.einsum("nir,niqc->rqc", pulled, effects.effect, optimize=True)
-    return Seen(shared, white, SeenPoses(effects.knots, at_knots))
+    # The tile was solved with the gradient of exact poses: where the two differ, noise would make
+    # more of beta than there is of it.
+    alone = pulled.transpose(2, 1, 0) * (noise / np.sqrt(weight))
+    poses = SeenPoses(effects.knots, at_knots)
+    least = within_whole(Seen(rows, alone, poses).together(Seen(rows, alone, poses)))
+    white = np.einsum("rs,sin->rin", least, white, optimize=True)
+    return Seen(shared, white, SeenPoses(effects.knots, np.tensordot(least, at_knots, 1)))
+
+
+def within_whole(part: FloatArray) -> FloatArray:
+    """Return what takes a part of unit variances, (r, r), to no more than the whole, (r, r)."""
+    squares, axes = np.linalg.eigh(part)
+    return np.asarray((axes / np.sqrt(np.maximum(squares / WHOLE, 1.0))) @ axes.T)
+
+
+def shared_poses(members: list[IntArray], poses: SurveyPoses) -> list[tuple[int, int]]:
+    """Return the pairs of tiles whose readings were taken while the same errors of poses lasted.
+
+    Without them the covariance of all tiles, each next to the other on a pass, would be none.
+    """
+    cell = np.floor(poses.seconds / (APART * poses.lasting_s)).astype(np.int64)
+    pair_tiles, pair_cells = [], []
+    for tile, rows in enumerate(members):
+        own = np.isin(poses.reading, rows)
+        when = np.unique(np.stack([poses.drive[own], cell[own]], axis=1), axis=0)
+        for later in (0, 1):
+            pair_tiles.append(np.full(len(when), tile))
+            pair_cells.append(when + np.array([0, later]))
+    every, number = np.unique(np.concatenate(pair_cells), axis=0, return_inverse=True)
+    tile_of = np.concatenate(pair_tiles)
+    numbers: IntArray = np.asarray(number).ravel()
+    return together(tile_of, numbers, (len(members), len(every)))
+
+
+def together(tile: IntArray, number: IntArray, shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return the pairs of tiles that have a number in common, shapes (K,) both."""
+    has = csr_array((np.ones(len(tile)), (tile, number)), shape=shape)
+    pairs = tril(has @ has.T, -1)
+    return list(zip(pairs.row.tolist(), pairs.col.tolist(), strict=True))
 
 
 def shared_readings(
@@ -382,8 +423,6 @@ def shared_readings(
     """
     tile = np.repeat(np.arange(len(members)), [len(rows) for rows in members])
     reading = np.concatenate([np.empty(0, dtype=np.int64), *members])
-    has = csr_array((np.ones(len(tile)), (tile, reading)), shape=(len(members), count))
     often = np.bincount(reading, minlength=count) > 1
-    together = tril(has @ has.T, -1)
-    pairs = list(zip(together.row.tolist(), together.col.tolist(), strict=True))
+    pairs = together(tile, reading, (len(members), count))
     return [rows[often[rows]] for rows in members], pairs

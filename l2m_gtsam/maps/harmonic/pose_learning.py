@@ -10,7 +10,7 @@ from l2m_gtsam.maps.harmonic.evidence import condition, normal_of
 from l2m_gtsam.maps.harmonic.furnish import COARSE
 from l2m_gtsam.maps.harmonic.learning import Window, maximise
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
-from l2m_gtsam.maps.harmonic.pose_sizes import FoundPoses, noise_beside, pose_sizes
+from l2m_gtsam.maps.harmonic.pose_sizes import FoundPoses, lasting, noise_beside, pose_sizes
 from l2m_gtsam.maps.harmonic.representatives import spread_tiles
 from l2m_gtsam.maps.harmonic.tile_sums import shared_noise
 from l2m_gtsam.maps.harmonic.tiles import Tiles
@@ -34,6 +34,8 @@ def with_pose_errors(
         Of the map.
     """
     if poses.stated:
+        if not poses.duration_stated and not lasting(learnt, tiles, poses):
+            return None
         share = noise_beside(learnt, tiles, poses)
         return relearnt(replace(quieter(learnt, share), poses=poses), options)
     if options.hyperparameters is not None:  # with the noise that is given there is nothing to find
@@ -45,8 +47,8 @@ def with_pose_errors(
         current = relearnt(beside(current, poses, found), options)
         exact = replace(current, poses=None)
         again = pose_sizes(exact, Tiles(exact), poses, noise_known=True)
-        if again is None:
-            break
+        if again is None:  # scales that fit better leave nothing of them
+            return None
         found = again
         current = exact
     done = beside(current, poses, found)

@@ -140,6 +140,16 @@ def pose_sizes(
     return best if best.gain > LEAST_GAIN and best.credible else None
 
 
+def lasting(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> bool:
+    """Return whether a survey is more likely with stated errors that last than with exact poses.
+
+    Errors that every pose has of its own are noise of each reading, which a map has learnt.
+    """
+    some = spread_tiles(learnt.tiling, [len(rows) for rows in learnt.members], MOST_TILES)
+    seen = in_threads(partial(pose_view, learnt, tiles, poses), some)
+    return sum(each.system.posterior(np.ones(len(each.part))).likelihood for each in seen) > 0
+
+
 def noise_beside(learnt: Learnt, tiles: Tiles, poses: SurveyPoses) -> float:
     """Return the share of the noise's variance that is left beside errors of stated sizes."""
     some = spread_tiles(learnt.tiling, [len(rows) for rows in learnt.members], MOST_TILES)
