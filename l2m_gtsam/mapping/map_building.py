@@ -35,7 +35,7 @@ class MappingOptions(Options):
     pose_noise: PoseNoiseOptions = PoseNoiseOptions()
     """How wrong the survey's poses are. Where neither this nor the recording says so, a harmonic
     map looks for it in its readings; with both sigmas 0 poses count as exact. Where only sizes are
-    stated, and not how long errors last (`correlation_s`), they count if the readings of a pass have
+    stated, and not how long errors last (`correlation_s`), they count if readings of a pass have
     them in common; else they are noise of each reading, which the map has learnt."""
     model: MapOptions = MapOptions()
     """The kind of map and its options."""
