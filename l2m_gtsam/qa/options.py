@@ -1,7 +1,7 @@
 """Thresholds of verdicts, and of outliers in a fleet."""
 
 from collections.abc import Iterable
-from typing import Self
+from typing import Any, Self
 
 from pydantic import Field, PositiveFloat, model_validator
 
@@ -105,8 +105,29 @@ class SlamQaOptions(Options):
     """Share of true calibrations that may, by chance, be reported as changed by refining them."""
 
 
+FORMER_HALVES = "halves_sigmas"
+
+
 class QaOptions(Options):
     """Thresholds of the verdict in a report."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_former_halves(cls, given: Any) -> Any:
+        """Take `halves_sigmas`, as it was, for `halves_apart`.
+
+        It limited the root mean square over t, C and H in sigmas, by 2 and 4 where this has 1 and 2
+        of what chance exceeds seldom.
+        """
+        if not (isinstance(given, dict) and isinstance(given.get(FORMER_HALVES), dict)):
+            return given
+        former = {key: value for key, value in given.items() if key != FORMER_HALVES}
+        limits = given[FORMER_HALVES]
+        halved = {
+            name: value / 2 if isinstance(value, int | float) else value
+            for name, value in limits.items()
+        }
+        return {"halves_apart": halved, **former}
 
     position_sigma_m: Limit = Limit(warn=0.01, fail=0.03)
     """Largest standard deviation of a sensor's position, metres."""

@@ -24,7 +24,9 @@ from l2m_gtsam.storage.files import atomic_path
 
 FORMAT = "l2m-map"
 VERSION = 3
-READ = (2, VERSION)  # of version 2 are maps that were not kept up
+FORMER = 2  # of maps that have nothing of what came with the present version
+LATER = frozenset({"steps", "pose_pairs"})  # arrays of maps that are kept up, or know wrong poses
+READ = (FORMER, VERSION)
 HEADER, CHECKSUM, ARRAYS = "header.npy", "checksum.npy", "arrays/"
 LIDAR = "lidar/"
 LIDAR_SHAPES = {"points": (3,), "R": (3, 3), "p": (3,)}
@@ -131,7 +133,7 @@ def _lidar(path: Path, arrays: Arrays) -> LidarMap:
 def _encode_header(path: Path, state: MapState) -> npt.NDArray[np.uint8]:
     content = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSION if LATER & state.arrays.keys() else FORMER,
         "kind": state.kind,
         "options": state.options,
         "provenance": state.provenance,

@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from l2m_gtsam.maps.build import map_from_state
+from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.records.calibration import Return, SensorStatus, Uncertainty
 from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.records.sensor_models import Model
@@ -191,3 +193,11 @@ def test_other_files_are_written_the_same(tmp_path: Path) -> None:
     save_map(tmp_path / "map.npz", load_map(FILES / "map.npz"))
     for name in ("metrics.json", "map.npz"):
         assert (tmp_path / name).read_bytes() == (FILES / name).read_bytes()
+
+
+def test_the_former_limit_of_halves_is_understood() -> None:
+    assert QaOptions.model_validate({"halves_sigmas": {"warn": 3.0, "fail": 6.0}}) == QaOptions(
+        halves_apart=Limit(warn=1.5, fail=3.0)
+    )
+    with pytest.raises(ValidationError, match="halves_apart"):
+        QaOptions.model_validate({"halves_sigmas": {"warn": 3.0, "fail": "much"}})
