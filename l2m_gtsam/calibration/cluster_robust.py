@@ -101,7 +101,7 @@ class ByParts:
 
 
 @dataclass(frozen=True)
-class Ratio:
+class VarianceRatio:
     """A variance found over that expected.
 
     Attributes
@@ -121,17 +121,17 @@ class Ratio:
         return self.value if self.value > limit else 1.0
 
 
-UNKNOWN = Ratio(1.0, np.inf)
+UNKNOWN = VarianceRatio(1.0, np.inf)
 
 
 @dataclass(frozen=True)
 class Scatter:
     """The scatter of one division of a drive into parts: t, C, H and time offset."""
 
-    t: Ratio
-    C: Ratio
-    H: Ratio
-    offset: Ratio
+    t: VarianceRatio
+    C: VarianceRatio
+    H: VarianceRatio
+    offset: VarianceRatio
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Scores:
     found: FloatArray
     expected: FloatArray
 
-    def ratio(self, covariance: FloatArray, block: slice) -> Ratio:
+    def ratio(self, covariance: FloatArray, block: slice) -> VarianceRatio:
         """Return the variance found over that expected.
 
         Parameters
@@ -170,7 +170,7 @@ class Scores:
         spread = float(2 * (parts * parts.transpose(0, 2, 1)).sum())  # variance of ``found``
         if not (expected > 0 and spread > 0):
             return UNKNOWN
-        return Ratio(found / expected, 2 * expected**2 / spread)
+        return VarianceRatio(found / expected, 2 * expected**2 / spread)
 
 
 def scatters(

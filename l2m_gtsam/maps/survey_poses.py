@@ -135,10 +135,10 @@ class SurveyPoses:
         felt = np.flatnonzero(size)
         change = (shift[:, 3:] - gradient[at] @ shift[:, :3])[:, :, felt] * size[felt]
         spacing = self.lasting_s / KNOTS
-        knots = Knots.at(self.drive[mine], self.seconds[mine], spacing, self.lasting_s)
+        knots = ErrorKnots.at(self.drive[mine], self.seconds[mine], spacing, self.lasting_s)
         while len(knots.drive) > MOST_KNOTS:
             spacing *= 2
-            knots = Knots.at(self.drive[mine], self.seconds[mine], spacing, self.lasting_s)
+            knots = ErrorKnots.at(self.drive[mine], self.seconds[mine], spacing, self.lasting_s)
         effect = np.zeros((len(rows), len(knots.drive), 3, len(felt)))
         for side in range(2):
             weighted = change * knots.weight[:, side, None, None]
@@ -152,7 +152,7 @@ def rounded(shift: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Knots:
+class ErrorKnots:
     """Q times at which errors are numbers of their own, and what P pairs take of them.
 
     Attributes
@@ -172,7 +172,9 @@ class Knots:
     weight: FloatArray
 
     @classmethod
-    def at(cls, drive: IntArray, seconds: FloatArray, spacing: float, lasting_s: float) -> "Knots":
+    def at(
+        cls, drive: IntArray, seconds: FloatArray, spacing: float, lasting_s: float
+    ) -> "ErrorKnots":
         """Return the knots around pairs; errors have unit variance also between two."""
         before = np.floor(seconds / spacing)
         part = seconds / spacing - before
@@ -185,7 +187,7 @@ class Knots:
         when = spacing * some[:, 1].astype(np.float64)
         return cls(some[:, 0], when, lasting_s, index.reshape(-1, 2), weight)
 
-    def correlation(self, other: "Knots") -> FloatArray:
+    def correlation(self, other: "ErrorKnots") -> FloatArray:
         """Return the correlation with errors at other knots, shape (Q, Q')."""
         apart = np.abs(self.seconds[:, None] - other.seconds) / self.lasting_s
         same = self.drive[:, None] == other.drive
@@ -206,7 +208,7 @@ class KnotEffects:
         Of a unit of each in uT, map frame, shape (n, 3, Q, c).
     """
 
-    knots: Knots
+    knots: ErrorKnots
     felt: IntArray
     effect: FloatArray
 

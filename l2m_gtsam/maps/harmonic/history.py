@@ -10,7 +10,7 @@ from l2m_gtsam.records.map_diary import MapDiary, MapDrive
 
 
 @dataclass(frozen=True)
-class Step:
+class TileStep:
     """How the field of a tile moved between two drives.
 
     Attributes
@@ -26,7 +26,7 @@ class Step:
     depth: float
 
 
-STILL = Step(0.0, 0.0)
+STILL = TileStep(0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class History:
     cells
         Whole-numbered places of tiles that have steps, shape (M, 2).
     shares, depths
-        Of each one's step before each drive; see ``Step``, shapes (M, D).
+        Of each one's step before each drive; see ``TileStep``, shapes (M, D).
     freed
         Structures that are others since a drive: number of the structure and of the drive, (P, 2).
     diary
@@ -87,7 +87,7 @@ class History:
         last = np.full(len(structures), self.drives - 1)
         return replace(self, freed=np.vstack([self.freed, np.column_stack([structures, last])]))
 
-    def with_steps(self, grid: Grid, steps: dict[int, Step]) -> "History":
+    def with_steps(self, grid: Grid, steps: dict[int, TileStep]) -> "History":
         """Return the same with steps of tiles of a grid before the last drive."""
         moved = {tile: step for tile, step in steps.items() if step.share > 0}
         places = grid.cells[list(moved)].reshape(-1, 2)
@@ -104,13 +104,13 @@ class History:
     def _row(cell: IntArray, cells: IntArray) -> int:
         return int(np.flatnonzero((cells == cell).all(axis=1))[0])
 
-    def steps_of(self, cell: IntArray) -> list[Step]:
+    def steps_of(self, cell: IntArray) -> list[TileStep]:
         """Return the steps of a tile by its place, (2,), before each drive."""
         own = np.flatnonzero((self.cells == cell).all(axis=1))
         if not len(own):
             return [STILL] * self.drives
         return [
-            Step(float(share), float(depth))
+            TileStep(float(share), float(depth))
             for share, depth in zip(self.shares[own[0]], self.depths[own[0]], strict=True)
         ]
 

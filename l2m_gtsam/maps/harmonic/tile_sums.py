@@ -12,7 +12,7 @@ from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import Normal, normal_of
 from l2m_gtsam.maps.harmonic.fading import carried, likelihood, share_left
 from l2m_gtsam.maps.harmonic.family import UniformField
-from l2m_gtsam.maps.harmonic.history import STILL, Step
+from l2m_gtsam.maps.harmonic.history import STILL, TileStep
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
@@ -132,7 +132,7 @@ def by_drive(learnt: Learnt, index: int, rows: IntArray) -> list[tuple[int, IntA
     return [(int(number), rows[own == number]) for number in np.unique(own)]
 
 
-def moved_by(learnt: Learnt, index: int, basis: Basis, drive: int, step: Step) -> FloatArray:
+def moved_by(learnt: Learnt, index: int, basis: Basis, drive: int, step: TileStep) -> FloatArray:
     """Return how far each weight of a tile moved before a drive: rho, shape (m,)."""
     near, history = learnt.structure_numbers(index), learnt.history
     freed = [False] * len(near) if history is None else history.freed_before(drive, near)
@@ -148,7 +148,7 @@ def moved_by(learnt: Learnt, index: int, basis: Basis, drive: int, step: Step) -
     return moved
 
 
-def likeliest_step(learnt: Learnt, index: int) -> Step:
+def likeliest_step(learnt: Learnt, index: int) -> TileStep:
     """Return how far a tile moved before the last drive, whose readings it has already."""
     history, rows = learnt.history, learnt.members[index]
     if history is None:
@@ -165,7 +165,7 @@ def likeliest_step(learnt: Learnt, index: int) -> Step:
     told = np.exp(log_variance) * np.diag((before + new).FF) / noise**2 > INFORMATIVE
     before, new, variance = among(before, told), among(new, told), log_variance[told]
 
-    def value(step: Step) -> float:
+    def value(step: TileStep) -> float:
         moved = moved_by(learnt, index, basis, last, step)[told]
         return likelihood(before, new, variance, noise, moved)
 
@@ -173,10 +173,10 @@ def likeliest_step(learnt: Learnt, index: int) -> Step:
     for depth in DEPTHS:
         highest = -np.inf
         for share in SHARES:
-            now = value(Step(share, depth))
+            now = value(TileStep(share, depth))
             highest = max(highest, now)
             if now > best:
-                best, found = now, Step(share, depth)
+                best, found = now, TileStep(share, depth)
             if now < highest - PAST:
                 break
     return found

@@ -25,7 +25,7 @@ FRESH = 500  # a survey's seed over that of the hall
 
 
 @dataclass(frozen=True)
-class MapErrors:
+class MapScore:
     """How far off a map is.
 
     Attributes
@@ -44,9 +44,9 @@ class MapErrors:
 class RoundsEnd:
     """Errors after the last round: of the first survey, of the kept map, of a fresh survey."""
 
-    first: MapErrors
-    kept: MapErrors
-    fresh: MapErrors
+    first: MapScore
+    kept: MapScore
+    fresh: MapScore
     field_map: FieldMap
 
 
@@ -111,7 +111,7 @@ class Warehouse:
             series=tuple(replace(each, stamp_ns=each.stamp_ns + late) for each in recording.series),
         )
 
-    def errors_of(self, field_map: FieldMap) -> MapErrors:
+    def errors_of(self, field_map: FieldMap) -> MapScore:
         """Return how far off a map is where sensors come, at heights that no survey had."""
         hall, noise = self.hall, self.options.noise
         points = np.concatenate(
@@ -123,7 +123,7 @@ class Warehouse:
         known = field_map.query(points)
         e = (known.field - hall.world.field(points))[known.inside]
         z = e / np.sqrt(known.variance[known.inside])
-        return MapErrors(float(np.sqrt(np.mean(e**2))), float(np.sqrt(np.mean(z**2))))
+        return MapScore(float(np.sqrt(np.mean(e**2))), float(np.sqrt(np.mean(z**2))))
 
 
 def rounds_end(options: ChangesStudyOptions, seed: int, rounds: int) -> RoundsEnd:
