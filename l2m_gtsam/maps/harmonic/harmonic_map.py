@@ -14,7 +14,7 @@ from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.pose_learning import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
-from l2m_gtsam.maps.harmonic.suite_sizes import sized, suite_sizes
+from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
 from l2m_gtsam.maps.harmonic.tiles import Tiles
@@ -127,9 +127,11 @@ class HarmonicMap:
         cls, learnt: Learnt, options: HarmonicOptions, suite: SuiteErrors
     ) -> "HarmonicMap":
         """Return the map with the errors of its sensors: stated, or as the survey shows them."""
-        if suite.stated:
-            return cls.condition(replace(learnt, suite=suite), options)
         exact = cls.condition(learnt, options)
+        if suite.stated:
+            doubts = stated_doubts(learnt, exact.tiles, suite)
+            learnt = replace(learnt, suite=suite)
+            return cls(learnt, options, Tiles(learnt, exact.tiles.solved)).doubted(doubts)
         sizes = suite_sizes(learnt, exact.tiles, suite)
         if sizes is None:
             return exact

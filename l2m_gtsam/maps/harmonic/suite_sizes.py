@@ -17,7 +17,7 @@ of the sensors' differences, and of H as it shows under several headings.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import cholesky, null_space
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.error_modes import TileModes, moved_weights
@@ -25,12 +25,16 @@ from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SIZE, SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
+from l2m_gtsam.records.stated_size import StatedSize
+from l2m_gtsam.records.variance_shares import ErrorCause
 from l2m_gtsam.solve.variance_components import WeightSystem
 
 MOST_TILES = 24  # of the survey, spread over it
 NAMES = ("t", "C", "H", "offset")
 PARTS = np.repeat(np.arange(len(NAMES)), [3, 9, 3, 1])
 H = NAMES.index("H")
+JUDGED = (NAMES.index("C"), NAMES.index("H"))
+SMALLEST = 0.01  # of what was stated
 LEAST_GAIN = 16.0  # twice a logarithm of likelihood; chance gives four sizes that in 0.1 % of maps
 
 
@@ -65,6 +69,22 @@ class SuiteSizes:
         )
 
 
+@dataclass(frozen=True)
+class TileView:
+    """What the readings of one tile, or of several, say of the sensors' errors.
+
+    Attributes
+    ----------
+    system
+        Information and pull of all of them.
+    squares
+        Sum of squares of the residuals, white by the map's noise.
+    """
+
+    system: WeightSystem
+    squares: float
+
+
 def suite_sizes(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> SuiteSizes | None:
     """Return how far off the sensors are; None where the survey shows nothing of it.
 
@@ -75,19 +95,76 @@ def suite_sizes(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> SuiteSizes 
     suite
         What errors of the sensors do to the readings.
     """
-    count = len(learnt.tiling)
-    some = np.unique(np.linspace(0, count - 1, min(count, MOST_TILES)).astype(int)).tolist()
-    seen = in_threads(lambda index: tile_view(learnt, tiles, suite, index), some)
     turned, part = differences(len(suite.sensors))
     spectra = (part == np.arange(len(NAMES))[:, None]).astype(np.float64)
-    information = np.sum([each.system.information for each in seen], axis=0)
-    pull = np.sum([each.system.pull for each in seen], axis=0)
-    system = WeightSystem(turned.T @ information @ turned, turned.T @ pull)
+    view = survey_view(learnt, tiles, suite, turned)
     # The map's noise has these errors in it: what they explain is none.
-    found = system.components_and_noise(spectra, sum(each.squares for each in seen))
+    found = view.system.components_and_noise(spectra, view.squares)
     if found.gain < LEAST_GAIN:
         return None
     return SuiteSizes(*np.sqrt(found.sizes).tolist())
+
+
+def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize:
+    """Return how large errors of C and H are beside what was stated of them, all alike.
+
+    Places of sensors are not judged: millimetres hardly show, and waves that a map misses between
+    the heights of two sensors look like them.
+
+    Parameters
+    ----------
+    learnt, tiles, suite
+        As in ``suite_sizes``; the covariance is the one stated.
+    """
+    turned, part = differences(len(suite.sensors))
+    known = np.einsum("ij,ij->j", turned, suite.covariance @ turned) > 0
+    turned, part = turned[:, known], part[known]
+    # Independent numbers of unit variance as stated. Those of C and H come last, so that places
+    # and clocks, which they may hang together with, stay as they are stated.
+    order = np.argsort(np.isin(part, JUDGED), kind="stable")
+    turned, judged = turned[:, order], np.isin(part[order], JUDGED)
+    root = cholesky(turned.T @ suite.covariance @ turned, lower=True)
+    view = survey_view(learnt, tiles, suite, turned @ root)
+    system = view.system.beside((~judged).astype(float)).among(np.flatnonzero(judged))
+    alike = np.ones((1, int(judged.sum())))
+    found = system.components_and_noise(alike, view.squares)
+    gain = found.gain - 2 * system.whiter(found.noise).posterior(alike[0]).likelihood
+    return StatedSize(ErrorCause.SUITE, max(float(np.sqrt(found.sizes[0])), SMALLEST), gain)
+
+
+def calibrated_together(suite: SuiteErrors) -> bool:
+    """Return whether sensors have errors in common, as those that a survey has calibrated.
+
+    If it was this very survey it fits them better than their sigmas, which are right nevertheless.
+    """
+    own = np.kron(np.eye(len(suite.sensors)), np.ones((SIZE, SIZE)))
+    return bool(suite.covariance[own == 0].any())
+
+
+def stated_doubts(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> tuple[str, ...]:
+    """Return what is wrong with sigmas that were stated of a survey's sensors, a sentence."""
+    found = stated_size(learnt, tiles, suite)
+    if not found.is_wrong or (found.ratio < 1 and calibrated_together(suite)):
+        return ()
+    wrong = "too small" if found.ratio > 1 else "too large"
+    return (
+        (
+            f"the sigmas stated of the survey's sensors are {wrong}: by the survey their C and H "
+            f"are off by {found.ratio:.2g} times as much, and sigmas of a calibration are {wrong}; "
+            "correct them (--suite)"
+        ),
+    )
+
+
+def survey_view(learnt: Learnt, tiles: Tiles, suite: SuiteErrors, turned: FloatArray) -> TileView:
+    """Return what some tiles together say of combinations of the errors, shape (16 S, k)."""
+    count = len(learnt.tiling)
+    some = np.unique(np.linspace(0, count - 1, min(count, MOST_TILES)).astype(int)).tolist()
+    seen = in_threads(lambda index: tile_view(learnt, tiles, suite, index), some)
+    information = np.sum([each.system.information for each in seen], axis=0)
+    pull = np.sum([each.system.pull for each in seen], axis=0)
+    system = WeightSystem(turned.T @ information @ turned, turned.T @ pull)
+    return TileView(system, sum(each.squares for each in seen))
 
 
 def differences(sensors: int) -> tuple[FloatArray, IntArray]:
@@ -104,22 +181,6 @@ def differences(sensors: int) -> tuple[FloatArray, IntArray]:
         columns.append(own.reshape(sensors * SIZE, -1))
         parts += [part] * every[part].shape[1]
     return np.concatenate(columns, axis=1), np.array(parts)
-
-
-@dataclass(frozen=True)
-class TileView:
-    """What the readings of one tile say of the sensors' errors.
-
-    Attributes
-    ----------
-    system
-        Information and pull of all of them.
-    squares
-        Sum of squares of the residuals, white by the map's noise.
-    """
-
-    system: WeightSystem
-    squares: float
 
 
 def tile_view(learnt: Learnt, tiles: Tiles, suite: SuiteErrors, index: int) -> TileView:

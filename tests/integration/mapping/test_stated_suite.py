@@ -1,0 +1,64 @@
+"""Sigmas of a survey's sensors that are stated wrongly are noticed, a third and thrice."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.suite_sizes import stated_doubts
+from l2m_gtsam.studies.troubles.options import TroublesOptions, World
+from l2m_gtsam.studies.troubles.places import place_of
+from l2m_gtsam.studies.troubles.surveys import known_suite, survey_of
+
+OPTIONS, SEED = TroublesOptions(survey_readings=900), 742
+
+
+@cache
+def surveyed(times: float) -> HarmonicMap:
+    """Return the map of a hall whose suite is stated so many times too large."""
+    place, right = place_of(World.HALL, SEED), known_suite(OPTIONS)
+    recorded = survey_of(place, OPTIONS).recorded(right, place, OPTIONS, off=True)
+    stated = {}
+    for name, each in right.items():
+        assert each.covariance is not None
+        stated[name] = replace(each, covariance=times**2 * each.covariance)
+    found = map_recordings([recorded], stated, MappingOptions(model=OPTIONS.map), place.cloud())
+    assert isinstance(found, HarmonicMap)
+    return found
+
+
+def doubts(times: float, *, together: bool = False) -> tuple[str, ...]:
+    """Return what that map would say of such a suite, whose sensors may have errors in common."""
+    found = surveyed(1.0)
+    suite = found.learnt.suite
+    assert suite is not None
+    covariance = times**2 * suite.covariance
+    if together:  # heights of all sensors
+        heights = np.arange(2, len(covariance), 16)
+        covariance[np.ix_(heights, heights)] += 1e-6
+    return stated_doubts(found.learnt, found.tiles, replace(suite, covariance=covariance))
+
+
+def test_a_suite_that_is_stated_rightly_is_not_doubted() -> None:
+    assert not [each for each in surveyed(1.0).summary.doubts if "sigmas stated" in each]
+
+
+@pytest.mark.parametrize(("times", "words"), [(1 / 3, "too small"), (3.0, "too large")])
+def test_a_suite_that_is_stated_wrongly_is_doubted(times: float, words: str) -> None:
+    (found,) = doubts(times)
+    assert words in found
+
+
+def test_the_map_of_a_wrongly_stated_suite_says_so() -> None:
+    summary = surveyed(1 / 3).summary
+    assert [each for each in summary.doubts if "are too small" in each]
+
+
+def test_sensors_that_a_survey_calibrated_may_be_better_than_stated() -> None:
+    # It may be this very survey, which fits them too well to judge them by.
+    assert not doubts(3.0, together=True)
+    (found,) = doubts(1 / 3, together=True)
+    assert "too small" in found
