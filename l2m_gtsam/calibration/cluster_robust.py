@@ -22,6 +22,25 @@ Compared with that the scatter has no bias by few parts (Bell and McCaffrey, Sur
 by the ratio of both, but for what stated errors of the survey's sensors make of it: the map is made
 of readings like the drive's, with errors that last like theirs; a stated error is what it is.
 
+How well a ratio is known if errors are *not* as modelled is another matter: one cause may be behind
+the scatter in all directions, and then B parts are B - 1 squares, whatever the number of directions
+(Bester, Conley and Hansen, Journal of Econometrics 165, 2011). How many directions differ is seen
+in the scores u_b themselves, white by the covariance, shape (B, n). For normal errors of rho
+squares among parts and nu among directions
+
+.. math::
+    \frac{\mathrm{tr}\,(u^T u)^2}{(\mathrm{tr}\, u^T u)^2}
+        \approx \frac1\rho + \frac1\nu + \frac1{\rho \nu}, \qquad \rho = B - 1
+
+and the ratio is a mean of :math:`\rho \nu` squares. Errors of an estimate go the same few ways: a
+squared distance in n dimensions, over n times the ratio, is about Fisher's with nu and
+:math:`\rho \nu` degrees of freedom (Box, Annals of Mathematical Statistics 25, 1954).
+
+An offset that wanders is none that more parts know better: H of any moment of the drive is as far
+from its mean as parts are. With w_b what a unit of H in a part adds to H of the whole, parts whose
+H scatters by s sigmas add :math:`s^2 \sum_b w_b P w_b^T` to what is found. That s counts beside
+the variance of the mean.
+
 An error that is the same in all parts, as a shift of the whole map, is not seen.
 """
 
@@ -41,6 +60,7 @@ HALVINGS = 4  # into sixteen parts; eight are pairs of them
 FALSE_ALARMS = 0.002  # of calibrations whose errors are as modelled
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15), "offset": slice(15, 16)}
 NONE = np.empty(0, dtype=np.int64)
+TINY = np.finfo(np.float64).tiny
 TESTS = 4 * len(BLOCKS)  # of a sensor: parts by time and by place, of two sizes
 
 
@@ -109,11 +129,18 @@ class VarianceRatio:
     value
         Their ratio.
     freedom
-        How well it is known: it is a mean square of so many errors (Satterthwaite).
+        How well it is known if errors are as modelled: it is a mean square of so many of them
+        (Satterthwaite).
+    parts
+        How many squares the scatter has in each direction, B - 1.
+    directions
+        How many directions differ by the scatter itself, whatever the errors are.
     """
 
     value: float
     freedom: float
+    parts: int
+    directions: float
 
     def beyond_chance(self, false_alarms: float) -> float:
         """Return the ratio, one where chance explains the excess."""
@@ -121,17 +148,27 @@ class VarianceRatio:
         return self.value if self.value > limit else 1.0
 
 
-UNKNOWN = VarianceRatio(1.0, np.inf)
+UNKNOWN = VarianceRatio(1.0, np.inf, 1, np.inf)
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """The scatter of one division of a drive into parts: t, C, H and time offset."""
+    """The scatter of one division of a drive into parts: t, C, H and time offset.
+
+    Attributes
+    ----------
+    t, C, H, offset
+        Variances of estimates over those expected.
+    spread_of_H
+        Mean square of H in a part about H of the whole, beyond that expected, over the variance of
+        H as the model has it; not below zero.
+    """
 
     t: VarianceRatio
     C: VarianceRatio
     H: VarianceRatio
     offset: VarianceRatio
+    spread_of_H: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -144,10 +181,13 @@ class Scores:
         Shape (B, 16).
     expected
         Their covariances if all errors are as modelled, shape (B, 16, 16).
+    share
+        What a unit of each parameter in one part adds to all of the whole, shape (B, 16, 16).
     """
 
     found: FloatArray
     expected: FloatArray
+    share: FloatArray
 
     def ratio(self, covariance: FloatArray, block: slice) -> VarianceRatio:
         """Return the variance found over that expected.
@@ -159,18 +199,48 @@ class Scores:
         block
             The parameters whose variances are taken together, each in its own sigmas.
         """
-        sigma = np.sqrt(np.diag(covariance)[block])
-        correlation = covariance[block, block] / np.outer(sigma, sigma)
-        # Sum of squares in the metric of P: which axes the block is written in does not matter.
-        lower = cholesky(correlation, lower=True)
-        white = solve_triangular(lower, np.diag(1 / sigma), lower=True)
-        found = float(((self.found[:, block] @ white.T) ** 2).sum())
+        white = whitening_of(covariance[block, block])
+        scores = self.found[:, block] @ white.T
+        found = float((scores**2).sum())
         parts = white @ self.expected[:, block, block] @ white.T
         expected = float(np.trace(parts.sum(axis=0)))
         spread = float(2 * (parts * parts.transpose(0, 2, 1)).sum())  # variance of ``found``
         if not (expected > 0 and spread > 0):
             return UNKNOWN
-        return VarianceRatio(found / expected, 2 * expected**2 / spread)
+        squares, freedom = len(scores) - 1, 2 * expected**2 / spread
+        directions = min(directions_of(scores), freedom / squares)
+        return VarianceRatio(found / expected, freedom, squares, directions)
+
+    def spread(self, covariance: FloatArray, block: slice) -> float:
+        """Return the mean square of parameters in parts beyond that expected, over their variance.
+
+        Parameters
+        ----------
+        covariance, block
+            As in ``ratio``.
+        """
+        white = whitening_of(covariance[block, block])
+        scores = self.found[:, block] @ white.T
+        expected = float(np.einsum("ij,bjk,ik->", white, self.expected[:, block, block], white))
+        share = np.linalg.solve(white.T, (white @ self.share[:, block, block]).transpose(0, 2, 1))
+        beyond = float((scores**2).sum()) - expected
+        return max(beyond, 0.0) / max(float((share**2).sum()), TINY)
+
+
+def whitening_of(covariance: FloatArray) -> FloatArray:
+    """Return W with ``W P W^T = 1`` for a covariance P, (n, n), whatever its units are."""
+    # Sums of squares in the metric of P: which axes a block is written in does not matter.
+    sigma = np.sqrt(np.diag(covariance))
+    lower = cholesky(covariance / np.outer(sigma, sigma), lower=True)
+    return np.asarray(solve_triangular(lower, np.diag(1 / sigma), lower=True))
+
+
+def directions_of(scores: FloatArray) -> float:
+    """Return in how many of n directions white scores, (B, n), differ from part to part."""
+    parts, together = len(scores) - 1, scores.T @ scores
+    alike = float((together**2).sum() / max(np.trace(together) ** 2, TINY))
+    differing = (1 + 1 / parts) / max(alike - 1 / parts, TINY)
+    return float(np.clip(differing, 1, len(together)))
 
 
 def scatters(
@@ -198,9 +268,9 @@ def scatters(
         labels[used] = halved(axes, HALVINGS)
         white = gathered(rows, labels, own, covariance)
         for merged in (white, white.paired()):
-            scores = merged.scores(covariance)
+            scores = merged.scores(own, covariance)
             ratios = {name: scores.ratio(P, block) for name, block in BLOCKS.items()}
-            found.append(Scatter(**ratios))
+            found.append(Scatter(**ratios, spread_of_H=scores.spread(P, BLOCKS["H"])))
     return tuple(found)
 
 
@@ -282,14 +352,15 @@ class Gathered:
         sums = (each[::2] + each[1::2] for each in (self.found, self.brought, self.crossed))
         return Gathered(*sums)
 
-    def scores(self, covariance: HalfCovariance) -> Scores:
-        """Return scores, and what is expected of them."""
+    def scores(self, own: IntArray, covariance: HalfCovariance) -> Scores:
+        """Return scores of sixteen parameters among all, and what is expected of them."""
         expected = self.brought.copy()
         for at, crossed in zip(expected, self.crossed, strict=True):
             # Of thousands of variables a part touches hundreds.
             touched = np.flatnonzero(crossed.any(axis=1))
             at -= covariance.across(touched, crossed[touched])
-        return Scores(self.found, expected)
+        share = self.crossed[:, own].transpose(0, 2, 1)
+        return Scores(self.found, expected, share)
 
 
 def gathered(

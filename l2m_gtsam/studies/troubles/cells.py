@@ -20,6 +20,7 @@ from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.surveys import TroubledPlace
 
+CHANCE = 0.05  # of a scatter: with less an offset is said to wander
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15)}
 
 
@@ -34,14 +35,17 @@ class Checked:
     distance
         Squared distance from the truth in the covariance of noise and map.
     ratios
-        Variances found over those expected: of 16 and 8 parts by time, and as many by place.
-    freedom
-        How well each is known.
+        Variances found over those expected: of 16 and 8 parts by time, and as many by place; of H
+        with what it is apart in parts, where the scatter is no chance.
+    directions, freedom
+        In how many directions errors differ, by the scatter itself, and how well each ratio is
+        known.
     """
 
     name: str
     distance: float
     ratios: tuple[float, ...]
+    directions: tuple[float, ...]
     freedom: tuple[float, ...]
 
 
@@ -150,8 +154,15 @@ def with_check(judged: JudgedSensor, alone: ByParts, truth: KnownSensor) -> Judg
     for name, at in BLOCKS.items():
         found = [getattr(each, name) for each in alone.scatters]
         distance = float(e[at] @ np.linalg.solve(P[at, at], e[at]))
-        ratios, freedom = tuple(r.value for r in found), tuple(r.freedom for r in found)
-        checked.append(Checked(name, distance, ratios, freedom))
+        ratios, directions = tuple(r.value for r in found), tuple(r.directions for r in found)
+        if name == "H":  # the truth is H of one moment
+            apart = tuple(each.spread_of_H for each in alone.scatters)
+            ratios = tuple(
+                r.value + spread * (r.beyond_chance(CHANCE) > 1)
+                for r, spread in zip(found, apart, strict=True)
+            )
+        freedom = tuple(r.parts * r.directions for r in found)
+        checked.append(Checked(name, distance, ratios, directions, freedom))
     return replace(judged, alone=tuple(checked))
 
 

@@ -232,7 +232,8 @@ def by_check(known: list[JudgedSensor], name: str, dof: int) -> Share | None:
     """Return how many 95 % ellipsoids of the check alone hold the truth in t, C or H.
 
     The variance is that of eight parts by time or by place, whichever scatter more, as errors
-    last in one or the other; it is known by few parts, whence Fisher's distribution.
+    last in one or the other; it is known by few parts and few directions, whence Fisher's
+    distribution.
     """
     found = [each for sensor in known for each in sensor.alone if each.name == name]
     if not found:
@@ -242,9 +243,9 @@ def by_check(known: list[JudgedSensor], name: str, dof: int) -> Share | None:
 
 def inside(found: Checked, dof: int) -> bool:
     """Return whether the 95 % ellipsoid of the check alone holds the truth."""
-    scattered = [(found.ratios[k], found.freedom[k]) for k in EIGHT_PARTS]
-    ratio, freedom = max(scattered)
-    return bool(found.distance / ratio <= dof * f.ppf(LEVEL, dof, freedom))
+    k = max(EIGHT_PARTS, key=lambda each: found.ratios[each])
+    limit = f.ppf(LEVEL, found.directions[k], found.freedom[k])
+    return bool(found.distance / found.ratios[k] <= dof * limit)
 
 
 TROUBLES = TroublesStudy()

@@ -108,15 +108,18 @@ def judged(level: Level, distance: float | None) -> JudgedSensor:
 
 
 def test_the_check_alone_takes_the_larger_scatter() -> None:
-    """Of eight parts by time or by place; with 16 degrees of freedom the limit is 3 * 3.24."""
+    """Of eight parts by time or by place; with 3 and 16 degrees of freedom up to 3 * 3.24."""
     by_time = (1.0, 2.0, 1.0, 1.5)
     for distance, holds in ((2 * 3 * 3.23, True), (2 * 3 * 3.25, False)):
-        assert inside(Checked("t", distance, by_time, (32.0, 16.0, 32.0, 8.0)), 3) is holds
+        freedom = (32.0, 16.0, 32.0, 8.0)
+        assert inside(Checked("t", distance, by_time, (3.0,) * 4, freedom), 3) is holds
     row = row_of(
         World.HALL,
         Trouble.CLEAN,
         [
-            replace(judged(Level.PASS, 3.0), alone=(Checked("t", d, by_time, (9.0,) * 4),))
+            replace(
+                judged(Level.PASS, 3.0), alone=(Checked("t", d, by_time, (3.0,) * 4, (9.0,) * 4),)
+            )
             for d in (1.0, 100.0)
         ],
     )
