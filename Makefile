@@ -5,6 +5,9 @@ export MPLBACKEND := Agg
 # Blocks of a few hundred readings are too small for BLAS threads.
 export OPENBLAS_NUM_THREADS ?= 1
 
+# Tests start many processes: these share bytecode, whatever the environment says.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test study benchmark docs reference docs-serve magyc lock clean
 
 demo: .venv/runtime.stamp

@@ -35,7 +35,8 @@ class ClusterOptions(Options):
     """Who computes."""
 
     workers: int = Field(default=cpu_count() or 1, ge=1)
-    """Processes on this machine, one core each; not looked at with a scheduler."""
+    """Processes on this machine, one core each, at most one for each task; not looked at with a
+    scheduler."""
     scheduler: str | None = None
     """Address of a running Dask scheduler, tcp://host:port, whose workers have this package."""
 
@@ -87,7 +88,9 @@ def computed(
     """
     if not keys:
         return
-    with connected(options) as client:
+    # each process takes seconds of imports: one without a task would only be in the way
+    needed = options.model_copy(update={"workers": min(options.workers, len(keys))})
+    with connected(needed) as client:
         from distributed.scheduler import KilledWorker
 
         alone: list[Key] = []

@@ -19,7 +19,7 @@ from l2m_gtsam.records.calibration import (
 from l2m_gtsam.records.disturbance import EXPLAINED
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
 from l2m_gtsam.storage.result_set import check_set
-from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
+from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml
 
 FORMAT = "l2m-calibration"
 VERSION = 1
@@ -177,7 +177,12 @@ def read_calibration(path: Path) -> CalibrationResult:
     CalibrationError
         The file is missing, damaged or something else.
     """
-    found = read_checked(path, _FILE, _as_record, added=("distortion", "judgement"))
+    return calibration_in(path, read_yaml(path, CalibrationError))
+
+
+def calibration_in(path: Path, content: Any) -> CalibrationResult:
+    """Return the calibration in the plain content of a file, see ``read_calibration``."""
+    found = checked(path, content, _FILE, _as_record, added=("distortion", "judgement"))
     check_set(path, CalibrationError)
     if found.judgement is not None and not found.judgement.verdict.follows:
         raise CalibrationError(

@@ -9,11 +9,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator, model_validator
 
 from l2m_gtsam.data import Distortion, KnownSensor, Matrix, Vector
-from l2m_gtsam.errors import Notice
+from l2m_gtsam.errors import CalibrationError, Notice
 from l2m_gtsam.records.calibration import SensorStatus, TimeOffset
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.known_errors import StatedErrors
-from l2m_gtsam.storage.yaml_file import read_checked, write_yaml
+from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml
 
 
 class _Finite(BaseModel):
@@ -157,7 +157,7 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
     CalibrationError
         The file is missing or is not of this form.
     """
-    found = read_checked(path, _FILE)
+    found = checked(path, read_yaml(path, CalibrationError), _FILE)
     if found.verdict is not None and found.verdict.level is Level.FAIL:
         warnings.warn(f"{path}: its verdict is FAIL; its sensors are used", Notice, stacklevel=2)
     return {
@@ -172,19 +172,26 @@ def read_known_sensors(path: Path) -> dict[str, KnownSensor]:
 
 def level_of(path: Path) -> Level | None:
     """Return the verdict on the sensors of a file, if it has one; errors as of the reader."""
-    found = read_checked(path, _FILE)
+    found = checked(path, read_yaml(path, CalibrationError), _FILE)
     return None if found.verdict is None else found.verdict.level
 
 
-def read_listed_sensors(path: Path) -> dict[str, ListedSensor]:
+def listed_sensors_in(path: Path, content: Any) -> dict[str, ListedSensor]:
     """Return the sensors of a list by name, with how well they are known.
+
+    Parameters
+    ----------
+    path
+        Of the list.
+    content
+        Its plain content.
 
     Raises
     ------
     CalibrationError
-        The file is missing or is not of this form.
+        It is not of this form.
     """
-    return dict(read_checked(path, _LIST).sensors)
+    return dict(checked(path, content, _LIST).sensors)
 
 
 def _known(name: str, entry: _Known) -> KnownSensor:

@@ -13,8 +13,8 @@ from l2m_gtsam.records.calibration import (
     Uncertainty,
 )
 from l2m_gtsam.solve.rotation import polar_rotation
-from l2m_gtsam.storage.calibration_file import FORMAT, read_calibration
-from l2m_gtsam.storage.known_sensors import ListedSensor, read_listed_sensors
+from l2m_gtsam.storage.calibration_file import FORMAT, calibration_in
+from l2m_gtsam.storage.known_sensors import ListedSensor, listed_sensors_in
 from l2m_gtsam.storage.yaml_file import read_yaml
 
 NO_SYNC = SyncCounts(0, 0, 0, 0, 0, 0, 0)
@@ -33,8 +33,8 @@ def read_sensors(path: Path) -> CalibrationResult:
     """
     content = read_yaml(path, CalibrationError)
     if isinstance(content, dict) and content.get("format") == FORMAT:
-        return read_calibration(path)
-    listed = read_listed_sensors(path)
+        return calibration_in(path, content)
+    listed = listed_sensors_in(path, content)
     assumed = [name for name, each in listed.items() if not each.has_sigmas]
     named = ", ".join(assumed[:5]) + (" and others" if len(assumed) > 5 else "")
     note = (

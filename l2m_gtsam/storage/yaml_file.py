@@ -127,18 +127,21 @@ def yaml_text(content: dict[str, Any], header: str) -> str:
     return rows.filled(stream.getvalue())
 
 
-def read_checked(
+def checked(
     path: Path,
+    plain: Any,
     adapter: TypeAdapter[Content],
     prepare: Callable[[Any], Any] = lambda content: content,
     added: tuple[str, ...] = (),
 ) -> Content:
-    """Return the content of a YAML file about sensors as a type.
+    """Return the plain content of a YAML file about sensors as a type.
 
     Parameters
     ----------
     path
         The file.
+    plain
+        Its content, see ``read_yaml``.
     adapter
         Of the type.
     prepare
@@ -149,9 +152,8 @@ def read_checked(
     Raises
     ------
     CalibrationError
-        The file is missing, is not YAML or is not of this form; the line names the first fault.
+        The content is not of this form; the line names the first fault.
     """
-    plain = read_yaml(path, CalibrationError)
     try:
         return adapter.validate_python(prepare(plain) if isinstance(plain, dict) else plain)
     except ValidationError as error:

@@ -1,14 +1,19 @@
 """A small fleet that was run through the command line."""
 
 import csv
+import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+
+import pytest
 
 from l2m_gtsam.batch.fleet_task import FleetOrder
 from tests.drives.fleets import Place, make_place, not_a_bag, truncated, vehicle
 from tests.support.command_line import Finished, l2m
+from tests.support.made_once import made_once
 
+SAID = "said.json"  # what was printed
 HOSTILE = "<img src=x onerror=alert(1)>.bag"
 
 
@@ -34,7 +39,15 @@ class FleetRun:
         return FleetOrder(self.bags, self.place.map, self.place.config, self.out)
 
 
-def run_small_fleet(folder: Path) -> FleetRun:
+def small_fleet(factory: pytest.TempPathFactory) -> FleetRun:
+    """Return the fleet of this run of the tests; tests that spoil it copy it first."""
+    folder = made_once(factory, "fleet", _run)
+    place = Place(folder / "place" / "map.npz", folder / "place" / "fleet.yaml")
+    said = Finished(**json.loads((folder / SAID).read_text()))
+    return FleetRun(place, folder / "bags", folder / "out", said)
+
+
+def _run(folder: Path) -> None:
     """Run three bags of two vehicles and two that are broken."""
     place, bags, out = make_place(folder / "place"), folder / "bags", folder / "out"
     vehicle(bags / "truck_1" / "day_0.bag", seed=1)
@@ -43,7 +56,8 @@ def run_small_fleet(folder: Path) -> FleetRun:
     truncated(bags / "truck_2" / "day_1.bag")
     not_a_bag(bags / "truck_2" / HOSTILE)
     where = ("--map", place.map, "--config", place.config, "--out", out)
-    return FleetRun(place, bags, out, l2m("batch", bags, *where, "--workers", "1"))
+    said = l2m("batch", bags, *where, "--workers", "1")
+    (folder / SAID).write_text(json.dumps(asdict(said)))
 
 
 def table(out: Path) -> list[dict[str, str]]:

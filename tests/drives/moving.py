@@ -1,6 +1,7 @@
 """Drives of a vehicle whose motor adds a field of its own, over a map that knows its errors."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -64,6 +65,7 @@ class MovingDrive:
         return np.asarray(found - np.concatenate([known.t_lidar_mag, known.distortion.vector()]))
 
 
+@cache
 def surveyed(seed: int) -> HarmonicMap:
     """Return the map of a survey of 700 readings."""
     rng = np.random.default_rng(seed)

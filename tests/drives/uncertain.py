@@ -1,5 +1,7 @@
 """A small survey of which a map knows its errors, and a drive of two sensors over it."""
 
+from functools import cache
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -33,6 +35,7 @@ SENSORS = small_sensors(2)
 STARTS = np.stack([s.t_lidar_mag for s in SENSORS]) + 0.05
 
 
+@cache
 def surveyed_map() -> HarmonicMap:
     """A survey of 700 readings in nine tiles and more."""
     rng = np.random.default_rng(0)

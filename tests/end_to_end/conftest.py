@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tests.drives.fleet_runs import FleetRun, run_small_fleet
+from tests.drives.fleet_runs import FleetRun, small_fleet
 from tests.support.command_line import Demo, l2m_process
 from tests.worlds.halls import SMALL_HALL
 
@@ -20,5 +20,5 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
 
 @pytest.fixture(scope="session")
 def fleet_run(tmp_path_factory: pytest.TempPathFactory) -> FleetRun:
-    """Run a small fleet; tests that spoil it copy it first."""
-    return run_small_fleet(tmp_path_factory.mktemp("fleet"))
+    """A small fleet that was run; tests that spoil it copy it first."""
+    return small_fleet(tmp_path_factory)

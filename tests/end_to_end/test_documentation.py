@@ -14,6 +14,7 @@ from l2m_gtsam.config import load_options
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
+from tests.support.map_files import copy_map
 from tests.support.pages import blocks, run_page, words
 from tests.support.repository import REPOSITORY
 
@@ -56,11 +57,11 @@ def workplace(tutorial: Path, tmp_path: Path) -> Path:
         (sim / "mapping_ros1.bag", "mapping.bag"),
         (sim / "suite.yaml", "suite.yaml"),
         (sim / "structure.ply", "cloud.ply"),
-        (tutorial / "map.npz", "map.npz"),
         (tutorial / "result" / "calibration.yaml", "calibration.yaml"),
         (tutorial / "result" / "calibration.yaml", "old.yaml"),
     ):
         shutil.copy(source, tmp_path / name)
+    copy_map(tutorial / "map.npz", tmp_path / "map.npz")
     robot = '<robot name="r"><link name="velodyne"/></robot>'
     (tmp_path / "robot.urdf").write_text(robot)
     return tmp_path

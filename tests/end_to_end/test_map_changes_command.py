@@ -13,6 +13,7 @@ from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.records.map_diary import Happening
 from l2m_gtsam.storage.map_file import load_map, save_map
 from tests.support.command_line import complaint_here, ended, l2m
+from tests.support.map_files import copy_map
 from tests.worlds.yard import START, make_yard, route, survey, with_steel, world
 
 DAY = 86_400 * 10**9
@@ -117,9 +118,9 @@ def test_the_picture_shows_it(kept: Kept) -> None:
 
 
 def test_bad_drives_are_one_line_and_leave_the_map(kept: Kept, tmp_path: Path) -> None:
-    path, given = tmp_path / "map.npz", ("--changes", "--out", tmp_path / "map.npz")
-    path.write_bytes(kept.taken.read_bytes())
-    short = route(-3, 0.5)
+    path = copy_map(kept.taken, tmp_path / "map.npz")
+    given = ("--changes", "--out", path)
+    short = route(-3, -1.8)
 
     def refused(drive: Path, *more: str | Path) -> str:
         line = complaint_here("map", "update", path, drive, *more, *given)
@@ -148,8 +149,7 @@ def test_bad_drives_are_one_line_and_leave_the_map(kept: Kept, tmp_path: Path) -
 def test_an_update_that_ends_half_way_leaves_the_old_map(
     kept: Kept, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "map.npz"
-    path.write_bytes(kept.taken.read_bytes())
+    path = copy_map(kept.taken, tmp_path / "map.npz")
     later = survey(tmp_path, "later", route(-3, 0.5), 10, None, START + 5 * DAY)
 
     def killed(*_: object) -> None:

@@ -11,7 +11,7 @@ from tests.worlds.study_sites import TINY_BASIN as TINY
 
 
 def test_a_study_from_options_to_page_and_again(tmp_path: Path) -> None:
-    """Two local processes, then one; the second run has more to do, the third nothing."""
+    """One cell, which takes one process; the second run has one more to do, the third nothing."""
     one_start = TINY.model_copy(update={"starts": 1, "few_starts": 1, "rings": 1})
     options, out = tmp_path / "tiny.yaml", tmp_path / "out"
     command = ("study", "basin", "--options", options, "--out", out, "--workers")

@@ -16,6 +16,7 @@ from l2m_gtsam.storage.record_files import read_validation
 from l2m_gtsam.storage.yaml_file import read_yaml, write_yaml
 from tests.drives.yard import CalibratedYard, H, calibrated_yard, written
 from tests.support.command_line import complaint_here, l2m
+from tests.support.map_files import copy_map
 from tests.worlds.yard import NOISE
 
 
@@ -56,7 +57,7 @@ def test_the_commands_of_the_page_run(
     (block,) = re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
     shutil.copy(calibration, tmp_path / "calibration.yaml")
     shutil.copy(calibration, tmp_path / "old.yaml")
-    shutil.copy(field_map, tmp_path / "map.npz")
+    copy_map(field_map, tmp_path / "map.npz")
     written(tmp_path, "ros1", seed=6)
     monkeypatch.chdir(tmp_path)
     outs = []

@@ -1,5 +1,6 @@
 """Parts of harmonic maps and a small map of dipoles and a post, for tests of either."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,7 @@ def within_survey(count: int = 300) -> FloatArray:
     return np.random.default_rng(6).uniform([-1.4, -1.1, 0.2], [1.4, 1.1, 0.8], (count, 3))
 
 
+@cache
 def fitted_map() -> HarmonicMap:
     """Return a map of ``readings``, coarse and fast, with structure that has a field."""
     ours = HarmonicMap.fit(*readings(), OPTIONS, POST)

@@ -1,6 +1,7 @@
 """A map of harmonic potentials: tiles of floor and ceiling modes, uniform field and sources."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -274,9 +275,15 @@ class HarmonicMap:
         return blend.field, blend.gradient, variance
 
     def compile(self) -> "CompiledMap":
-        """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster."""
-        compiled = CompiledTiles.of(self.learnt, self.options, self.tiles)
-        return CompiledMap(self.learnt, self.options, self.tiles, compiled)
+        """Return the form for solvers: the same field within 5 nT and 20 nT/m, and far faster.
+
+        Whoever asks again shares the tiles that are compiled already.
+        """
+        return CompiledMap(self.learnt, self.options, self.tiles, self._compiled)
+
+    @cached_property
+    def _compiled(self) -> CompiledTiles:
+        return CompiledTiles.of(self.learnt, self.options, self.tiles)
 
     def field_and_gradient(self, points: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Return field and gradient, also outside; see ``FieldMap``."""

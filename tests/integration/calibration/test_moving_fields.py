@@ -13,7 +13,6 @@ from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.cli.tables.calibration import model_note, model_tables
 from l2m_gtsam.data import FloatArray, ScalarSeries
 from l2m_gtsam.errors import SyncError
-from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     SensorCalibration,
@@ -30,11 +29,6 @@ MORE_SEEDS = range(1, 5)
 STRONG = 0.6  # uT/A, of a current that swings by 2 A: twenty times the noise
 
 
-@cache
-def field_map(seed: int) -> HarmonicMap:
-    return surveyed(seed)
-
-
 @dataclass(frozen=True)
 class Calibrated:
     """A drive and its calibrations without and with the motor's current."""
@@ -48,7 +42,7 @@ class Calibrated:
 def calibrated(seed: int, strengths: tuple[float, ...]) -> Calibrated:
     drive = moving_drive(seed, strengths)
     results = (
-        calibrate(recording, field_map(seed), options(drive))
+        calibrate(recording, surveyed(seed), options(drive))
         for recording in (drive.silent, drive.recording)
     )
     return Calibrated(drive, *results)
@@ -144,7 +138,7 @@ def test_readings_that_were_rejected_count_again() -> None:
     on = np.arange(500) * STEP_NS * 1e-9 % 6 < 1.0
     drive = moving_drive(1, (1.0,), np.where(on, 20.0, 0.0))
     silent, told = (
-        calibrate(recording, field_map(1), options(drive)).sensors[0]
+        calibrate(recording, surveyed(1), options(drive)).sensors[0]
         for recording in (drive.silent, drive.recording)
     )
     # Poses are needed for a quarter of a second, five readings, on either side.
@@ -184,8 +178,8 @@ def test_readings_without_a_known_number_are_dropped_and_counted() -> None:
     (motor,) = drive.recording.scalars
     late = replace(motor, stamp_ns=motor.stamp_ns[100:], value=motor.value[100:])
     recording = replace(drive.recording, scalars=(late,))
-    sensor = calibrate(recording, field_map(1), options(drive)).sensors[0]
-    without = calibrate(drive.silent, field_map(1), options(drive)).sensors[0]
+    sensor = calibrate(recording, surveyed(1), options(drive)).sensors[0]
+    without = calibrate(drive.silent, surveyed(1), options(drive)).sensors[0]
     assert sensor.sync.kept + sensor.sync.without_regressor == without.sync.kept
     # Poses are needed for a quarter of a second on either side, thinning takes some more.
     assert 80 <= sensor.sync.without_regressor <= 100

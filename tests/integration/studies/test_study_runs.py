@@ -15,6 +15,7 @@ import pytest
 from l2m_gtsam.errors import ClusterError, ConfigError
 from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.studies.run import STUDY_FILE, run_study
+from tests.support.inline_study import run_inline
 from tests.support.toy_study import TOY, ToyOptions, ToySummary
 
 ROOT = Path(__file__).parents[3]
@@ -30,7 +31,7 @@ def run(
 
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> ToySummary:
-    return run(tmp_path_factory.mktemp("one"), ToyOptions())
+    return run_inline(TOY, ToyOptions(), tmp_path_factory.mktemp("one"))
 
 
 @pytest.fixture(autouse=True)
@@ -59,7 +60,7 @@ def test_a_lost_worker_loses_nothing(tmp_path: Path, expected: ToySummary) -> No
 
 def test_only_missing_cells_are_computed(tmp_path: Path, expected: ToySummary) -> None:
     log = tmp_path / "log"
-    run(tmp_path / "out", ToyOptions(cells=4))
+    run_inline(TOY, ToyOptions(cells=4), tmp_path / "out")
     assert run(tmp_path / "out", ToyOptions(log=str(log))) == expected
     assert set(counted(log)) == {"cell-4", "cell-5"}
 
@@ -137,13 +138,13 @@ def test_a_scheduler_that_is_not_there_is_one_line(
 
 
 def test_a_folder_holds_one_study(tmp_path: Path) -> None:
-    run(tmp_path, ToyOptions())
+    run_inline(TOY, ToyOptions(), tmp_path)
     with pytest.raises(ConfigError, match="other options"):
         run(tmp_path, ToyOptions(seed=2))
 
 
 def test_a_broken_cell_is_named(tmp_path: Path) -> None:
-    run(tmp_path, ToyOptions())
+    run_inline(TOY, ToyOptions(), tmp_path)
     (tmp_path / "cells" / "cell-2.json").write_text("{")
     with pytest.raises(ConfigError, match=r"cell-2\.json"):
         run(tmp_path, ToyOptions())

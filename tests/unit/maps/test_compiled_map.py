@@ -1,5 +1,5 @@
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -192,8 +192,22 @@ def test_new_readings_are_in_the_compiled_map() -> None:
     assert np.abs(expected[0] - exact.field_and_gradient(points)[0]).max() > 0.1
 
 
+def test_solvers_share_compiled_tiles() -> None:
+    """A second calibration on a map compiles nothing again."""
+    exact = replace(dipoles())
+    points = near(exact, 50)
+    exact.compile().field_and_gradient(points)
+    before = dict(exact.compile().compiled.made)
+    assert before
+    exact.compile().field_and_gradient(points)
+    after = exact.compile().compiled.made
+    assert {index: id(tile) for index, tile in after.items()} == {
+        index: id(tile) for index, tile in before.items()
+    }
+
+
 def test_tiles_are_compiled_when_they_are_needed() -> None:
-    exact = dipoles()
+    exact = replace(dipoles())  # without compiled tiles
     fast = exact.compile()
     assert not fast.compiled.made
     points = near(exact, 200)
@@ -205,13 +219,13 @@ def test_tiles_are_compiled_when_they_are_needed() -> None:
 
 
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    exact = dipoles()
+    exact = replace(dipoles())
     fast, points = exact.compile(), near(exact, 300)
     expected = fast.field_and_gradient(points)
     assert len(fast.compiled.made) > 2
     sizes = [tile.nbytes for tile in fast.compiled.made.values() if isinstance(tile, CompiledTile)]
     monkeypatch.setattr(compiled, "MEMORY", 2 * max(sizes))
-    again = exact.compile()
+    again = replace(exact).compile()
     found = again.field_and_gradient(points)
     np.testing.assert_array_equal(found[0], expected[0])
     kept = [tile.nbytes for tile in again.compiled.made.values() if isinstance(tile, CompiledTile)]
@@ -228,7 +242,7 @@ def test_where_no_grid_is_good_enough_the_exact_tile_answers(
     module: object, limit: str, value: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, limit, value)
-    exact = dipoles()
+    exact = replace(dipoles())
     fast, points = exact.compile(), near(exact, 50)
     assert_same(exact, fast, points)
     assert list(fast.compiled.made.values()) == [exact.tiles[i] for i in fast.compiled.made]
@@ -236,7 +250,7 @@ def test_where_no_grid_is_good_enough_the_exact_tile_answers(
 
 def test_a_grid_that_errs_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled_tile, "WAVE", 2.0)  # far too coarse
-    exact = dipoles()
+    exact = replace(dipoles())
     fast, points = exact.compile(), near(exact, 500)
     field, _ = fast.field_and_gradient(points)
     true_field, _ = exact.field_and_gradient(points)
