@@ -217,7 +217,9 @@ def calibrate_suite_file(
     check_outputs(out, suffix=".yaml")
     assumed = None if known is None else read_known_sensors(known)
     recordings = [read_drive(bag, config, progress) for bag in bags]
-    found = calibrate_suite(recordings, assumed, config.mapping.suite, progress)
+    found = calibrate_suite(
+        recordings, assumed, config.mapping.suite, progress, config.mapping.pose_noise
+    )
     if known is not None and level_of(known) is Level.FAIL:
         doubt = f"what was known of the sensors is {known}, whose verdict is FAIL"
         found = replace(found, doubts=(*found.doubts, doubt))

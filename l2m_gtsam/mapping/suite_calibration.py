@@ -9,10 +9,18 @@ import numpy as np
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
 from l2m_gtsam.errors import CalibrationError, L2MError, MapError
 from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteCalibrationOptions
-from l2m_gtsam.mapping.suite_solver import SuiteSolution, SuiteStep, first_step, solve_suite
+from l2m_gtsam.mapping.suite_poses import with_pose_errors
+from l2m_gtsam.mapping.suite_solver import (
+    SuiteSolution,
+    SuiteStep,
+    first_step,
+    prior_information,
+    solve_suite,
+)
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.joining import joined
+from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.recording.sync import stuck_sensors, synchronise, with_offsets
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -60,6 +68,7 @@ def calibrate_suite(
     assumed: Mapping[str, KnownSensor] | None,
     options: SuiteCalibrationOptions,
     progress: Progress,
+    pose_noise: PoseNoiseOptions | None = None,
 ) -> CalibrationResult:
     """Calibrate the sensors of a mapping suite from its own drives.
 
@@ -74,6 +83,9 @@ def calibrate_suite(
         How sure that is, and how to solve.
     progress
         Called with a stage and the fraction of it that is done.
+    pose_noise
+        How wrong the drives' poses are, as for a map: where nothing says so it is looked for, with
+        both sigmas 0 poses count as exact.
 
     Raises
     ------
@@ -88,7 +100,16 @@ def calibrate_suite(
     drive = suite_drive(recordings, assumed, options)
     solution = solve_suite(drive.at, drive.assumed, options, progress)
     _check_ending(drive, solution, options)
-    return _result(drive, solution, options)
+    posed = with_pose_errors(
+        solution.last,
+        drive.recording.trajectory,
+        PoseNoiseOptions() if pose_noise is None else pose_noise,
+        prior_information(len(drive.assumed), options),
+    )
+    found = _result(drive, replace(solution, last=posed.round), options)
+    if posed.found is None:
+        return found
+    return replace(found, doubts=(*found.doubts, posed.found.doubt))
 
 
 @one_blas_thread()

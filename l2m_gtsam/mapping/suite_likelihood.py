@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import Field
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
@@ -159,21 +159,82 @@ def suite_likelihood(
         Of the field, and the noise.
     """
     readings, basis, noise = window.readings, window.basis, prior.noise
+    at = window_slopes(window, sensors, prior)
+    complexity = _complexity_slopes(basis, at.points, at.scale, at.field, noise)
+    r, J = at.residual, at.slopes
+    slope = -np.einsum("ni,nij->j", r, J) / noise**2
+    slope -= np.einsum("ni,nij->j", complexity, at.places)
+    turned, volume = _volume_change(readings, sensors)
+    value = at.field.value - volume
+    return SuiteLikelihood(value, slope - turned, at.information(J), (r,))
+
+
+@dataclass(frozen=True)
+class WindowSlopes:
+    """A window's readings beside its most likely field, and how they hang on the sensors.
+
+    Attributes
+    ----------
+    basis
+        Of the window, m weights.
+    noise
+        Of a reading in uT.
+    undone
+        Readings with their distortion undone.
+    points
+        Where they count as taken, shape (N, 3).
+    field, scale
+        Posterior of the weights, each in units of its prior's standard deviation, shape (m,).
+    residual
+        Undistorted readings less the most likely field, uT, shape (N, 3).
+    gradient
+        Of that field in uT/m, shape (N, 3, 3).
+    places, slopes
+        Derivatives of places and residuals by the sensors' parameters, shapes (N, 3, 16 S).
+    """
+
+    basis: Basis
+    noise: float
+    undone: Undistorted
+    points: FloatArray
+    field: Evidence
+    scale: FloatArray
+    residual: FloatArray
+    gradient: FloatArray
+    places: FloatArray
+    slopes: FloatArray
+
+    def information(self, columns: FloatArray) -> FloatArray:
+        """Return ``A^T (sigma^2 I + F S F^T)^-1 A`` for A in uT, shape (N, 3, k): (k, k)."""
+        return _information(self.basis, self.points, self.scale, self.field, columns, self.noise)
+
+    def beside_field(self, values: FloatArray) -> FloatArray:
+        """Return what no field explains of values in uT, shape (N, 3)."""
+        shared = np.zeros(len(self.scale))
+        for at in batches(len(values)):
+            F = self.basis.features(self.points[at])
+            shared += np.einsum("nim,ni->m", F, values[at])
+        weights = cho_solve((self.field.factor, True), self.scale * shared / self.noise**2)
+        left = values.copy()
+        for at in batches(len(values)):
+            left[at] -= self.basis.features(self.points[at]) @ (self.scale * weights)
+        return left
+
+
+def window_slopes(window: SuiteWindow, sensors: FloatArray, prior: Hyperparameters) -> WindowSlopes:
+    """Return the readings of a window beside its field; parameters of ``suite_likelihood``."""
+    readings, basis = window.readings, window.basis
     undone = undistorted(readings, sensors)
     points = undone.points - undone.points.mean(axis=0) + window.middle
     log_variance = basis.prior(prior).log_variance
     normal = normal_of(basis, TrainingSet(points, undone.field, np.ones(len(readings))))
-    found, D = evidence(normal, log_variance, noise), np.exp(0.5 * log_variance)
+    found, D = evidence(normal, log_variance, prior.noise), np.exp(0.5 * log_variance)
     predicted, gradient = basis.field_and_gradient(points, D * found.mean)
-    r = undone.field - predicted
     places = _wide(_place_slopes(readings, undone), readings.sensor, len(sensors))
     places -= places.mean(axis=0)
     J = _wide(_field_slopes(readings, undone), readings.sensor, len(sensors)) - gradient @ places
-    complexity = _complexity_slopes(basis, points, D, found, noise)
-    slope = -np.einsum("ni,nij->j", r, J) / noise**2 - np.einsum("ni,nij->j", complexity, places)
-    turned, volume = _volume_change(readings, sensors)
-    information = _information(basis, points, D, found, J, noise)
-    return SuiteLikelihood(found.value - volume, slope - turned, information, (r,))
+    r = undone.field - predicted
+    return WindowSlopes(basis, prior.noise, undone, points, found, D, r, gradient, places, J)
 
 
 def _volume_change(readings: Readings, sensors: FloatArray) -> tuple[FloatArray, float]:

@@ -7,7 +7,7 @@ are learnt again in each round. Where waves from below and above do not explain 
 beside the way is searched for with the sensors that were found, and the rounds go on with it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
@@ -224,7 +224,7 @@ class SuiteProblem:
             sensors, score = better
             if settled:
                 break
-        alike = likeness(windows, score)
+        alike = likeness(windows, score.residuals)
         return SuiteRound(
             sensors, windows, score.residuals, self._covariance(score, alike), settled
         )
@@ -287,14 +287,14 @@ class SuiteProblem:
         )
 
 
-def likeness(windows: SuiteWindows, score: SuiteLikelihood) -> float:
+def likeness(windows: SuiteWindows, residuals: Sequence[FloatArray]) -> float:
     """Return how many readings count as one, from how residuals go together in time.
 
     Poses of a tracking system, the clock between two of its samples and waves that are left out err
     alike for a while.
     """
     parts, rows, first = [], [], 0
-    for window, residual in zip(windows.parts, score.residuals, strict=True):
+    for window, residual in zip(windows.parts, residuals, strict=True):
         sensor, stamp = window.readings.sensor, window.readings.stamp_ns
         for i in np.unique(sensor):
             own = np.flatnonzero(sensor == i)

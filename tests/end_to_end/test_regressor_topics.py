@@ -47,6 +47,15 @@ def drive(yard: Yard) -> Path:
             "/mag": ("sensor_msgs/MagneticField", make.magnetic(stamp, field[n] * 1e-6)),
             "/motor": ("std_msgs/Float64", make("std_msgs/Float64", data=amperes[n])),
             "/fan": ("std_msgs/Float64", make("std_msgs/Float64", data=1.5)),
+            "/warmth": (
+                "sensor_msgs/Temperature",
+                make(
+                    "sensor_msgs/Temperature",
+                    header=make.header(stamp, "mag"),
+                    temperature=24.5,
+                    variance=0.01,
+                ),
+            ),
         }
         entries += [Entry(topic, kind, stamp, each) for topic, (kind, each) in messages.items()]
     return write(yard.west.parent, "mcap", entries, "drive")
@@ -98,6 +107,10 @@ def test_without_asking_nothing_is_shown_of_models(
     [
         ({"motor": {"topic": "/engine"}}, "regressor 'motor': no topic '/engine'; there are: "),
         ({"fan": {"topic": "/fan"}}, "regressor 'fan': it is 1.5 at all readings"),
+        (
+            {"warmth": {"topic": "/warmth", "field": "temperature"}},
+            "regressor 'warmth': it is 24.5 at all readings",
+        ),
         ({"motor": {"topic": "/motor", "feild": "data"}}, "accepted here: field, scale, topic"),
         ({"motor": {"topic": "/motor", "field": "a b"}}, "bag.regressors.motor.field: "),
         ({"1": {"topic": "/motor"}}, "bag.regressors.1"),
