@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -19,6 +20,7 @@ from l2m_gtsam.cli.app import app
 from l2m_gtsam.cli.maps import map_app
 from l2m_gtsam.errors import Notice
 from l2m_gtsam.records.verdict import Level
+from l2m_gtsam.storage.bounded_yaml import BoundedYAML
 from l2m_gtsam.storage.calibrated_topics import VERDICT_TOPIC
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
@@ -160,8 +162,21 @@ class Commands(RuleBasedStateMachine):
 def test_a_fail_leaves_no_file_without_a_verdict(
     place: CalibratedYard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six walks of six commands; pages, which take long, are drawn elsewhere."""
+    """Six walks of six commands; pages, which take long, are drawn elsewhere.
+
+    A text that several commands read is parsed for the first of them.
+    """
     monkeypatch.setattr(reports, "calibration_page", lambda *_, **__: "")
+    parsed, parse = dict[str, Any](), BoundedYAML.load
+
+    def load(reader: BoundedYAML, stream: Any) -> Any:
+        if not isinstance(stream, str):
+            return parse(reader, stream)
+        if stream not in parsed:
+            parsed[stream] = parse(reader, stream)
+        return deepcopy(parsed[stream])
+
+    monkeypatch.setattr(BoundedYAML, "load", load)
     Commands.place, Commands.folder = place, tmp_path
     kinds = {"ros1": "ros1", "sqlite3": "sqlite3", "mcap": "mcap"}
     Commands.bags = {kind: written(tmp_path, kind, f"drive_{kind}") for kind in kinds}

@@ -7,6 +7,7 @@ all that were found before, and stays if it explains more than its parameters do
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
@@ -328,11 +329,27 @@ class SourcePrior:
 
 @dataclass(frozen=True)
 class _State:
-    """Cost at some sources, its gradient and information by the free parameters."""
+    """Cost at some sources; a step that is refused needs no derivatives.
 
+    Attributes
+    ----------
+    rows, shapes, free, prior
+        What the cost is of.
+    off
+        What free parameters differ from their mean by, shape (P,).
+    pulled
+        Precision times residuals, shape (N, 3).
+    cost
+        Squared length of the white residuals, and of ``off``.
+    """
+
+    rows: MarginalRows
+    shapes: list[SourceShape]
+    free: BoolArray
+    prior: "SourcePrior"
+    off: FloatArray
+    pulled: FloatArray
     cost: float
-    gradient: FloatArray
-    information: FloatArray
 
     @classmethod
     def at(
@@ -342,14 +359,26 @@ class _State:
         field = sum(
             (s.field_and_gradient(rows.points)[0] for s in shapes), np.zeros_like(rows.points)
         )
-        J = np.concatenate([s.derivatives(rows.points) for s in shapes], axis=2)[:, :, free]
         pulled, squared = rows.pull(rows.residual - field)
         off = theta[free] - prior.mean
-        return cls(
-            squared + float(prior.information @ off**2),
-            np.einsum("nim,ni->m", J, pulled) - prior.information * off,
-            rows.information(J) + np.diag(prior.information),
-        )
+        cost = squared + float(prior.information @ off**2)
+        return cls(rows, shapes, free, prior, off, pulled, cost)
+
+    @cached_property
+    def _jacobian(self) -> FloatArray:
+        every = [each.derivatives(self.rows.points) for each in self.shapes]
+        return np.asarray(np.concatenate(every, axis=2)[:, :, self.free])
+
+    @cached_property
+    def gradient(self) -> FloatArray:
+        """By the free parameters, downwards, shape (P,)."""
+        pull = np.einsum("nim,ni->m", self._jacobian, self.pulled)
+        return np.asarray(pull - self.prior.information * self.off)
+
+    @cached_property
+    def information(self) -> FloatArray:
+        """Of the free parameters, shape (P, P)."""
+        return self.rows.information(self._jacobian) + np.diag(self.prior.information)
 
 
 def _free(shape: SourceShape) -> BoolArray:
