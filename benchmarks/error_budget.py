@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.last_stage import laps
 from benchmarks.one_key import NOISE, hall, survey
-from l2m_gtsam.calibration.alternation import OneKeyOptions, start_estimate
+from l2m_gtsam.calibration.alternation import Alternated, OneKeyOptions, start_estimate
 from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.one_key import settle, solve_one_key
 from l2m_gtsam.calibration.uncertain import settle_by_any, solve_uncertain
@@ -73,7 +73,7 @@ def cost(field_map: CompiledMap, readings: Readings) -> Cost:
         noise=np.full(SENSORS, NOISE),
     )
     asked = RememberedMap(field_map)
-    joint = settle(readings, asked, start, OPTIONS, silent, None)
+    joint = settle(readings, asked, Alternated(start, start.t, steps=0), OPTIONS, silent, None)
     if joint.problem is None:
         raise RuntimeError("no sensor has enough readings")
     view = joint.problem.view

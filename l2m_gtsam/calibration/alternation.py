@@ -70,12 +70,28 @@ class OneKeyOptions(Options):
     rank: RankOptions = RankOptions()
     """When a direction counts as determined."""
 
+    @property
+    def some_readings(self) -> int:
+        """Readings of each sensor that are enough to come near."""
+        return max(self.alternation_readings, self.min_readings)
+
 
 @dataclass(frozen=True)
 class Alternated:
-    """Where the alternation arrived, and after how many steps."""
+    """Where the alternation arrived.
+
+    Attributes
+    ----------
+    estimate
+        All sensors.
+    asked
+        Where the map was asked last: places of all sensors, metres, shape (S, 3).
+    steps
+        How many were taken.
+    """
 
     estimate: Estimate
+    asked: FloatArray
     steps: int
 
 
@@ -99,30 +115,23 @@ def alternate(
     options: OneKeyOptions,
     progress: Progress,
 ) -> Alternated:
-    """Alternate closed form and translation graph until no sensor moves further than settled."""
+    """Alternate closed form and translation graph until no sensor moves further than settled.
+
+    It only has to come near: `alternation_readings` of each sensor are enough.
+    """
     estimate, furthest = start, options.settled_m
-    readings = spread(readings, max(options.alternation_readings, options.min_readings))
-    for step in range(1, options.max_steps + 1):
-        view = observe(readings, field_map, estimate, FEWEST)
+    asked, step = estimate.t, 0
+    while step < options.max_steps:
+        view, asked, step = observe(readings, field_map, estimate, FEWEST), estimate.t, step + 1
         if not view.sensors:
-            return Alternated(estimate, step)
+            break
         moved = move_sensors(view, field_map, fit_distortions(view, estimate, options), options)
         move = float(np.abs(moved.t - estimate.t).max())
         estimate, furthest = moved, max(furthest, move)
         progress("alternation", _share_done(move, furthest, options.settled_m))
         if move <= options.settled_m:
             break
-    return Alternated(estimate, step)
-
-
-def spread(readings: Readings, most: int) -> Readings:
-    """Return at most so many readings of each sensor, evenly over its own."""
-    keep = np.zeros(len(readings), dtype=np.bool_)
-    for sensor in range(len(readings.sensors)):
-        rows = np.arange(len(readings))[readings.rows_of(sensor)]
-        count = min(most, len(rows))
-        keep[rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]] = True
-    return readings.select(keep)
+    return Alternated(estimate, asked, step)
 
 
 def fit_distortions(view: View, estimate: Estimate, options: OneKeyOptions) -> Estimate:

@@ -15,7 +15,7 @@ from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_so
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
-from l2m_gtsam.calibration.view import QueryableMap, View, observe
+from l2m_gtsam.calibration.view import QueryableMap, View, glimpse, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.calibration import Uncertainty
 from l2m_gtsam.solve.rank import Determinacy
@@ -66,7 +66,9 @@ def forecast(
         What is known of the sensors beforehand; without a nominal rotation C = I.
     """
     every = np.full(len(t_lidar_mag), noise)
-    ideal = ideal_estimate(readings, field_map, t_lidar_mag, every, options, priors)
+    start = replace(start_estimate(t_lidar_mag, options, priors), noise=every)
+    view = observe(readings, field_map, start, options.min_readings)
+    ideal = ideal_sensors(start, view, options)
     view = ideal.view
     if not view.sensors:
         return Forecast(view, (), options.uncertainty)
@@ -112,7 +114,11 @@ def rank_tests(
     noise
         Standard deviation of each sensor's noise in uT, shape (S,).
     """
-    ideal = ideal_estimate(readings, field_map, t_lidar_mag, noise, options, priors)
+    start = replace(start_estimate(t_lidar_mag, options, priors), noise=noise)
+    few, least = options.some_readings, options.min_readings
+    # Where the solve has asked for it: a few readings' variance tells what is determined.
+    view = glimpse(readings, field_map, start, t_lidar_mag, least, few)
+    ideal = ideal_sensors(start, view, options)
     if not ideal.view.sensors:
         return {}
     return joint_problem(ideal.view, field_map, ideal.estimate, options).determinacies
@@ -126,18 +132,20 @@ class Ideal:
     view: View
 
 
-def ideal_estimate(
-    readings: Readings,
-    field_map: QueryableMap,
-    t_lidar_mag: FloatArray,
-    noise: FloatArray,
-    options: OneKeyOptions,
-    priors: Priors,
-) -> Ideal:
-    """Return sensors at places, (S, 3), with C a rotation, H = 0 and the solve's own ridge."""
-    options = options.model_copy(update={"sensor_noise_ut": float(noise.max())})  # it is given
-    start = replace(start_estimate(t_lidar_mag, options, priors), noise=noise)
-    view = observe(readings, field_map, start, options.min_readings)
+def ideal_sensors(start: Estimate, view: View, options: OneKeyOptions) -> Ideal:
+    """Return sensors with C a rotation, H = 0 and the solve's own ridge.
+
+    Parameters
+    ----------
+    start
+        Where they are assumed, and their noise.
+    view
+        What the map says there.
+    options
+        How to solve.
+    """
+    # Their noise is given.
+    options = options.model_copy(update={"sensor_noise_ut": float(start.noise.max())})
     field = np.einsum("nij,nj->ni", start.C()[view.readings.sensor], view.b_lidar)
     view = replace(view, readings=replace(view.readings, field=field))
     return Ideal(replace(start, ridge=fit_distortions(view, start, options).ridge), view)

@@ -21,6 +21,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky
+from scipy.linalg.blas import dtrmm
 from scipy.linalg.lapack import dpotri
 
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
@@ -66,7 +67,7 @@ class HalfCovariance:
     scale
         Unit of each variable, shape (n,).
     half
-        U in these units, shape (n, n); upper triangular where it comes from a factor.
+        U in these units, upper triangular, shape (n, n).
     """
 
     scale: FloatArray
@@ -108,6 +109,12 @@ class HalfCovariance:
         half = scaled.T @ self.half[np.ix_(at, at)] @ scaled
         return np.asarray(half + half.T)
 
+    def around(self, A: FloatArray) -> FloatArray:
+        """Return the same for A of all variables, shape (n, m)."""
+        scaled = A * self.scale[:, None]
+        half = scaled.T @ dtrmm(1.0, self.half.T, scaled, lower=1, trans_a=1)
+        return np.asarray(half + half.T)
+
     def times(self, A: FloatArray) -> FloatArray:
         """Return ``Sigma A`` for A of all variables, shape (n, m)."""
         scaled = A * self.scale[:, None]
@@ -132,7 +139,9 @@ class HalfCovariance:
             grown = 1 / (1 / deviation**2 + said)
             column *= np.sqrt(grown - column[variable]) / column[variable]
             white = column / self.scale
-            half = half + 0.5 * np.outer(white, white)
+            grown_by = np.triu(np.outer(white, white))
+            grown_by[np.diag_indices_from(grown_by)] *= 0.5
+            half = half + grown_by
             added.append(column)
         root = np.column_stack([np.empty((len(self), 0)), *added])
         return HalfCovariance(self.scale, half), root
@@ -157,6 +166,8 @@ class JointInformation:
         Covariance of all variables, each in units of its sigma if all others were known.
     step
         To the least cost, shape (n,).
+    decrement
+        How long that is for all variables together, in standard deviations.
     loose
         What the covariance of all variables has beyond that of the system, a root, shape (n, k).
     """
@@ -165,6 +176,7 @@ class JointInformation:
     rows: Sequence[Rows]
     every: HalfCovariance
     step: FloatArray
+    decrement: float
     loose: FloatArray
 
     def covariance(self, keys: Sequence[int]) -> FloatArray:
@@ -274,7 +286,8 @@ def joint_information(
         lower = root_by_qr(rows, weights, scale)
     step = scale * cho_solve((lower, True), scale * pull, check_finite=False)
     every = HalfCovariance.from_factor(lower, scale)
-    return JointInformation(columns, rows, every, step, np.empty((count, 0)))
+    decrement = float(np.sqrt(max(pull @ step, 0.0)))
+    return JointInformation(columns, rows, every, step, decrement, np.empty((count, 0)))
 
 
 def root_by_qr(rows: Sequence[Rows], weights: FloatArray, scale: FloatArray) -> FloatArray:

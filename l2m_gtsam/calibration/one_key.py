@@ -17,7 +17,12 @@ from typing import Protocol
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import OneKeyOptions, alternate, start_estimate
+from l2m_gtsam.calibration.alternation import (
+    Alternated,
+    OneKeyOptions,
+    alternate,
+    start_estimate,
+)
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.cluster_robust import ByParts
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
@@ -39,9 +44,12 @@ from l2m_gtsam.calibration.view import (
     QueryableMap,
     RememberedMap,
     View,
+    glimpse,
     observe,
     places_of,
     remembered,
+    seen_from,
+    spread,
 )
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, Readings, Trajectory
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -56,7 +64,8 @@ from l2m_gtsam.solve.rank import Determinacy
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
 MAX_ROUNDS = 10
 SETTLED_M = 1e-5
-# The map's variance changes over decimetres: after a shorter move it is not asked for again.
+# The map's variance changes over decimetres: it is not asked again while all readings are as near
+# to where it was.
 REOBSERVE_M = 5e-3
 # A vehicle moves a tenth of a millimetre meanwhile.
 SETTLED_S = 1e-4
@@ -218,10 +227,11 @@ def _solved(
     finish: Finish,
 ) -> OneKeySolution:
     field_map = remembered(field_map)
-    good = readings.select(plausible(readings, field_map, t_start, options.robust))
+    some = readings.select(spread(readings, options.some_readings))
+    some = some.select(plausible(some, field_map, t_start, options.robust))
     start = start_estimate(t_start, options, priors)
-    near = alternate(good, field_map, start, options, progress)
-    joint = settle(readings, field_map, near.estimate, options, progress, trajectory)
+    near = alternate(some, field_map, start, options, progress)
+    joint = settle(readings, field_map, near, options, progress, trajectory)
     outcome = OneKeySolution(
         readings=joint.readings,
         estimate=joint.estimate,
@@ -264,13 +274,11 @@ def remember_near(field_map: RememberedMap, joint: "Joint", estimate: Estimate) 
 
     Field and gradient are those of the places themselves.
     """
-    near = np.abs(estimate.t - joint.asked).max(axis=1) <= REOBSERVE_M
-    whole = joint.whole.readings
-    rows = np.flatnonzero(near[whole.sensor])
-    x = places_of(whole[rows], estimate.t)
-    field, gradient = field_map.field_and_gradient(x)
-    variance, inside = joint.whole.map_variance[rows], np.ones(len(rows), dtype=np.bool_)
-    field_map.remember(x, FieldSample(field, gradient, variance, inside))
+    x = places_of(joint.whole.readings, estimate.t)
+    near = np.abs(x - joint.asked).max(axis=1) <= REOBSERVE_M
+    field, gradient = field_map.field_and_gradient(x[near])
+    variance, inside = joint.whole.map_variance[near], np.ones(len(field), dtype=np.bool_)
+    field_map.remember(x[near], FieldSample(field, gradient, variance, inside))
 
 
 def shared_errors(
@@ -295,10 +303,10 @@ class Joint:
         All, with their poses at the estimated time offsets.
     estimate
         All sensors.
-    asked
-        Where the map was asked for its variance: places of all sensors, metres, shape (S, 3).
     whole
         The readings inside the map.
+    asked
+        Where the map was asked for its variance at these, metres, shape (M, 3).
     weights
         How far each of them counts, shape (M,).
     problem
@@ -311,8 +319,8 @@ class Joint:
 
     readings: Readings
     estimate: Estimate
-    asked: FloatArray
     whole: View
+    asked: FloatArray
     weights: FloatArray
     problem: JointProblem | None
     ending: Ending
@@ -329,7 +337,7 @@ class Joint:
 def settle(
     readings: Readings,
     field_map: QueryableMap,
-    estimate: Estimate,
+    near: Alternated,
     options: OneKeyOptions,
     progress: Progress,
     trajectory: Trajectory | None,
@@ -338,8 +346,11 @@ def settle(
 
     That is the graduated loop too: each round trusts readings as the residuals of the last say.
     """
-    whole = observe(readings, field_map, estimate, options.min_readings)
-    asked, ending, settled = estimate.t, Ending.TOLERANCE, False
+    estimate, few = near.estimate, options.some_readings
+    # The first round moves all sensors: a few readings' variance is enough for it.
+    whole = glimpse(readings, field_map, estimate, near.asked, options.min_readings, few)
+    asked = np.full((len(whole.readings), 3), np.inf)
+    ending, settled = Ending.TOLERANCE, False
     last: Trusted | None = None
     problem: JointProblem | None = None
     for round_ in range(MAX_ROUNDS):
@@ -347,7 +358,7 @@ def settle(
         now = trusted(whole, field_map, estimate, options, round_, last)
         if not now.view.sensors:
             weights = now.weights
-            return Joint(readings, estimate, asked, whole, weights, None, ending, settled=False)
+            return Joint(readings, estimate, whole, asked, weights, None, ending, settled=False)
         problem = joint_problem(now.view, field_map, estimate, options)
         step = joint_step(problem, estimate, options, exact=now.final)
         moved = float(np.abs(step.estimate.t - estimate.t).max())
@@ -359,11 +370,14 @@ def settle(
             break
         if late > SETTLED_S and trajectory is not None:
             readings = with_offsets(readings, trajectory, estimate.offset)
-        if moved > REOBSERVE_M or late > SETTLED_S:
+            whole = replace(whole, readings=readings[whole.rows])
+        if np.abs(places_of(whole.readings, estimate.t) - asked).max() > REOBSERVE_M:
             whole = observe(readings, field_map, estimate, options.min_readings)
-            asked = estimate.t
+            asked = places_of(whole.readings, estimate.t)
+        else:
+            whole = seen_from(whole, field_map, estimate)
     progress("joint graph", 1.0)
     if last is None or not settled:  # the last round's weights are not those of its result
         last = trusted(whole, field_map, estimate, options, MAX_ROUNDS, None)
         problem = joint_problem(last.view, field_map, estimate, options)
-    return Joint(readings, estimate, asked, whole, last.weights, problem, ending, settled)
+    return Joint(readings, estimate, whole, asked, last.weights, problem, ending, settled)

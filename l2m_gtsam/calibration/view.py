@@ -7,7 +7,7 @@ step after the other asks for the field where the last one ended, of all reading
 count: ``RememberedMap`` is asked for no place twice, and remembers the last answer, too.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock, local
 from typing import Any, Protocol, runtime_checkable
 
@@ -87,22 +87,74 @@ def observe(
     readings: Readings, field_map: QueryableMap, estimate: Estimate, min_readings: int
 ) -> View:
     """Ask the map at the estimated sensor positions, once for all sensors."""
-    R = readings.R_map_lidar
     sample = field_map.query(places_of(readings, estimate.t))
-    counts = np.bincount(readings.sensor[sample.inside], minlength=len(estimate.t))
+    return _view(readings, sample, len(estimate.t), min_readings)
+
+
+def glimpse(
+    readings: Readings,
+    field_map: QueryableMap,
+    estimate: Estimate,
+    t: FloatArray,
+    min_readings: int,
+    most: int,
+) -> View:
+    """Return a view whose variance is that of a few readings: each has that of the nearest.
+
+    Parameters
+    ----------
+    readings, field_map
+        Of S sensors, and the map.
+    estimate
+        Where the field is taken.
+    t
+        Where the variance is: near by, or where the map was asked before, metres, shape (S, 3).
+    min_readings
+        That a sensor needs.
+    most
+        Readings of a sensor whose variance is asked for.
+    """
+    few, every = np.flatnonzero(spread(readings, most)), np.arange(len(readings))
+    # The first and the last reading of each sensor are among them: both neighbours are its own.
+    after = np.searchsorted(few, every)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(every - few[before] < few[after] - every, before, after)
+    known = field_map.query(places_of(readings[few], t))
+    field, gradient = field_map.field_and_gradient(places_of(readings, estimate.t))
+    sample = FieldSample(field, gradient, known.variance[nearest], known.inside[nearest])
+    return _view(readings, sample, len(estimate.t), min_readings)
+
+
+def spread(readings: Readings, most: int) -> BoolArray:
+    """Return which are at most so many readings of each sensor, evenly over its own, shape (N,)."""
+    keep = np.zeros(len(readings), dtype=np.bool_)
+    for sensor in range(len(readings.sensors)):
+        rows = np.arange(len(readings))[readings.rows_of(sensor)]
+        count = min(most, len(rows))
+        keep[rows[np.linspace(0, len(rows) - 1, count).round().astype(int)]] = True
+    return keep
+
+
+def _view(readings: Readings, sample: FieldSample, sensors: int, min_readings: int) -> View:
+    """Return the view of what the map says of all readings."""
+    counts = np.bincount(readings.sensor[sample.inside], minlength=sensors)
     usable = counts >= min_readings
     keep = sample.inside & usable[readings.sensor]
-    b_lidar = np.einsum("nji,nj->ni", R[keep], sample.field[keep])
-    sensors = [int(s) for s in np.flatnonzero(usable)]
     return View(
         readings=readings.select(keep),
-        b_lidar=b_lidar,
+        b_lidar=np.einsum("nji,nj->ni", readings.R_map_lidar[keep], sample.field[keep]),
         map_variance=sample.variance[keep],
         trust=np.ones(int(keep.sum())),
         rows=np.flatnonzero(keep),
         inside=sample.inside,
-        sensors=sensors,
+        sensors=[int(s) for s in np.flatnonzero(usable)],
     )
+
+
+def seen_from(view: View, field_map: QueryableMap, estimate: Estimate) -> View:
+    """Return a view with the field of the estimated sensor positions, and the variance it had."""
+    field, _ = field_map.field_and_gradient(places_of(view.readings, estimate.t))
+    return replace(view, b_lidar=np.einsum("nji,nj->ni", view.readings.R_map_lidar, field))
 
 
 MOST = 500_000  # places that are remembered: 100 MB

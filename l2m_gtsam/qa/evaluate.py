@@ -9,11 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import spread
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.calibrate import Calibrated
 from l2m_gtsam.calibration.one_key import solve_part
 from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.calibration.view import spread
 from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.parallel.threads import in_threads, one_blas_thread, side_by_side
@@ -237,7 +237,7 @@ def _parts(
     budget: Budget = NOTHING_FOUND,
 ) -> dict[int, PartialEstimate]:
     """Return what some of the readings determine of each sensor that they are enough for."""
-    few = spread(readings, max(most, options.solve.min_readings))
+    few = readings.select(spread(readings, max(most, options.solve.min_readings)))
     near = options.solve.model_copy(update={"max_steps": min(STEPS, options.solve.max_steps)})
     if duration := calibrated.solution.pose_duration:
         lasting = near.pose_noise.lasting(duration.seconds)

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import ConfigDict
 
 # Squares and sums of such numbers are finite; no quantity is nearly as large in any unit.
@@ -26,8 +27,17 @@ def _fits(value: Sequence[Any], shape: Sequence[str], lengths: dict[str, int]) -
 
 def _largest(value: Any) -> float:
     """Return the largest finite number in rows of rows."""
+    try:
+        sizes = np.abs(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError, OverflowError):  # rows of different lengths, or no numbers
+        return _largest_of_each(value)
+    return float(np.max(sizes, where=np.isfinite(sizes), initial=0.0))
+
+
+def _largest_of_each(value: Any) -> float:
+    """Return the same, number by number."""
     if isinstance(value, tuple | list):
-        return max(map(_largest, value), default=0.0)
+        return max(map(_largest_of_each, value), default=0.0)
     if isinstance(value, int):
         return float(min(abs(value), HUGE))
     return abs(value) if isinstance(value, float) and math.isfinite(value) else 0.0

@@ -111,10 +111,9 @@ def felt(
             first = white.stop
         own[np.ix_(at, at)] += Z.T @ Z
         pull[at] -= Z.T @ np.concatenate([each.residual for each, _ in groups])
-    everything = np.arange(len(across))
     # The residuals are those of the system itself, which holds the survey's sensors tighter.
     loose = joint.loose.T @ across
-    information = own - joint.every.across(everything, across) + loose.T @ loose
+    information = own - joint.every.around(across) + loose.T @ loose
     system = WeightSystem(0.5 * (information + information.T), pull)
     squares = sum(float(each.residual @ each.residual) for each in rows)
     return Felt(processes, columns, system, squares)

@@ -8,10 +8,9 @@ from time import process_time
 
 import numpy as np
 
-from l2m_gtsam.calibration.alternation import spread
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.start.global_start import find_starts
-from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, spread
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.maps.training import ThinningOptions, TrainingSet
@@ -59,7 +58,7 @@ class MappedDrive:
 
     def thinned(self, most: int) -> "MappedDrive":
         """Return the drive with so many readings of each sensor."""
-        return replace(self, readings=spread(self.readings, most))
+        return replace(self, readings=self.readings.select(spread(self.readings, most)))
 
 
 def mapped_drive(
