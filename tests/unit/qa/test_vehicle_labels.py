@@ -9,7 +9,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Annotation
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.qa.report.figures.vehicle import MOST_NAMES, SIDE, TOP, Viewpoint, vehicle_figure
+from l2m_gtsam.qa.report.figures.names import MOST_NAMES
+from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, Viewpoint, vehicle_figure
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.verdict import Level, SensorVerdict, Verdict
 from l2m_gtsam.storage.calibration_file import read_calibration
@@ -27,7 +28,7 @@ def calibration(places: FloatArray) -> CalibrationResult:
 
 
 def labels(result: CalibrationResult, view: Viewpoint) -> tuple[list[str], FloatArray]:
-    """Return what is written beside sensors, and its corners in pixels, (N, 4)."""
+    """Return what is written beside sensors and lidar, and its corners in pixels, (N, 4)."""
     sensors = tuple(SensorVerdict(each.sensor, Level.PASS, ()) for each in result.sensors)
     figure = vehicle_figure(result, Verdict(Level.PASS, (), sensors), view)
     FigureCanvasAgg(figure)
@@ -35,7 +36,7 @@ def labels(result: CalibrationResult, view: Viewpoint) -> tuple[list[str], Float
     found = [
         each
         for each in figure.findobj(Annotation)
-        if isinstance(each, Annotation) and each.get_text().startswith("mag_")
+        if isinstance(each, Annotation) and each.get_text().startswith(("mag_", "lidar"))
     ]
     boxes = [each.get_window_extent().extents for each in found]
     return [each.get_text() for each in found], np.array(boxes)
@@ -47,6 +48,9 @@ VEHICLES = {
     "at one place": 0.2 + rng.normal(0, 1e-3, (20, 3)),
     "close together": rng.normal([0.2, -0.1, 0.15], 0.02, (20, 3)),
     "all over": rng.uniform(-0.5, 0.5, (20, 3)),
+    "on a frame": np.array(
+        [(0.3 * i, 0.4 * j, 0.2 * k) for i in (-1, 1) for j in (-1, 1) for k in (0, 1)]
+    ),
     "in a row": np.column_stack([np.linspace(-1, 1, 12), np.zeros(12), np.full(12, 0.1)]),
 }
 
@@ -63,7 +67,7 @@ def test_no_name_is_written_over_another(name: str, view: Viewpoint) -> None:
         last = lines[-1]
         others = int(last.split()[1]) if last.startswith("and ") else 0
         told += len(lines) - bool(others) + others
-    assert told == len(places)
+    assert told == len(places) + 1
     for one, other in combinations(boxes, 2):
         # A pixel: letters have some room in their boxes.
         assert np.any((one[2:] < other[:2] + 1) | (other[2:] < one[:2] + 1)), texts

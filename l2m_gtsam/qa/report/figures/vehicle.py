@@ -1,7 +1,7 @@
 """Where the sensors sit on the vehicle, with their ellipses: in the report, and as one picture."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,17 +10,16 @@ from matplotlib.patches import Ellipse
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.qa.report.figures.map import draw_map
+from l2m_gtsam.qa.report.figures.names import GAP, Box, Label, placed
 from l2m_gtsam.qa.report.hover import axes_places
 from l2m_gtsam.qa.report.svg import (
     BAD,
     FAIR,
     GOOD,
     INK,
-    MUTED,
     SMALL,
     ellipse,
     new_figure,
-    short_name,
 )
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import MapPicture
@@ -32,11 +31,6 @@ COLOURS = {Level.PASS: GOOD, Level.WARN: FAIR, Level.FAIL: BAD}
 SHAPES = {Level.PASS: "o", Level.WARN: "^", Level.FAIL: "X"}
 # An ellipse that is less than this share of the picture is a dot: all are drawn larger then.
 SEEN = 0.1
-BEHIND = 12.0  # points: names of dots that are closer would cover each other
-LETTER, LINE = 0.7 * SMALL, 1.4 * SMALL  # points, about: how wide a letter is, and a line high
-GAP = np.array([10.0, 6.0])  # points from a dot to its name
-MOST_NAMES = 4  # of one label
-FAR = 0.75  # of the picture: names beyond this are written on the left of their dot, or below it
 MARGIN = 0.2  # around all places, of what they span
 ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200)
 
@@ -62,7 +56,6 @@ def vehicle_figure(result: CalibrationResult, verdict: Verdict, view: Viewpoint)
         _draw(axes, sensor, verdict[sensor.sensor].level, view, factor)
     _name(axes, found, view)
     axes.plot(0, 0, "s", color=INK, markersize=9, markerfacecolor="none")
-    axes.annotate("lidar", (0, 0), xytext=(-14, -13), textcoords="offset points", color=MUTED)
     names = ["xyz"[k] for k in view.axes]
     axes.set(xlabel=f"{names[0]} (m), forward", ylabel=f"{names[1]} (m)")
     axes.set_title(f"95 % ellipses{_drawn(factor)}")
@@ -105,66 +98,26 @@ def _places(found: list[SensorCalibration], view: Viewpoint) -> FloatArray:
     return np.vstack([room, *own])
 
 
-@dataclass(frozen=True, eq=False)
-class _Label:
-    """Names beside a place in a view, which may be far on the right or high in it."""
-
-    at: FloatArray
-    names: tuple[str, ...]
-    right: bool
-    high: bool
-
-    @property
-    def lines(self) -> list[str]:
-        """What is written; of many names the first ones, and how many there are."""
-        shown = [*map(short_name, self.names)]
-        if len(shown) <= MOST_NAMES:
-            return shown
-        return [*shown[: MOST_NAMES - 1], f"and {len(shown) - MOST_NAMES + 1} others"]
-
-    @property
-    def hangs(self) -> bool:
-        """Whether lines are stacked downwards: there is no room for so many above."""
-        return self.high and len(self.lines) > 2
-
-    def covers(self, other: "_Label", scale: float) -> bool:
-        """Return whether it would be written over another one, with so many points to a metre."""
-        if np.abs(self.at - other.at).max() * scale < BEHIND:
-            return True
-        (low, high), (its_low, its_high) = self._box(scale), other._box(scale)
-        return bool(np.all((low < its_high) & (its_low < high)))
-
-    def _box(self, scale: float) -> tuple[FloatArray, FloatArray]:
-        """Return about where it is written, in points."""
-        width, height = LETTER * max(map(len, self.lines)), LINE * len(self.lines)
-        extent, back = np.array([width, height]), np.array([self.right, self.hangs])
-        low = scale * self.at + np.where(back, -extent - GAP, GAP)
-        return low, low + extent
-
-
 def _name(axes: Axes, found: list[SensorCalibration], view: Viewpoint) -> None:
-    """Write names; those that would be written over each other share a label."""
+    """Write names of sensors and of the lidar."""
     places = _places(found, view)
     room = np.array([axes.bbox.width, axes.bbox.height]) * 72.0 / axes.figure.dpi
-    scale = float((room / ((1 + 2 * MARGIN) * np.ptp(places, axis=0))).min())
-    far, top = places.min(axis=0) + FAR * np.ptp(places, axis=0)
-    labels: list[_Label] = []
-    for sensor in found:
-        at = sensor.t_lidar_mag[list(view.axes)]
-        label = _Label(at, (sensor.sensor,), bool(at[0] > far), bool(at[1] > top))
-        # One that grows may reach others.
-        while there := next((each for each in labels if each.covers(label, scale)), None):
-            labels.remove(there)
-            label = replace(there, names=there.names + label.names)
-        labels.append(label)
-    for label in labels:
+    span = np.ptp(places, axis=0)
+    scale = float((room / ((1 + 2 * MARGIN) * span)).min())
+    middle = 0.5 * scale * (places.min(axis=0) + places.max(axis=0))
+    frame = Box(middle - 0.5 * room, middle + 0.5 * room)
+    dots = scale * np.vstack([np.zeros(2), *(s.t_lidar_mag[list(view.axes)] for s in found)])
+    labels = [Label(dots[0], ("lidar",))]
+    labels += [Label(at, (s.sensor,)) for at, s in zip(dots[1:], found, strict=True)]
+    for label in placed(labels, dots, frame):
+        right, up = label.side * GAP
         text = axes.annotate(
             "\n".join(label.lines),
-            tuple(label.at),
-            xytext=tuple(np.where([label.right, label.hangs], -GAP, GAP)),
+            tuple(label.at / scale),
+            xytext=(right, up),
             textcoords="offset points",
-            ha="right" if label.right else "left",
-            va="top" if label.hangs else "bottom",
+            ha=("right", "center", "left")[label.side[0] + 1],
+            va=("top", "center", "bottom")[label.side[1] + 1],
             fontsize=SMALL,
         )
         text.set_in_layout(False)  # a long name is no reason to draw the vehicle smaller
@@ -269,9 +222,6 @@ def _draw_vehicle(
             axes.add_patch(region)
     _name(axes, sensors, view)
     axes.plot(0, 0, "s", color="0.4", markersize=8)
-    axes.annotate(
-        "lidar", (0, 0), xytext=(-8, -12), textcoords="offset points", ha="right", fontsize=SMALL
-    )
     axes.plot([], [], ".", color=ESTIMATE, label=f"estimate, 95 % ellipse{_drawn(factor)}")
     if truth:
         axes.plot([], [], "+", color=TRUTH, label="truth")
