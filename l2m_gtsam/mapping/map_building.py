@@ -16,8 +16,9 @@ from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SuiteErrors
-from l2m_gtsam.maps.survey_poses import SurveyPoses, poses_together
+from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.maps.training import checked_readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import one_blas_thread
@@ -74,7 +75,7 @@ class SurveyReadings:
             np.concatenate([self.points, other.points]),
             np.concatenate([self.field, other.field]),
             self.suite.followed_by(other.suite, len(self.points)),
-            poses_together(self.poses, other.poses, len(self.points)),
+            errors_together(self.poses, other.poses, len(self.points)),
         )
 
 

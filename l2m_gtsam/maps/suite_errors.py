@@ -82,6 +82,10 @@ class SuiteErrors:
         same = self.sensors == other.sensors
         return replace(self, covariance=other.covariance) if same else None
 
+    def from_reading(self, first: int) -> "SuiteErrors":
+        """Return the same of readings that begin with this number."""
+        return replace(self, reading=self.reading + first)
+
     def followed_by(self, other: "SuiteErrors", first: int) -> "SuiteErrors":
         """Return the errors of these readings and of others that are numbered from ``first`` on.
 
@@ -135,17 +139,3 @@ class SuiteErrors:
         effect = np.zeros((n, len(self.sensors), 3, SIZE))
         effect[at, self.sensor[known]] = change  # each pair is there once
         return np.asarray(effect.transpose(0, 2, 1, 3).reshape(n, 3, -1))
-
-
-def errors_together(
-    before: SuiteErrors | None, after: SuiteErrors | None, first: int
-) -> SuiteErrors | None:
-    """Return the errors of readings and of others after them; see ``SuiteErrors.followed_by``.
-
-    Absent are those of sensors that count as exact.
-    """
-    if after is None:
-        return before
-    if before is None:
-        return replace(after, reading=after.reading + first)
-    return before.followed_by(after, first)

@@ -97,6 +97,10 @@ class SurveyPoses:
             shift=self.shift[own],
         )
 
+    def from_reading(self, first: int) -> "SurveyPoses":
+        """Return the same of readings that begin with this number."""
+        return replace(self, reading=self.reading + first)
+
     def followed_by(self, other: "SurveyPoses", first: int) -> "SurveyPoses":
         """Return the errors of these readings and of others that are numbered from ``first`` on."""
         drives = int(self.drive.max(initial=-1)) + 1
@@ -225,17 +229,3 @@ class KnotEffects:
     def part(self) -> IntArray:
         """Which of the six errors each column of ``white`` is of, shape (Q c,)."""
         return np.tile(self.felt, len(self.knots.drive))
-
-
-def poses_together(
-    before: SurveyPoses | None, after: SurveyPoses | None, first: int
-) -> SurveyPoses | None:
-    """Return the errors of readings and of others after them; see ``SurveyPoses.followed_by``.
-
-    Absent are those of poses that count as exact.
-    """
-    if after is None:
-        return before
-    if before is None:
-        return replace(after, reading=after.reading + first)
-    return before.followed_by(after, first)

@@ -28,9 +28,10 @@ from l2m_gtsam.maps.harmonic.tiling import (
     surveyed_area,
     tiling_of,
 )
-from l2m_gtsam.maps.suite_errors import SuiteErrors, errors_together
+from l2m_gtsam.maps.reading_errors import errors_together
+from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.survey import survey_doubts
-from l2m_gtsam.maps.survey_poses import SurveyPoses, poses_together
+from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.maps.training import TrainingSet, cubes_of, joined, merged
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.map_diary import UNDATED, MapDrive
@@ -224,7 +225,7 @@ class Learnt:
         owner = cubes_of(together.points, options.merge)
         errors = errors_together(self.suite, suite, len(self.readings))
         errors = None if errors is None else errors.averaged(owner, together.weight)
-        wrong_poses = poses_together(self.poses, poses, len(self.readings))
+        wrong_poses = errors_together(self.poses, poses, len(self.readings))
         if wrong_poses is not None:
             wrong_poses = wrong_poses.averaged(owner, together.weight)
         readings = merged(together, options.merge, options.independent)

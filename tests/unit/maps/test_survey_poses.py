@@ -17,7 +17,8 @@ from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.tile_correlation import shared_poses, within_whole
-from l2m_gtsam.maps.survey_poses import KNOTS, SurveyPoses, poses_together
+from l2m_gtsam.maps.reading_errors import errors_together
+from l2m_gtsam.maps.survey_poses import KNOTS, SurveyPoses
 from l2m_gtsam.maps.training import TrainingSet
 from tests.worlds.exact import DipoleWorld, dipole_world
 from tests.worlds.harmonic import GIVEN, basis, places, rms
@@ -67,12 +68,12 @@ def test_errors_have_their_variance_at_any_time_and_last_as_long_as_stated() -> 
 
 def test_two_surveys_have_nothing_in_common() -> None:
     one, other = errors(10), errors(6, seed=1)
-    both = poses_together(one, other, 10)
+    both = errors_together(one, other, 10)
     assert both is not None
     assert not set(both.drive[:10]) & set(both.drive[10:])
     np.testing.assert_array_equal(both.reading, np.arange(16))
-    assert poses_together(None, None, 4) is None
-    late = poses_together(None, other, 10)
+    assert errors_together(None, None, 4) is None
+    late = errors_together(None, other, 10)
     assert late is not None
     np.testing.assert_array_equal(late.reading, other.reading + 10)
 
