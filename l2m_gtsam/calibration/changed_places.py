@@ -35,6 +35,7 @@ from l2m_gtsam.solve.chi_square import quantile
 
 CELL_M = 1.0  # edge of the cells that are suspected
 SURE = 0.999  # of cells with nothing but noise so many are not
+ENOUGH, UNLIKE = 10, 2.0  # readings of a cell, and their squares over those of most cells
 AXES = 3
 ROUNDS = 4  # of solving with sources and looking for them again
 SETTLED_SIGMAS = 0.3
@@ -75,7 +76,8 @@ def suspected(
     """Return where readings differ from the map by more than it may err, metres, shape (M, 3).
 
     Cell by cell of the floor, with all errors of the map in a cell alike: quick, and no more than
-    a first look.
+    a first look. Beside small steel the field differs by ways that cancel in a cell's mean: there
+    the squares are larger than elsewhere on the drive.
     """
     readings, estimate = drive.view.readings, drive.estimate
     places = places_of(readings, estimate.t)
@@ -94,8 +96,10 @@ def suspected(
     variance = (
         mean(drive.view.map_variance) + mean(own) * sensors / np.maximum(count, sensors)[:, None]
     )
-    squared = np.sum(mean(drive.averages.residual) ** 2 / variance, axis=1)
-    wrong = squared > quantile(SURE, AXES)
+    left = drive.averages.residual
+    wrong = np.sum(mean(left) ** 2 / variance, axis=1) > quantile(SURE, AXES)
+    single = mean(left**2 / (drive.view.map_variance + own)).sum(axis=1)
+    wrong |= (count >= ENOUGH) & (single > UNLIKE * np.median(single))
     wrong |= 1 - np.bincount(cell, drive.averages.counted) / count > 0.5
     return np.asarray(mean(places)[wrong])
 

@@ -24,6 +24,7 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.geometry import carried_back
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import MapPrediction
+from l2m_gtsam.slam.odometry import OdometrySteps
 from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import whitening
 
@@ -45,12 +46,15 @@ class RelativeMotions:
     by_step
         Adjoints that take a perturbation of the end of a step to the lidar at a reading, as if it
         were rigidly fixed to that end, shape (N, 6, 6).
+    odometry
+        The steps as odometry has them.
     """
 
     readings: KeyPoseReadings
     steps: tuple[gtsam.Pose3, ...]
     covariance: FloatArray
     by_step: FloatArray
+    odometry: OdometrySteps
 
     @classmethod
     def along(cls, drive: Drive, poses: Sequence[gtsam.Pose3]) -> "RelativeMotions":
@@ -60,7 +64,11 @@ class RelativeMotions:
         shifted = interpolated_readings(drive, rows, [steps[k] for k in key.tolist()])
         end = from_end(drive.readings, drive.steps.R[key], drive.steps.p[key])
         by_step = carried_back(end.R_key_lidar, end.p_key_lidar)
-        return cls(shifted, steps, drive.steps.covariance, by_step)
+        return cls(shifted, steps, drive.steps.covariance, by_step, drive.steps)
+
+    def without(self, brought: FloatArray) -> "RelativeMotions":
+        """Return the same without what something adds to the readings, uT, shape (N, 3)."""
+        return replace(self, readings=replace(self.readings, field=self.readings.field - brought))
 
     def interpolation_covariance(self, rows: IntArray, by_lidar: FloatArray) -> FloatArray:
         """Return the bridge's covariance of n residuals, each alone, uT^2, shape (n, 3, 3).

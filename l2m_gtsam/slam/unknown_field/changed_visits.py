@@ -1,32 +1,29 @@
 r"""Visits of a tile that found another field there: steel was moved between two laps.
 
-Readings of a visit differ from the field that earlier ones left for two reasons: the poses of the
-visit are off, by one rigid motion as far as a tile is concerned, or the field has changed. Both are
-asked of the same readings,
+Readings of a visit differ from the field that earlier ones left for two reasons: the vehicle was
+not where it is believed to have been, by one rigid motion as far as a tile is concerned, or the
+field has changed. Both are asked of the same readings,
 
 .. math::
     b = F w + D \xi + v \quad \text{or} \quad b = F (w + \delta) + D \xi + v
 
 with w as earlier visits know it, xi the motion and delta a change as the prior of the waves has it,
-but smaller: as large as makes the readings most likely.
+but smaller: as large as makes the readings most likely. What is known of the motion otherwise, by
+odometry and by other tiles, is that of ``visit_graph``.
 """
 
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.spatial.transform import Rotation
+from scipy.linalg import cho_factor, cho_solve, eigh
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 
-SHARES = (0.003, 0.01, 0.03, 0.1)  # of a change, over the prior of the waves
-CLEAR = 10.0  # in nats: odds of 22,000 to 1 that the field changed
-LIKELY = 0.5  # where something was moved on this drive, its field reaches other tiles, too
+SHARES = (0.0, 0.003, 0.01, 0.03, 0.1)  # of a change, over the prior of the waves
 SPIKE = 6.0  # sigmas from the field of the others, beyond which a reading is none of the field
-MOTION = np.repeat([np.deg2rad(5.0), 0.3], 3)  # standard deviations of xi, rad and metres
-STEPS = 6  # of Gauss and Newton
-HALVED = (1.0, 0.3, 0.1)  # of a step, where the whole one does not help
+MOTION = np.repeat([np.deg2rad(5.0), 0.3], 3)  # what is known of xi at least, rad and metres
 
 
 @dataclass(frozen=True)
@@ -39,41 +36,190 @@ class Seen:
         Where, metres, and what, uT, shapes (n, 3).
     variance
         Of each reading per axis, uT^2, shape (n, 3).
+    key_pose
+        Number of the key pose that each hangs on, shape (n,).
     """
 
     points: FloatArray
     field: FloatArray
     variance: FloatArray
+    key_pose: IntArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> "Seen":
+        return Seen(self.points[rows], self.field[rows], self.variance[rows], self.key_pose[rows])
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """What is left of a visit that was moved, with derivatives by the motion."""
+class Remembered:
+    """What readings say of a tile's m weights, besides their prior.
+
+    Attributes
+    ----------
+    information, pulled
+        Sums over readings, shapes (m, m) and (m,).
+    """
+
+    information: FloatArray
+    pulled: FloatArray
+
+    @classmethod
+    def of(cls, tile: LinearField, seen: Seen) -> "Remembered":
+        """Return what readings say."""
+        root = 1 / np.sqrt(seen.variance)
+        white = (tile.features(seen.points) * root[:, :, None]).reshape(-1, len(tile))
+        return cls(white.T @ white, white.T @ (seen.field * root).ravel())
+
+    def __add__(self, other: "Remembered") -> "Remembered":
+        """Return what both say."""
+        return Remembered(self.information + other.information, self.pulled + other.pulled)
+
+
+@dataclass(frozen=True)
+class EarlierField:
+    """A tile's m weights as earlier visits know them.
+
+    Attributes
+    ----------
+    mean
+        Shape (m,).
+    axes, variance
+        Of their covariance: columns are directions, shape (m, m), with variances, shape (m,).
+    """
+
+    mean: FloatArray
+    axes: FloatArray
+    variance: FloatArray
+
+    @classmethod
+    def of(cls, earlier: Remembered) -> "EarlierField":
+        """Return the weights by what earlier visits remember, and their prior."""
+        known, axes = eigh(earlier.information)
+        variance = 1 / (1 + np.maximum(known, 0.0))
+        return cls(axes @ (variance * (axes.T @ earlier.pulled)), axes, variance)
+
+
+@dataclass(frozen=True)
+class VisitResiduals:
+    """What a visit's readings differ from the field of earlier visits by.
+
+    Attributes
+    ----------
+    left
+        In the anchor's frame, uT, shape (n, 3).
+    by_motion
+        What a motion takes off, per rad and metre, shape (n, 3, 6).
+    features
+        The field of the weights, shape (n, 3, m).
+    """
 
     left: FloatArray
-    D: FloatArray
-    motion: FloatArray
+    by_motion: FloatArray
+    features: FloatArray
+
+    @classmethod
+    def of(
+        cls, tile: LinearField, earlier: EarlierField, visit: Seen, node: gtsam.Pose3
+    ) -> "VisitResiduals":
+        """Return them.
+
+        Parameters
+        ----------
+        tile, earlier, visit
+            As of ``VisitEvidence.of``.
+        node
+            Pose in the anchor's frame that the motion is a right perturbation of.
+        """
+        R, p = node.rotation().matrix(), node.translation()
+        field, gradient = tile.field_and_gradient(visit.points, earlier.mean)
+        # A turned vehicle reads another field, and elsewhere.
+        turned = skew(visit.field) - gradient @ skew(visit.points - p)
+        D = np.concatenate([turned @ R, gradient @ R], axis=2)
+        return cls(visit.field - field, D, tile.features(visit.points))
 
 
-def change_gain(tile: LinearField, earlier: Seen, visit: Seen) -> float:
-    """Return how much likelier it is that a visit found another field than earlier ones, in nats.
+@dataclass(frozen=True)
+class Motion:
+    """A motion of six numbers in information form: a right perturbation of a pose.
 
-    Parameters
+    Attributes
     ----------
-    tile
-        Waves of the tile, of unit prior variance.
-    earlier, visit
-        Their readings.
+    information, pulled
+        Shapes (6, 6) and (6,).
     """
-    earlier, visit = trusted(tile, earlier), trusted(tile, visit)
-    F = tile.features(earlier.points).reshape(-1, len(tile))
-    white = F / np.sqrt(earlier.variance).reshape(-1, 1)
-    information = np.eye(len(tile)) + white.T @ white
-    factor = cho_factor(information)
-    pulled = white.T @ (earlier.field / np.sqrt(earlier.variance)).ravel()
-    mean = cho_solve(factor, pulled)
-    values = [likelihood(tile, mean, factor, visit, share) for share in (0.0, *SHARES)]
-    return max(values[1:]) - values[0]
+
+    information: FloatArray
+    pulled: FloatArray
+
+
+@dataclass(frozen=True)
+class VisitEvidence:
+    """What a visit says of its motion, for each of ``SHARES``.
+
+    Attributes
+    ----------
+    motions
+        Of each share.
+    constant
+        Likelihood without any motion, in nats but for a constant that all shares have.
+    """
+
+    motions: tuple[Motion, ...]
+    constant: FloatArray
+
+    @classmethod
+    def of(
+        cls, tile: LinearField, earlier: EarlierField, visit: Seen, node: gtsam.Pose3
+    ) -> "VisitEvidence":
+        """Return what a visit says.
+
+        Parameters
+        ----------
+        tile
+            Waves of the tile, of unit prior variance.
+        earlier
+            What earlier visits know of it.
+        visit
+            Its readings.
+        node
+            Pose in the anchor's frame that the motion is of.
+        """
+        own, root = VisitResiduals.of(tile, earlier, visit, node), 1 / np.sqrt(visit.variance)
+        X = np.concatenate([own.left[:, :, None], own.by_motion], axis=2)
+        X = (X * root[:, :, None]).reshape(-1, 7)
+        F = (own.features * root[:, :, None]).reshape(-1, len(tile)) @ earlier.axes
+        seen, by_weights, alone = F.T @ F, F.T @ X, X.T @ X
+        motions, constant = [], []
+        for share in SHARES:
+            # By Woodbury: weights as earlier visits and a change leave them, and noise.
+            prior = earlier.variance + share**2
+            factor = cho_factor(seen + np.diag(1 / prior))
+            squared = alone - by_weights.T @ cho_solve(factor, by_weights)
+            log_det = float(np.log(prior).sum() + 2 * np.log(np.diag(factor[0])).sum())
+            motions.append(Motion(squared[1:, 1:], squared[1:, 0]))
+            constant.append(-0.5 * (float(squared[0, 0]) + log_det))
+        return cls(tuple(motions), np.array(constant))
+
+    def followed_by(self, later: "VisitEvidence") -> "VisitEvidence":
+        """Return what both parts of a visit say if nothing had changed before the later one."""
+        first, constant = self.motions[0], self.constant[0] + later.constant
+        pairs = [
+            Motion(first.information + each.information, first.pulled + each.pulled)
+            for each in later.motions
+        ]
+        return VisitEvidence(tuple(pairs), constant)
+
+    def likelihoods(self, known: Motion) -> FloatArray:
+        """Return how likely each share is with what is known of the motion, in nats."""
+        values = []
+        for own, constant in zip(self.motions, self.constant, strict=True):
+            factor = cho_factor(known.information + own.information)
+            pulled = known.pulled + own.pulled
+            log_det = 2 * float(np.log(np.diag(factor[0])).sum())
+            values.append(constant + 0.5 * (float(pulled @ cho_solve(factor, pulled)) - log_det))
+        return np.array(values)
 
 
 def trusted(tile: LinearField, seen: Seen) -> Seen:
@@ -81,55 +227,7 @@ def trusted(tile: LinearField, seen: Seen) -> Seen:
     weights = tile.robust_weights(seen.points, seen.field, seen.variance)
     field, _ = tile.field_and_gradient(seen.points, weights)
     squared = np.sum((seen.field - field) ** 2 / seen.variance, axis=1)
-    keep = squared <= SPIKE**2
-    return Seen(seen.points[keep], seen.field[keep], seen.variance[keep])
-
-
-def likelihood(
-    tile: LinearField,
-    mean: FloatArray,
-    factor: tuple[FloatArray, bool],
-    visit: Seen,
-    share: float,
-) -> float:
-    """Return how likely a visit is with a change of this share, in nats, but for a constant.
-
-    What field and change may be wrong by is that at the poses as they are believed.
-    """
-    F = tile.features(visit.points).reshape(-1, len(tile))
-    S = F @ cho_solve(factor, F.T) + share**2 * (F @ F.T)
-    S[np.diag_indices_from(S)] += visit.variance.ravel()
-    noise, fit = cho_factor(S), fitted(tile, mean, visit, np.zeros(6))
-    for _ in range(STEPS):
-        pulled = cho_solve(noise, fit.D)
-        information = fit.D.T @ pulled + np.diag(MOTION**-2)
-        step = np.linalg.solve(information, pulled.T @ fit.left - fit.motion / MOTION**2)
-        trials = [fitted(tile, mean, visit, fit.motion + scale * step) for scale in HALVED]
-        best = min((fit, *trials), key=lambda each: _chi2(noise, each))
-        if best is fit:
-            break
-        fit = best
-    log_det = 2 * float(np.log(np.diag(noise[0])).sum())
-    log_det += float(np.linalg.slogdet(information)[1])
-    return -0.5 * (_chi2(noise, fit) + log_det)
-
-
-def _chi2(noise: tuple[FloatArray, bool], fit: "_Fit") -> float:
-    return float(fit.left @ cho_solve(noise, fit.left) + np.sum((fit.motion / MOTION) ** 2))
-
-
-def fitted(tile: LinearField, mean: FloatArray, visit: Seen, motion: FloatArray) -> _Fit:
-    """Return what is left of a visit moved by (rotation, translation) about its middle."""
-    middle = visit.points.mean(axis=0)
-    R = Rotation.from_rotvec(motion[:3]).as_matrix()
-    arm = (visit.points - middle) @ R.T
-    points, b = middle + arm + motion[3:], visit.field @ R.T
-    field, gradient = tile.field_and_gradient(points, mean)
-    D = np.empty((len(points), 3, 6))
-    # A turned vehicle reads another field, and elsewhere: what is left changes by -D d(motion).
-    D[:, :, :3] = skew(b) - gradient @ skew(arm)
-    D[:, :, 3:] = gradient
-    return _Fit((b - field).ravel(), D.reshape(-1, 6), motion)
+    return seen[np.asarray(squared <= SPIKE**2)]
 
 
 def skew(v: FloatArray) -> FloatArray:

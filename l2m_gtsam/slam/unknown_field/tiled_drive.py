@@ -8,7 +8,6 @@ import numpy as np
 from l2m_factors import (
     Calibrations,
     ComplexityPenalty,
-    KeyPoseReadings,
     M,
     TileBatch,
     effective_parameters_factor,
@@ -16,11 +15,11 @@ from l2m_factors import (
 )
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings, predict
+from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
-from l2m_gtsam.slam.unknown_field.changed_visits import CLEAR, LIKELY, Seen, change_gain
 from l2m_gtsam.slam.unknown_field.linear_field import AXES, LinearField
+from l2m_gtsam.slam.unknown_field.revisited_tiles import RevisitedTiles
 from l2m_gtsam.slam.unknown_field.sensor_noise import SlowErrors
 from l2m_gtsam.slam.unknown_field.tiles import (
     Anchoring,
@@ -28,6 +27,7 @@ from l2m_gtsam.slam.unknown_field.tiles import (
     WaveTile,
     anchor_tiles,
     level_axes,
+    relative_place,
 )
 
 
@@ -99,10 +99,14 @@ class TiledDrive:
         The tile of each key pose.
     tiles
         Tiles with readings.
+    brought
+        What steel that was moved on the drive adds to its N readings where their tiles are older,
+        uT, in the sensors' frames, shape (N, 3).
     """
 
     anchoring: Anchoring
     tiles: tuple[OccupiedTile, ...]
+    brought: FloatArray
 
     @classmethod
     def partition(
@@ -117,8 +121,8 @@ class TiledDrive:
         p = np.stack([pose.translation() for pose in poses])
         axes = level_axes(R)
         anchoring = anchor_tiles(R, p, prior.options.core)
-        visits = RevisitedTiles(motions, poses, sensors, prior, axes)
-        anchoring = visits.renewed(anchoring)
+        renewed = RevisitedTiles(motions, poses, sensors, prior, axes).renewed(anchoring)
+        anchoring, motions = renewed.anchoring, motions.without(renewed.brought)
         owner = anchoring.tile[motions.readings.key_pose]
         tiles = []
         for number, anchor in enumerate(anchoring.anchor.tolist()):
@@ -127,18 +131,18 @@ class TiledDrive:
                 where = relative_place(motions.readings[rows], poses, anchor, sensors)
                 field = WaveTile.about(prior, R[anchor].T @ axes[anchor], where.x)
                 tiles.append(OccupiedTile(number, anchor, rows, field, where))
-        return cls(anchoring, tuple(tiles))
+        return cls(anchoring, tuple(tiles), renewed.brought)
 
     def moved(
         self, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors
     ) -> "TiledDrive":
         """Return the same tiles with their readings at another estimate."""
-        own = motions.readings
+        own = motions.without(self.brought).readings
         tiles = (
             replace(tile, placed=relative_place(own[tile.rows], poses, tile.anchor, sensors))
             for tile in self.tiles
         )
-        return TiledDrive(self.anchoring, tuple(tiles))
+        return replace(self, tiles=tuple(tiles))
 
     def weights(self, sensors: KnownSensors, noise: FloatArray) -> gtsam.Values:
         """Return robust estimates of the weights of all tiles."""
@@ -203,7 +207,7 @@ class TiledDrive:
         slow
             Slow errors of the readings, which are variables then.
         """
-        graph = gtsam.NonlinearFactorGraph()
+        graph, motions = gtsam.NonlinearFactorGraph(), motions.without(self.brought)
         for tile, penalty in zip(self.tiles, penalties, strict=True):
             rows = np.intersect1d(tile.rows, chosen)
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
@@ -223,97 +227,3 @@ class TiledDrive:
         if slow is not None:
             graph.push_back(slow.graph())
         return graph
-
-
-def relative_place(
-    readings: KeyPoseReadings, poses: list[gtsam.Pose3], anchor: int, sensors: KnownSensors
-) -> PlacedReadings:
-    """Return readings at the poses of their key poses in the frame of an anchor."""
-    origin = poses[anchor]
-    own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
-    return place_readings(readings, own, sensors)
-
-
-KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged
-GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
-
-
-@dataclass(frozen=True)
-class DividedTiles:
-    """Tiles some of which changed, and between which key poses each did."""
-
-    anchoring: Anchoring
-    between: tuple[tuple[int, int], ...]
-
-
-@dataclass(frozen=True)
-class RevisitedTiles:
-    """Tiles at an estimate of poses, and whether later visits find the field of earlier ones.
-
-    Attributes
-    ----------
-    motions, poses, sensors, prior
-        As for ``TiledDrive.partition``.
-    axes
-        Level axes of the key poses in the map, shape (K, 3, 3).
-    """
-
-    motions: RelativeMotions
-    poses: list[gtsam.Pose3]
-    sensors: KnownSensors
-    prior: FieldPrior
-    axes: FloatArray
-
-    def renewed(self, anchoring: Anchoring) -> Anchoring:
-        """Return the same with a tile of its own from each visit on that found another field.
-
-        Steel that was moved is felt in other tiles, too: a visit between whose key poses and those
-        of the visit before a tile changed clearly needs little evidence.
-        """
-        # Sensors at places that are not known find other fields from visit to visit, too.
-        t = np.diagonal(self.sensors.covariance, axis1=-2, axis2=-1)[..., :3]
-        if np.sqrt(t.max()) > KNOWN_M:
-            return anchoring
-        sure = self._divided(anchoring, ())
-        return self._divided(anchoring, sure.between).anchoring if sure.between else anchoring
-
-    def _divided(self, anchoring: Anchoring, known: tuple[tuple[int, int], ...]) -> "DividedTiles":
-        anchors, tile = anchoring.anchor.tolist(), anchoring.tile.copy()
-        between = []
-        for number in range(len(anchoring)):
-            own = np.flatnonzero(tile == number)
-            visits = np.split(own, np.flatnonzero(np.diff(own) > GONE) + 1)
-            first = 0
-            for k in range(1, len(visits)):
-                last, start = int(visits[k - 1][-1]), int(visits[k][0])
-                alike = any(last < end and begin < start for begin, end in known)
-                earlier = np.concatenate(visits[first:k])
-                gain = self._gain(anchors[tile[earlier[0]]], earlier, visits[k])
-                if gain > (LIKELY if alike else CLEAR):
-                    later, first = np.concatenate(visits[k:]), k
-                    tile[later] = len(anchors)
-                    anchors.append(start)
-                    between.append((last, start))
-        return DividedTiles(Anchoring(np.array(anchors), tile), tuple(between))
-
-    def _gain(self, anchor: int, earlier: IntArray, visit: IntArray) -> float:
-        rows = [np.flatnonzero(np.isin(self._key_pose, each)) for each in (earlier, visit)]
-        if not all(len(each) for each in rows):
-            return 0.0
-        every = np.concatenate(rows)
-        where = relative_place(self.motions.readings[every], self.poses, anchor, self.sensors)
-        R = self.poses[anchor].rotation().matrix()
-        field = WaveTile.about(self.prior, R.T @ self.axes[anchor], where.x)
-        noise = self.sensors.noise[self.motions.readings.sensor[every], None]
-        variance = noise**2 + field.unresolved(where.x)
-        b, count = where.field(self.sensors), len(rows[0])
-        before, after = slice(0, count), slice(count, len(every))
-        return change_gain(
-            field,
-            Seen(where.x[before], b[before], variance[before]),
-            Seen(where.x[after], b[after], variance[after]),
-        )
-
-    @property
-    def _key_pose(self) -> IntArray:
-        return np.asarray(self.motions.readings.key_pose)

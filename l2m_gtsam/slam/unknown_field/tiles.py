@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.family import UniformField
@@ -18,8 +19,8 @@ from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, left_out, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
 from l2m_gtsam.maps.harmonic.tiling import Resolution, resolution_of, surveyed_area
 from l2m_gtsam.maps.training import merged, training_set
-from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.map_prediction import place_readings
+from l2m_gtsam.slam.drive import Drive, KnownSensors
+from l2m_gtsam.slam.map_prediction import PlacedReadings, place_readings
 from l2m_gtsam.slam.options import TileOptions
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 
@@ -240,3 +241,12 @@ def level_axes(R: FloatArray) -> FloatArray:
     """Return level axes in the map with the vehicle's heading, shape (K, 3, 3)."""
     yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
     return np.asarray(Rotation.from_euler("z", yaw[:, None]).as_matrix())
+
+
+def relative_place(
+    readings: KeyPoseReadings, poses: list[gtsam.Pose3], anchor: int, sensors: KnownSensors
+) -> PlacedReadings:
+    """Return readings at the poses of their key poses in the frame of an anchor."""
+    origin = poses[anchor]
+    own = {int(k): origin.between(poses[int(k)]) for k in np.unique(readings.key_pose)}
+    return place_readings(readings, own, sensors)

@@ -25,8 +25,8 @@ from l2m_gtsam.slam.unknown_field.spectrum import (
     LearntReadings,
     learnt_spectrum,
 )
-from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, TiledDrive, relative_place
-from l2m_gtsam.slam.unknown_field.tiles import Anchoring
+from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, TiledDrive
+from l2m_gtsam.slam.unknown_field.tiles import Anchoring, relative_place
 
 LEAST_WAVES = 50
 CUT = 3.0  # waves shorter than the length over this count as noise
@@ -100,7 +100,7 @@ class WholePrior:
         where = relative_place(motions.readings, poses, 0, sensors)
         tile = OccupiedTile(0, 0, everything, self.field, where)
         own = Anchoring(np.zeros(1, dtype=np.int64), np.zeros(len(poses), dtype=np.int64))
-        return TiledDrive(own, (tile,))
+        return TiledDrive(own, (tile,), np.zeros_like(motions.readings.field))
 
 
 def learnt_prior(
