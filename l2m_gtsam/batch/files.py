@@ -177,7 +177,10 @@ class SavedMap:
         for drive in drives:
             self.check_frame(drive)
         progress("loading the map", 0.0)
-        field_map = with_tiles(map_from_state(self.state), self.path)
+        try:
+            field_map = with_tiles(map_from_state(self.state), self.path)
+        except MapError as error:
+            raise MapError(f"{self.path}: {error}") from error
         progress("loading the map", 1.0)
         return field_map
 

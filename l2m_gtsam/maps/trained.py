@@ -305,7 +305,9 @@ def state_array(state: MapState, name: str) -> FloatArray:
 def first_complaint(error: ValidationError) -> str:
     """Return the first complaint of pydantic as one line."""
     detail = error.errors()[0]
-    return f"{'.'.join(str(part) for part in detail['loc'])}: {detail['msg']}"
+    where = ".".join(str(part) for part in detail["loc"])
+    what = detail["msg"].removeprefix("Value error, ")
+    return f"{where}: {what}" if where else what
 
 
 def describe(learning: LikelihoodFit) -> str:

@@ -9,11 +9,16 @@ from l2m_gtsam.records.places import LARGEST, ChangedSource
 DATE = re.compile(r"[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}Z")
 
 
+HIDDEN = "came: or steel of the opposite moment went that the survey's cloud does not show"
+
+
 class Happening(StrEnum):
     """What happened to steel."""
 
     CAME = "came"
     WENT = "went"
+    EITHER = "came or went"
+    """Steel came, or steel of the opposite moment went that no survey had seen."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,11 @@ class DatedChange:
     drive: int
     before: int
     other: int | None = None
+
+    @property
+    def went(self) -> bool:
+        """Whether steel is no longer there that the map had, or that was brought before."""
+        return self.what is Happening.WENT
 
 
 @dataclass(frozen=True)
@@ -130,16 +140,22 @@ class MapDiary:
 def words_of(diary: MapDiary, number: int) -> str:
     """Return what happened to the steel of a change, by its index, in a few words."""
     change = diary.changes[number]
-    if change.what is Happening.WENT:
+    if change.went:
         goes = [k for k, each in enumerate(diary.changes) if taken_from(each) == number]
         how = f"moved to {goes[0] + 1}" if goes else "went"
         return how if change.other is None else f"{how} (was {change.other + 1})"
-    return "came" if change.other is None else f"moved from {change.other + 1}"
+    return change.what.value if change.other is None else f"moved from {change.other + 1}"
+
+
+def doubtful(diary: MapDiary) -> str | None:
+    """Return what else steel that came may be; nothing where none did."""
+    came = any(each.what is Happening.CAME and each.other is None for each in diary.changes)
+    return HIDDEN if came else None
 
 
 def taken_from(change: DatedChange) -> int | None:
     """Return the index of the change that took steel away which this one brought."""
-    return change.other if change.what is Happening.CAME else None
+    return None if change.went else change.other
 
 
 def between(diary: MapDiary, number: int) -> str:

@@ -33,15 +33,23 @@ def dated_changes(
         What the map went through before.
     """
     drive, first = len(diary.drives), len(diary.changes)
-    changes = []
+    changes, came = [], Happening.CAME if has_cloud(field_map, diary) else Happening.EITHER
     for source in sources:
         brought = brought_by(source, diary.changes)
         gone = -float(standing_moment(field_map, source) @ source.moment)
         taken = gone > TAKEN * float(source.moment @ source.moment)
-        what = Happening.WENT if brought is not None or taken else Happening.CAME
+        what = Happening.WENT if brought is not None or taken else came
         before = last_felt(field_map, source)
         changes.append(DatedChange(what, source, drive, before, brought))
     return tuple(with_moves(changes, first))
+
+
+def has_cloud(field_map: HarmonicMap, diary: MapDiary) -> bool:
+    """Return whether a map knows where steel stood when it was surveyed.
+
+    Without, steel that went and steel of the opposite moment that came are one and the same field.
+    """
+    return len(field_map.learnt.strengths) > len(diary.changes)
 
 
 def last_felt(field_map: HarmonicMap, source: ChangedSource) -> int:
@@ -57,10 +65,10 @@ def last_felt(field_map: HarmonicMap, source: ChangedSource) -> int:
 
 def brought_by(source: ChangedSource, changes: Sequence[DatedChange]) -> int | None:
     """Return the change that brought the steel which a source takes away; the last, if any."""
-    gone = {each.other for each in changes if each.what is Happening.WENT}
+    gone = {each.other for each in changes if each.went}
     for number in reversed(range(len(changes))):
         each = changes[number]
-        if each.what is Happening.CAME and number not in gone and opposite(source, each.source):
+        if not each.went and number not in gone and opposite(source, each.source):
             return number
     return None
 
@@ -102,11 +110,11 @@ def with_moves(changes: list[DatedChange], first: int) -> list[DatedChange]:
     first
         Number of the first of them among all.
     """
-    went = [k for k, each in enumerate(changes) if each.what is Happening.WENT]
+    went = [k for k, each in enumerate(changes) if each.went]
     moved = []
     for change in changes:
         alike = [k for k in went if same_size(change.source, changes[k].source)]
-        if change.what is Happening.CAME and alike:
+        if not change.went and alike:
             went.remove(alike[0])
             change = DatedChange(
                 change.what, change.source, change.drive, change.before, first + alike[0]

@@ -1,17 +1,25 @@
 """A map that is kept up from the command line: steel comes, goes, and the map tells it."""
 
 import json
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
 
+from l2m_gtsam.cli.tables.map_changes import changes_table
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.records.map_diary import Happening
+from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
+from l2m_gtsam.qa.report.figures.map_changes import draw_changes
+from l2m_gtsam.records.map_diary import UNDATED, Happening, MapDiary, words_of
+from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.storage.map_file import load_map, save_map
+from l2m_gtsam.upkeep.dated_changes import dated_changes
 from tests.support.command_line import complaint_here, ended, l2m
 from tests.support.map_files import copy_map
 from tests.worlds.yard import START, make_yard, route, survey, with_steel, world
@@ -75,7 +83,32 @@ def test_what_came_and_went_is_told(kept: Kept) -> None:
     assert "1 came" in out
     assert "2023-11-14 and 2023-11-15" in out
     assert "2 went (was 1)" in out
+    # A cloud need not show all steel: what came may as well have gone.
+    assert "or steel of the opposite moment went" in out
     assert "2023-11-15 and 2023-11-16" in out
+
+
+def test_without_a_cloud_it_came_or_went(kept: Kept) -> None:
+    """Steel of the survey that is taken away is a source of the opposite moment."""
+    zero, source = np.zeros(3), np.array([0.5, -1.0, 0.5])
+    found = ChangedSource(source, zero + 0.01, -MOMENT, zero + 0.1, zero, 100.0, 0.5, 5.0, 1)
+    surveyed = opened(kept.surveyed)
+    bare = replace(surveyed.learnt, sources=NO_SOURCES, strengths=np.empty(0))
+    blind = HarmonicMap.condition(bare, surveyed.options)
+    survey_of = MapDiary((UNDATED,))
+    (known,), (change,) = (dated_changes(each, [found], survey_of) for each in (surveyed, blind))
+    assert (known.what, change.what) == (Happening.CAME, Happening.EITHER)
+    diary = MapDiary((UNDATED, UNDATED), (change,))
+    assert words_of(diary, 0) == "came or went"
+    again = replace(found, moment=MOMENT)
+    (back,) = dated_changes(blind, [again], diary)
+    assert (back.what, back.other) == (Happening.WENT, 0)
+    picture = kept.folder / "either.png"
+    figure, axes = plt.subplots()
+    draw_changes(axes, diary)
+    figure.savefig(picture)
+    plt.close(figure)
+    assert list(changes_table(diary).columns[0].cells) == ["1 came or went"]
 
 
 def test_the_map_is_that_of_the_place_as_it_is(kept: Kept) -> None:
@@ -160,3 +193,61 @@ def test_an_update_that_ends_half_way_leaves_the_old_map(
     assert ended("map", "update", path, later, *given).code != 0
     assert path.read_bytes() == kept.taken.read_bytes()
     assert [each for each in tmp_path.rglob("*") if "npz" in each.name] == [path]
+
+
+HOSTILE = "<img src=x onerror=alert(1)>\x1b[31m"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (
+            lambda diary: diary.update(drives=diary["drives"][:1]),
+            "of a drive that the map does not",
+        ),
+        (lambda diary: diary["drives"].append(diary["drives"][0]), "history is damaged"),
+        (lambda diary: diary["drives"][0].update(begun=HOSTILE), "dates of drives are like"),
+        (lambda diary: diary["changes"][0].update(what=HOSTILE), "changes.0.what"),
+        (lambda diary: diary["changes"][0].update(other=99), "a change belongs to one that"),
+        (lambda diary: diary["changes"][0]["source"].update(position=[1e300, 0, 0]), "position"),
+    ],
+    ids=["short", "long", "date", "what", "other", "nowhere"],
+)
+def test_a_spoilt_diary_is_one_line(
+    kept: Kept, tmp_path: Path, spoil: Callable[[Any], None], told: str
+) -> None:
+    state, path = load_map(kept.taken), tmp_path / "map.npz"
+    diary = json.loads(json.dumps(state.provenance["diary"]))
+    spoil(diary)
+    save_map(path, replace(state, provenance={**state.provenance, "diary": diary}))
+    line = complaint_here("map", "info", path)
+    assert str(path) in line
+    assert told in line
+    assert "\x1b" not in line
+
+
+def test_a_diary_of_another_map_is_one_line(kept: Kept, tmp_path: Path) -> None:
+    state, path = load_map(kept.surveyed), tmp_path / "map.npz"
+    diary = load_map(kept.taken).provenance["diary"]
+    save_map(path, replace(state, provenance={**state.provenance, "diary": diary}))
+    assert "it is of another map" in complaint_here("map", "info", path)
+
+
+def test_maps_that_cannot_be_read_or_written_are_one_line(kept: Kept, tmp_path: Path) -> None:
+    later = survey(tmp_path, "later", route(-3, 0.5), 10, None, START + 5 * DAY)
+    given = (later, "--config", kept.config, "--suite", kept.suite, "--changes", "--out")
+    whole, path = kept.taken.read_bytes(), tmp_path / "map.npz"
+    for count in (10, len(whole) // 2, len(whole) - 30):
+        path.write_bytes(whole[:count])
+        assert "damaged" in complaint_here("map", "update", path, *given, path)
+        assert path.read_bytes() == whole[:count]
+    folder, below = tmp_path / "folder.npz", kept.suite / "map.npz"
+    folder.mkdir()
+    assert "not a regular file" in complaint_here("map", "update", kept.taken, *given, folder)
+    assert "is a file" in complaint_here("map", "update", kept.taken, *given, below)
+    named = tmp_path / "named.yaml"
+    named.write_text(json.dumps({"sensors": {HOSTILE: {"t_lidar_mag": [0, 0, 0]}}}))
+    hostile = (later, "--config", kept.config, "--suite", named, "--changes", "--out", path)
+    line = complaint_here("map", "update", kept.taken, *hostile)
+    assert "does not list the sensor" in line
+    assert "\x1b" not in line

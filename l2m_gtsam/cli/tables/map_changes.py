@@ -4,7 +4,7 @@ import numpy as np
 from rich.table import Table
 
 from l2m_gtsam.cli.tables import add_numbers, plain_table
-from l2m_gtsam.records.map_diary import MapDiary, between, words_of
+from l2m_gtsam.records.map_diary import MapDiary, between, doubtful, words_of
 
 HEADINGS = ("x y z (m)", "+- (m)", "A m2", "+-", "at most (uT)")
 
@@ -14,7 +14,9 @@ def changes_table(diary: MapDiary) -> Table:
     drives = len(diary.drives) - 1
     drive = "one drive" if drives == 1 else f"{drives} drives"
     since = f"{drive} since the survey ({diary.drives[0].day})"
-    caption = None if diary.changes else "nothing came or went that the drives noticed"
+    caption = doubtful(diary)
+    if not diary.changes:
+        caption = "nothing came or went that the drives noticed"
     table = plain_table(f"What changed: {since}", caption)
     for heading in ("what", "between"):
         table.add_column(heading, no_wrap=True)

@@ -203,6 +203,8 @@ def suite_from_state(state: MapState, count: int) -> SuiteErrors | None:
 def history_from_state(state: MapState, count: int, structures: int) -> History | None:
     """Return what so many readings went through, after checks; none in most maps."""
     if "drive" not in state.arrays:
+        if "diary" in state.provenance:
+            raise damaged("diary is", "it is of another map, this one knows of no drives")
         return None
     try:
         diary = DIARY.validate_python(state.provenance.get("diary"))

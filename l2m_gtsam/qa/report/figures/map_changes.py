@@ -1,5 +1,6 @@
 """What changed in a map since its survey, drawn on it: steel that came, went or was moved."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -7,12 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from l2m_gtsam.qa.report.svg import SMALL
-from l2m_gtsam.records.map_diary import DatedChange, Happening, MapDiary, between, words_of
+from l2m_gtsam.records.map_diary import (
+    DatedChange,
+    Happening,
+    MapDiary,
+    between,
+    doubtful,
+    words_of,
+)
 
 # Of steel that came, and of steel that is no longer there: seen on the map's colours by all.
 HERE, GONE = "#d55e00", "#56b4e9"
 ONE_PLACE_M = 0.3  # so near, changes are marked together
 MOST_LINES = 14  # of the list beside the picture
+WIDEST = 52  # letters of its lines
 FADED: Any = {"fill": False, "hatch": "////", "linewidth": 0.0, "alpha": 0.35}
 ARROW: Any = {"arrowstyle": "-|>", "color": HERE, "linewidth": 1.6, "shrinkA": 9, "shrinkB": 9}
 
@@ -25,7 +34,7 @@ def draw_changes(axes: Axes, diary: MapDiary) -> None:
             Rectangle(tuple(corner), stretch.edge, stretch.edge, edgecolor="0.2", **FADED)
         )
     for change in diary.changes:
-        if change.what is Happening.CAME and change.other is not None:
+        if not change.went and change.other is not None:
             start = diary.changes[change.other].source.position[:2]
             axes.annotate("", tuple(change.source.position[:2]), tuple(start), arrowprops=ARROW)
     for numbers in together(diary):
@@ -50,17 +59,16 @@ def together(diary: MapDiary) -> list[list[int]]:
 
 def draw_change(axes: Axes, change: DatedChange, name: str) -> None:
     """Draw a source: filled where it came, empty where it went, with two sigmas around it."""
-    source, came = change.source, change.what is Happening.CAME
-    colour = HERE if came else GONE
+    source, colour = change.source, GONE if change.went else HERE
     x, y = source.position[:2]
     ends = np.array([source.position - source.half_axis, source.position + source.half_axis])
     axes.plot(*ends[:, :2].T, color=colour, linewidth=4, solid_capstyle="round")
     radius = 2 * float(np.max(source.position_sigma[:2]))
     axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=colour, linewidth=1.0))
-    face = colour if came else "none"
-    axes.plot(
-        x, y, "o", markerfacecolor=face, markersize=10, markeredgecolor=colour, markeredgewidth=2.5
-    )
+    half = change.what is Happening.EITHER
+    face: Any = {"fillstyle": "left" if half else "none" if change.went else "full"}
+    face |= {"markerfacecolor": colour, "markerfacecoloralt": "white"}
+    axes.plot(x, y, "o", markersize=10, markeredgecolor=colour, markeredgewidth=2.5, **face)
     style: Any = {"xytext": (8, 6), "textcoords": "offset points", "fontsize": SMALL + 1}
     box: Any = {"facecolor": "white", "edgecolor": colour, "alpha": 0.9, "pad": 1.5}
     axes.annotate(name, (x, y), color="black", bbox=box, **style)
@@ -78,7 +86,8 @@ def list_changes(axes: Axes, diary: MapDiary) -> None:
         lines.append(f"and {len(numbers) - MOST_LINES} earlier ones: see `l2m map info`")
     if not numbers:
         lines = ["nothing came or went that the drives noticed"]
-    lines += ["", "full: came; empty: went; arrow: moved"] if numbers else []
+    lines += ["", "full: came; empty: went; half: either; arrow: moved"] if numbers else []
+    lines += textwrap.wrap(doubtful(diary) or "", WIDEST)
     if diary.faded:
         lines += ["hatched: readings before a drive count less there"]
     drives = len(diary.drives) - 1
