@@ -66,7 +66,7 @@ def draw_change(axes: Axes, change: DatedChange, name: str) -> None:
     radius = 2 * float(np.max(source.position_sigma[:2]))
     axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=colour, linewidth=1.0))
     half = change.what is Happening.EITHER
-    face: Any = {"fillstyle": "left" if half else "none" if change.went else "full"}
+    face: Any = {"fillstyle": "bottom" if half else "none" if change.went else "full"}
     face |= {"markerfacecolor": colour, "markerfacecoloralt": "white"}
     axes.plot(x, y, "o", markersize=10, markeredgecolor=colour, markeredgewidth=2.5, **face)
     style: Any = {"xytext": (8, 6), "textcoords": "offset points", "fontsize": SMALL + 1}
@@ -91,8 +91,7 @@ def list_changes(axes: Axes, diary: MapDiary) -> None:
     if diary.faded:
         lines += ["hatched: readings before a drive count less there"]
     drives = len(diary.drives) - 1
-    title = f"What changed in {drives} drives since {diary.drives[0].day}"
-    if diary.drives[0].ended is None:
-        title = f"What changed in {drives} drives since the survey"
+    since = "the survey" if diary.drives[0].ended is None else diary.drives[0].day
+    title = f"What changed in {'one drive' if drives == 1 else f'{drives} drives'} since {since}"
     axes.set_title(title, loc="left", fontsize=11)
     axes.text(0.0, 1.0, "\n".join(lines), va="top", transform=axes.transAxes, fontsize=9)
