@@ -59,9 +59,10 @@ from l2m_gtsam.solve.chi_square import quantile
 HALVINGS = 4  # into sixteen parts; eight are pairs of them
 FALSE_ALARMS = 0.002  # of calibrations whose errors are as modelled
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15), "offset": slice(15, 16)}
+WHOLE = slice(0, 15)  # t, C and H together
 NONE = np.empty(0, dtype=np.int64)
 TINY = np.finfo(np.float64).tiny
-TESTS = 4 * len(BLOCKS)  # of a sensor: parts by time and by place, of two sizes
+TESTS = 4 * (len(BLOCKS) + 1)  # of a sensor: parts by time and by place, of two sizes
 
 
 @dataclass(frozen=True)
@@ -72,12 +73,15 @@ class Excess:
     ----------
     factors
         Variances found over those expected.
+    whole
+        The same of t, C and H together, in all directions alike.
     brought
         The covariance of (t, C row by row, H, time offset) by the model if the survey's sensors
         were exact, shape (16, 16).
     """
 
     factors: Unmodelled = EXPLAINED
+    whole: float = 1.0
     brought: FloatArray = field(default_factory=lambda: np.zeros((SENSOR, SENSOR)))
 
     def widened(self, covariance: FloatArray) -> FloatArray:
@@ -86,15 +90,16 @@ class Excess:
         What is infinite, as not determined, stays so.
         """
         known = np.isfinite(np.diag(covariance))
-        added = np.zeros_like(self.brought)
+        # What scatters in t, C and H together makes sums of them wrong that the model knows well.
+        added = (self.whole - 1) * self.brought
         for name, block in BLOCKS.items():
-            if (factor := getattr(self.factors, name)) <= 1:
+            if (factor := getattr(self.factors, name)) <= self.whole:
                 continue
             # All that hangs on the block grows with it, so that what is known of sums stays so:
             # the covariance ends between the model's and a multiple of that.
             across = self.brought[:, block]
             explained = across @ np.linalg.solve(self.brought[block, block], across.T)
-            added += (factor - 1) * explained
+            added += (factor - self.whole) * explained
         return np.asarray(covariance + np.where(np.outer(known, known), added, 0.0))
 
 
@@ -159,6 +164,8 @@ class Scatter:
     ----------
     t, C, H, offset
         Variances of estimates over those expected.
+    whole
+        The same of t, C and H together.
     spread_of_H
         Mean square of H in a part about H of the whole, beyond that expected, over the variance of
         H as the model has it; not below zero.
@@ -168,6 +175,7 @@ class Scatter:
     C: VarianceRatio
     H: VarianceRatio
     offset: VarianceRatio
+    whole: VarianceRatio
     spread_of_H: float = 0.0
 
 
@@ -270,7 +278,8 @@ def scatters(
         for merged in (white, white.paired()):
             scores = merged.scores(own, covariance)
             ratios = {name: scores.ratio(P, block) for name, block in BLOCKS.items()}
-            found.append(Scatter(**ratios, spread_of_H=scores.spread(P, BLOCKS["H"])))
+            whole, spread = scores.ratio(P, WHOLE), scores.spread(P, BLOCKS["H"])
+            found.append(Scatter(**ratios, whole=whole, spread_of_H=spread))
     return tuple(found)
 
 
@@ -299,11 +308,13 @@ def unmodelled(
     if not found:
         return Excess()
     P, alarms = covariance.among(own), FALSE_ALARMS / (TESTS * tests)
+    whole = max(each.whole.beyond_chance(alarms) for each in found)
     largest = {
-        name: max(getattr(each, name).beyond_chance(alarms) for each in found) for name in BLOCKS
+        name: max(whole, *(getattr(each, name).beyond_chance(alarms) for each in found))
+        for name in BLOCKS
     }
     across, theirs = covariance.columns(stated)[own], covariance.among(stated)
-    return Excess(Unmodelled(**largest), P - across @ np.linalg.solve(theirs, across.T))
+    return Excess(Unmodelled(**largest), whole, P - across @ np.linalg.solve(theirs, across.T))
 
 
 def halved(points: FloatArray, times: int) -> IntArray:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from l2m_gtsam.calibration.cluster_robust import (
     BLOCKS,
+    WHOLE,
     Excess,
     Scores,
     directions_of,
@@ -122,35 +123,43 @@ def test_what_the_model_explains_is_left_alone() -> None:
 def test_an_error_that_lasts_is_found_and_counted() -> None:
     rng = np.random.default_rng(4)
     distances: dict[str, list[float]] = {name: [] for name in BLOCKS}
-    stated = []
+    stated, together = [], []
     for _ in range(60):
         one = fitted(rng, lasting=2.0)
         found = one.unmodelled()
         P = one.covariance[np.ix_(OWN, OWN)]
-        wide = found.widened(P)
+        wide, e = found.widened(P), one.error[WHOLE]
+        together.append(float(e @ np.linalg.solve(wide[WHOLE, WHOLE], e)) / len(e))
         for name, block in BLOCKS.items():
             e = one.error[block]
             distances[name].append(float(e @ np.linalg.solve(wide[block, block], e)) / len(e))
             stated.append(float(e @ np.linalg.solve(P[block, block], e)) / len(e))
     assert np.mean(stated) > 10  # the model's own covariance is far too small
+    # Sums of t, C and H, too, which blocks one by one leave as well known as the model has them.
+    assert 0.7 < np.mean(together) < 1.7
     for name, found_distances in distances.items():
         # Sixteen parts of which the fit takes some leave heavy tails: 1.04 to 1.37 over many seeds.
         assert 0.7 < np.mean(found_distances) < 1.7, name
 
 
-@given(seed=st.integers(0, 10_000), factors=st.lists(st.floats(1.0, 50.0), min_size=4, max_size=4))
+@given(
+    seed=st.integers(0, 10_000),
+    factors=st.lists(st.floats(1.0, 50.0), min_size=4, max_size=4),
+    whole=st.floats(1.0, 20.0),
+)
 @settings(max_examples=40, deadline=None)
 def test_a_wider_covariance_lies_between_the_models_and_its_largest_multiple(
-    seed: int, factors: list[float]
+    seed: int, factors: list[float], whole: float
 ) -> None:
     """In every direction: one that is known well stays known better than the others."""
     A = np.random.default_rng(seed).standard_normal((16, 20))
     P = A @ A.T
-    excess = Excess(Unmodelled(*factors), P)
+    factors = [max(factor, whole) for factor in factors]
+    excess = Excess(Unmodelled(*factors), whole, P)
     wide = excess.widened(P)
-    most = 1 + sum(factor - 1 for factor in factors)
+    most = whole + sum(factor - whole for factor in factors)
     size = np.linalg.norm(wide)
-    assert np.linalg.eigvalsh(wide - P).min() > -1e-9 * size
+    assert np.linalg.eigvalsh(wide - whole * P).min() > -1e-9 * size
     assert np.linalg.eigvalsh(most * P - wide).min() > -1e-9 * size
     for factor, block in zip(factors, BLOCKS.values(), strict=True):
         own = wide[block, block] - factor * P[block, block]
