@@ -23,6 +23,7 @@ from functools import partial
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dtrtri
 from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray, IntArray
@@ -75,6 +76,23 @@ class WeightPosterior:
 
 
 @dataclass(frozen=True)
+class WeightFit:
+    """What a prior of weights is worth.
+
+    Attributes
+    ----------
+    likelihood, rest
+        As of ``WeightPosterior``.
+    share
+        How much of each weight's prior variance the readings take away, shape (m,).
+    """
+
+    likelihood: float
+    rest: FloatArray
+    share: FloatArray
+
+
+@dataclass(frozen=True)
 class WeightSystem:
     """What readings say of m weights, before any prior of these.
 
@@ -114,6 +132,35 @@ class WeightSystem:
         likelihood = 0.5 * float(v @ v) - float(np.log(np.diag(lower)).sum())
         return WeightPosterior(likelihood, self.pull - Z.T @ v, Z)
 
+    def left_to(self, variances: FloatArray, at: IntArray) -> "WeightSystem":
+        """Return ``beside(variances).among(at)``, at the cost of these weights only."""
+        root = np.sqrt(variances)
+        lower = self._factor(root)
+        own = np.column_stack([self.information[:, at], self.pull]) * root[:, None]
+        white = solve_triangular(lower, own, lower=True, check_finite=False)
+        Z, v = white[:, :-1], white[:, -1]
+        return WeightSystem(self.information[np.ix_(at, at)] - Z.T @ Z, self.pull[at] - Z.T @ v)
+
+    def fit(self, variances: FloatArray) -> WeightFit:
+        """Return what a prior of these variances, shape (m,), is worth: a third of ``posterior``.
+
+        With ``K = (1 + S^1/2 I S^1/2)^-1`` it is ``S^1/2 M S^1/2 = 1 - K``.
+        """
+        root = np.sqrt(variances)
+        lower = self._factor(root)
+        likelihood = -float(np.log(np.diag(lower)).sum())
+        inverse, _ = dtrtri(lower, lower=1, overwrite_c=1)
+        white = inverse @ (root * self.pull)
+        rest = self.pull - self.information @ (root * (inverse.T @ white))
+        share = 1 - np.einsum("ij,ij->j", inverse, inverse)
+        return WeightFit(likelihood + 0.5 * float(white @ white), rest, share)
+
+    def _factor(self, root: FloatArray) -> FloatArray:
+        """Return the lower Cholesky factor of ``1 + S^1/2 I S^1/2``, in Fortran order, (m, m)."""
+        inner = root[:, None] * self.information * root
+        inner[np.diag_indices_from(inner)] += 1.0
+        return np.asarray(cholesky(inner.T, lower=True, overwrite_a=True, check_finite=False))
+
     def scores(self, spectra: FloatArray) -> FloatArray:
         """Return how far K processes of these spectra, (K, m), are from not being there, (K,).
 
@@ -123,29 +170,44 @@ class WeightSystem:
         spread = 2 * np.einsum("ki,ij,kj->k", spectra, self.information**2, spectra)
         return np.asarray(found / np.sqrt(np.where(spread > 0, spread, 1.0)))
 
-    def components(self, spectra: FloatArray) -> VarianceComponents:
-        """Return the most likely sizes of K processes of these spectra, shape (K, m)."""
+    def components(
+        self, spectra: FloatArray, about: FloatArray | None = None
+    ) -> VarianceComponents:
+        """Return the most likely sizes of K processes.
+
+        Parameters
+        ----------
+        spectra
+            Shape (K, m).
+        about
+            Where they are near by, shape (K,); without it each is as large as is just felt.
+        """
         alone = np.diag(self.information)
         felt = spectra @ alone
         count = np.count_nonzero(spectra, axis=1)
-        sizes = np.where(felt > 0, count / np.where(felt > 0, felt, 1.0), 0.0)
+        just = np.where(felt > 0, count / np.where(felt > 0, felt, 1.0), 0.0)
+        sizes = just if about is None else about
         last = -np.inf
         for _ in range(MOST_UPDATES):
-            found = self.posterior(sizes @ spectra)
+            variances = sizes @ spectra
+            found = self.fit(variances)
             if found.likelihood - last < ENOUGH:
                 break
             last = found.likelihood
-            informed = spectra @ (alone - np.einsum("ij,ij->j", found.root, found.root))
+            known = found.share / np.where(variances > 0, variances, 1.0)  # the diagonal of M
+            informed = spectra @ known
             ratio = (spectra @ found.rest**2) / np.where(informed > 0, informed, 1.0)
             sizes = sizes * np.sqrt(np.where(informed > 0, ratio, 0.0))
             sizes = np.where(sizes * felt > NEGLIGIBLE, sizes, 0.0)
-        return VarianceComponents(sizes, 2 * self.posterior(sizes @ spectra).likelihood)
+        return VarianceComponents(sizes, 2 * self.fit(sizes @ spectra).likelihood)
 
     def whiter(self, noise: float) -> "WeightSystem":
         """Return the same where the noise has this share of its variance only."""
         return WeightSystem(self.information / noise, self.pull / noise)
 
-    def components_and_noise(self, spectra: FloatArray, squares: float) -> VarianceComponents:
+    def components_and_noise(
+        self, spectra: FloatArray, squares: float, about: FloatArray | None = None
+    ) -> VarianceComponents:
         """Return the most likely sizes where what they explain is no noise.
 
         Parameters
@@ -154,13 +216,16 @@ class WeightSystem:
             Of K processes, shape (K, m).
         squares
             Sum of squares of all residuals, white by a noise that has all of that in it.
+        about
+            As in ``components``.
         """
-        noise = 1.0
+        noise, start = 1.0, about
         for _ in range(ROUNDS):
             system = self.whiter(noise)
-            found = replace(system.components(spectra), noise=noise)
+            found = replace(system.components(spectra, start), noise=noise)
+            start = about if about is None else found.sizes
             variances = found.sizes @ spectra
-            explained = self.pull @ (variances * system.posterior(variances).rest)
+            explained = self.pull @ (variances * system.fit(variances).rest)
             noise = max(1 - float(explained) / squares, LEAST_NOISE)
         return found
 
@@ -220,7 +285,7 @@ def noise_left(
     noise = 1.0
     for _ in range(ROUNDS):
         explained = sum(
-            float(own.pull @ (d * own.whiter(noise).posterior(d).rest))
+            float(own.pull @ (d * own.whiter(noise).fit(d).rest))
             for own, d in zip(systems, variances, strict=True)
         )
         noise = max(1 - explained / squares, LEAST_NOISE)
@@ -233,8 +298,9 @@ def _cost(
     """Return the negative log likelihood of the logarithms of all sizes, and its slope, (K,)."""
     sizes, value, slope = np.exp(x), 0.0, np.zeros(len(x))
     for each, d in zip(systems, spectra, strict=True):
-        found = each.posterior(sizes @ d)
-        known = np.diag(each.information) - np.einsum("ij,ij->j", found.root, found.root)
+        variances = sizes @ d
+        found = each.fit(variances)
+        known = found.share / np.where(variances > 0, variances, 1.0)
         value += found.likelihood
         slope += 0.5 * sizes * (d @ (found.rest**2 - known))
     return -value, -slope

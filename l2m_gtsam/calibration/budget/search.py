@@ -208,16 +208,17 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess
     at = np.flatnonzero(every.any(axis=0))
     every = every[:, at]
     system = known.system.among(at)
-    fit = system.components_and_noise(every, known.squares)
+    alone = np.concatenate([each.sizes for each in taken.values()])
+    fit = system.components_and_noise(every, known.squares, alone)
     system = system.whiter(fit.noise)
     kept = []
     for k, each in taken.items():
         others = np.where(of == k, 0.0, fit.sizes) @ every
         own = known.columns[k]
         here = np.searchsorted(at, own)
-        left = system.beside(others).among(here)
+        left = system.left_to(others, here)
         sizes = fit.sizes[of == k]
-        likely = left.posterior(sizes @ each.process.forms[each.form]).likelihood
+        likely = left.fit(sizes @ each.process.forms[each.form]).likelihood
         gain = 2 * likely - _price(each.process)
         if gain > LEAST_GAIN:
             kept.append(FoundProcess(each.process, each.form, sizes, gain))
