@@ -170,23 +170,12 @@ class WeightSystem:
         spread = 2 * np.einsum("ki,ij,kj->k", spectra, self.information**2, spectra)
         return np.asarray(found / np.sqrt(np.where(spread > 0, spread, 1.0)))
 
-    def components(
-        self, spectra: FloatArray, about: FloatArray | None = None
-    ) -> VarianceComponents:
-        """Return the most likely sizes of K processes.
-
-        Parameters
-        ----------
-        spectra
-            Shape (K, m).
-        about
-            Where they are near by, shape (K,); without it each is as large as is just felt.
-        """
+    def components(self, spectra: FloatArray) -> VarianceComponents:
+        """Return the most likely sizes of K processes of these spectra, shape (K, m)."""
         alone = np.diag(self.information)
         felt = spectra @ alone
         count = np.count_nonzero(spectra, axis=1)
-        just = np.where(felt > 0, count / np.where(felt > 0, felt, 1.0), 0.0)
-        sizes = just if about is None else about
+        sizes = np.where(felt > 0, count / np.where(felt > 0, felt, 1.0), 0.0)
         last = -np.inf
         for _ in range(MOST_UPDATES):
             variances = sizes @ spectra
@@ -205,9 +194,7 @@ class WeightSystem:
         """Return the same where the noise has this share of its variance only."""
         return WeightSystem(self.information / noise, self.pull / noise)
 
-    def components_and_noise(
-        self, spectra: FloatArray, squares: float, about: FloatArray | None = None
-    ) -> VarianceComponents:
+    def components_and_noise(self, spectra: FloatArray, squares: float) -> VarianceComponents:
         """Return the most likely sizes where what they explain is no noise.
 
         Parameters
@@ -216,14 +203,11 @@ class WeightSystem:
             Of K processes, shape (K, m).
         squares
             Sum of squares of all residuals, white by a noise that has all of that in it.
-        about
-            As in ``components``.
         """
-        noise, start = 1.0, about
+        noise = 1.0
         for _ in range(ROUNDS):
             system = self.whiter(noise)
-            found = replace(system.components(spectra, start), noise=noise)
-            start = about if about is None else found.sizes
+            found = replace(system.components(spectra), noise=noise)
             variances = found.sizes @ spectra
             explained = self.pull @ (variances * system.fit(variances).rest)
             noise = max(1 - float(explained) / squares, LEAST_NOISE)

@@ -208,8 +208,7 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess
     at = np.flatnonzero(every.any(axis=0))
     every = every[:, at]
     system = known.system.among(at)
-    alone = np.concatenate([each.sizes for each in taken.values()])
-    fit = system.components_and_noise(every, known.squares, alone)
+    fit = system.components_and_noise(every, known.squares)
     system = system.whiter(fit.noise)
     kept = []
     for k, each in taken.items():

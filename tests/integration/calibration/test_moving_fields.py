@@ -158,7 +158,8 @@ def test_a_map_without_known_errors_and_a_motor() -> None:
         for each in (drive.silent, drive.recording)
     )
     assert told.uncertainty is Uncertainty.INDEPENDENT
-    assert nees(drive, silent)[0] > 1000
+    # It was over 1,000 before parts that disagree widened sums of t, C and H, too.
+    assert nees(drive, silent)[0] > 500
     assert nees(drive, told)[0] < 44  # 15 degrees of freedom: one in ten thousand
     (motor,) = told.sensors[0].moving
     assert np.abs((motor.h - drive.h[0]) / motor.sigma).max() < 4
