@@ -76,7 +76,8 @@ def cells(figure: Drawing, panel: Panel, at: FloatArray, words: Sequence[str]) -
 def axes_places(axes: Axes, at: FloatArray, words: Sequence[str]) -> None:
     """Show words around places of matplotlib's axes, shape (N, 2)."""
     for (a, b), text in zip(at, words, strict=True):
-        axes.plot(a, b, "o", color="none", markersize=2 * REACH, gid=hover_name(text))
+        # In front of all that is written: a name may lie over the place of another.
+        axes.plot(a, b, "o", color="none", markersize=2 * REACH, gid=hover_name(text), zorder=9)
 
 
 def axes_strips(axes: Axes, x: FloatArray, words: Sequence[str], height: float = 1.0) -> None:
