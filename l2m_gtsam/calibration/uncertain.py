@@ -29,6 +29,7 @@ from l2m_gtsam.calibration.optimise import Ending, LinearSolver
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import NEAR_SIGMAS, UncertainProblem
 from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
@@ -97,13 +98,14 @@ def solve_uncertain(
     progress(0.0)
     drive = UncertainDrive.of(view, field_map, errors, near, options)
     found = settle_by_any(drive, near, tests, options, lambda done: progress(SEARCHED * done))
-    budget = NOTHING_FOUND
     # Processes would take up what is stated too small: it is judged without them.
     stated = found.problem.stated(found.joint, found.values, options.sensor_noise_ut)
     # What a map leaves that does not know its own errors is no process of the drive.
-    if found.ending is not Ending.SINGULAR and sigmas_hold(errors):
-        budget = found.problem.searched(found.joint)
-    scattered = found.problem.scattered(found.joint)
+    searched = found.ending is not Ending.SINGULAR and sigmas_hold(errors)
+    budget, scattered = side_by_side(
+        lambda: found.problem.searched(found.joint) if searched else NOTHING_FOUND,
+        lambda: found.problem.scattered(found.joint),
+    )
     by_parts = found.problem.by_parts(found.joint, found.estimate, scattered)
     if budget.found:
         with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
