@@ -14,8 +14,10 @@ from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.solve.noise import NOISE_RANGE
 from l2m_gtsam.solve.variance_components import WeightSystem
 
+NOTHING_LEFT = 2 * NOISE_RANGE[0]  # uT
 HIDDEN = 0.5  # of the noise that neighbours show: less is no estimate of it
 SMALLEST = 0.01  # of what was stated
 
@@ -79,6 +81,22 @@ def size_beside_noise(sensors: Sequence[NoiseBesidePoses]) -> StatedSize | None:
     freedom = sum(each.residual.size for each in hidden)
     ratio = max(float(np.sqrt(squared)), SMALLEST)
     return StatedSize(ErrorCause.POSES, ratio, freedom * (ratio**2 - 1 - 2 * float(np.log(ratio))))
+
+
+def leave_noise(stated: Sequence[StatedSize], noise: FloatArray) -> bool:
+    """Return whether errors as they were stated leave noise by which others can be found.
+
+    Where they are too large and explain all that a sensor reads, what is left is rounding.
+
+    Parameters
+    ----------
+    stated
+        What the readings show of them.
+    noise
+        Of each sensor, as estimated beside them, uT, shape (S,).
+    """
+    too_large = any(each.is_wrong and each.ratio < 1 for each in stated)
+    return not (too_large and bool((noise <= NOTHING_LEFT).any()))
 
 
 def size_of_shared(

@@ -26,6 +26,7 @@ from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver
+from l2m_gtsam.calibration.stated_sizes import leave_noise
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import NEAR_SIGMAS, UncertainProblem
 from l2m_gtsam.calibration.view import QueryableMap, View
@@ -102,6 +103,7 @@ def solve_uncertain(
     stated = found.problem.stated(found.joint, found.values, options.sensor_noise_ut)
     # What a map leaves that does not know its own errors is no process of the drive.
     searched = found.ending is not Ending.SINGULAR and sigmas_hold(errors)
+    searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
     budget, scattered = side_by_side(
         lambda: found.problem.searched(found.joint) if searched else NOTHING_FOUND,
         lambda: found.problem.scattered(found.joint),

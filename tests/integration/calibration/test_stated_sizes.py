@@ -7,6 +7,7 @@ from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.qa.verdict.uncertainty import stated_wrongly
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
+from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.records.stated_size import StatedSize
 from l2m_gtsam.records.variance_shares import ErrorCause
 from l2m_gtsam.studies.troubles.drives import troubled_drive
@@ -14,8 +15,8 @@ from l2m_gtsam.studies.troubles.options import Trouble
 from tests.drives.troubled import DRIVE, OPTIONS, hall
 
 
-def found(times: float, cause: ErrorCause) -> list[StatedSize]:
-    """Return the sizes of a drive whose noise or poses are stated so many times too large."""
+def calibration(times: float, cause: ErrorCause) -> CalibrationResult:
+    """Return that of a drive whose noise or poses are stated so many times too large."""
     place = hall(Trouble.CLEAN)
     if cause is ErrorCause.NOISE:
         solve, trouble = OneKeyOptions(sensor_noise_ut=times * OPTIONS.noise), Trouble.CLEAN
@@ -28,8 +29,12 @@ def found(times: float, cause: ErrorCause) -> list[StatedSize]:
         solve, trouble = OneKeyOptions(pose_noise=poses), Trouble.POSES
     recording, _ = troubled_drive(OPTIONS, place, trouble, DRIVE)
     options = CalibrationOptions(solve=solve)
-    result = calibrated(recording, place.field_map, options).result
-    return [each for each in result.stated if each.cause is cause]
+    return calibrated(recording, place.field_map, options).result
+
+
+def found(times: float, cause: ErrorCause) -> list[StatedSize]:
+    """Return the sizes of such a drive."""
+    return [each for each in calibration(times, cause).stated if each.cause is cause]
 
 
 @pytest.mark.parametrize("cause", [ErrorCause.NOISE, ErrorCause.POSES])
@@ -42,7 +47,10 @@ def test_what_is_stated_rightly_is_not_noted(cause: ErrorCause) -> None:
 @pytest.mark.parametrize("cause", [ErrorCause.NOISE, ErrorCause.POSES])
 @pytest.mark.parametrize(("times", "words"), [(3.0, "too large"), (1 / 3, "too small")])
 def test_what_is_stated_wrongly_is_noted(cause: ErrorCause, times: float, words: str) -> None:
-    sizes = found(times, cause)
+    result = calibration(times, cause)
+    # Where stated errors leave no noise, no process is found in what rounding leaves.
+    assert all(each.status is SensorStatus.SOLVED for each in result.sensors)
+    sizes = [each for each in result.stated if each.cause is cause]
     assert sizes
     notes = stated_wrongly(sizes)
     assert len(notes) == len(sizes)
