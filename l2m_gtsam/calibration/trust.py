@@ -15,7 +15,7 @@ from l2m_gtsam.data import BoolArray, FloatArray, Readings
 from l2m_gtsam.solve.noise import map_covariance, reading_covariance, whitening
 from l2m_gtsam.solve.robust import (
     WEIGHTS,
-    Judged,
+    JudgedReadings,
     Loss,
     RobustOptions,
     consistent,
@@ -199,8 +199,8 @@ def residuals(readings: Readings, field_map: QueryableMap, estimate: Estimate) -
 
 def judged(
     readings: Readings, field_map: QueryableMap, estimate: Estimate, rejected: BoolArray
-) -> Judged:
+) -> JudgedReadings:
     """Return readings with their places, residuals and the verdict, shape (N,), of the solve."""
     t = estimate.t[readings.sensor]
     place = np.einsum("nij,nj->ni", readings.R_map_lidar, t) + readings.p_map_lidar
-    return Judged(readings, place, residuals(readings, field_map, estimate), rejected)
+    return JudgedReadings(readings, place, residuals(readings, field_map, estimate), rejected)

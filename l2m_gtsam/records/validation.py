@@ -90,7 +90,7 @@ class ChiSquare(Record):
 
 
 @dataclass(frozen=True)
-class Change(Record):
+class CalibrationChange(Record):
     """A part of a calibration that is no longer what it was.
 
     Attributes
@@ -119,7 +119,7 @@ class Change(Record):
 class MinimumDetectableChange(Record):
     """The smallest change of a part, all others as calibrated, that a drive surely shows.
 
-    Five standard deviations, in the units of ``Change``; infinite where it shows none.
+    Five standard deviations, in the units of ``CalibrationChange``; infinite where it shows none.
     """
 
     part: CalibrationPart
@@ -170,7 +170,7 @@ class ValidatedSensor(Record):
     uniform: float
     nis: ChiSquare
     parameters: ChiSquare
-    changes: tuple[Change, ...]
+    changes: tuple[CalibrationChange, ...]
     detectable: Annotated[
         tuple[MinimumDetectableChange, ...],
         Field(
@@ -274,7 +274,7 @@ class ComparedSensor(Record):
     difference: Row
     sigma: Row
     tests: tuple[ChangeTest, ...]
-    changes: tuple[Change, ...]
+    changes: tuple[CalibrationChange, ...]
 
     def test(self, name: str) -> ChangeTest:
         """Return the test of a group by its name."""

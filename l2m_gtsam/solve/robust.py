@@ -235,7 +235,7 @@ LATER_S = 5.0  # from one passage to the next
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedReadings:
     """Readings with the verdict of the solve.
 
     Attributes
@@ -256,7 +256,7 @@ class Judged:
     rejected: BoolArray
 
 
-def disagreements(judged: Judged) -> tuple[Disagreement, ...]:
+def disagreements(judged: JudgedReadings) -> tuple[Disagreement, ...]:
     """Return stretches of the drive over which readings were rejected, in order of time.
 
     Those of several sensors at about the same time are one.
@@ -267,7 +267,7 @@ def disagreements(judged: Judged) -> tuple[Disagreement, ...]:
     return tuple(described(judged, rows) for rows in together(judged, runs))
 
 
-def runs_of(judged: Judged, sensor: int) -> list[IntArray]:
+def runs_of(judged: JudgedReadings, sensor: int) -> list[IntArray]:
     """Return the rows of each run of rejected readings of one sensor."""
     own = np.arange(len(judged.rejected))[judged.readings.rows_of(sensor)]
     rows = own[judged.rejected[own]]
@@ -278,7 +278,7 @@ def runs_of(judged: Judged, sensor: int) -> list[IntArray]:
     return [run for run in runs if len(run) >= FEWEST]
 
 
-def together(judged: Judged, runs: list[IntArray]) -> list[IntArray]:
+def together(judged: JudgedReadings, runs: list[IntArray]) -> list[IntArray]:
     """Return the rows of runs that overlap in time, joined, in order of time."""
     stamps, end = judged.readings.stamp_ns, 0
     joined: list[IntArray] = []
@@ -292,7 +292,7 @@ def together(judged: Judged, runs: list[IntArray]) -> list[IntArray]:
     return joined
 
 
-def described(judged: Judged, rows: IntArray) -> Disagreement:
+def described(judged: JudgedReadings, rows: IntArray) -> Disagreement:
     """Return what is known of a stretch."""
     readings = judged.readings
     stamps = readings.stamp_ns[rows]
@@ -311,7 +311,7 @@ def described(judged: Judged, rows: IntArray) -> Disagreement:
     )
 
 
-def passed_again(judged: Judged, rows: IntArray) -> Return:
+def passed_again(judged: JudgedReadings, rows: IntArray) -> Return:
     """Return what the same sensors read at the same place at another time."""
     readings, stamps = judged.readings, judged.readings.stamp_ns
     low, high = stamps[rows].min() - LATER_S * 1e9, stamps[rows].max() + LATER_S * 1e9

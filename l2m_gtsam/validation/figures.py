@@ -11,7 +11,12 @@ from l2m_gtsam.qa.metrics.changes import change_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence, sensor_evidence
 from l2m_gtsam.qa.metrics.fit import curves, field_error, fit_figures, refitted, series
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
-from l2m_gtsam.records.validation import Change, ChiSquare, MinimumDetectableChange, ValidatedSensor
+from l2m_gtsam.records.validation import (
+    CalibrationChange,
+    ChiSquare,
+    MinimumDetectableChange,
+    ValidatedSensor,
+)
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, columns_of, width
 from l2m_gtsam.validation.innovation import detectable_change
 from l2m_gtsam.validation.recheck import Recheck, SensorDrive
@@ -103,7 +108,7 @@ def _chi_square(value: float, freedom: int) -> ChiSquare:
     return ChiSquare(value, freedom, float(low), float(high))
 
 
-def _changes(found: Recheck) -> tuple[Change, ...]:
+def _changes(found: Recheck) -> tuple[CalibrationChange, ...]:
     """Return the changes with what chance makes of each beside the others."""
     changes = []
     for part in found.parts:

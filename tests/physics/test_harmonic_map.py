@@ -82,7 +82,7 @@ def differences(field_map: HarmonicMap, points: FloatArray, step: float = 1e-4) 
 
 def alone(field_map: HarmonicMap, points: FloatArray) -> FloatArray:
     """Return the points at which one tile answers alone."""
-    visits = field_map.learnt.tiling.visits(points)
+    visits = field_map.learnt.tiling.by_tile(points)
     return np.asarray(points[np.concatenate([v.rows[v.share == 1] for v in visits])])
 
 

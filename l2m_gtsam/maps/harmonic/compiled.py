@@ -19,8 +19,8 @@ from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tile_shares import Blend
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.harmonic.visits import Blend
 from l2m_gtsam.maps.tile_store import Arrays
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count
@@ -127,10 +127,10 @@ class CompiledTiles:
     def blended(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the blended prediction of the tiles at points."""
         blend = Blend.of(len(points))
-        for visit in self.learnt.tiling.visits(points):
-            tile = self.tile(visit.tile)
-            for start in range(0, len(visit.rows), AT_ONCE):
-                rows, share = visit.rows[start : start + AT_ONCE], visit.share[start:]
+        for part in self.learnt.tiling.by_tile(points):
+            tile = self.tile(part.tile)
+            for start in range(0, len(part.rows), AT_ONCE):
+                rows, share = part.rows[start : start + AT_ONCE], part.share[start:]
                 if isinstance(tile, CompiledTile):
                     tile.add_to(blend, points, rows, share)
                 else:

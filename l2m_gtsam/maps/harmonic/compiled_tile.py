@@ -19,8 +19,8 @@ from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid, PotentialLatti
 from l2m_gtsam.maps.harmonic.spline import spline_derivatives
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
+from l2m_gtsam.maps.harmonic.tile_shares import Blend
 from l2m_gtsam.maps.harmonic.tiling import WAVE_NUMBERS
-from l2m_gtsam.maps.harmonic.visits import Blend
 
 FIELD_TOLERANCE = 0.005  # uT
 GRADIENT_TOLERANCE = 0.02  # uT/m

@@ -18,8 +18,8 @@ from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
+from l2m_gtsam.maps.harmonic.tile_shares import Blend, TilePoints
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.harmonic.visits import Blend, Visit
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.maps.tile_store import TileStore
@@ -261,17 +261,17 @@ class HarmonicMap:
     def _answers(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return field, gradient and variance at points, also outside."""
         blend, variance = Blend.of(len(points)), np.empty_like(points)
-        visits, owner = self.learnt.tiling.visits(points), self.learnt.tiling.grid.block_of(points)
+        parts, owner = self.learnt.tiling.by_tile(points), self.learnt.tiling.grid.block_of(points)
 
-        def answer(visit: Visit) -> TileShare:
+        def answer(part: TilePoints) -> TileShare:
             # All points of a tile at once: it may not stay in memory.
-            tile, at = self.tiles[visit.tile], points[visit.rows]
-            own = owner[visit.rows] == visit.tile
+            tile, at = self.tiles[part.tile], points[part.rows]
+            own = owner[part.rows] == part.tile
             return TileShare(tile.field_and_gradient(at), own, tile.variance(at[own]))
 
-        for visit, found in zip(visits, in_threads(answer, visits), strict=True):
-            blend.add(visit.rows, visit.share, found.values)
-            variance[visit.rows[found.own]] = found.variance
+        for part, found in zip(parts, in_threads(answer, parts), strict=True):
+            blend.add(part.rows, part.share, found.values)
+            variance[part.rows[found.own]] = found.variance
         return blend.field, blend.gradient, variance
 
     def compile(self) -> "CompiledMap":
@@ -289,9 +289,9 @@ class HarmonicMap:
         """Return field and gradient, also outside; see ``FieldMap``."""
         points = checked_points(points)
         blend = Blend.of(len(points))
-        for visit in self.learnt.tiling.visits(points):
-            values = self.tiles[visit.tile].field_and_gradient(points[visit.rows])
-            blend.add(visit.rows, visit.share, values)
+        for part in self.learnt.tiling.by_tile(points):
+            values = self.tiles[part.tile].field_and_gradient(points[part.rows])
+            blend.add(part.rows, part.share, values)
         return blend.field, blend.gradient
 
     def variance(self, points: FloatArray) -> FloatArray:
@@ -302,7 +302,7 @@ class HarmonicMap:
         rows = [np.flatnonzero(owner == tile) for tile in tiles]
         # Neighbours know a place about equally well: that of the core it lies in speaks for it.
         parts = in_threads(
-            lambda visit: self.tiles[visit[0]].variance(points[visit[1]]),
+            lambda part: self.tiles[part[0]].variance(points[part[1]]),
             list(zip(tiles, rows, strict=True)),
         )
         variance = np.empty_like(points)

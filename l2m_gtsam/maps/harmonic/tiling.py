@@ -15,7 +15,7 @@ from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid, grid_over
 from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR
-from l2m_gtsam.maps.harmonic.visits import Visit, shares_of
+from l2m_gtsam.maps.harmonic.tile_shares import TilePoints, shares_of
 from l2m_gtsam.options import Options
 
 # Modes per square metre of box and squared wave number: a quarter of a disc of half waves.
@@ -166,7 +166,7 @@ class Tiling:
         )  # twice differentiable at both ends
         return np.asarray(smooth[:, 0] * smooth[:, 1])
 
-    def visits(self, points: FloatArray) -> list[Visit]:
+    def by_tile(self, points: FloatArray) -> list[TilePoints]:
         """Return which tiles have a share in which points; far from all of them the nearest has.
 
         Parameters
@@ -183,7 +183,7 @@ class Tiling:
         rows, tiles, share = rows[order], tiles[order], share[order]
         edges = np.flatnonzero(np.diff(tiles, prepend=-1, append=-1)).tolist()
         return [
-            Visit(int(tiles[start]), rows[start:stop], share[start:stop])
+            TilePoints(int(tiles[start]), rows[start:stop], share[start:stop])
             for start, stop in pairwise(edges)
         ]
 

@@ -13,9 +13,9 @@ from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.recording.drive_trace import same_drive
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.validation import (
+    CalibrationChange,
     CalibrationComparison,
     CalibrationPart,
-    Change,
     ChangeTest,
     ComparedSensor,
     NotValidated,
@@ -153,7 +153,7 @@ def compare_sensor(new: SensorCalibration, old: SensorCalibration, chance: float
 def differences(
     new: SensorCalibration, old: SensorCalibration, whole: CalibrationDifference
 ) -> dict[CalibrationPart, CalibrationDifference]:
-    """Return the differences of the parts of a calibration, in the units of ``Change``."""
+    """Return the differences of a calibration's parts, in the units of ``CalibrationChange``."""
     jacobians = [shape_derivatives(s.distortion.C) for s in (new, old)]
     shapes = [
         np.concatenate([gains(s.distortion.C), skews_deg(s.distortion.C)]) for s in (new, old)
@@ -220,7 +220,7 @@ def _changes(
     parts: Mapping[CalibrationPart, CalibrationDifference],
     tests: Mapping[str, ChangeTest],
     chance: float,
-) -> tuple[Change, ...]:
+) -> tuple[CalibrationChange, ...]:
     """Return the parts that chance does not explain, the surest first.
 
     All parts and the whole are tested: each gets its share of the chance to be wrong.
@@ -234,11 +234,13 @@ def _changes(
     )
 
 
-def change_of(part: CalibrationPart, value: FloatArray, sigma: FloatArray, chance: float) -> Change:
+def change_of(
+    part: CalibrationPart, value: FloatArray, sigma: FloatArray, chance: float
+) -> CalibrationChange:
     """Return a change of a part; entries that are open do not count for its size."""
     known = np.isfinite(sigma) & np.isfinite(value)
     seen = np.abs(value[known])
     longest = part in (CalibrationPart.GAINS, CalibrationPart.ANGLES)
     size = seen.max(initial=0.0) if longest else np.linalg.norm(seen)
     shown = np.where(known, value, np.nan)
-    return Change(part, row(shown), row(sigma), float(size), chance)
+    return CalibrationChange(part, row(shown), row(sigma), float(size), chance)

@@ -8,9 +8,9 @@ from l2m_gtsam.qa.options import Limit, QaOptions, ValidationOptions, thresholds
 from l2m_gtsam.qa.verdict.places import source_reasons
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, outside_map
 from l2m_gtsam.records.validation import (
+    CalibrationChange,
     CalibrationComparison,
     CalibrationPart,
-    Change,
     ComparedSensor,
     DriveValidation,
     NotValidated,
@@ -29,7 +29,7 @@ NAMES = {
     CalibrationPart.OFFSET: "its offset H",
     CalibrationPart.CLOCK: "its clock",
 }
-# Factor from the units of ``Change``, unit, digits of its parts, and along what they are.
+# Factor from the units of ``CalibrationChange``, unit, digits of its parts, and their axes.
 SHOWN = {
     CalibrationPart.PLACE: (1e3, "mm", 1, " along the lidar's x, y, z"),
     CalibrationPart.ROTATION: (1.0, "°", 2, " about its own x, y, z"),
@@ -139,7 +139,7 @@ def _changed(sensor: ValidatedSensor, options: QaOptions) -> list[Reason]:
     ]
 
 
-def _change(change: Change, options: QaOptions, text: str, doubt: str = "") -> Reason:
+def _change(change: CalibrationChange, options: QaOptions, text: str, doubt: str = "") -> Reason:
     """Return a change as a reason; a negligible one is only a note."""
     level = limits_of(options.validation)[change.part].level(change.size)
     what = text.format(name=NAMES[change.part], amount=by_how_much(change))
@@ -238,7 +238,7 @@ def amount(part: CalibrationPart, size: float) -> str:
     return f"{number}{'' if unit == '°' else ' '}{unit}"
 
 
-def by_how_much(change: Change) -> str:
+def by_how_much(change: CalibrationChange) -> str:
     """Return size, parts and sigmas of a change."""
     factor, unit, digits, along = SHOWN[change.part]
     space = "" if unit == "°" else " "

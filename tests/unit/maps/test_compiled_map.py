@@ -108,7 +108,7 @@ def test_the_error_is_within_what_is_promised(case: Case) -> None:
     assert np.abs(gradient - true_gradient).max() < GRADIENT_TOLERANCE
     # It was the grids that answered.
     assert np.abs(field - true_field).max() > 1e-7
-    for visit in case.exact.learnt.tiling.visits(points):
+    for visit in case.exact.learnt.tiling.by_tile(points):
         tile = case.compiled.compiled.tile(visit.tile)
         assert isinstance(tile, CompiledTile)
         local = tile.tile.basis.frame.localise(points[visit.rows])
@@ -213,7 +213,7 @@ def test_tiles_are_compiled_when_they_are_needed() -> None:
     points = near(exact, 200)
     points = points[points[:, 0] < points[:, 0].min() + 0.5]
     fast.field_and_gradient(points)
-    visited = {visit.tile for visit in exact.learnt.tiling.visits(points)}
+    visited = {visit.tile for visit in exact.learnt.tiling.by_tile(points)}
     assert set(fast.compiled.made) == visited
     assert len(visited) < len(exact.tiles)
 
@@ -230,7 +230,7 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(found[0], expected[0])
     kept = [tile.nbytes for tile in again.compiled.made.values() if isinstance(tile, CompiledTile)]
     assert 0 < sum(kept) <= 2 * max(sizes)
-    last = exact.learnt.tiling.visits(points)[-1].tile
+    last = exact.learnt.tiling.by_tile(points)[-1].tile
     assert last in again.compiled.made
 
 

@@ -37,7 +37,7 @@ def test_visits_are_those_of_the_rule(seed: int) -> None:
     on = of.grid.centres[rng.integers(0, len(of), 100)]
     points[:100, :2] = on + rng.choice([-0.5, 0.0, 0.5], (100, 2)) * of.grid.size
     found = np.zeros((len(points), len(of)))
-    visits = of.visits(points)
+    visits = of.by_tile(points)
     for visit in visits:
         assert (visit.share > 0).all()
         found[visit.rows, visit.tile] += visit.share
@@ -49,4 +49,4 @@ def test_visits_are_those_of_the_rule(seed: int) -> None:
 
 
 def test_no_points_no_visits() -> None:
-    assert not tiling(np.random.default_rng(0)).visits(np.empty((0, 3)))
+    assert not tiling(np.random.default_rng(0)).by_tile(np.empty((0, 3)))

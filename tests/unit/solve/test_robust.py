@@ -12,7 +12,7 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.records.calibration import Return
 from l2m_gtsam.solve.robust import (
     WEIGHTS,
-    Judged,
+    JudgedReadings,
     Loss,
     RobustOptions,
     consistent,
@@ -158,13 +158,13 @@ def there_and_back(count: int = 100) -> Readings:
     )
 
 
-def judged(rejected: IntArray) -> Judged:
+def judged(rejected: IntArray) -> JudgedReadings:
     readings = there_and_back()
     residual = np.zeros((len(readings), 3))
     residual[rejected, 2] = 7.0
     wrong = np.zeros(len(readings), dtype=np.bool_)
     wrong[rejected] = True
-    return Judged(readings, readings.p_map_lidar, residual, wrong)
+    return JudgedReadings(readings, readings.p_map_lidar, residual, wrong)
 
 
 def test_what_passes_by_is_told_from_what_has_changed() -> None:

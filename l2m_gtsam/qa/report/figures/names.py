@@ -18,7 +18,7 @@ SIDES = ((1, 1), (-1, 1), (1, -1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
 
 
 @dataclass(frozen=True)
-class Box:
+class TextBox:
     """A rectangle in points: lower and upper corner, shape (2,)."""
 
     low: FloatArray
@@ -29,7 +29,7 @@ class Box:
         """Square points."""
         return float(np.prod(self.high - self.low))
 
-    def shared(self, other: "Box") -> float:
+    def shared(self, other: "TextBox") -> float:
         """Return the area that both cover."""
         overlap = np.minimum(self.high, other.high) - np.maximum(self.low, other.low)
         return float(np.prod(np.maximum(overlap, 0.0)))
@@ -62,19 +62,19 @@ class Label:
         return [*shown[: MOST_NAMES - 1], f"and {len(shown) - MOST_NAMES + 1} others"]
 
     @property
-    def box(self) -> Box:
+    def box(self) -> TextBox:
         """About where it is written."""
         extent = np.array([LETTER * max(map(len, self.lines)), LINE * len(self.lines)])
         side = np.array(self.side)
         low = self.at + side * GAP + 0.5 * (side - 1) * extent
-        return Box(low, low + extent)
+        return TextBox(low, low + extent)
 
     def joined(self, other: "Label") -> "Label":
         """Return one label for the names of both."""
         return replace(self, names=self.names + other.names)
 
 
-def placed(labels: Sequence[Label], dots: FloatArray, frame: Box) -> list[Label]:
+def placed(labels: Sequence[Label], dots: FloatArray, frame: TextBox) -> list[Label]:
     """Return labels beside their dots; those that would be written over each other are joined.
 
     Parameters
@@ -87,7 +87,7 @@ def placed(labels: Sequence[Label], dots: FloatArray, frame: Box) -> list[Label]
         The picture.
     """
     left = _apart(labels)
-    marks = [Box(each - DOT, each + DOT) for each in dots]
+    marks = [TextBox(each - DOT, each + DOT) for each in dots]
     while True:
         done: list[Label] = []
         for label in left:
@@ -119,7 +119,9 @@ def _apart(labels: Sequence[Label]) -> list[Label]:
     return apart
 
 
-def _cost(box: Box, written: Sequence[Box], marks: Sequence[Box], frame: Box) -> float:
+def _cost(
+    box: TextBox, written: Sequence[TextBox], marks: Sequence[TextBox], frame: TextBox
+) -> float:
     """Return how bad a place for a name is: over another is worse than over dots or outside."""
     over = sum(box.shared(each) for each in written)
     hidden = sum(box.shared(each) for each in marks)

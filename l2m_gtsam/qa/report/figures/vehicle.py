@@ -10,7 +10,7 @@ from matplotlib.patches import Ellipse
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Trajectory
 from l2m_gtsam.qa.report.figures.map import draw_map
-from l2m_gtsam.qa.report.figures.names import GAP, Box, Label, placed
+from l2m_gtsam.qa.report.figures.names import GAP, Label, TextBox, placed
 from l2m_gtsam.qa.report.hover import axes_places
 from l2m_gtsam.qa.report.svg import (
     BAD,
@@ -105,7 +105,7 @@ def _name(axes: Axes, found: list[SensorCalibration], view: Viewpoint) -> None:
     span = np.ptp(places, axis=0)
     scale = float((room / ((1 + 2 * MARGIN) * span)).min())
     middle = 0.5 * scale * (places.min(axis=0) + places.max(axis=0))
-    frame = Box(middle - 0.5 * room, middle + 0.5 * room)
+    frame = TextBox(middle - 0.5 * room, middle + 0.5 * room)
     dots = scale * np.vstack([np.zeros(2), *(s.t_lidar_mag[list(view.axes)] for s in found)])
     labels = [Label(dots[0], ("lidar",))]
     labels += [Label(at, (s.sensor,)) for at, s in zip(dots[1:], found, strict=True)]

@@ -12,7 +12,7 @@ MOST = 4  # tiles that have a share in one place: bands are at most half a core 
 
 
 @dataclass(frozen=True)
-class Visit:
+class TilePoints:
     """Points that one tile has a share in.
 
     Attributes
