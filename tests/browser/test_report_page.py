@@ -17,6 +17,7 @@ from tests.support.browsing import (
     check_silence,
     check_values,
 )
+from tests.support.repository import REPOSITORY
 
 FIGURES = 4 + 3 * 8  # of vehicle and map, and of each sensor
 # A figure that failed to draw is a blank card: of one that is drawn at least this share differs
@@ -28,6 +29,17 @@ def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:
     check_silence(looked)
 
 
+def test_no_style_depends_on_width_and_scheme() -> None:
+    """Else a light desk and a dark phone would not show all that there is."""
+    queries = [
+        query
+        for path in (REPOSITORY / "l2m_gtsam" / "qa" / "report" / "templates").glob("*.css")
+        for query in re.findall(r"@media[^{]*", path.read_text(encoding="utf-8"))
+    ]
+    assert any("prefers-color-scheme" in each for each in queries)
+    assert not [each for each in queries if "prefers-color-scheme" in each and "width" in each]
+
+
 def test_every_figure_is_seen(looked: Looked) -> None:
     check_figures(looked, FIGURES)
 
@@ -37,13 +49,13 @@ def test_it_fits_a_phone(looked: Looked) -> None:
 
 
 def test_no_card_is_cut_off(looked: Looked) -> None:
-    assert [each["cut"] for each in looked.looks] == [[]] * 4
+    assert [each["cut"] for each in looked.looks] == [[]] * 2
 
 
 def test_light_and_dark_differ(looked: Looked) -> None:
     light, dark = (
-        np.asarray(Image.open(looked.folder / f"desk-{scheme}.png").convert("L"), dtype=float)
-        for scheme in ("light", "dark")
+        np.asarray(Image.open(looked.folder / f"{name}.png").convert("L"), dtype=float)
+        for name in ("desk", "phone")
     )
     assert np.median(light) > 200
     assert np.median(dark) < 60

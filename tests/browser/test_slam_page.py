@@ -9,6 +9,7 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.localisation_page import localisation_page
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.validation import NamedSource
+from tests.drives.hostile import localisation
 from tests.drives.localised import record
 from tests.support.browsing import (
     BAG,
@@ -20,6 +21,7 @@ from tests.support.browsing import (
     check_silence,
     check_values,
     look,
+    missing_names,
 )
 
 FIGURES = 6 + 2 * 5  # of the whole with a truth, and of each refined sensor
@@ -36,9 +38,9 @@ def hostile() -> LocalisationRecord:
         told,
         sensors=tuple(sensors),
         refined=tuple(replace(each, sensor=names[each.sensor]) for each in told.refined),
-        notes=(NOTE,),
+        notes=(*localisation().notes, NOTE),
         message="the map explains <b>most</b> of the readings",
-        sources=(NamedSource("drive", BAG, "ab12"),),
+        sources=(*localisation().sources, NamedSource("drive", BAG, "ab12")),
         options={"slam": {"</pre><script>alert(6)</script>": 1}},
     )
 
@@ -75,6 +77,7 @@ def test_names_from_a_bag_are_text(looked: Looked) -> None:
     shown = (*list(HOSTILE.values())[:2], BAG, NOTE, "<b>most</b>")
     for each in looked.looks:
         assert all(name in each["text"] for name in shown)
+        assert missing_names(each["text"]) == []
         assert each["title"].startswith("WARN: localisation over ")
 
 

@@ -5,9 +5,8 @@ import json
 import pytest
 
 from tests.drives.fleet_runs import FleetRun, small_fleet
-from tests.support.command_line import Demo, l2m_process
+from tests.support.command_line import Demo, l2m
 from tests.worlds.halls import SMALL_HALL
-
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
@@ -15,7 +14,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     folder = tmp_path_factory.mktemp("demo")
     options = folder / "hall.yaml"
     options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
-    return Demo(folder, l2m_process("demo", "--options", options, "--out", folder).out)
+    return Demo(folder, l2m("demo", "--options", options, "--out", folder).out)
 
 
 @pytest.fixture(scope="session")

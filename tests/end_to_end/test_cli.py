@@ -12,13 +12,7 @@ from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from tests.drives.bags import Entry, ros, write
-from tests.support.browsing import (
-    check_accessibility,
-    check_figures,
-    check_phone,
-    check_silence,
-    look,
-)
+from tests.support.browsing import drawn_figures
 from tests.support.command_line import Demo, complaint_here, ended, l2m, l2m_process, one_line
 
 
@@ -69,12 +63,10 @@ def check_demo(demo: Demo, sensors: int, t_m: float, C: float, H_ut: float) -> N
         assert picture.width > 1000
 
 
-def test_the_report_of_a_hall_is_seen(demo: Demo, browser: str, tmp_path: Path) -> None:
-    looked = look(browser, demo.folder / "report.html", tmp_path)
-    check_silence(looked)
-    check_figures(looked, 4 + 8 * 2)  # of vehicle and map, and of each sensor
-    check_phone(looked)
-    check_accessibility(looked)
+def test_the_report_of_a_hall_has_its_figures(demo: Demo) -> None:
+    drawn = drawn_figures(demo.folder / "report.html")
+    assert len(drawn) == 4 + 8 * 2  # of vehicle and map, and of each sensor
+    assert min(drawn) > 5
 
 
 def test_inspect_shows_every_topic(demo: Demo) -> None:

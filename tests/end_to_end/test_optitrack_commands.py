@@ -6,13 +6,7 @@ import pytest
 
 from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
-from tests.support.browsing import (
-    check_accessibility,
-    check_figures,
-    check_phone,
-    check_silence,
-    look,
-)
+from tests.support.browsing import drawn_figures
 from tests.support.command_line import l2m
 
 
@@ -44,9 +38,7 @@ def test_optitrack_configuration_on_real_bags(optitrack: Path, shared_data: Path
     assert result.options["bag"]["poses"] == "/optitrack/pose"
 
 
-def test_the_report_of_a_real_bag_is_seen(optitrack: Path, browser: str, tmp_path: Path) -> None:
-    looked = look(browser, optitrack / "result" / "report.html", tmp_path)
-    check_silence(looked)
-    check_figures(looked, 4 + 8)
-    check_phone(looked)
-    check_accessibility(looked)
+def test_the_report_of_a_real_bag_has_its_figures(optitrack: Path) -> None:
+    drawn = drawn_figures(optitrack / "result" / "report.html")
+    assert len(drawn) == 4 + 8
+    assert min(drawn) > 5

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ from typing import Any
 import pytest
 
 from l2m_gtsam.batch.reports import find_browser
+from l2m_gtsam.text.shown import shown_lines
+from tests.drives.hostile import NAMES
 
 PROGRAMS = Path(__file__).parents[1] / "browser"
 TIMEOUT_S = 280
@@ -63,14 +66,14 @@ def told_by(program: str, browser: str, *arguments: str | Path) -> dict[str, Any
 
 
 def look(browser: str, page: Path, folder: Path) -> Looked:
-    """Open a page on a desk and on a phone, light and dark, and tell what is found."""
+    """Open a page on a light desk and on a dark phone, and tell what is found."""
     told = told_by("look.js", browser, page, folder)
     return Looked(told["looks"], told["tabbed"], folder)
 
 
 def check_silence(looked: Looked) -> None:
     """Nothing is reported on the console, and nothing is asked of any address."""
-    assert len(looked.looks) == 4
+    assert [each["window"] for each in looked.looks] == ["desk", "phone"]
     for each in looked.looks:
         assert each["errors"] == []
         assert each["requests"] == []
@@ -87,6 +90,12 @@ def check_figures(looked: Looked, count: int) -> None:
             assert figure["drawn"] > 5
             assert min(figure["width"], figure["height"]) > 100
             assert figure["hovered"] is not False
+
+
+def drawn_figures(page: Path) -> list[int]:
+    """Return how many parts are drawn in each figure of a page, without looking at it."""
+    figures = re.findall(r"<figure.*?</figure>", page.read_text(encoding="utf-8"), re.DOTALL)
+    return [len(re.findall("<(?:path|image|use) ", each)) for each in figures]
 
 
 def check_values(looked: Looked) -> None:
@@ -106,6 +115,17 @@ def check_accessibility(looked: Looked) -> None:
     """Axe-core has no serious finding."""
     for each in looked.looks:
         assert [fault for fault in each["accessibility"] if fault["impact"] in GRAVE] == []
+
+
+def missing_names(text: str) -> list[str]:
+    """Return which of twenty hostile names cannot be read in the text of a page."""
+    seen = _plain(text)
+    return [name for name in NAMES[:-1] if _plain(shown_lines(name)) not in seen]
+
+
+def _plain(text: str) -> str:
+    # what stands in backticks is code, without them
+    return "".join(text.replace("`", "").split())
 
 
 HOSTILE = {
