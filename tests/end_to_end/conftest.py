@@ -8,6 +8,7 @@ from tests.drives.fleet_runs import FleetRun, small_fleet
 from tests.support.command_line import Demo, l2m
 from tests.worlds.halls import SMALL_HALL
 
+
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
     """Run the demonstration in a small hall."""
