@@ -21,10 +21,11 @@ from l2m_gtsam.batch.fleet_task import (
 )
 from l2m_gtsam.batch.reports import OUTCOME_FILE
 from l2m_gtsam.errors import NoRoomError
-from l2m_gtsam.parallel.cluster import ClusterOptions, Work
+from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.fleet import DriveOutcome
 from tests.drives.fleet_runs import FleetRun, table
 from tests.drives.fleets import not_a_bag, vehicle
+from tests.support.one_process import computed_here
 
 Spoil = Callable[[FleetRun], None]
 
@@ -173,16 +174,10 @@ def test_a_full_disk_is_no_row(
     vehicle(there.bags / "truck_1" / "day_0.bag", seed=8)
     before = contents(there.out)
 
-    def serial(
-        work: Work[FleetTask, Path, DriveOutcome], tasks: list[FleetTask], _: ClusterOptions
-    ) -> Iterator[tuple[FleetTask, DriveOutcome]]:
-        for task in tasks:
-            yield task, work.task(task, work.prepare(work.place(task)))
-
     def full(*_: object) -> NoReturn:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(batch_fleet, "computed", serial)
+    monkeypatch.setattr(batch_fleet, "computed", computed_here)
     with monkeypatch.context() as patch:
         patch.setattr(fleet_task, "write_outcome", full)  # the last of a drive's results
         with pytest.raises(NoRoomError, match=r"day_0: .* No space left on device; make room"):

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 from ruamel.yaml import YAML
 
+from l2m_gtsam.batch import fleet as batch_fleet
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.qa.fleet import with_outliers
 from l2m_gtsam.qa.options import FleetOptions, QaOptions
@@ -35,6 +36,7 @@ from tests.drives.fleets import write as write_drive
 from tests.drives.hostile import NAMES, fleet_rows, localisation
 from tests.drives.localised import record
 from tests.support.command_line import Finished, ended, l2m
+from tests.support.one_process import computed_here
 
 DANGEROUS = {"script", "img", "iframe", "object", "embed", "base", "form", "meta-refresh"}
 OTHERS = ("kalibr", "bias-scale", "px4", "ardupilot")  # seconds each, and of the same parts
@@ -222,8 +224,9 @@ def test_the_page_of_a_localisation() -> None:
 
 
 @pytest.mark.study
-def test_whole_commands(tmp_path: Path) -> None:
+def test_whole_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A drive with a sensor of each name, in a fleet with a vehicle of such a name; and SLAM."""
+    monkeypatch.setattr(batch_fleet, "computed", computed_here)
     place, config = make_place(tmp_path / "place"), tmp_path / "config.yaml"
     known = [replace(mounted(PLACE)[0], sensor=name) for name in NAMES]
     bag = write_drive(tmp_path / "drive.mcap", eight(), tuple(known), seed=1)

@@ -6,12 +6,16 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.storage.yaml_file import write_yaml
+from l2m_gtsam.studies import run
 from tests.support.command_line import complaint_here, l2m
+from tests.support.one_process import computed_here
 from tests.worlds.study_sites import TINY_BASIN as TINY
 
 
-def test_a_study_from_options_to_page_and_again(tmp_path: Path) -> None:
-    """One cell, which takes one process; the second run has one more to do, the third nothing."""
+def test_a_study_from_options_to_page_and_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One cell, in another process; the second run has one more to do, the third nothing."""
     one_start = TINY.model_copy(update={"starts": 1, "few_starts": 1, "rings": 1})
     options, out = tmp_path / "tiny.yaml", tmp_path / "out"
     command = ("study", "basin", "--options", options, "--out", out, "--workers")
@@ -22,6 +26,7 @@ def test_a_study_from_options_to_page_and_again(tmp_path: Path) -> None:
     written = cell.stat().st_mtime_ns
     more = one_start.model_copy(update={"distortions": 2})
     write_yaml(options, more.model_dump(mode="json"), "Small.")
+    monkeypatch.setattr(run, "computed", computed_here)
     second = l2m(*command, "1")
     assert "| 0.00-1.50 | 2 |" in second.out
     assert cell.stat().st_mtime_ns == written

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from ruamel.yaml import YAML
 
+from l2m_gtsam.batch import fleet as batch_fleet
 from l2m_gtsam.batch import reports
 from l2m_gtsam.cli.app import app
 from l2m_gtsam.cli.maps import map_app
@@ -28,6 +29,7 @@ from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.record_files import read_validation
 from tests.drives.yard import CalibratedYard, calibrated_yard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
+from tests.support.one_process import computed_here
 
 FORMATS = ("ros2-launch", "urdf", "kalibr", "json", "bias-scale", "px4", "ardupilot")
 ROBOT = '<robot name="r">\n  <link name="lidar"/>\n</robot>\n'
@@ -281,8 +283,11 @@ def strict_command(place: CalibratedYard, failed: Failed, name: str) -> list[str
 
 
 @pytest.mark.parametrize("name", ["batch", "calibrate", "validate"])
-def test_strict_ends_with_three(place: CalibratedYard, failed: Failed, name: str) -> None:
+def test_strict_ends_with_three(
+    place: CalibratedYard, failed: Failed, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Everything is written; only the exit code differs. `slam` is tried below."""
+    monkeypatch.setattr(batch_fleet, "computed", computed_here)
     command, out = strict_command(place, failed, name), failed.folder / "out"
     run = ended(*command, "--out", out, "--strict")
     assert run.code == 3, run.err
