@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from l2m_gtsam.batch.options_reference import pages
+from l2m_gtsam.batch.options_text import pages
 
 DOCS = Path(__file__).parents[1] / "docs"
 

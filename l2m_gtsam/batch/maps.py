@@ -18,9 +18,9 @@ from l2m_gtsam.maps.field_map import FieldMap, MapSummary, Remembering
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.qa.report.figures.map import map_figure
 from l2m_gtsam.qa.report.svg import save_figure
-from l2m_gtsam.recording.drive_dates import drive_dates
 from l2m_gtsam.records.map_diary import MapDiary
 from l2m_gtsam.storage.map_file import save_map
+from l2m_gtsam.upkeep.dated_changes import drive_dates
 from l2m_gtsam.upkeep.kept_map import kept_up
 
 

@@ -33,8 +33,14 @@ from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import Usage
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.storage.listed_sensors import read_sensors
-from l2m_gtsam.storage.online_log import LogLine, OnlineLog, logged_trajectory, read_log
-from l2m_gtsam.storage.online_state import read_state, write_state
+from l2m_gtsam.storage.online_log import (
+    LogLine,
+    OnlineLog,
+    logged_trajectory,
+    read_log,
+    read_state,
+    write_state,
+)
 from l2m_gtsam.storage.point_cloud2 import has_clouds
 from l2m_gtsam.storage.pose_files import read_tum
 from l2m_gtsam.storage.trajectory_files import write_tum

@@ -53,7 +53,7 @@ from scipy.linalg import cholesky, solve_triangular
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
-from l2m_gtsam.records.disturbance import EXPLAINED, Unmodelled
+from l2m_gtsam.records.error_budget import EXPLAINED, Unmodelled
 from l2m_gtsam.solve.chi_square import quantile
 
 HALVINGS = 4  # into sixteen parts; eight are pairs of them

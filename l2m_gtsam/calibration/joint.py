@@ -34,8 +34,7 @@ from l2m_gtsam.calibration.variance_parts import Parts
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.records.calibration import ResidualFigures
-from l2m_gtsam.records.disturbance import EXPLAINED, Unmodelled
-from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.records.error_budget import EXPLAINED, ErrorCause, Unmodelled
 from l2m_gtsam.solve.noise import (
     HALF,
     estimate_noise,

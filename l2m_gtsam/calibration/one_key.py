@@ -56,8 +56,7 @@ from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.recording.sync import with_offsets
 from l2m_gtsam.records.calibration import Uncertainty
-from l2m_gtsam.records.pose_duration import PoseDuration
-from l2m_gtsam.records.stated_size import StatedSize
+from l2m_gtsam.records.error_budget import PoseDuration, StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
 # The joint graph is solved again while its frozen weights still change; they settle in two or

@@ -25,7 +25,7 @@ from l2m_gtsam.calibration.pose_errors import error_of_poses, pose_seconds
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
-from l2m_gtsam.records.pose_duration import DurationSource, PoseDuration
+from l2m_gtsam.records.error_budget import DurationSource, PoseDuration
 
 LAGS = np.array([1, 2, 3, 5, 8, 16, 32, 64, 128])  # bins
 BLOCKS = 32  # of a drive: how much the correlation scatters is seen in them

@@ -12,8 +12,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.records.stated_size import StatedSize
-from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
 from l2m_gtsam.solve.noise import NOISE_RANGE
 from l2m_gtsam.solve.variance_components import WeightSystem
 

@@ -31,7 +31,7 @@ from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_value
 from l2m_gtsam.calibration.uncertain_graph import NEAR_SIGMAS, UncertainProblem
 from l2m_gtsam.calibration.view import QueryableMap, View
 from l2m_gtsam.parallel.threads import side_by_side
-from l2m_gtsam.records.stated_size import StatedSize
+from l2m_gtsam.records.error_budget import StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6

@@ -58,8 +58,7 @@ from l2m_gtsam.calibration.stated_sizes import (
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive
 from l2m_gtsam.calibration.variance_parts import PriorRows, variance_parts
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.records.stated_size import StatedSize
-from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
 from l2m_gtsam.solve.linear_algebra import covariance_root
 from l2m_gtsam.solve.noise import HALF, estimate_noise, residual_figures
 from l2m_gtsam.solve.rank import Determinacy

@@ -19,7 +19,7 @@ from l2m_gtsam.calibration.group_noise import GroupNoise
 from l2m_gtsam.calibration.joint_information import JointInformation, columns_at
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.records.variance_shares import ErrorCause, VarianceShare
+from l2m_gtsam.records.error_budget import ErrorCause, VarianceShare
 
 BLOCKS = (slice(0, 3), slice(3, 12), slice(12, 15))  # t, C, H
 BY_SYMBOL = {

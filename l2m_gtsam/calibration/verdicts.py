@@ -14,9 +14,9 @@ from l2m_gtsam.calibration.priors import Contradiction
 from l2m_gtsam.calibration.variance_parts import variance_shares
 from l2m_gtsam.data import Distortion, Readings, SyncCounts, Synchronised
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.geometry import PolarRotation, dead_axis, polar_rotation
 from l2m_gtsam.records.calibration import FoundStart, SensorCalibration, SensorStatus, TimeOffset
 from l2m_gtsam.solve.explain import Movement
-from l2m_gtsam.solve.rotation import PolarRotation, dead_axis, polar_rotation
 
 # A Newton step of a tenth of a standard deviation would still be worth taking.
 CONVERGED_SIGMAS = 0.1

@@ -8,10 +8,9 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.pose_shifts import survey_poses
+from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
 from l2m_gtsam.mapping.suite_calibration import suite_doubts
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
-from l2m_gtsam.mapping.suite_shifts import suite_errors
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap

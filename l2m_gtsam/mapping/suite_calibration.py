@@ -8,6 +8,7 @@ import numpy as np
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
 from l2m_gtsam.errors import CalibrationError, L2MError, MapError
+from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_poses import with_pose_errors
 from l2m_gtsam.mapping.suite_solver import (
@@ -30,7 +31,6 @@ from l2m_gtsam.records.calibration import (
     Uncertainty,
 )
 from l2m_gtsam.solve.noise import residual_figures
-from l2m_gtsam.solve.rotation import polar_rotation
 
 REACH = 5.0  # standard deviations of a clock for which readings need poses around them
 NOTICED = 0.1  # share of the residuals' squares; sensors as assumed explain 16 S / 3 N of them

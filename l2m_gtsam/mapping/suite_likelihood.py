@@ -18,7 +18,7 @@ from scipy.linalg import cho_solve, solve_triangular
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Evidence, evidence, normal_of
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 from l2m_gtsam.recording.sync import SyncOptions

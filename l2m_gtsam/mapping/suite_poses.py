@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from l2m_gtsam.data import FloatArray, Trajectory
-from l2m_gtsam.mapping.pose_shifts import survey_poses
+from l2m_gtsam.mapping.shifts import survey_poses
 from l2m_gtsam.mapping.suite_likelihood import WindowSlopes, window_slopes
 from l2m_gtsam.mapping.suite_solver import SuiteRound, likeness
 from l2m_gtsam.maps.harmonic.pose_sizes import LASTING_S, PARTS, FoundPoses, PoseView, likely

@@ -8,8 +8,8 @@ from l2m_gtsam.data import FloatArray, IntArray, Readings
 from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions, SuiteWindow, undistorted
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import normal_of
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningOptions, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.representatives import spread_tiles

@@ -14,8 +14,7 @@ import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.kernel import scaled
-from l2m_gtsam.maps.posterior import Posterior
+from l2m_gtsam.maps.posterior import Posterior, scaled
 
 FAST = {"reassoc", "contract", "nsz"}
 LEAST = -700.0  # an exponent of which float64 still has the power

@@ -7,9 +7,8 @@ import numpy as np
 from l2m_gtsam.calibration.explanation import from_priors, undetermined
 from l2m_gtsam.calibration.forecast import Forecast, forecast
 from l2m_gtsam.calibration.joint import SensorSolution
-from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.calibration.options import CalibrationOptions, priors_of
 from l2m_gtsam.calibration.prepare import prepare
-from l2m_gtsam.calibration.prior_options import priors_of
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.start.rigid_groups import placed
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
@@ -25,6 +24,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.maps.field_map import Summarised
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.planning.motion import (
@@ -39,7 +39,6 @@ from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.records.plan import DrivePlan, MotionPlan, SensorPlan, Worst
 from l2m_gtsam.solve.explain import Movement, held_offset, movement
 from l2m_gtsam.solve.rank import PARAMETERS, RankOptions
-from l2m_gtsam.solve.rotation import polar_rotation
 
 NANOSECONDS = 1e9
 BREAK_NS = 60_000_000_000  # between a drive and a motion that is added to it

@@ -1,4 +1,4 @@
-"""Drives of a fleet: rows of its table, and parameters unlike those of a vehicle's other drives."""
+"""Drives of a fleet: rows of its table, parameters unlike those of other drives, history."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -205,3 +205,40 @@ def expected_deviation(value: FloatArray, sigma: FloatArray) -> FloatArray:
     spread = float(median_abs_deviation(value, scale="normal"))
     smallest = np.finfo(float).tiny  # values that are exact and all alike
     return np.asarray(np.maximum(np.sqrt(sigma**2 + of_median), max(spread, smallest)))
+
+
+@dataclass(frozen=True)
+class VerdictHistory:
+    """The verdicts on the sensors of a vehicle, in order of time.
+
+    Attributes
+    ----------
+    vehicle
+        Its name.
+    drives
+        Names of bags with their dates, the oldest first.
+    sensors
+        Names, and a verdict for each drive; none where the drive was not calibrated, or has no such
+        sensor.
+    """
+
+    vehicle: str
+    drives: tuple[tuple[str, str], ...]
+    sensors: tuple[tuple[str, tuple[str | None, ...]], ...]
+
+
+def verdict_histories(rows: Sequence[FleetRow]) -> tuple[VerdictHistory, ...]:
+    """Return the histories of all vehicles that have several drives, in the order of the rows."""
+    found = [_history(name, rows) for name in dict.fromkeys(row.vehicle for row in rows)]
+    return tuple(each for each in found if len(each.drives) > 1)
+
+
+def _history(vehicle: str, rows: Sequence[FleetRow]) -> VerdictHistory:
+    own = [row for row in rows if row.vehicle == vehicle]
+    drives = sorted({(row.date, row.bag) for row in own})
+    levels = {
+        (row.sensor.sensor, row.date, row.bag): row.verdict for row in own if row.sensor is not None
+    }
+    names = sorted({name for name, _, _ in levels})
+    sensors = tuple((name, tuple(levels.get((name, *drive)) for drive in drives)) for name in names)
+    return VerdictHistory(vehicle, tuple((bag, date) for date, bag in drives), sensors)

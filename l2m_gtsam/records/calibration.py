@@ -14,13 +14,17 @@ from pydantic import Field, GetCoreSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from l2m_gtsam.data import Distortion, FloatArray, InFile, Matrix, SourceFile, SyncCounts, Vector
-from l2m_gtsam.records.disturbance import EXPLAINED, Disturbance, Unmodelled
+from l2m_gtsam.records.error_budget import (
+    EXPLAINED,
+    Disturbance,
+    PoseDuration,
+    StatedSize,
+    Unmodelled,
+    VarianceShare,
+)
 from l2m_gtsam.records.places import ChangedSource
-from l2m_gtsam.records.pose_duration import PoseDuration
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
-from l2m_gtsam.records.stated_size import StatedSize
-from l2m_gtsam.records.variance_shares import VarianceShare
 from l2m_gtsam.records.verdict import Judgement
 
 

@@ -4,7 +4,7 @@ from enum import StrEnum
 
 from pydantic import Field, model_validator
 
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.options import AnyQuaternion, Options
 from l2m_gtsam.recording.odometry_jumps import JumpOptions
 from l2m_gtsam.solve.robust import RobustOptions

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import Distortion, Trajectory
+from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.localisation import (
     DriftFigures,
@@ -22,7 +23,6 @@ from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.misfit import fits_decoy_as_well
 from l2m_gtsam.slam.pose_graph import PoseGraph
 from l2m_gtsam.slam.solution import DriveSolution
-from l2m_gtsam.solve.rotation import polar_rotation
 
 # Share of the readings inside the map below which a drive is not localised by it.
 LEAST_INSIDE = 0.1

@@ -16,7 +16,7 @@ from l2m_gtsam.records.calibration import (
     SensorCalibration,
     Uncertainty,
 )
-from l2m_gtsam.records.disturbance import EXPLAINED
+from l2m_gtsam.records.error_budget import EXPLAINED
 from l2m_gtsam.records.verdict import NOT_JUDGED, Judgement
 from l2m_gtsam.storage.result_set import check_set
 from l2m_gtsam.storage.yaml_file import checked, read_yaml, write_yaml

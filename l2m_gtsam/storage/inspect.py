@@ -27,10 +27,14 @@ from l2m_gtsam.storage.messages import (
 )
 from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.point_cloud2 import CLOUD_TYPE
-from l2m_gtsam.storage.pose_check import needed_frames
 from l2m_gtsam.storage.pose_files import read_poses
 from l2m_gtsam.storage.selection import select_fields, select_poses, several_frames
-from l2m_gtsam.storage.topic_content import TopicContent, collect_paths, collected_topics
+from l2m_gtsam.storage.topic_content import (
+    TopicContent,
+    collect_paths,
+    collected_topics,
+    needed_frames,
+)
 from l2m_gtsam.storage.units import (
     PLAUSIBLE_UT,
     Strength,

@@ -6,13 +6,13 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, SyncCounts
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     SensorCalibration,
     SensorStatus,
     Uncertainty,
 )
-from l2m_gtsam.solve.rotation import polar_rotation
 from l2m_gtsam.storage.calibration_file import FORMAT, calibration_in
 from l2m_gtsam.storage.known_sensors import ListedSensor, listed_sensors_in
 from l2m_gtsam.storage.yaml_file import read_yaml

@@ -1,4 +1,4 @@
-"""The log of a localisation on line: JSON lines with poses and events, as they come.
+"""Localisations on line in files: their log, JSON lines with poses and events, and saved states.
 
 Lines are appended and flushed, so that what was written before a kill stays; a line that was cut
 short is left out when the log is read.
@@ -9,13 +9,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TextIO
+from typing import Any, TextIO
 
 import numpy as np
+import numpy.typing as npt
 
-from l2m_gtsam.data import Trajectory
-from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.data import MapState, Trajectory
+from l2m_gtsam.errors import ConfigError, MapError
 from l2m_gtsam.storage.files import unwritten
+from l2m_gtsam.storage.map_file import load_map, save_map
 
 MOST_LINE = 10_000  # characters
 POSE_FIELDS = {"R": (3, 3), "p": (3,), "covariance": (6, 6)}
@@ -128,4 +130,63 @@ def logged_trajectory(lines: Sequence[LogLine]) -> Trajectory:
     }
     return Trajectory(
         np.array(stamps, dtype=np.int64), own["R"], own["p"], "map", "lidar", own["covariance"]
+    )
+
+
+KIND = "online-state"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """A state.
+
+    Attributes
+    ----------
+    arrays
+        Numeric arrays by name.
+    facts
+        Plain values.
+    """
+
+    arrays: dict[str, npt.NDArray[Any]]
+    facts: dict[str, Any]
+
+
+def write_state(path: Path, state: SavedState) -> None:
+    """Write a state under a temporary name and rename it.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    arrays = {name: np.asarray(array) for name, array in state.arrays.items()}
+    save_map(path, MapState(KIND, arrays, state.facts, {"version": VERSION}))
+
+
+def read_state(path: Path) -> SavedState:
+    """Return a state.
+
+    Raises
+    ------
+    ConfigError
+        There is no such file, it is something else, or it is damaged.
+    """
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file; begin without --resume")
+    try:
+        found = load_map(path)
+    except MapError as error:
+        raise ConfigError(damaged(path)) from error
+    if found.kind != KIND or found.provenance != {"version": VERSION}:
+        raise ConfigError(damaged(path))
+    return SavedState(found.arrays, found.options)
+
+
+def damaged(path: Path) -> str:
+    """Return that a file is no state."""
+    return (
+        f"{path}: not a state that this version of `l2m slam --online` saved, or damaged; begin "
+        "without --resume"
     )

@@ -11,8 +11,8 @@ from l2m_gtsam.data import ScalarSeries
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bag_options import RegressorTopic, Stamps
+from l2m_gtsam.storage.field_types import Step, number_at, steps_of
 from l2m_gtsam.storage.log import Log, Message
-from l2m_gtsam.storage.message_paths import Step, number_at, steps_of
 from l2m_gtsam.storage.open_log import open_log
 from l2m_gtsam.storage.selection import listed
 

@@ -23,7 +23,7 @@ from rosbags.rosbag2 import metadata as ros2_metadata
 from rosbags.rosbag2 import reader as ros2
 from rosbags.rosbag2 import storage_mcap, storage_sqlite3
 
-from l2m_gtsam.storage.bounded_yaml import BoundedYAML
+from l2m_gtsam.storage.yaml_file import BoundedYAML
 
 MEBIBYTE = 1 << 20
 # Recorders close a chunk at some megabytes; one message, a scan or a picture, may be larger.

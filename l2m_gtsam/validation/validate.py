@@ -33,9 +33,8 @@ from l2m_gtsam.records.validation import (
     ValidatedSensor,
 )
 from l2m_gtsam.solve.correction import without_moving
-from l2m_gtsam.validation.figures import Thinning, offset_s, sensor_figures
+from l2m_gtsam.validation.figures import Thinning, doubts_and_notes, offset_s, sensor_figures
 from l2m_gtsam.validation.innovation import KnownCalibration
-from l2m_gtsam.validation.notes import doubts_and_notes
 from l2m_gtsam.validation.places import (
     PlaceOrVehicle,
     is_searched,

@@ -17,8 +17,8 @@ from l2m_gtsam.data import (
     SourceFile,
     Trajectory,
 )
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.records.calibration import Uncertainty

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
 from tests.worlds.exact import DipoleWorld, dipole_world, random_sensors

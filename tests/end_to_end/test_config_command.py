@@ -7,8 +7,7 @@ import pytest
 from pydantic import BaseModel
 from ruamel.yaml import YAML
 
-from l2m_gtsam.batch.options_reference import inside_of, pages
-from l2m_gtsam.batch.options_text import options_text
+from l2m_gtsam.batch.options_text import inside_of, options_text, pages
 from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.options import meanings
 from l2m_gtsam.storage.inspect import inspect_bag

@@ -21,12 +21,12 @@ from l2m_gtsam.cli.app import app
 from l2m_gtsam.cli.maps import map_app
 from l2m_gtsam.errors import Notice
 from l2m_gtsam.records.verdict import Level
-from l2m_gtsam.storage.bounded_yaml import BoundedYAML
 from l2m_gtsam.storage.calibrated_topics import VERDICT_TOPIC
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.record_files import read_validation
+from l2m_gtsam.storage.yaml_file import BoundedYAML
 from tests.drives.yard import CalibratedYard, calibrated_yard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
 from tests.support.one_process import computed_here

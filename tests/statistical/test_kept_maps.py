@@ -2,7 +2,7 @@
 
 import pytest
 
-from l2m_gtsam.studies.changes.options import ChangesStudyOptions
+from l2m_gtsam.studies.changes.loads import ChangesStudyOptions
 from l2m_gtsam.studies.changes.rounds import rounds_end
 
 pytestmark = pytest.mark.study

@@ -12,8 +12,8 @@ from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.data import FieldSeries, FloatArray, KnownSensor, Recording, SourceFile, Trajectory
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.planning.motion import MotionOptions, PlanOptions

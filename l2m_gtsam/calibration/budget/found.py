@@ -20,7 +20,7 @@ from l2m_gtsam.calibration.budget.processes import (
 )
 from l2m_gtsam.calibration.budget.search import FoundProcess
 from l2m_gtsam.data import FloatArray, IntArray, Readings
-from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
+from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind
 
 AXES = 3
 

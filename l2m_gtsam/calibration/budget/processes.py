@@ -20,7 +20,7 @@ from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.pose_errors import pose_features
 from l2m_gtsam.calibration.view import QueryableMap, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
-from l2m_gtsam.records.disturbance import DisturbanceKind
+from l2m_gtsam.records.error_budget import DisturbanceKind
 from l2m_gtsam.solve.linear_algebra import right_divided
 
 WANDER_MODES = 24  # slower ones hold all but 2 % of a walk; faster ones of 1/f noise are noise

@@ -9,7 +9,7 @@ import numpy as np
 from l2m_gtsam.calibration.budget.processes import Process
 from l2m_gtsam.calibration.joint_information import JointInformation, Rows
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.records.disturbance import DisturbanceKind
+from l2m_gtsam.records.error_budget import DisturbanceKind
 from l2m_gtsam.solve.variance_components import VarianceComponents, WeightSystem
 
 # Twice a logarithm of likelihood. Where a process is not there, half of all drives give zero, and

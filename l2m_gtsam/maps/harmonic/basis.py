@@ -8,9 +8,8 @@ from itertools import chain, compress
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.family import Family, WeightPrior
+from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, WeightPrior
 from l2m_gtsam.maps.harmonic.frame import TileFrame, turn_rows
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 
 BATCH = 512  # points whose features are in memory, and about in cache, at once
 

@@ -11,8 +11,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile, sources_of
-from l2m_gtsam.maps.harmonic.entries import compiled_entry, solved_entry
-from l2m_gtsam.maps.harmonic.kept_arrays import finite, floats, integers
+from l2m_gtsam.maps.harmonic.entries import compiled_entry, finite, floats, integers, solved_entry
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.near_sources import NearSources
 from l2m_gtsam.maps.harmonic.places import Places

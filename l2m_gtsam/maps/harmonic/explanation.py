@@ -8,7 +8,7 @@ import numpy as np
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import Weights, condition, normal_of
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.parallel.threads import in_threads

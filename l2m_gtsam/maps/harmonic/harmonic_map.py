@@ -12,7 +12,7 @@ from l2m_gtsam.maps.field_map import MapSummary, masked, unknown
 from l2m_gtsam.maps.harmonic.compiled import CompiledTiles
 from l2m_gtsam.maps.harmonic.error_modes import ErrorModes, error_modes
 from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
-from l2m_gtsam.maps.harmonic.pose_learning import with_pose_errors
+from l2m_gtsam.maps.harmonic.pose_sizes import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
 from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes

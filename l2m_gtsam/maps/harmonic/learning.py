@@ -10,8 +10,8 @@ from scipy.optimize import Bounds, minimize
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import Normal, evidence, normal_of
+from l2m_gtsam.maps.harmonic.family import BOUNDS, Hyperparameters
 from l2m_gtsam.maps.harmonic.furnish import COARSE, basis_of
-from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
 from l2m_gtsam.maps.harmonic.local import LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles
 from l2m_gtsam.maps.harmonic.structure import Sources

@@ -10,10 +10,10 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.grid import grid_from
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.explanation import UNJUDGED, Explanation
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.frame import TileFrame, tile_frame
 from l2m_gtsam.maps.harmonic.furnish import FINE, basis_of
 from l2m_gtsam.maps.harmonic.history import History
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, LearningOptions
 from l2m_gtsam.maps.harmonic.local import LocalOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions

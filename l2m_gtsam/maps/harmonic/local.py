@@ -8,8 +8,7 @@ from pydantic import Field
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import EvidenceSlopes, Normal, evidence, marginalised
-from l2m_gtsam.maps.harmonic.family import WeightPrior
-from l2m_gtsam.maps.harmonic.hyperparameters import BOUNDS, Hyperparameters
+from l2m_gtsam.maps.harmonic.family import BOUNDS, Hyperparameters, WeightPrior
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.options import Options
 

@@ -21,9 +21,8 @@ import numpy as np
 from numba import njit
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.harmonic.family import WeightPrior
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
-from l2m_gtsam.maps.harmonic.symmetric import FAST, add_symmetric
+from l2m_gtsam.maps.harmonic.family import Hyperparameters, WeightPrior
+from l2m_gtsam.maps.harmonic.triangular import FAST, add_symmetric
 
 FLOOR, CEILING = "floor", "ceiling"
 

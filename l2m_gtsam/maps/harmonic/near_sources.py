@@ -20,7 +20,7 @@ from scipy.special import binom
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialLattice
-from l2m_gtsam.maps.harmonic.symmetric import add_symmetric
+from l2m_gtsam.maps.harmonic.triangular import add_symmetric
 
 ORDER = 7  # of the polynomial: the smooth part is as smooth as the grid's spline
 TAYLOR = binom(-1.5, np.arange(ORDER + 1))  # of (1 + t)^(-3/2)

@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
 from l2m_gtsam.maps.harmonic.evidence import Weights, condition, normal_of
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.training import TrainingSet
 from l2m_gtsam.options import Options
 

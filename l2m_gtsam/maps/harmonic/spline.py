@@ -15,7 +15,7 @@ from numba import njit
 from scipy import ndimage
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.symmetric import FAST
+from l2m_gtsam.maps.harmonic.triangular import FAST
 
 DEGREE = 7
 WIDTH = DEGREE + 1  # coefficients per axis that a point needs

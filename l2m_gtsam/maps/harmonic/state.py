@@ -10,8 +10,8 @@ from pydantic import TypeAdapter, ValidationError
 from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.grid import grid_from
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.history import History
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import ORIGIN, HarmonicOptions, Learnt, reach_of
 from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources
 from l2m_gtsam.maps.harmonic.tiling import LEAST_CORE, Resolution, Tiling, blend_of

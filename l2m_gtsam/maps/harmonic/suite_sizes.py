@@ -25,8 +25,7 @@ from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SIZE, SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
-from l2m_gtsam.records.stated_size import StatedSize
-from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
 from l2m_gtsam.solve.variance_components import WeightSystem
 
 MOST_TILES = 24  # of the survey, spread over it

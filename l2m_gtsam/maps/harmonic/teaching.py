@@ -18,8 +18,8 @@ from l2m_gtsam.maps.harmonic.evidence import (
     whitened_factor,
 )
 from l2m_gtsam.maps.harmonic.explanation import explanation_of, patchwork
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.furnish import COARSE
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learning import LearningEnd, learn
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt, laid_out
 from l2m_gtsam.maps.harmonic.representatives import rough_tiles, spread_tiles

@@ -8,8 +8,8 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Weights
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.frame import clip_rows
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import left_out
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.grid import Grid, grid_over
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR
 from l2m_gtsam.maps.harmonic.tile_shares import TilePoints, shares_of
 from l2m_gtsam.options import Options

@@ -1,14 +1,49 @@
-"""A triangular factor as solves for many right sides want it: block of rows by block of rows."""
+"""Small matrices that are kept in parts: symmetric gradients, and triangular roots."""
 
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from scipy.linalg.blas import dgemm, dtrmm
 from scipy.linalg.lapack import dtrtri
 
 from l2m_gtsam.data import FloatArray
+
+# Sums in any order and fused products: loops run in vector registers. What breaks NaN stays off.
+FAST = {"reassoc", "contract", "nsz"}
+
+
+@njit(cache=True, nogil=True, inline="always")
+def add_symmetric(
+    n: int,
+    bx: float,
+    by: float,
+    bz: float,
+    xx: float,
+    yy: float,
+    zz: float,
+    xy: float,
+    xz: float,
+    yz: float,
+    field: FloatArray,
+    gradient: FloatArray,
+) -> None:
+    """Add a field and its symmetric gradient to those of a point."""
+    field[n, 0] += bx
+    field[n, 1] += by
+    field[n, 2] += bz
+    gradient[n, 0, 0] += xx
+    gradient[n, 1, 1] += yy
+    gradient[n, 2, 2] += zz
+    gradient[n, 0, 1] += xy
+    gradient[n, 1, 0] += xy
+    gradient[n, 0, 2] += xz
+    gradient[n, 2, 0] += xz
+    gradient[n, 1, 2] += yz
+    gradient[n, 2, 1] += yz
+
 
 BLOCK = 96  # rows: large enough for products of matrices, small beside the whole
 

@@ -20,8 +20,7 @@ from l2m_gtsam.qa.report.figures.comparison import drives_figure
 from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
-from l2m_gtsam.qa.verdict.calibration import judge
-from l2m_gtsam.qa.verdict.measured import Measured, measured
+from l2m_gtsam.qa.verdict.calibration import Measured, judge, measured
 from l2m_gtsam.qa.verdict.places import best_of, cause_sentence
 from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration

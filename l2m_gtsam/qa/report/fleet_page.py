@@ -12,7 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.qa.fleet_history import verdict_histories
+from l2m_gtsam.qa.fleet import verdict_histories
 from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.figures.trends import SIGMAS, Trend, trend_figure, trends
 from l2m_gtsam.qa.report.page import Picture, own_file, render, roll_pitch_yaw, with_sigma

@@ -9,7 +9,7 @@ import numpy as np
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.drive import StartPose, as_pose
@@ -36,7 +36,7 @@ from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExplorerState, MarginalizedPose
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile
-from l2m_gtsam.storage.online_state import SavedState
+from l2m_gtsam.storage.online_log import SavedState
 
 FOLLOWING, EXPLORING, SEARCHING, WAITING = "following", "exploring", "searching", "waiting"
 SENSORS = ("t", "distortion", "covariance")

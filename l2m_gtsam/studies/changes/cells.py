@@ -9,8 +9,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.places import ChangedSource
-from l2m_gtsam.studies.changes.loads import LoadedHall, Loads
-from l2m_gtsam.studies.changes.options import ChangesStudyOptions
+from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, Loads
 from l2m_gtsam.studies.honesty.drives import drive_seed
 from l2m_gtsam.studies.validation.drives import NO_STEEL, path_of, recorded
 

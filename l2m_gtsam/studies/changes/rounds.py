@@ -11,8 +11,14 @@ from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.simulate.hall_drives import calibration_drive, patrol, survey
 from l2m_gtsam.simulate.steel_hall import CloudVariant, SteelHall, hall_cloud, steel_hall
-from l2m_gtsam.studies.changes.loads import Loads, drawn, joined, outside, surface
-from l2m_gtsam.studies.changes.options import ChangesStudyOptions
+from l2m_gtsam.studies.changes.loads import (
+    ChangesStudyOptions,
+    Loads,
+    drawn,
+    joined,
+    outside,
+    surface,
+)
 from l2m_gtsam.studies.validation.drives import NO_STEEL, HallPath, direction, recorded
 from l2m_gtsam.upkeep.kept_map import kept_up
 

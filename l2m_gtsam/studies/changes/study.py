@@ -9,8 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from l2m_gtsam.studies.changes.cells import NEAR_M, ChangesCell, TrueChange, cell_of
-from l2m_gtsam.studies.changes.loads import LoadedHall, loaded_hall
-from l2m_gtsam.studies.changes.options import ChangesStudyOptions
+from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, loaded_hall
 from l2m_gtsam.studies.statistics import Share
 from l2m_gtsam.studies.study import Study
 

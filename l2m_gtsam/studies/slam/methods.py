@@ -1,12 +1,16 @@
-"""SLAM without a map, method by method: what each makes of one drive with one sensor."""
+"""SLAM without a map, method by method: cells of the study, and what each makes of one drive."""
 
 from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
 from time import process_time
 
 import numpy as np
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, IntArray, SyncCounts, Trajectory
+from l2m_gtsam.options import Options
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
@@ -17,8 +21,16 @@ from l2m_gtsam.records.calibration import (
 from l2m_gtsam.slam.exploration import NOTHING_GAINED, explore
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.peers.reduced_rank_ekf import ReducedRankEkfOptions, reduced_rank_ekf
-from l2m_gtsam.studies.slam.recipes import DriftRecipe, Form
-from l2m_gtsam.studies.slam.recordings import TrueDrive
+from l2m_gtsam.studies.slam.recordings import (
+    ROBOT,
+    SHIP,
+    DriftRecipe,
+    Form,
+    TrueDrive,
+    drifted,
+    robot_run,
+    ship_run,
+)
 from l2m_gtsam.studies.statistics import nees
 
 EXACT = 1e-10  # variance of a calibration that is taken as given
@@ -139,3 +151,94 @@ def mean_nees(estimate: Trajectory, truth: Trajectory) -> float | None:
     turn = Rotation.from_matrix(estimate.R.transpose(0, 2, 1) @ truth.R).as_rotvec()
     shift = np.einsum("nji,nj->ni", estimate.R, truth.p - estimate.p)
     return float(nees(np.hstack([turn, shift])[1:], estimate.covariance[1:]).mean())
+
+
+SHIP_RUNS = ("ship-1", "ship-2")
+WALK_TIMES = 10.0  # the drift of a step as noise of the walk: half a metre in 500 steps
+
+
+class DriftKind(StrEnum):
+    """Which errors odometry has."""
+
+    PUBLISHED = "published"
+    WALK = "walk"
+
+
+class SlamStudyOptions(Options):
+    """Of the study of SLAM in an unknown field."""
+
+    data: str = "../shared/data"
+    """Folder of the recordings, which are no part of this package."""
+    recordings: tuple[str, ...] = SHIP_RUNS
+    """Runs of the ship, and `robot-1` to `robot-4`: passes whose field has so much detail that a
+    drive takes ten minutes and more."""
+    seed: int = Field(default=0, ge=0)
+    """The first;"""
+    seeds: int = Field(default=2, ge=1)
+    """and how many, of the drift's noise."""
+    noise_ut: float = Field(default=5.0, gt=0)
+    """Of a reading per axis, as the publication on the ship has it: a tenth of the field."""
+    drift: DriftRecipe = DriftRecipe()
+    """Errors of odometry. The random walk has none that all steps share, and ten times as much
+    noise more."""
+    filter: ReducedRankEkfOptions = ReducedRankEkfOptions()
+    """Parameters of the peer."""
+
+
+@dataclass(frozen=True)
+class SlamCell:
+    """What the methods make of one drive with one odometry."""
+
+    path_m: float
+    key_poses: int
+    odometry: MethodRow
+    filter: MethodRow
+    ours: MethodRow
+
+
+def cell_keys(options: SlamStudyOptions) -> tuple[str, ...]:
+    """Return all cells."""
+    return tuple(
+        f"{site}-{kind}-{form}-{options.seed + number}"
+        for site in options.recordings
+        for kind in DriftKind
+        for form in Form
+        for number in range(options.seeds)
+    )
+
+
+def site_of(key: str) -> str:
+    """Return the recording of a cell."""
+    return "-".join(key.split("-")[:2])
+
+
+def read_drive(options: SlamStudyOptions, site: str) -> TrueDrive:
+    """Return a recording with its true poses."""
+    vehicle, run = site.split("-")
+    if vehicle == "ship":
+        return ship_run(Path(options.data) / SHIP, int(run))
+    return robot_run(Path(options.data) / ROBOT, int(run))
+
+
+def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:
+    """Return a cell."""
+    *_, kind, form, seed = key.split("-")
+    recipe = recipe_of(DriftKind(kind), options.drift)
+    odometry = drifted(drive.truth, recipe, Form(form), int(seed))
+    stated = stated_drift(drive.truth, recipe, Form(form))
+    ours, rows = our_row(drive, odometry, stated, options.noise_ut)
+    return SlamCell(
+        path_m=float(drive.path_m),
+        key_poses=len(rows),
+        odometry=odometry_row(drive, odometry, rows),
+        filter=filter_row(drive, odometry, rows, options.filter),
+        ours=ours,
+    )
+
+
+def recipe_of(kind: DriftKind, published: DriftRecipe) -> DriftRecipe:
+    """Return the errors of a kind of drift."""
+    if kind is DriftKind.PUBLISHED:
+        return published
+    level = published.level_m + WALK_TIMES * published.drift_m
+    return published.model_copy(update={"drift_m": 0.0, "level_m": level})

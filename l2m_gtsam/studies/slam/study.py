@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.slam.cells import (
+from l2m_gtsam.studies.slam.methods import (
+    MethodRow,
     SlamCell,
     SlamStudyOptions,
     cell_keys,
@@ -15,7 +16,6 @@ from l2m_gtsam.studies.slam.cells import (
     read_drive,
     site_of,
 )
-from l2m_gtsam.studies.slam.methods import MethodRow
 from l2m_gtsam.studies.slam.recordings import TrueDrive
 from l2m_gtsam.studies.study import Study
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
+from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.troubles.options import Trouble
 from tests.drives.troubled import OPTIONS, drive, hall

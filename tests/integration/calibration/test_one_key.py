@@ -14,7 +14,7 @@ from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.calibration.optimise import Optimizer, covariance_by_qr, joint_covariance
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FieldSample, FloatArray, KnownSensor
-from l2m_gtsam.records.disturbance import EXPLAINED
+from l2m_gtsam.records.error_budget import EXPLAINED
 from l2m_gtsam.solve.closed_form import ClosedFormOptions, Method
 from tests.worlds.exact import DipoleWorld, dipole_world, drive, random_sensors
 

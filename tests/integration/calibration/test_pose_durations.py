@@ -7,7 +7,7 @@ from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.pose_duration import DurationSource
+from l2m_gtsam.records.error_budget import DurationSource
 from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble
 from tests.drives.troubled import DRIVE, OPTIONS, hall

@@ -8,8 +8,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.qa.verdict.uncertainty import stated_wrongly
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
-from l2m_gtsam.records.stated_size import StatedSize
-from l2m_gtsam.records.variance_shares import ErrorCause
+from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
 from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble
 from tests.drives.troubled import DRIVE, OPTIONS, hall

@@ -10,7 +10,7 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.one_key import OneKeySolution, solve_one_key
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, LidarMotion, Readings
 from l2m_gtsam.mapping.map_building import map_fields, sensor_positions
-from l2m_gtsam.mapping.suite_shifts import suite_errors
+from l2m_gtsam.mapping.shifts import suite_errors
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from tests.drives.uncertain import (
     GIVEN,

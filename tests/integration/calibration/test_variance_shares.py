@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
-from l2m_gtsam.records.variance_shares import ErrorCause, VarianceShare
+from l2m_gtsam.records.error_budget import ErrorCause, VarianceShare
 from l2m_gtsam.studies.troubles.options import Trouble
 from tests.drives.troubled import drive
 

@@ -10,8 +10,7 @@ from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.suite_sizes import stated_doubts
 from l2m_gtsam.studies.troubles.options import TroublesOptions, World
-from l2m_gtsam.studies.troubles.places import place_of
-from l2m_gtsam.studies.troubles.surveys import known_suite, survey_of
+from l2m_gtsam.studies.troubles.surveys import known_suite, place_of, survey_of
 
 OPTIONS, SEED = TroublesOptions(survey_readings=900), 742
 

@@ -17,7 +17,7 @@ from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
-from l2m_gtsam.storage.online_state import SavedState, read_state, write_state
+from l2m_gtsam.storage.online_log import SavedState, read_state, write_state
 from tests.drives.lost import QUICK, lost_drive, searching
 from tests.drives.online import OnlineRun, driven, seconds_of, with_readings
 from tests.drives.slam import COARSE, SlamDrive, calibrated, laps, slam_drive, small_hall

@@ -12,8 +12,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult, Uncertainty
 from l2m_gtsam.slam.exploration import NOTHING_GAINED, Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.studies.slam.recipes import DriftRecipe, Form, drifted
-from l2m_gtsam.studies.slam.recordings import SHIP, TrueDrive, ship_run
+from l2m_gtsam.studies.slam.recordings import SHIP, DriftRecipe, Form, TrueDrive, drifted, ship_run
 from tests.drives.calibrations import sensor
 from tests.worlds.yard import NOISE as YARD_NOISE_UT
 from tests.worlds.yard import route, world

@@ -22,7 +22,7 @@ from l2m_gtsam.calibration.cluster_robust import (
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.records.disturbance import EXPLAINED, Unmodelled
+from l2m_gtsam.records.error_budget import EXPLAINED, Unmodelled
 
 READINGS, SHARED, FEW = 240, 12, 8
 LASTS = READINGS // 16  # readings in a row: a part of the drive

@@ -9,7 +9,7 @@ from l2m_gtsam.calibration.stated_sizes import (
     size_of_noise,
     without_prior,
 )
-from l2m_gtsam.records.stated_size import LEAST_GAIN
+from l2m_gtsam.records.error_budget import LEAST_GAIN
 from l2m_gtsam.solve.linear_algebra import inverse
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, Readings, Trajectory
-from l2m_gtsam.mapping.pose_shifts import survey_poses
+from l2m_gtsam.mapping.shifts import survey_poses
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 
 COUNT, STEP = 20, 1e-6

@@ -6,8 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Trajectory
 from l2m_gtsam.mapping.map_building import map_fields, sensor_positions
+from l2m_gtsam.mapping.shifts import TIME, suite_covariance, suite_errors
 from l2m_gtsam.mapping.suite_calibration import errors_in_common
-from l2m_gtsam.mapping.suite_shifts import TIME, suite_covariance, suite_errors
 from l2m_gtsam.maps.suite_errors import SIZE
 from l2m_gtsam.recording.sync import TWIST_S, with_offsets
 

@@ -12,10 +12,9 @@ from l2m_gtsam.maps.harmonic import compiled, compiled_tile, harmonic_map, poten
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile
 from l2m_gtsam.maps.harmonic.evidence import Weights
-from l2m_gtsam.maps.harmonic.family import UniformField
+from l2m_gtsam.maps.harmonic.family import Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.tile import Tile

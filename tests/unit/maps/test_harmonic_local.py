@@ -6,8 +6,8 @@ from scipy.optimize import minimize
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.evidence import evidence, normal_of
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.local import NAMES, LocalOptions, local_hyperparameters
 from l2m_gtsam.maps.training import TrainingSet, training_set

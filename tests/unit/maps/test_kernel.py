@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.distance import cdist
 
-from l2m_gtsam.maps.kernel import kernel_matrix, scaled
+from l2m_gtsam.maps.posterior import kernel_matrix, scaled
 
 # The exponent is a difference of squares of up to 30 length scales, whose digits end at 1e-13.
 ROUNDING = 1e-12

@@ -7,7 +7,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.bilinear.bilinear_map import BilinearMap
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map, map_from_state
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.hyperparameters import KernelHyperparameters
 from l2m_gtsam.maps.sliding_gp import SlidingGP, SlidingGPOptions
 from tests.worlds.exact import dipole_world

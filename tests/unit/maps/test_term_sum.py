@@ -8,9 +8,8 @@ from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.compiled_tile import sources_of
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import Weights
-from l2m_gtsam.maps.harmonic.family import Family, UniformField
+from l2m_gtsam.maps.harmonic.family import Family, Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
 from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, SourceFile
+from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.qa.fleet import rotations_apart
 from l2m_gtsam.qa.metrics.changes import (
     compare_calibrations,
@@ -22,7 +23,6 @@ from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.validation import judge_validation
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
 from l2m_gtsam.records.validation import CalibrationPart
-from l2m_gtsam.solve.rotation import polar_rotation
 from tests.drives.calibrations import SIGMA, calibration, open_in, rotations, sensor, unsolved
 
 CHANCE = 1e-3

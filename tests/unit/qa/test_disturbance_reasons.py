@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.qa.verdict.disturbances import disturbance_reasons
+from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
-from l2m_gtsam.records.variance_shares import ErrorCause, VarianceShare
+from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind, ErrorCause, VarianceShare
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.calibration_file import read_calibration
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from l2m_gtsam.qa.fleet_history import verdict_histories
+from l2m_gtsam.qa.fleet import verdict_histories
 from l2m_gtsam.qa.options import FleetOptions
 from l2m_gtsam.qa.report.fleet_page import fleet_page
 from tests.drives.fleet_rows import row

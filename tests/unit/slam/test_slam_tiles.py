@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.slam.options import TileOptions
 from l2m_gtsam.slam.unknown_field.tiles import (

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.hyperparameters import Hyperparameters
+from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.slam.options import DriftOptions, TileOptions
 from l2m_gtsam.slam.relative_motion import RelativeMotions

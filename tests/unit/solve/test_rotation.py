@@ -8,7 +8,7 @@ from scipy.linalg import polar
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.solve.rotation import polar_rotation
+from l2m_gtsam.geometry import polar_rotation
 
 
 @settings(max_examples=50)

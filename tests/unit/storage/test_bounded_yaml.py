@@ -12,7 +12,7 @@ from ruamel.yaml.error import YAMLError
 
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError
-from l2m_gtsam.storage.bounded_yaml import MAX_BYTES, MAX_DEPTH, BoundedYAML, TooMuchYAMLError
+from l2m_gtsam.storage.yaml_file import MAX_BYTES, MAX_DEPTH, BoundedYAML, TooMuchYAMLError
 from tests.support.alarms import ends_within
 
 MOST_S = 5.0  # of a core; the worst takes under 1 s here

@@ -6,9 +6,13 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.records.disturbance import Disturbance, DisturbanceKind
-from l2m_gtsam.records.stated_size import StatedSize
-from l2m_gtsam.records.variance_shares import ErrorCause, VarianceShare
+from l2m_gtsam.records.error_budget import (
+    Disturbance,
+    DisturbanceKind,
+    ErrorCause,
+    StatedSize,
+    VarianceShare,
+)
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from tests.drives.calibrations import calibration, sensor
 

@@ -15,8 +15,13 @@ from l2m_gtsam.studies.changes.cells import (
     false_alarms,
     found_changes,
 )
-from l2m_gtsam.studies.changes.loads import Loads, five_changes, joined, outside
-from l2m_gtsam.studies.changes.options import ChangesStudyOptions
+from l2m_gtsam.studies.changes.loads import (
+    ChangesStudyOptions,
+    Loads,
+    five_changes,
+    joined,
+    outside,
+)
 from l2m_gtsam.studies.changes.study import CHANGES
 
 OPTIONS = ChangesStudyOptions()

@@ -1,7 +1,6 @@
 """The summary and the page of the study of SLAM, from cells that are made up."""
 
-from l2m_gtsam.studies.slam.cells import SlamCell, SlamStudyOptions
-from l2m_gtsam.studies.slam.methods import MethodRow
+from l2m_gtsam.studies.slam.methods import MethodRow, SlamCell, SlamStudyOptions
 from l2m_gtsam.studies.slam.study import SLAM
 
 

@@ -18,9 +18,8 @@ from l2m_gtsam.studies.troubles.drives import (
     walk,
 )
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
-from l2m_gtsam.studies.troubles.places import place_of
 from l2m_gtsam.studies.troubles.study import TROUBLES, CellName, inside, kind, row_of
-from l2m_gtsam.studies.troubles.surveys import known_suite, survey_of
+from l2m_gtsam.studies.troubles.surveys import known_suite, place_of, survey_of
 
 OPTIONS = TroublesOptions(surveys=2, drives=1)
 

@@ -10,10 +10,8 @@ import pytest
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.simulate.hall_drives import calibration_drive
 from l2m_gtsam.simulate.steel_hall import steel_hall
-from l2m_gtsam.studies.validation.cells import ValidationCell, is_right
-from l2m_gtsam.studies.validation.drives import altered
-from l2m_gtsam.studies.validation.options import TrueCause, ValidationStudyOptions
-from l2m_gtsam.studies.validation.study import VALIDATION, change_of
+from l2m_gtsam.studies.validation.drives import TrueCause, ValidationStudyOptions, altered
+from l2m_gtsam.studies.validation.study import VALIDATION, ValidationCell, change_of, is_right
 
 OPTIONS = ValidationStudyOptions()
 STEEL = np.array([1.0, 2.0, 0.5])

@@ -7,8 +7,7 @@ import pytest
 
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.studies.peers.reduced_rank_ekf import ReducedRankEkfOptions, reduced_rank_ekf
-from l2m_gtsam.studies.slam.recipes import DriftRecipe, Form, drifted
-from l2m_gtsam.studies.slam.recordings import SHIP, ship_run
+from l2m_gtsam.studies.slam.recordings import SHIP, DriftRecipe, Form, drifted, ship_run
 
 PUBLISHED = {1: (1.91, 0.58, 0.53, 0.09), 2: (1.45, 0.39, 0.52, 0.11)}
 """Rms of dead reckoning and of the filter in metres, each with its spread, by run."""
