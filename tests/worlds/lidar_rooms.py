@@ -41,7 +41,7 @@ ROOM = Room(
 CORRIDOR = Room(((-500.0, -1.5, 0.0), (500.0, 1.5, 2.8)))
 
 
-def directions(beams: int = 32, columns: int = 360) -> FloatArray:
+def directions(beams: int = 32, columns: int = 180) -> FloatArray:
     """Return the rays of a spinning lidar, +-20 degrees up and down, shape (beams * columns, 3)."""
     up, around = np.meshgrid(
         np.deg2rad(np.linspace(-20, 20, beams)),

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
@@ -31,21 +31,23 @@ STRONG = 0.6  # uT/A, of a current that swings by 2 A: twenty times the noise
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A drive and its calibrations without and with the motor's current."""
+    """A drive and its calibrations without and with the motor's current, made when asked for."""
 
+    seed: int
     drive: MovingDrive
-    silent: CalibrationResult
-    told: CalibrationResult
+
+    @cached_property
+    def silent(self) -> CalibrationResult:
+        return calibrate(self.drive.silent, surveyed(self.seed), options(self.drive))
+
+    @cached_property
+    def told(self) -> CalibrationResult:
+        return calibrate(self.drive.recording, surveyed(self.seed), options(self.drive))
 
 
 @cache
 def calibrated(seed: int, strengths: tuple[float, ...]) -> Calibrated:
-    drive = moving_drive(seed, strengths)
-    results = (
-        calibrate(recording, surveyed(seed), options(drive))
-        for recording in (drive.silent, drive.recording)
-    )
-    return Calibrated(drive, *results)
+    return Calibrated(seed, moving_drive(seed, strengths))
 
 
 def vector(sensor: SensorCalibration) -> FloatArray:
