@@ -1,12 +1,33 @@
 """The demonstration and a small fleet on disk, made once for all tests of the command line."""
 
 import json
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
+from l2m_gtsam.batch import drives, reports, validation
 from tests.drives.fleet_runs import FleetRun, small_fleet
 from tests.support.command_line import Demo, l2m
 from tests.worlds.halls import SMALL_HALL
+
+
+@pytest.fixture(scope="module")
+def without_pages() -> Iterator[None]:
+    """Draw no pages and pictures, which take a second each and are looked at in other tests."""
+
+    def empty(*_: object) -> str:
+        return ""
+
+    def touched(_: object, path: Path) -> None:
+        path.touch()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reports, "calibration_page", empty)
+        patch.setattr(reports, "localisation_page", empty)
+        patch.setattr(validation, "validation_page", empty)
+        patch.setattr(drives, "save_figure", touched)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,8 @@ from l2m_gtsam.storage.pose_files import read_tum
 from tests.drives.yard import CalibratedYard, calibrated_yard
 from tests.support.command_line import complaint_here, l2m
 
+pytestmark = pytest.mark.usefixtures("without_pages")
+
 PROGRAM = [sys.executable, "-c", "from l2m_gtsam.cli.app import main; main()"]
 TIMEOUT_S = 120
 

@@ -14,6 +14,8 @@ from tests.drives.bags import Entry, ros, write
 from tests.support.command_line import complaint_here, l2m
 from tests.worlds.yard import NOISE, START, STEP, Yard, make_yard, route, world
 
+pytestmark = pytest.mark.usefixtures("without_pages")
+
 H = np.array([0.8, -0.5, 0.6])  # uT/A
 
 

@@ -4,12 +4,15 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.support.command_line import l2m, l2m_process
 from tests.worlds.halls import SMALL_HALL
 from tests.worlds.quick_maps import QUICK_HARMONIC
+
+pytestmark = pytest.mark.usefixtures("without_pages")
 
 PRIOR = {"floor_scale": 4.0, "floor_depth": 0.6, "noise": 0.1}
 QUICK = {"mapping": {"model": {"harmonic": QUICK_HARMONIC | {"hyperparameters": PRIOR}}}}

@@ -10,21 +10,13 @@ from l2m_gtsam.studies import run
 from tests.support.command_line import complaint_here, l2m
 from tests.support.one_process import computed_here
 from tests.worlds.study_sites import TINY_BASIN as TINY
-from tests.worlds.study_sites import one_row_site
 
 
 def test_a_study_from_options_to_page_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One cell, in another process; the second run has one more to do, the third nothing."""
-    one_start = TINY.model_copy(
-        update={
-            "starts": 1,
-            "few_starts": 1,
-            "rings": 1,
-            "site": one_row_site(0.2, size=(11.0, 6.4)),
-        }
-    )
+    one_start = TINY.model_copy(update={"starts": 1, "few_starts": 1, "rings": 1})
     options, out = tmp_path / "tiny.yaml", tmp_path / "out"
     command = ("study", "basin", "--options", options, "--out", out, "--workers")
     write_yaml(options, one_start.model_dump(mode="json"), "Small.")

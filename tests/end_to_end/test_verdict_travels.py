@@ -16,7 +16,6 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from ruamel.yaml import YAML
 
 from l2m_gtsam.batch import fleet as batch_fleet
-from l2m_gtsam.batch import reports
 from l2m_gtsam.cli.app import app
 from l2m_gtsam.cli.maps import map_app
 from l2m_gtsam.errors import Notice
@@ -30,6 +29,8 @@ from l2m_gtsam.storage.yaml_file import BoundedYAML
 from tests.drives.yard import CalibratedYard, calibrated_yard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
 from tests.support.one_process import computed_here
+
+pytestmark = pytest.mark.usefixtures("without_pages")
 
 FORMATS = ("ros2-launch", "urdf", "kalibr", "json", "bias-scale", "px4", "ardupilot")
 ROBOT = '<robot name="r">\n  <link name="lidar"/>\n</robot>\n'
@@ -164,11 +165,10 @@ class Commands(RuleBasedStateMachine):
 def test_a_fail_leaves_no_file_without_a_verdict(
     place: CalibratedYard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six walks of six commands; pages, which take long, are drawn elsewhere.
+    """Six walks of six commands.
 
     A text that several commands read is parsed for the first of them.
     """
-    monkeypatch.setattr(reports, "calibration_page", lambda *_, **__: "")
     parsed, parse = dict[str, Any](), BoundedYAML.load
 
     def load(reader: BoundedYAML, stream: Any) -> Any:

@@ -15,12 +15,10 @@ from l2m_gtsam.studies.site import SiteOptions
 from tests.worlds.quick_maps import quick
 
 
-def one_row_site(
-    noise: float, kind: str = "harmonic", size: tuple[float, float] = (16.0, 9.0)
-) -> SiteOptions:
-    """Return a hall of this size (m) with this noise of its sensors (uT) and a quick map."""
+def one_row_site(noise: float, kind: str = "harmonic") -> SiteOptions:
+    """Return the hall with this noise of its sensors (uT) and a quick map of this kind."""
     hall = ScenarioOptions(
-        floor_plan=FloorPlanOptions(length=size[0], width=size[1], rack_rows=1, blocks=1),
+        floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
         suite=MappingSuiteOptions(lateral=(0.0,)),
         array=SensorArrayOptions(count=1),
         noise=NoiseOptions(field=noise),

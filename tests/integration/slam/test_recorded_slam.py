@@ -1,7 +1,7 @@
 """A recorded drive in the map of another, by a sensor that mapped without a calibration.
 
-Its start is told or looked for. Calibrated and mapped is the first run alone. Poses of the second, to which drift is added, are its
-odometry; without it they are what errors are compared with.
+Its start is told or looked for. Calibrated and mapped is the first run alone. Poses of the second,
+to which drift is added, are its odometry; without it they are what errors are compared with.
 """
 
 from dataclasses import replace

@@ -14,8 +14,10 @@ import pytest
 
 from l2m_gtsam.errors import ClusterError, ConfigError
 from l2m_gtsam.parallel.cluster import ClusterOptions
+from l2m_gtsam.studies import run as study_run
 from l2m_gtsam.studies.run import STUDY_FILE, run_study
 from tests.support.inline_study import run_inline
+from tests.support.one_process import computed_here
 from tests.support.toy_study import TOY, ToyOptions, ToySummary
 
 ROOT = Path(__file__).parents[3]
@@ -44,28 +46,30 @@ def counted(log: Path) -> dict[str, int]:
     return {key: lines.count(key) for key in lines}
 
 
-def test_two_workers_give_the_digits_of_one(tmp_path: Path, expected: ToySummary) -> None:
-    assert run(tmp_path, ToyOptions(), workers=2) == expected
-    text = (tmp_path / "toy.md").read_text()
-    assert TOY.page(expected) in text
-    assert json.loads((tmp_path / STUDY_FILE).read_text())["summary"]["mean"] == expected.mean
-
-
-def test_a_lost_worker_loses_nothing(tmp_path: Path, expected: ToySummary) -> None:
-    log = tmp_path / "log"
+def test_two_workers_give_the_digits_of_one_and_one_that_is_lost_loses_nothing(
+    tmp_path: Path, expected: ToySummary
+) -> None:
+    log, out = tmp_path / "log", tmp_path / "out"
     options = ToyOptions(log=str(log), deadly="cell-3")
-    assert run(tmp_path / "out", options, workers=2) == expected
+    assert run(out, options, workers=2) == expected
     assert counted(log)["cell-3"] == 2
+    assert TOY.page(expected) in (out / "toy.md").read_text()
+    assert json.loads((out / STUDY_FILE).read_text())["summary"]["mean"] == expected.mean
 
 
-def test_only_missing_cells_are_computed(tmp_path: Path, expected: ToySummary) -> None:
+def test_only_missing_cells_are_computed(
+    tmp_path: Path, expected: ToySummary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study_run, "computed", computed_here)
     log = tmp_path / "log"
     run_inline(TOY, ToyOptions(cells=4), tmp_path / "out")
     assert run(tmp_path / "out", ToyOptions(log=str(log))) == expected
     assert set(counted(log)) == {"cell-4", "cell-5"}
 
 
-def test_a_killed_study_goes_on(tmp_path: Path, expected: ToySummary) -> None:
+def test_a_killed_study_goes_on(
+    tmp_path: Path, expected: ToySummary, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, log = tmp_path / "out", tmp_path / "log"
     program = (
         "import sys; from pathlib import Path\n"
@@ -97,6 +101,7 @@ def test_a_killed_study_goes_on(tmp_path: Path, expected: ToySummary) -> None:
     assert before
     assert len(before) < len(expected.values)
     log.unlink()
+    monkeypatch.setattr(study_run, "computed", computed_here)
     assert run(out, ToyOptions(log=str(log))) == expected
     assert not before & set(counted(log))
 
