@@ -192,11 +192,18 @@ class KeyPoseBatch(ABC):
         return self._own_stamp(values, key_pose) + of_sensors
 
     def _evaluated(self, values: gtsam.Values, present: list[int]) -> KeyPoseResiduals:
+        return key_pose_residuals(
+            self._readings, self._field(values), *self._evaluation_point(values, present)
+        )
+
+    def _evaluation_point(
+        self, values: gtsam.Values, present: list[int]
+    ) -> tuple[FloatArray, FloatArray, Calibrations]:
+        """Return the key pose of each reading, (N, 3, 3) and (N, 3) in metres, and the sensors."""
         R, p = np.tile(np.eye(3), (len(self._rows), 1, 1)), np.zeros((len(self._rows), 3))
         slots = {k: slot for slot, k in enumerate(self._rows)}
         for k in present:
             pose = self._pose(values, k)
             R[slots[k]], p[slots[k]] = pose.rotation().matrix(), pose.translation()
         sensors = self._variables.calibrations(values, self._variables.on(np.arange(len(self))))
-        field = self._field(values)
-        return key_pose_residuals(self._readings, field, R[self._slot], p[self._slot], sensors)
+        return R[self._slot], p[self._slot], sensors

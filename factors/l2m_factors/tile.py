@@ -23,7 +23,12 @@ import numpy as np
 
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
 from l2m_factors.key_pose_batch import KeyPoseBatch
-from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
+from l2m_factors.key_pose_readings import (
+    Calibrations,
+    KeyPoseReadings,
+    KeyPoseResiduals,
+    key_pose_residuals,
+)
 from l2m_factors.keys import M, X
 from l2m_factors.motion import skew
 from l2m_factors.slow_error import SlowError
@@ -100,6 +105,8 @@ class TileBatch(KeyPoseBatch):
     ) -> None:
         super().__init__(readings, fixed)
         self._number, self._anchor, self._tile = number, anchor, field
+        self._point: tuple[FloatArray, FloatArray, Calibrations]  # of the last evaluation
+        self._by_weights: dict[int, FloatArray] = {}  # what no factor has taken yet
 
     def keys_of(self, key_pose: int) -> list[int]:
         """Return the keys that the readings on a key pose depend on.
@@ -115,7 +122,7 @@ class TileBatch(KeyPoseBatch):
         """Return derivatives by each of ``keys_of`` of n readings, each of shape (n, 3, .)."""
         rows, relative = self._rows[key_pose], self._pose(values, key_pose)
         by_sensors = self._variables.jacobians(residuals.reading, rows)
-        blocks = [self._by_weights(values, key_pose), *by_sensors]
+        blocks = [self._taken_by_weights(key_pose), *by_sensors]
         if key_pose == self._anchor:
             return blocks
         by_key = residuals.de_dX[rows]
@@ -148,11 +155,30 @@ class TileBatch(KeyPoseBatch):
         by_key = np.concatenate([-R @ skew(where.t_key), np.tile(R, (n, 1, 1))], axis=2)
         return [by_key, -by_key @ where.T_anchor_key.inverse().AdjointMap(), *blocks]
 
-    def _by_weights(self, values: gtsam.Values, key_pose: int) -> FloatArray:
-        where = self.places(values, key_pose)
-        R = where.T_anchor_key.rotation().matrix() @ where.R_key_lidar
-        C = self._variables.C(values, self._rows[key_pose])
-        return np.asarray(C @ R.transpose(0, 2, 1) @ self._tile.features(where.x))
+    def _evaluated(self, values: gtsam.Values, present: list[int]) -> KeyPoseResiduals:
+        self._point = R, p, sensors = self._evaluation_point(values, present)
+        self._by_weights = {}
+        return key_pose_residuals(self._readings, self._field(values), R, p, sensors)
+
+    def _taken_by_weights(self, key_pose: int) -> FloatArray:
+        """Return derivatives by the weights of n readings, shape (n, 3, m).
+
+        All of the batch are evaluated at once, and each is let go when its factor has taken it: a
+        drive's together are as large as its linear system.
+        """
+        if key_pose not in self._by_weights:
+            every = self._derivatives_by_weights()
+            self._by_weights = {k: every[rows] for k, rows in self._rows.items()}
+        return self._by_weights.pop(key_pose)
+
+    def _derivatives_by_weights(self) -> FloatArray:
+        """Return derivatives by the weights where all N residuals were evaluated, (N, 3, m)."""
+        (R, p, known), readings = self._point, self._readings
+        R_key_lidar, p_key_lidar = readings.lidar_at(known.offset)
+        t_key = np.einsum("nij,nj->ni", R_key_lidar, known.t[readings.sensor]) + p_key_lidar
+        x = np.einsum("nij,nj->ni", R, t_key) + p
+        C = known.distortion[readings.sensor, :9].reshape(-1, 3, 3)
+        return np.asarray(C @ (R @ R_key_lidar).transpose(0, 2, 1) @ self._tile.features(x))
 
     def _pose(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:
         if key_pose == self._anchor:
