@@ -18,7 +18,7 @@ and not their sizes, leaves them to the end where calibrations are on all factor
 process with a segmentation fault in a section of 27 variables (GTSAM 4.3.0).
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import TypeVar
@@ -70,6 +70,33 @@ def levenberg_marquardt(
         values = second.optimize()
         left -= second.iterations()
     return Optimised(values, Ending.TOLERANCE if left > 0 else Ending.ITERATION_LIMIT)
+
+
+def stepwise_levenberg_marquardt(
+    graph: gtsam.NonlinearFactorGraph,
+    start: gtsam.Values,
+    ordering: gtsam.Ordering,
+    max_iterations: int,
+    close: float = TOLERANCE,
+) -> Generator[None, None, gtsam.Values]:
+    """Minimise a graph's error by Levenberg-Marquardt, one iteration after the other.
+
+    Yields after each but the last, and returns the values. Parameters as of
+    ``levenberg_marquardt``, whose result it has.
+    """
+    first = _optimizer(graph, start, ordering, max_iterations, close, LinearSolver.CHOLESKY)
+    before, error = first.lambda_(), first.error()
+    while True:
+        first.iterate()
+        decrease, error = error - first.error(), first.error()
+        converged = decrease <= max(close, TOLERANCE * (error + decrease))
+        if converged or first.iterations() >= max_iterations:
+            break
+        yield
+    left = max_iterations - first.iterations()
+    if first.lambda_() > before and left > 0:  # as there: Cholesky has failed
+        return _optimizer(graph, first.values(), ordering, left, close, LinearSolver.QR).optimize()
+    return first.values()
 
 
 def colamd_ordering(graph: gtsam.NonlinearFactorGraph) -> gtsam.Ordering:

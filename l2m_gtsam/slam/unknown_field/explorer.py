@@ -3,12 +3,14 @@
 The memory is one Gaussian over the field's weights, tile by tile, the key poses that anchor tiles,
 and the last key pose. The last stretch of the path is solved again as it grows, with the memory as
 its prior; at its end the memory is updated, and the stretch's other poses are marginalised. So both
-cost and memory grow with the building and not with the drive.
+cost and memory grow with the building and not with the drive. The work is spread over the key poses
+that come meanwhile.
 
 The correlations between tiles are essential: tiles that count as independent, or as exactly known,
 drift as odometry does, and the sigmas do not show it.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gtsam
@@ -29,14 +31,16 @@ from l2m_gtsam.slam.unknown_field.open_section import OpenSection
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior
 
 GROUP, SECTION = 20, 100  # limits in key poses instead of metres, for a vehicle that turns
+FINISHED = object()
+PIECE_M = 0.1  # of path, in which a piece of the work is done; at least one at a key pose
 
 
 class ExploringOptions(Options):
     """How an unknown field is explored on line; lengths in metres of path."""
 
     group_m: float = Field(default=2.0, gt=0)
-    """New key poses are solved after this distance; until then they are predicted by odometry. Half
-    of it costs nearly twice the time."""
+    """New key poses are solved after this distance; until then, and while it is solved, they are
+    predicted by odometry. Half of it costs nearly twice the time."""
     section_m: float = Field(default=10.0, gt=0)
     """So much is solved together; of what lies further back tiles alone are kept. A vehicle that
     comes back as far off as odometry has drifted has to find its place within it."""
@@ -117,6 +121,7 @@ class Explorer:
         self._pace = ExploringOptions() if pace is None else pace
         self._memory = FieldMemory.at_start(start)
         self._waiting: list[ArrivedKeyPose] = []  # until they are solved
+        self._work: Iterator[None] | None = None  # on the section, which is not finished
         self._path_m = self._solved_m = self._opened_m = 0.0
         self._first, self._solved = 0, -1
         self._past: list[MarginalizedPose] = []
@@ -147,8 +152,11 @@ class Explorer:
         self._dead_reckon(key_pose)
         if self._section is None and self._path_m >= self._options.tiles.learn_over_m:
             self._learn()
-        elif self._section is not None and self._is_due():
-            self._solve(self._section)
+        elif self._section is not None:
+            if self._work is None and self._is_due():
+                self._work = self._solving(self._section)
+            for _ in range(max(round(key_pose.length_m / PIECE_M), 1)):
+                self._go_on()
         return self._belief
 
     def finish(self) -> Belief:
@@ -161,8 +169,10 @@ class Explorer:
         """
         if self._section is None:
             self._learn()
-        elif self._waiting:
-            self._solve(self._section)
+        self._complete()
+        if self._section is not None and self._waiting:
+            self._work = self._solving(self._section)
+            self._complete()
         return self._belief
 
     @classmethod
@@ -189,13 +199,13 @@ class Explorer:
 
     def state(self) -> "ExplorerState":
         """Solve for what is waiting, close the section, and return what is to be kept."""
-        section = self._section
-        if section is None:
+        if self._section is None:
             return ExplorerState(None, self._memory, (), tuple(self._waiting), 0)
         self.finish()
         if self._solved > self._first:
-            self._hand_over(section, self._solved)
-        return ExplorerState(section.prior, self._memory, tuple(self._past), (), self._solved)
+            self._work = self._handing_over(self._section)
+            self._complete()
+        return ExplorerState(self._section.prior, self._memory, tuple(self._past), (), self._solved)
 
     def poses(self) -> list[gtsam.Pose3]:
         """Return all solved key poses, past ones relative to their anchors' current estimates."""
@@ -247,7 +257,8 @@ class Explorer:
             self._waiting.append(each)
             self._dead_reckon(each)
             if self._is_due():
-                self._solve(self._section)
+                self._work = self._solving(self._section)
+                self._complete()
 
     def _is_due(self) -> bool:
         path = self._path_m - self._solved_m
@@ -260,21 +271,41 @@ class Explorer:
             self._belief = predicted.marginalize_previous()
             self._path_m += key_pose.length_m
 
-    def _solve(self, section: OpenSection) -> None:
-        """Solve the last stretch with what is waiting, and begin another if it is long."""
-        with reported_ill_conditioning():
-            self._belief = section.extend(self._waiting)
-            self._solved, self._solved_m = self._waiting[-1].number, self._path_m
-            self._waiting = []
-            long = self._path_m - self._opened_m >= self._pace.section_m
-            if long or self._solved - self._first >= SECTION:
-                self._hand_over(section, self._solved)
+    def _go_on(self) -> None:
+        """Do a piece of the work on the section, if there is any."""
+        if self._work is not None:
+            with reported_ill_conditioning():
+                finished = next(self._work, FINISHED)
+            if finished is FINISHED:
+                self._work = None
 
-    def _hand_over(self, section: OpenSection, last: int) -> None:
+    def _complete(self) -> None:
+        """Do all work on the section that has begun."""
+        while self._work is not None:
+            self._go_on()
+
+    def _solving(self, section: OpenSection) -> Iterator[None]:
+        """Solve the last stretch with what is waiting, and begin another if it is long."""
+        group, path_m = self._waiting, self._path_m
+        self._waiting = []
+        belief = yield from section.extended(group)
+        self._solved, self._solved_m = group[-1].number, path_m
+        for each in self._waiting:
+            belief = belief.predicted(each.step, each.covariance).marginalize_previous()
+        self._belief = belief
+        long = path_m - self._opened_m >= self._pace.section_m
+        if long or self._solved - self._first >= SECTION:
+            yield
+            yield from self._handing_over(section)
+
+    def _handing_over(self, section: OpenSection) -> Iterator[None]:
+        """Marginalise the solved key poses but anchors, and begin another section."""
+        last = self._solved
         for k in range(len(self._past), last + 1):
             anchor = section.tile(k).anchor
             self._past.append(
                 MarginalizedPose(anchor, section.pose(anchor).between(section.pose(k)))
             )
-        self._memory, self._first, self._opened_m = section.closed(), last, self._path_m
+        self._memory = yield from section.closed()
+        self._first, self._opened_m = last, self._solved_m
         self._section = section.next(self._memory, last)

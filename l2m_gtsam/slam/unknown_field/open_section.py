@@ -1,6 +1,6 @@
 """The last stretch of a drive through an unknown field, solved again as it grows."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -25,7 +25,11 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import between_factor
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
-from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt
+from l2m_gtsam.slam.solver import (
+    colamd_ordering,
+    joint_covariance,
+    stepwise_levenberg_marquardt,
+)
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile, tile_of
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
@@ -161,14 +165,18 @@ class OpenSection:
         self._counted: list[TileReadings] = []
         self._prior: gtsam.NonlinearFactorGraph | None = None
         self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
+        self._linear = gtsam.GaussianFactorGraph()  # at its solution
 
     @property
     def prior(self) -> FieldPrior:
         """The prior of the field."""
         return self._field_prior
 
-    def extend(self, new: Sequence[ArrivedKeyPose]) -> Belief:
-        """Add key poses, solve, and return the posterior of the last."""
+    def extended(self, new: Sequence[ArrivedKeyPose]) -> Generator[None, None, Belief]:
+        """Add key poses, solve, and return the posterior of the last.
+
+        Yields between pieces of the work, of a linearisation each.
+        """
         self._key_poses += [each for each in new if each.number > self._first]
         parts = [each.readings for each in self._key_poses]
         self._of_section = SectionReadings(joined_readings(parts), self._sensors)
@@ -179,18 +187,28 @@ class OpenSection:
         entered = [self._enter(k) for k in numbers]
         stages = AGAIN if any(entered) else ONWARDS
         for scale in stages[:-1]:
-            self._solve(self._factors(numbers[0], scale), 1)
+            graph = self._factors(numbers[0], scale)
+            yield
+            yield from self._solved(graph, 1)
+            yield
         graph = self._factors(numbers[0], stages[-1])
+        yield
         for each in self._counted:
             tile = self._tiles[each.laid.number]
             for factor in each.penalties(self._of_section, tile):
                 graph.add(factor)
-        self._solve(graph, self._options.max_iterations)
+        yield
+        yield from self._solved(graph, self._options.max_iterations)
+        yield
+        self._linear = self._graph.linearize(self._values)
         return self._belief()
 
-    def closed(self) -> FieldMemory:
-        """Return the memory updated by the section."""
-        known = self._memory.known.updated(self._known(self._kept()))
+    def closed(self) -> Generator[None, None, FieldMemory]:
+        """Return the memory updated by the section; yields between pieces of the work."""
+        after = self._known(self._kept())
+        yield
+        known = self._memory.known.updated(after)
+        yield
         tiles = list(self._tiles)
         for each in self._counted:
             tile = tiles[each.laid.number]
@@ -292,7 +310,7 @@ class OpenSection:
         mu = np.where(recent, SOFT, np.inf)
         return TileReadings.weighed(laid, prediction, noise, mu, self._options.robust)
 
-    def _solve(self, graph: gtsam.NonlinearFactorGraph, most: int) -> None:
+    def _solved(self, graph: gtsam.NonlinearFactorGraph, most: int) -> Generator[None, None, None]:
         """Solve for all variables of the section, with a limit of steps."""
         if self._prior is None:
             self._prior = gtsam.NonlinearFactorGraph()
@@ -300,8 +318,10 @@ class OpenSection:
                 self._prior.add(factor)
         graph.push_back(self._prior)
         self._graph = graph
-        found = levenberg_marquardt(graph, self._values, colamd_ordering(graph), most, CLOSE)
-        self._values = found.values
+        order = colamd_ordering(graph)
+        self._values = yield from stepwise_levenberg_marquardt(
+            graph, self._values, order, most, CLOSE
+        )
 
     def _kept(self) -> list[int]:
         """Return the variables that the memory keeps or shares, the last pose at the end."""
@@ -319,7 +339,7 @@ class OpenSection:
     def _known(self, keys: list[int]) -> JointGaussian:
         """Return the joint posterior of some variables."""
         sizes = {key: self._size(key) for key in keys}
-        covariance = joint_covariance(self._graph.linearize(self._values), keys)
+        covariance = joint_covariance(self._linear, keys)
         return JointGaussian(part_of(self._values, keys), sizes, covariance)
 
     def _belief(self) -> Belief:
