@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import gtsam
+import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
@@ -35,6 +36,7 @@ from l2m_gtsam.records.error_budget import StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6
+NEAR_M = 5e-3  # that the map's errors, which change over decimetres, are not asked for again
 SEARCHED = 0.6  # of the way, when it is known which processes a drive has
 SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
 
@@ -110,7 +112,11 @@ def solve_uncertain(
     )
     by_parts = found.problem.by_parts(found.joint, found.estimate, scattered)
     if budget.found:
-        with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
+        moved = float(np.abs(found.estimate.t - near.t)[view.sensors].max())
+        if budget.poses is None and moved < NEAR_M:
+            with_them = drive.beside(budget)
+        else:
+            with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
         found = settle_by_any(
             with_them,
             found.estimate,

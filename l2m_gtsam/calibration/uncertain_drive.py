@@ -90,3 +90,11 @@ class UncertainDrive:
         moving = moving_fields(view.readings, options.moving_field_ut)
         coverage = replace(coverage, moving=moving, budget=budget)
         return cls(view, field_map, WeightsPrior.of(coverage))
+
+    def beside(self, budget: Budget) -> "UncertainDrive":
+        """Return the same with processes that are no errors of poses, and the map as it was asked.
+
+        Errors of poses cut a drive at other knots, for which the map has to be asked again.
+        """
+        coverage = replace(self.prior.coverage, budget=budget)
+        return replace(self, prior=WeightsPrior.of(coverage))

@@ -10,7 +10,11 @@ from l2m_gtsam.calibration.budget.processes import Process
 from l2m_gtsam.calibration.joint_information import JointInformation, Rows
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import DisturbanceKind
-from l2m_gtsam.solve.variance_components import VarianceComponents, WeightSystem
+from l2m_gtsam.solve.variance_components import (
+    VarianceComponents,
+    WeightSystem,
+    shared_components,
+)
 
 # Twice a logarithm of likelihood. Where a process is not there, half of all drives give zero, and
 # 0.7 % more than this (a mixture of chi-square distributions, Self and Liang, JASA 82, 1987).
@@ -208,7 +212,7 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess
     at = np.flatnonzero(every.any(axis=0))
     every = every[:, at]
     system = known.system.among(at)
-    fit = system.components_and_noise(every, known.squares)
+    fit = shared_components([system], [every], known.squares)
     system = system.whiter(fit.noise)
     kept = []
     for k, each in taken.items():
