@@ -85,6 +85,7 @@ def _print_online(done: "OnlineOutcome", out: Path) -> None:
 def _print_off_line(done: "SlamOutcome", out: Path, wide: bool) -> None:
     from l2m_gtsam.cli.tables.slam import (
         drift_lines,
+        gain_lines,
         scan_lines,
         slam_table,
         start_lines,
@@ -95,6 +96,7 @@ def _print_off_line(done: "SlamOutcome", out: Path, wide: bool) -> None:
     lines = (
         *start_lines(done.result.start),
         *drift_lines(done.result),
+        *gain_lines(done.result.gain),
         *scan_lines(done.result.scans),
         *truth_lines(done.record.truth),
     )

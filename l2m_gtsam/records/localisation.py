@@ -199,6 +199,39 @@ class Explored(Record):
 
 
 @dataclass(frozen=True)
+class Gain(Record):
+    """What a correction of odometry's poses is worth, without a truth.
+
+    Attributes
+    ----------
+    likelier
+        Logarithm of how much likelier the readings are at the corrected poses, less what these
+        cost against odometry.
+    moved_m
+        Root mean square distance of the corrected positions from odometry's, metres.
+    doubt
+        Probability that odometry's positions are nearer to the true ones, by the sigmas.
+    shown
+        Whether the correction is kept; if not, poses are odometry's with their sigmas.
+    """
+
+    likelier: float
+    moved_m: float
+    doubt: float
+    shown: bool
+
+    @property
+    def reason(self) -> str:
+        """The figures as a clause."""
+        change = "likelier" if self.likelier > 0 else "less likely"
+        return (
+            f"the readings are {change} by exp({abs(self.likelier):.0f}) at poses that they "
+            f"correct by {self.moved_m:.2g} m rms, and odometry is nearer to the truth than these "
+            f"with a probability of {self.doubt:.2g}"
+        )
+
+
+@dataclass(frozen=True)
 class LocalisationResult:
     """A drive localised in a magnetic map, or in the field that it met.
 
@@ -230,6 +263,8 @@ class LocalisationResult:
         Key poses by odometry and scans, without magnetometers; absent without scans.
     scale
         Of odometry; absent where it counts as right.
+    gain
+        What the correction of odometry is worth; absent where there was a map.
     """
 
     status: LocalisationStatus
@@ -248,3 +283,4 @@ class LocalisationResult:
     scans: ScanUse | None = None
     by_scans: Trajectory | None = None
     scale: OdometryScale | None = None
+    gain: Gain | None = None

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from l2m_gtsam.records.localisation import (
     DriftFigures,
     Explored,
+    Gain,
     LocalisationStatus,
     OdometryScale,
     ScanUse,
@@ -311,6 +312,9 @@ class LocalisationRecord(Record):
         That it was computed with.
     judgement
         The verdict with its thresholds; files of older versions have none.
+    gain
+        What the correction of odometry is worth; absent where there was a map, and in files of
+        older versions.
     """
 
     SHAPES: ClassVar[Mapping[str, str]] = {
@@ -339,3 +343,4 @@ class LocalisationRecord(Record):
     versions: dict[str, str]
     options: dict[str, Any]
     judgement: Judgement | None = None
+    gain: Gain | None = None

@@ -9,24 +9,23 @@ from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.localisation import Explored, LocalisationResult, LocalisationStatus
+from l2m_gtsam.records.localisation import Explored, Gain, LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drive import EXACT_START, Drive
 from l2m_gtsam.slam.localisation import NO_SCANS, prepared
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
 from l2m_gtsam.slam.result import localisation_result
-from l2m_gtsam.slam.slips import judged, with_open_jumps
+from l2m_gtsam.slam.slips import judged, with_open_jumps, with_recorded_jumps
 from l2m_gtsam.slam.solution import DriveSolution
+from l2m_gtsam.slam.unknown_field.kept_odometry import with_gain
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution, map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from l2m_gtsam.slam.unknown_field.whole_smoother import DriveLikelihood, map_whole_drive
 
 NO_REVISITS = "no place was revisited: readings of an unknown field remove little drift then"
-NOTHING_GAINED = (
-    "the poses are those of odometry: the readings are no likelier at poses that they correct"
-)
+NOTHING_GAINED = "the poses are those of odometry, for no gain is shown"
 NO_FIELD = (
     "no field explains the readings at poses that odometry allows: is the calibration that of "
     "these sensors, and does the odometry jump?"
@@ -103,8 +102,8 @@ def explore(
         DriveLikelihood(drive, options) if has_one_sensor(drive) else None,
     )
     drive = odometry.drive
-    mapped = solve_field(drive, options, progress)
-    refined = options.calibration is CalibrationUse.REFINED
+    mapped = where_gained(drive, solve_field(drive, options, progress), options)
+    refined = options.calibration is CalibrationUse.REFINED and mapped.is_corrected
     kept = calibration if refined else None
     result = localisation_result(drive, mapped.solution, by_scans, kept)
     explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
@@ -115,11 +114,16 @@ def explore(
             *odometry.notes,
             *result.notes,
             *([] if explored.returned else [NO_REVISITS]),
-            *([] if mapped.gained else [NOTHING_GAINED]),
+            *(
+                []
+                if mapped.gain is None or mapped.gain.shown
+                else [f"{NOTHING_GAINED}: {mapped.gain.reason}"]
+            ),
             *([] if mapped.noise is None else [noise_note(mapped.noise, drive)]),
         ),
         bag=recording.source,
         explored=explored,
+        gain=mapped.gain,
     )
     points, field = field_samples(mapped.solution.drive, mapped.solution)
     return Exploration(result, mapped.solution, points, field)
@@ -155,6 +159,23 @@ def solve_field(drive: Drive, options: SlamOptions, progress: Progress) -> Field
     prior = drive_prior(drive, poses, options.tiles)
     progress("learning the field's prior", 1.0)
     return map_drive(drive, poses, prior, options, progress)
+
+
+def where_gained(drive: Drive, mapped: FieldSolution, options: SlamOptions) -> FieldSolution:
+    """Return a solved drive; where nothing is shown to be gained, at the poses of odometry."""
+    if mapped.gain is not None:
+        return mapped
+    prior = drive_prior(drive, without_field(drive, options).poses, options.tiles)
+    recorded = with_recorded_jumps(drive)
+    odometry = without_field(recorded, options).poses
+    return with_gain(mapped, recorded, odometry, prior, options)
+
+
+def gain_notes(gain: Gain | None) -> tuple[str, ...]:
+    """Return that poses are odometry's, and why; none where they are corrected."""
+    if gain is None or gain.shown:
+        return ()
+    return (f"{NOTHING_GAINED}: {gain.reason}",)
 
 
 def explored_result(result: LocalisationResult, explored: Explored) -> LocalisationResult:

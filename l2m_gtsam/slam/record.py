@@ -106,6 +106,7 @@ def localisation_record(
         odometry=_odometry(solution.drive, result.odometry),
         start=None if result.start is None else _start(result.start),
         explored=result.explored,
+        gain=result.gain,
         scans=result.scans,
         truth=truth,
         picture=map_picture(context.field_map, result.trajectory.p),

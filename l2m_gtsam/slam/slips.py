@@ -121,6 +121,16 @@ def with_open_jumps(drive: Drive) -> Drive:
     return replace(drive, steps=replace(steps, R=R, p=p, covariance=covariance))
 
 
+def with_recorded_jumps(drive: Drive) -> Drive:
+    """Return a drive with all steps as recorded, uncertain by what slips would make of them."""
+    recorded = drive.as_recorded(drive.jumps)
+    covariance = recorded.steps.covariance.copy()
+    for each in drive.jumps:
+        d = difference(drive, each)
+        covariance[each.step] += np.outer(d, d)
+    return replace(recorded, steps=replace(recorded.steps, covariance=covariance))
+
+
 def difference(drive: Drive, jump: OdometryJump) -> FloatArray:
     """Return by what a recorded step differs from the continued motion, rad and m, shape (6,)."""
     step = drive.step(jump.step)

@@ -18,7 +18,7 @@ and not their sizes, leaves them to the end where calibrations are on all factor
 process with a segmentation fault in a section of 27 variables (GTSAM 4.3.0).
 """
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from typing import TypeVar
@@ -81,11 +81,12 @@ def stepwise_levenberg_marquardt(
 ) -> Generator[None, None, gtsam.Values]:
     """Minimise a graph's error by Levenberg-Marquardt, one iteration after the other.
 
-    Yields after each but the last, and returns the values. Parameters as of
+    Yields before the first and after each but the last, and returns the values. Parameters as of
     ``levenberg_marquardt``, whose result it has.
     """
     first = _optimizer(graph, start, ordering, max_iterations, close, LinearSolver.CHOLESKY)
     before, error = first.lambda_(), first.error()
+    yield
     while True:
         first.iterate()
         decrease, error = error - first.error(), first.error()
@@ -202,6 +203,27 @@ class Marginals:
         left = self._qr.joint(own, gtsam.EliminateQR)
         net = left.eliminateSequential(ordered(keys), gtsam.EliminateQR)
         return covariance_of(net.matrix()[0])
+
+    def variance_along(self, directions: Mapping[int, FloatArray]) -> float:
+        """Return ``d^T P d`` for a direction d in which variables move together.
+
+        Parameters
+        ----------
+        directions
+            Its part of each variable, shapes (6,) for poses.
+        """
+        # P d is where the minimum goes if the cost is less by d times the variables.
+        pulled = gtsam.GaussianFactorGraph()
+        pulled.push_back(self._linear)
+        for key, own in directions.items():
+            pulled.add(gtsam.HessianFactor(key, np.zeros((len(own), len(own))), own, 0.0))
+        tree = self._cholesky
+        after = unless_indeterminate(lambda: pulled.optimize(self._ordering))
+        if tree is None or after is None:  # errors that go together are the largest
+            sigma = (np.sqrt(own @ self.of(key) @ own) for key, own in directions.items())
+            return float(sum(sigma)) ** 2
+        before = tree.optimize()
+        return float(sum(own @ (after.at(key) - before.at(key)) for key, own in directions.items()))
 
     @cached_property
     def _cholesky(self) -> gtsam.GaussianBayesTree | None:

@@ -37,6 +37,9 @@ LEGEND = {
     "chi2_per_dof": "mean square of whitened residuals; 1 is consistent",
     "scale": "longer: share by which all distances are longer than odometry has them, with its "
     "sigma; null where odometry's scale counts as right",
+    "gain": "of a drive without a map: nats by which readings are likelier at the corrected poses "
+    "than at odometry's, m rms between both, probability that odometry's are nearer to the truth; "
+    "not shown: the poses are odometry's",
     "steps": "mean square of the whitened differences between steps of the poses and odometry's",
     "truth": "errors against a trajectory that was given, nothing aligned; expected nees: 6",
     "start": "candidates for the start of the drive over the whole map, the likeliest first; "
@@ -130,9 +133,9 @@ def write_slam(path: Path, record: LocalisationRecord) -> None:
     OutputError
         The file cannot be written.
     """
-    unjudged = {"judgement"} if record.judgement is None else None
+    absent = {name for name in ("judgement", "gain") if getattr(record, name) is None}
     file = _SlamFile("l2m-slam", 4, LEGEND, **_parts(record))
-    _write(path, _SLAM.dump_json(file, exclude=unjudged))
+    _write(path, _SLAM.dump_json(file, exclude=absent))
 
 
 def read_slam(path: Path) -> LocalisationRecord:

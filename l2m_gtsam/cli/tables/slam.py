@@ -6,7 +6,7 @@ from rich.table import Table
 
 from l2m_gtsam.batch.online_slam import OnlineOutcome
 from l2m_gtsam.cli.tables import new_table
-from l2m_gtsam.records.localisation import LocalisationResult, ScanUse, StartSearch
+from l2m_gtsam.records.localisation import Gain, LocalisationResult, ScanUse, StartSearch
 from l2m_gtsam.records.localisation_file import TruthRecord
 
 MOST_EVENTS = 20  # that are printed
@@ -70,6 +70,13 @@ def scan_lines(scans: ScanUse | None) -> tuple[str, ...]:
         f"{scans.chi2_per_dof:.2f}), {scans.rejected} were rejected"
     )
     return (line,)
+
+
+def gain_lines(gain: Gain | None) -> tuple[str, ...]:
+    """Return what the correction of odometry is worth, a line; none where there was a map."""
+    if gain is None:
+        return ()
+    return (f"{'gained' if gain.shown else 'no gain shown'}: {gain.reason}",)
 
 
 def online_lines(done: OnlineOutcome) -> tuple[str, ...]:

@@ -197,7 +197,7 @@ class OpenSection:
             tile = self._tiles[each.laid.number]
             for factor in each.penalties(self._of_section, tile):
                 graph.add(factor)
-        yield
+            yield
         yield from self._solved(graph, self._options.max_iterations)
         yield
         self._linear = self._graph.linearize(self._values)

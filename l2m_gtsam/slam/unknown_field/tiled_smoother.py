@@ -21,6 +21,7 @@ from l2m_factors import X
 from l2m_gtsam.calibration.optimise import TOLERANCE, Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
+from l2m_gtsam.records.localisation import Gain
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, place_readings, poses_in, sensors_in
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
@@ -71,9 +72,11 @@ class FieldSolution:
         Number of tiles with readings.
     returns
         Numbers of the key poses that revisit a tile.
-    gained
-        Whether the readings are likelier at these poses than at those of odometry; if not, these
-        are odometry's.
+    marginals
+        Of the poses.
+    gain
+        What the correction of odometry is worth, once that was asked; where nothing is shown to be
+        gained the poses are odometry's.
     noise
         Of the sensor, where it is estimated from the drive.
     """
@@ -81,8 +84,14 @@ class FieldSolution:
     solution: DriveSolution
     tiles: int
     returns: IntArray
-    gained: bool = True
+    marginals: Marginals
+    gain: Gain | None = None
     noise: SensorNoise | None = None
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether the poses are those that the readings correct."""
+        return self.gain is None or self.gain.shown
 
 
 def map_drive(
@@ -245,7 +254,7 @@ class TiledProblem:
             poses=solved.poses,
             pose_covariance=pose_covariances_together(marginals, len(drive)),
             calibration_covariance=sensor_covariances(marginals, solved.values, sensors),
-            prediction=_in_map(predicted, tiled, solved.poses, sensors),
+            prediction=in_map(predicted, tiled, solved.poses, sensors),
             interpolation_covariance=predicted.interpolation_covariance,
             squared=predicted.squared(sensors.noise),
             weights=solved.weights,
@@ -259,10 +268,10 @@ class TiledProblem:
         )
         path = drive.steps.path
         returns = tiled.anchoring.returns(path, AWAY_M)
-        return FieldSolution(solution, len(tiled.tiles), returns)
+        return FieldSolution(solution, len(tiled.tiles), returns, marginals)
 
 
-def _in_map(
+def in_map(
     predicted: DrivePrediction, tiled: TiledDrive, poses: list[gtsam.Pose3], sensors: KnownSensors
 ) -> MapPrediction:
     """Return the tiles' predictions with positions and axes of the map."""

@@ -28,6 +28,7 @@ from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances, weights_last
 from l2m_gtsam.slam.unknown_field.forward_pass import FollowedDrive, followed
+from l2m_gtsam.slam.unknown_field.gain import gain_of
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.tiled_smoother import (
@@ -52,6 +53,7 @@ ROUNDS = (2, 2, 3)  # of each: readings are hung and weighed anew at the poses
 ITERATIONS = 4  # of each round
 CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
 HELD = 1e-3  # of odometry's sigmas: steps that are known so well leave the poses where they are
+UNDERSTATED = 2.0  # errors over their sigmas: 1.3 to 2.2 on the model ship
 SETTLED = 1.0  # movement of the poses in the last round, in their sigmas
 
 
@@ -89,7 +91,7 @@ def map_whole_drive(
 
     Returns
     -------
-    The poses; those of odometry where the readings are no less likely at them. None where the field
+    The poses; those of odometry where nothing is shown to be gained by others. None where the field
     has more detail than one basis holds.
     """
     whole = options.whole_field
@@ -112,8 +114,11 @@ def map_whole_drive(
         learnt = LearntPoses(solved.last.poses, prior)
     found = problem.finished(solved.last)
     bent = 0.5 * found.solution.odometry_chi2 * 6 * len(drive)
-    gained = learnt.prior.spectrum.log_likelihood - first.spectrum.log_likelihood - bent
-    if gained > 0:
+    likelier = learnt.prior.spectrum.log_likelihood - first.spectrum.log_likelihood - bent
+    gain = gain_of(
+        found.solution.poses, drive.dead_reckoning(), found.marginals, likelier, UNDERSTATED
+    )
+    if gain.shown:
         ending = Ending.TOLERANCE if is_settled(solved, found.solution) else Ending.ITERATION_LIMIT
         found = replace(found, solution=replace(found.solution, ending=ending), noise=noise)
     else:
@@ -124,7 +129,7 @@ def map_whole_drive(
     progress("solving poses and field", 1.0)
     p = np.stack([pose.translation() for pose in solution.poses])
     near = learnt.prior.spectrum.prior.length
-    return replace(found, solution=solution, returns=returned(p, drive.steps.path, near))
+    return replace(found, solution=solution, gain=gain, returns=returned(p, drive.steps.path, near))
 
 
 def as_calibrated(solution: DriveSolution, sensors: KnownSensors) -> DriveSolution:
@@ -289,7 +294,7 @@ def at_odometry(drive: Drive, prior: WholePrior, options: SlamOptions) -> FieldS
         odometry_chi2=0.0,
         ending=Ending.TOLERANCE,
     )
-    return replace(found, solution=solution, gained=False, noise=noise)
+    return replace(found, solution=solution, marginals=marginals, noise=noise)
 
 
 def returned(p: FloatArray, path: FloatArray, near_m: float) -> IntArray:

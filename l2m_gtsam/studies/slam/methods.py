@@ -18,7 +18,7 @@ from l2m_gtsam.records.calibration import (
     SensorStatus,
     Uncertainty,
 )
-from l2m_gtsam.slam.exploration import NOTHING_GAINED, explore
+from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.peers.reduced_rank_ekf import ReducedRankEkfOptions, reduced_rank_ekf
 from l2m_gtsam.studies.slam.recordings import (
@@ -98,7 +98,7 @@ def our_row(
             rms(found.p, truth.p),
             mean_nees(found, truth),
             1e3 * taken / len(rows),
-            NOTHING_GAINED in result.notes,
+            result.gain is not None and not result.gain.shown,
         ),
         rows,
     )

@@ -46,6 +46,9 @@ def test_a_place_that_is_come_to_again_takes_the_drift_out(
     # Poses of one drive err together: no more than twice the six of one pose in the mean.
     assert pose_nees(truth, result.trajectory).mean() < 12
     assert result.notes == ()
+    assert result.gain is not None
+    assert result.gain.shown
+    assert result.gain.doubt < 1e-3
 
 
 def test_the_field_along_the_way_is_what_it_was(
@@ -109,9 +112,14 @@ def test_little_is_lost_where_readings_are_rejected(
 def test_where_no_place_is_come_to_again_it_is_said(
     short: tuple[tuple[KnownSensor, ...], SlamDrive], short_plain: Exploration
 ) -> None:
-    """Little can be taken out, and sigmas say so."""
-    assert any("no place was revisited" in note for note in short_plain.result.notes)
-    trajectory = short_plain.result.trajectory
+    """Little can be taken out: no gain is shown, and the poses stay those of odometry."""
+    result = short_plain.result
+    assert any("no place was revisited" in note for note in result.notes)
+    assert result.gain is not None
+    assert not result.gain.shown
+    assert any(result.gain.reason in note for note in result.notes)
+    trajectory = result.trajectory
+    np.testing.assert_allclose(trajectory.p, result.odometry.p, atol=1e-9)
     assert pose_nees(short[1].truth, trajectory).mean() < 12
     assert trajectory.covariance is not None
     assert np.sqrt(trajectory.covariance[-1, 3:, 3:].diagonal()).min() > 0.05

@@ -1,7 +1,7 @@
 """Passes of a real wheeled robot: in the map of the others, and without one."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +9,11 @@ import pytest
 
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.progress import silent
+from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.robot import other_passes, robot_pass, walked
+from tests.drives.robot import RUNS, other_passes, robot_pass, walked
 from tests.drives.slam import drifted
 from tests.support.pose_errors import pose_nees, position_error
 
@@ -57,19 +58,46 @@ def test_in_the_map_of_the_others(shared_data: Path, run: int, drift: Drifted) -
     assert LOWEST <= nees <= HIGHEST
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("drift", [drifted, walked])
-@pytest.mark.parametrize("run", [1, 2, 3, 4])
-@missed("19 to 68 % removed; with the random walk passes 3 and 4 are worse than odometry")
-def test_without_a_map(shared_data: Path, run: int, drift: Drifted) -> None:
-    """The same with the others' calibration alone."""
+@dataclass(frozen=True)
+class WithoutMap:
+    """A pass that was solved without a map, by the others' calibration, and its true poses."""
+
+    truth: Trajectory
+    result: LocalisationResult
+
+
+@pytest.fixture(
+    scope="module", params=[(run, drift) for drift in (drifted, walked) for run in RUNS]
+)
+def without_map(request: pytest.FixtureRequest, shared_data: Path) -> WithoutMap:
+    run, drift = request.param
     suite, own = other_passes(shared_data, run).suite, robot_pass(shared_data, run)
     truth = own.trajectory[np.arange(0, len(own.trajectory), 5)]
     drive = replace(own, trajectory=drift(truth, np.random.default_rng(run)))
-    result = explore(drive, suite, OPTIONS, silent).result
+    return WithoutMap(truth, explore(drive, suite, OPTIONS, silent).result)
+
+
+@pytest.mark.study
+@missed("no gain shown, or 2 to 70 % removed; pivots of passes 1 and 4 are taken for slips")
+def test_without_a_map(without_map: WithoutMap) -> None:
+    """The same with the others' calibration alone."""
+    truth, result = without_map.truth, without_map.result
     before, after = (position_error(truth, each) for each in (result.odometry, result.trajectory))
     nees = pose_nees(truth, result.trajectory)[1:].mean()
-    print(f"{run}: {1e3 * before:.0f} -> {1e3 * after:.0f} mm, NEES {nees:.1f}")
+    print(f"{1e3 * before:.0f} -> {1e3 * after:.0f} mm, NEES {nees:.1f}, {result.gain}")
     assert not any("jumps" in note for note in result.notes)
     assert after <= (1 - WITHOUT) * before
     assert LOWEST <= nees <= HIGHEST
+
+
+@pytest.mark.study
+def test_it_is_never_worse_than_odometry_without_saying_so(without_map: WithoutMap) -> None:
+    """Either poses are nearer to the truth, or they are odometry's, and the result says why."""
+    truth, result = without_map.truth, without_map.result
+    before, after = (position_error(truth, each) for each in (result.odometry, result.trajectory))
+    assert result.gain is not None
+    if result.gain.shown:
+        assert after < before
+    else:
+        np.testing.assert_allclose(result.trajectory.p, result.odometry.p, atol=1e-9)
+        assert any(result.gain.reason in note for note in result.notes)

@@ -56,7 +56,7 @@ def errors(drive: TrueDrive, form: Form, seed: int) -> tuple[float, float, tuple
 def test_most_of_a_ships_drift_goes(shared_data: Path, run: int) -> None:
     """One drive scatters; with tiles odometry became worse on both runs."""
     before, after, notes = errors(ship_run(shared_data / SHIP, run), Form.WORLD, 0)
-    assert NOTHING_GAINED not in notes
+    assert not any(NOTHING_GAINED in note for note in notes)
     assert after < 0.5 * before
 
 
@@ -85,7 +85,7 @@ def yard_drive(noise_ut: float) -> Exploration:
 def test_the_stated_noise_does_not_count_and_the_field_is_the_true_one() -> None:
     """Where odometry is kept, its field is that at odometry's poses, by the given calibration."""
     one, other = yard_drive(0.02), yard_drive(5.0)
-    assert NOTHING_GAINED in one.result.notes
+    assert any(NOTHING_GAINED in note for note in one.result.notes)
     np.testing.assert_array_equal(one.result.trajectory.p, other.result.trajectory.p)
     np.testing.assert_array_equal(one.field, other.field)
     truth = world().field_and_gradient(one.points)[0]

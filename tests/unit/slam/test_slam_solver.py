@@ -15,6 +15,7 @@ from l2m_gtsam.slam.solver import (
     pose_covariances,
     pose_covariances_together,
     reported_ill_conditioning,
+    stepwise_levenberg_marquardt,
 )
 from tests.drives.pose_chain import FAR_APART, chain, off
 
@@ -75,6 +76,33 @@ def test_where_cholesky_is_refused_descents_go_on_by_qr(
         begin.insert(key, values.atPose3(key).retract(0.1 * rng.normal(size=6)))
     found = levenberg_marquardt(graph, begin, colamd_ordering(graph), 50).values
     assert graph.error(found) < 1e-3
+    found, _ = in_steps(graph, begin, 50)
+    assert graph.error(found) < 1e-3
+
+
+def in_steps(
+    graph: gtsam.NonlinearFactorGraph, begin: gtsam.Values, most: int
+) -> tuple[gtsam.Values, int]:
+    """Return values that are solved for step by step, and how often the work was interrupted."""
+    work, pauses = stepwise_levenberg_marquardt(graph, begin, colamd_ordering(graph), most), 0
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            return end.value, pauses
+        pauses += 1
+
+
+@pytest.mark.parametrize("most", [1, 3, 50])
+def test_step_by_step_it_is_the_same_descent(most: int) -> None:
+    graph, values, _ = chain([0.1] * 6, [0.02] * 6)
+    rng, begin = np.random.default_rng(4), gtsam.Values()
+    for key in values.keys():  # noqa: SIM118
+        begin.insert(key, values.atPose3(key).retract(0.3 * rng.normal(size=6)))
+    found, pauses = in_steps(graph, begin, most)
+    at_once = levenberg_marquardt(graph, begin, colamd_ordering(graph), most).values
+    assert found.equals(at_once, 1e-12)
+    assert pauses == most or (most == 50 and 3 <= pauses < 20)
 
 
 def test_what_no_factor_tells_is_refused_in_one_line() -> None:

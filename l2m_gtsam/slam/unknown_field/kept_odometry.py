@@ -1,0 +1,107 @@
+"""A drive through an unknown field whose poses stay those of odometry and scans."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from l2m_factors import X
+from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.pose_graph import link_graph, link_squared, odometry_graph, shared_values
+from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
+from l2m_gtsam.slam.solution import DriveSolution
+from l2m_gtsam.slam.solver import Marginals, colamd_ordering, jump_covariances, pose_covariances
+from l2m_gtsam.slam.unknown_field.gain import gain_of, readings_log_likelihood
+from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
+from l2m_gtsam.slam.unknown_field.tiled_smoother import AWAY_M, FieldSolution, in_map
+from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
+from l2m_gtsam.solve.robust import WEIGHTS
+
+
+def with_gain(
+    mapped: FieldSolution,
+    recorded: Drive,
+    odometry: list[gtsam.Pose3],
+    prior: FieldPrior,
+    options: SlamOptions,
+) -> FieldSolution:
+    """Return a drive in tiles with what its correction is worth.
+
+    Parameters
+    ----------
+    mapped
+        The drive with the poses that its readings correct.
+    recorded
+        The drive with its odometry as it was recorded.
+    odometry
+        Its K key poses by that and by scans.
+    prior
+        Of the field.
+    options
+        Loss of the readings.
+
+    Returns
+    -------
+    The corrected poses; where nothing is shown to be gained, those of odometry with their sigmas.
+    """
+    solution = mapped.solution
+    sensors, used = solution.drive.sensors, solution.used
+    likely = []
+    for poses in (solution.poses, odometry):
+        motions = RelativeMotions.along(recorded, poses)
+        tiled = TiledDrive.partition(motions, poses, sensors, prior)
+        likely.append(readings_log_likelihood(tiled, sensors, used))
+    bent = 0.5 * solution.odometry_chi2 * 6 * len(recorded)
+    gain = gain_of(solution.poses, odometry, mapped.marginals, likely[0] - likely[1] - bent)
+    if gain.shown:
+        return replace(mapped, gain=gain)
+    return replace(along_odometry(recorded, odometry, prior, options), gain=gain)
+
+
+def along_odometry(
+    drive: Drive, poses: list[gtsam.Pose3], prior: FieldPrior, options: SlamOptions
+) -> FieldSolution:
+    """Return a drive at poses by odometry and scans, with the field along them.
+
+    Parameters
+    ----------
+    drive
+        The drive; its calibrations count as they are.
+    poses
+        K key poses.
+    prior, options
+        As of ``with_gain``.
+    """
+    values = shared_values(drive)
+    for k, pose in enumerate(poses):
+        values.insert(X(k), pose)
+    graph = odometry_graph(drive)
+    graph.push_back(link_graph(drive.links))
+    marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
+    sensors, robust = drive.sensors, options.robust
+    motions = RelativeMotions.along(drive, poses)
+    tiled = TiledDrive.partition(motions, poses, sensors, prior)
+    weights = tiled.weights(sensors, sensors.noise)
+    predicted = DrivePrediction(motions, tiled.prediction(weights, sensors))
+    squared = predicted.squared(sensors.noise)
+    solution = DriveSolution(
+        drive=drive,
+        poses=poses,
+        pose_covariance=pose_covariances(marginals, len(drive)),
+        calibration_covariance=sensors.covariance,
+        prediction=in_map(predicted, tiled, poses, sensors),
+        interpolation_covariance=predicted.interpolation_covariance,
+        squared=squared,
+        weights=np.asarray(WEIGHTS[robust.loss](squared, robust.largest, np.inf)),
+        near_changes=np.zeros(len(squared), dtype=np.bool_),
+        odometry_chi2=0.0,
+        scale=None,
+        steady=None,
+        link_squared=link_squared(drive.links, values),
+        ending=Ending.TOLERANCE,
+        step_covariance=jump_covariances(marginals, drive),
+    )
+    returns = tiled.anchoring.returns(drive.steps.path, AWAY_M)
+    return FieldSolution(solution, len(tiled.tiles), returns, marginals)
