@@ -16,7 +16,7 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.pose_chain import FAR_APART, chain
 from tests.drives.slam import rounds
-from tests.unit.slam.test_tiled_drive import EXACT, PRIOR, UNIFORM
+from tests.drives.uniform import EXACT, PRIOR, UNIFORM
 from tests.worlds.exact import random_sensors
 
 START, STEP = [0.01] * 3 + [0.1] * 3, [0.02] * 3 + [0.05] * 3

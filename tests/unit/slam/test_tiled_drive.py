@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.maps.harmonic.family import Hyperparameters
-from l2m_gtsam.maps.harmonic.tiling import Resolution
-from l2m_gtsam.slam.options import DriftOptions, TileOptions
+from l2m_gtsam.slam.options import DriftOptions
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
-from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from tests.drives.drawn import DrawnDrive, drawn_drive
 from tests.drives.slam import rounds
-from tests.worlds.exact import DipoleWorld, random_sensors
+from tests.drives.uniform import EXACT, PRIOR, UNIFORM
+from tests.worlds.exact import random_sensors
 
-EXACT, NOISE = np.full(15, 1e-6), 0.2
+NOISE = 0.2
 # No odometry error to speak of, and no source: residuals are noise and nothing else.
 STILL = DriftOptions(
     steady=0.0,
@@ -27,9 +25,6 @@ STILL = DriftOptions(
     least_m=1e-6,
     least_deg=1e-6,
 )
-UNIFORM = DipoleWorld(np.array([22.0, 3.0, -38.0]), np.zeros((1, 3)) - 9.0, np.zeros((1, 3)))
-WEAK = Hyperparameters(floor_scale=1e-3, ceiling_scale=1e-3)
-PRIOR = FieldPrior(WEAK, Resolution(4.0, 3.0), TileOptions(modes=100))
 
 
 @pytest.fixture(scope="module")
