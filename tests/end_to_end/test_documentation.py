@@ -1,16 +1,23 @@
 """The documentation: every block of every page runs, every message is a real one."""
 
 import ast
+import hashlib
 import json
 import re
 import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
 
+from l2m_gtsam.api import calls
 from l2m_gtsam.api.results import JudgedCalibration
+from l2m_gtsam.batch import maps
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import load_options
+from l2m_gtsam.data import FloatArray, KnownSensor, Recording
+from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -38,6 +45,30 @@ LEAST_QUOTED = 60  # messages of the page; fewer would be a test that has lost i
 
 def named(page: Path) -> str:
     return page.relative_to(REPOSITORY).as_posix()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _a_map_is_built_once() -> Iterator[None]:
+    """Several pages build the same map of the same survey: the first builds it for all."""
+    built: dict[str, FieldMap] = {}
+
+    def once(
+        recordings: Sequence[Recording],
+        suite: Mapping[str, KnownSensor] | None,
+        options: MappingOptions,
+        cloud: FloatArray | None = None,
+    ) -> FieldMap:
+        bags = [each.source.sha256 for each in recordings]
+        points = None if cloud is None else hashlib.sha256(cloud.tobytes()).hexdigest()
+        key = repr((bags, suite, options, points))
+        if key not in built:
+            built[key] = map_recordings(recordings, suite, options, cloud)
+        return built[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (calls, maps):
+            patch.setattr(module, "map_recordings", once)
+        yield
 
 
 @pytest.fixture(scope="module")
