@@ -120,7 +120,7 @@ def test_wrong_fixes_are_left_out_and_counted(
 
 def test_where_scans_slip_magnetometers_hold() -> None:
     """A corridor that looks the same everywhere, along which odometry slips."""
-    known, drive = drive_of(22, rounds(40), sensors=2)
+    known, drive = drive_of(22, rounds(30), sensors=2)
     wide = Room(((-4.5, -500.0, 0.0), (4.5, 500.0, 2.8)))
     seen = fixes(wide, drive)
     result = found_by(drive, known, seen)
