@@ -35,6 +35,7 @@ ROOM = Room(
     (((5.5, -4.0, 0.0), (6.0, -3.0, 3.5)), ((4.5, 4.5, 0.0), (5.5, 5.5, 2.0))),
 )
 OPTIONS = SlamOptions(key_poses=COARSE)
+FAR_APART = COARSE.model_copy(update={"distance_m": 0.5})
 REGISTRATION = RegistrationOptions(unseen_m=100.0, unseen_deg=100.0)
 EVERY = 15  # poses: a scan each 0.75 s
 
@@ -140,8 +141,9 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     steps = scan_odometry(scans(ROOM, seen, rng), mended(drive), 0.25, OPTIONS)
     loops = ScanEvidence(loops=find_loop_closures(steps, LoopOptions()).loops)
     assert len(loops) > 10
-    # Tiles that are a little larger than by default: fewer, in less than half the time.
-    options = OPTIONS.model_copy(update={"tiles": TileOptions(core=4.0)})
+    # Tiles that are a little larger than by default, and fewer key poses: a third of the time.
+    coarse = {"tiles": TileOptions(core=4.0), "key_poses": FAR_APART}
+    options = OPTIONS.model_copy(update=coarse)
     found = explore(drive.recording, calibrated(known), options, silent, evidence=loops).result
     assert found.scans is not None
     assert found.by_scans is not None
