@@ -48,8 +48,8 @@ def test_what_is_stated_rightly_is_not_noted(cause: ErrorCause) -> None:
     [
         (3.0, "too large", ErrorCause.NOISE),
         (1 / 3, "too small", ErrorCause.POSES),
+        (3.0, "too large", ErrorCause.POSES),
         pytest.param(1 / 3, "too small", ErrorCause.NOISE, marks=pytest.mark.study),
-        pytest.param(3.0, "too large", ErrorCause.POSES, marks=pytest.mark.study),
     ],
 )
 def test_what_is_stated_wrongly_is_noted(times: float, words: str, cause: ErrorCause) -> None:
