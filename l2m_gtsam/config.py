@@ -9,7 +9,7 @@ from pydantic import BaseModel, ValidationError
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.lidar.options import PointCloudOptions
-from l2m_gtsam.mapping.map_building import MappingOptions
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.options import Options, words_of
 from l2m_gtsam.planning.motion import PlanOptions
 from l2m_gtsam.qa.options import FleetOptions, QaOptions

@@ -17,7 +17,8 @@ from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
 from l2m_gtsam.errors import InputError
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.build import refuse_structure
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, silent

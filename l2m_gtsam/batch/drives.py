@@ -16,12 +16,10 @@ from l2m_gtsam.batch.scan_poses import read_drives_on
 from l2m_gtsam.calibration.calibrate import calibrated
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.planning.plan import assumed_recording, plan
 from l2m_gtsam.progress import Progress, counter
 from l2m_gtsam.qa.evaluate import FIGURES, evaluate
 from l2m_gtsam.qa.report.figures.vehicle import calibration_figure
 from l2m_gtsam.qa.report.svg import save_figure
-from l2m_gtsam.qa.scene import scene_of
 from l2m_gtsam.qa.verdict.calibration import judgement_of
 from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
@@ -136,6 +134,8 @@ def calibrate_drive(
         save_figure(figure, stage / OVERVIEW_FILE)
     progress(FIGURES, 1.0)
     if view is not None:
+        from l2m_gtsam.qa.scene import scene_of
+
         ensure_folder(view.parent)
         write_scene(view, scene_of(recording, found))
     return Appraised(result, metrics)
@@ -169,6 +169,9 @@ def plan_bag(
     L2MError
         Whatever is wrong with the input, in one line.
     """
+    # Of all that is done with drives only this needs them: a calibration starts sooner without.
+    from l2m_gtsam.planning.plan import assumed_recording, plan
+
     saved, calibration = SavedMap.read(map_path), config.calibration
     if at or not has_fields(bag, config.bag):
         names = {_named(place): place for place in at or [(0.0, 0.0, 0.0)]}

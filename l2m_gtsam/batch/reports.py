@@ -19,9 +19,7 @@ from l2m_gtsam.options import first_fault
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import STAGE, calibration_page
-from l2m_gtsam.qa.report.localisation_page import localisation_page
 from l2m_gtsam.qa.verdict.calibration import judge, judgement_of
-from l2m_gtsam.qa.verdict.localisation import judgement_of_localisation
 from l2m_gtsam.qa.verdict.mounting import check_names
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import LocalisationRecord
@@ -52,6 +50,9 @@ def report_localisation(folder: Path, config: Path | None, page: Path) -> Judgem
     L2MError
         The record is missing or damaged; one line.
     """
+    # Reports on calibrations, which are more frequent, start sooner without.
+    from l2m_gtsam.qa.verdict.localisation import judgement_of_localisation
+
     source = folder / SLAM_FILE
     found = read_slam(source)
     if config is not None:
@@ -71,6 +72,8 @@ def report_localisation(folder: Path, config: Path | None, page: Path) -> Judgem
 
 def write_slam_report(page: Path, record: LocalisationRecord, options: QaOptions) -> None:
     """Write the report on a localisation."""
+    from l2m_gtsam.qa.report.localisation_page import localisation_page
+
     text = localisation_page(record, options)
     with published(page.parent, page.name, adds=True) as stage:
         _write_page(stage / page.name, text)

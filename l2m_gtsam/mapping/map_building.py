@@ -8,45 +8,21 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
 from l2m_gtsam.mapping.suite_calibration import suite_doubts
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
-from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
-from l2m_gtsam.maps.compare import CompareOptions, MapComparison, compare_maps
+from l2m_gtsam.maps.build import KINDS, build_map
+from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.maps.survey_poses import SurveyPoses
 from l2m_gtsam.maps.training import checked_readings
-from l2m_gtsam.options import Options
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.recording.sync import SyncOptions, stuck_sensors, synchronise, with_offsets
-from l2m_gtsam.storage.cloud_topic import CloudTopicOptions
-
-
-class MappingOptions(Options):
-    """How a map is built from mapping bags."""
-
-    sync: SyncOptions = SyncOptions(thin_distance_m=0.05, thin_angle_deg=10.0)
-    """Which readings enter; a map needs its readings spread in space, not in heading."""
-    pose_noise: PoseNoiseOptions = PoseNoiseOptions()
-    """How wrong the survey's poses are. Where neither this nor the recording says so, a harmonic
-    map looks for it in its readings; with both sigmas 0 poses count as exact. Where only sizes are
-    stated, and not how long errors last (`correlation_s`), they count if readings of a pass have
-    them in common; else they are noise of each reading, which the map has learnt."""
-    model: MapOptions = MapOptions()
-    """The kind of map and its options."""
-    structure: CloudTopicOptions = CloudTopicOptions(edge=0.05)
-    """How a structure cloud is read: from a file, which is in the map frame, only `edge` counts."""
-    lidar: CloudTopicOptions = CloudTopicOptions(edge=0.1, max_range=30.0)
-    """How scans become the cloud that is saved with the map; their topic is `lidar.topic`."""
-    compare: CompareOptions = CompareOptions()
-    """How `l2m map compare` holds readings out."""
-    suite: SuiteCalibrationOptions = SuiteCalibrationOptions()
-    """How `l2m map suite` calibrates the sensors that map."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ import numpy as np
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
 from l2m_gtsam.errors import CalibrationError, L2MError, MapError
 from l2m_gtsam.geometry import polar_rotation
-from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU, SuiteCalibrationOptions
+from l2m_gtsam.mapping.options import SuiteCalibrationOptions
+from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU
 from l2m_gtsam.mapping.suite_poses import with_pose_errors
 from l2m_gtsam.mapping.suite_solver import (
     SuiteSolution,

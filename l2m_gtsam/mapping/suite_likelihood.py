@@ -12,7 +12,6 @@ The last term is the price of a distortion that makes all fields small.
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import Field
 from scipy.linalg import cho_solve, solve_triangular
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings
@@ -20,42 +19,10 @@ from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.evidence import Evidence, evidence, normal_of
 from l2m_gtsam.maps.harmonic.family import Hyperparameters
 from l2m_gtsam.maps.training import TrainingSet
-from l2m_gtsam.options import Options
-from l2m_gtsam.recording.sync import SyncOptions
 
 SIZE = 16  # t, C row by row, H, time offset
 T, C, H, TAU = slice(0, 3), slice(3, 12), slice(12, 15), 15
 STEP_M = 1e-4  # of a central difference: features bend over centimetres
-
-
-class SuiteCalibrationOptions(Options):
-    """How the sensors of a mapping suite are calibrated from their own drive."""
-
-    sync: SyncOptions = SyncOptions(thin_distance_m=0.03, thin_angle_deg=5.0)
-    """Which readings enter. One place under two headings determines most of the sensors."""
-    position_m: float = Field(default=0.3, gt=0)
-    """How far a sensor may sit from where it is assumed, along each axis: standard deviation in
-    metres. Assumed is the lidar's origin, or the suite that is given to start from."""
-    matrix: float = Field(default=0.1, gt=0, lt=1)
-    """How far each entry of C may be from what is assumed, the identity if nothing is given."""
-    offset_ut: float = Field(default=20.0, gt=0)
-    """How far H may be from what is assumed, zero if nothing is given, in microtesla."""
-    clock_s: float = Field(default=0.02, gt=0)
-    """How far a sensor's clock may be off, in seconds."""
-    windows: int = Field(default=4, ge=1)
-    """Parts of the survey that are used, spread over it."""
-    readings: int = Field(default=3000, ge=100)
-    """The most readings of one of them."""
-    modes: int = Field(default=300, ge=50)
-    """About how many waves describe the field in one of them; time goes with the square."""
-    rounds: int = Field(default=20, ge=1)
-    """How often strength and depth of the field's sources are learnt anew, at the most. Sensors on
-    a planar robot settle slowly (about eight rounds): scale and depth of the field trade."""
-    steps: int = Field(default=10, ge=1)
-    """The most steps of the solve in one round."""
-    searches: int = Field(default=2, ge=0)
-    """How often steel beside the way is searched for where waves do not explain the survey, at the
-    most: after the rounds, and again with the sensors that this gave. 0 searches nothing."""
 
 
 @dataclass(frozen=True)

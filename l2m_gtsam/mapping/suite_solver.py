@@ -16,13 +16,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from l2m_gtsam.data import FloatArray, Readings
-from l2m_gtsam.mapping.suite_likelihood import (
-    SIZE,
-    C,
-    SuiteCalibrationOptions,
-    SuiteLikelihood,
-    suite_likelihood,
-)
+from l2m_gtsam.mapping.options import SuiteCalibrationOptions
+from l2m_gtsam.mapping.suite_likelihood import SIZE, C, SuiteLikelihood, suite_likelihood
 from l2m_gtsam.mapping.suite_windows import SuiteWindows, sources_in, windows_over
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, Sources
 from l2m_gtsam.progress import Progress

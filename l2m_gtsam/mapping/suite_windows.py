@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions, SuiteWindow, undistorted
+from l2m_gtsam.mapping.options import SuiteCalibrationOptions
+from l2m_gtsam.mapping.suite_likelihood import SuiteWindow, undistorted
 from l2m_gtsam.maps.harmonic.basis import Basis
 from l2m_gtsam.maps.harmonic.evidence import normal_of
 from l2m_gtsam.maps.harmonic.family import Hyperparameters

@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, KnownSensor, Readings
-from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
+from l2m_gtsam.mapping.map_building import suite_readings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.build import KINDS, MapOptions, build_map
 from l2m_gtsam.maps.training import TrainingSet, checked_readings
 from l2m_gtsam.options import Options

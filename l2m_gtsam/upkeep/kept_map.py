@@ -13,7 +13,8 @@ from l2m_gtsam.calibration.coverage import sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.map_building import MappingOptions, SurveyReadings, suite_readings
+from l2m_gtsam.mapping.map_building import SurveyReadings, suite_readings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed

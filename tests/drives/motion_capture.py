@@ -4,7 +4,8 @@ from pathlib import Path
 
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.storage.bag import read_recording

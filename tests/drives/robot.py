@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import Distortion, FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions, SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult

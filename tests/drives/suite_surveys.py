@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Recording, Trajectory
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
+from l2m_gtsam.mapping.options import SuiteCalibrationOptions
 from l2m_gtsam.records.calibration import CalibrationResult
 from tests.drives.slam import SlamDrive, slam_drive
 from tests.worlds.exact import DipoleWorld

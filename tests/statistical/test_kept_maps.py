@@ -3,7 +3,7 @@
 import pytest
 
 from l2m_gtsam.studies.changes.loads import ChangesStudyOptions
-from l2m_gtsam.studies.changes.rounds import rounds_end
+from tests.worlds.changing_hall import rounds_end
 
 pytestmark = pytest.mark.study
 

@@ -1,6 +1,6 @@
 """Sites of studies that are simulated, mapped and driven in seconds: one row of racks."""
 
-from l2m_gtsam.mapping.map_building import MappingOptions
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.simulate.route import CalibrationRouteOptions
 from l2m_gtsam.simulate.scenario import ScenarioOptions

@@ -17,7 +17,8 @@ from l2m_gtsam.data import (
     SourceFile,
     Trajectory,
 )
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.simulate.hall_drives import (
     LIDAR_M,
     STEP_NS,

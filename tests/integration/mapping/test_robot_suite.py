@@ -19,8 +19,8 @@ from l2m_gtsam.data import (
     SourceFile,
     Trajectory,
 )
+from l2m_gtsam.mapping.options import SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite, suite_doubts
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import SensorStatus
 

@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.suite_sizes import stated_doubts
 from l2m_gtsam.studies.troubles.options import TroublesOptions, World

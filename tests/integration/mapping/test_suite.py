@@ -7,7 +7,8 @@ import pytest
 
 from l2m_gtsam.data import Distortion, KnownSensor, Recording
 from l2m_gtsam.errors import MapError
-from l2m_gtsam.mapping.map_building import MappingOptions, suite_readings
+from l2m_gtsam.mapping.map_building import suite_readings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite, suite_doubts
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from l2m_gtsam.data import Recording, Trajectory
+from l2m_gtsam.mapping.options import SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_calibration import calibrate_suite
-from l2m_gtsam.mapping.suite_likelihood import SuiteCalibrationOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult

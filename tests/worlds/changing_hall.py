@@ -6,7 +6,7 @@ import numpy as np
 
 from l2m_gtsam.calibration.changed_places import ChangesOptions
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
-from l2m_gtsam.mapping.map_building import MappingOptions
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.simulate.hall_drives import calibration_drive, patrol, survey
