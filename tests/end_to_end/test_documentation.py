@@ -16,7 +16,8 @@ from l2m_gtsam.batch import maps
 from l2m_gtsam.batch.simulation import simulate_bags
 from l2m_gtsam.config import load_options
 from l2m_gtsam.data import FloatArray, KnownSensor, Recording
-from l2m_gtsam.mapping.map_building import MappingOptions, map_recordings
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
