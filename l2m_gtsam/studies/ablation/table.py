@@ -53,7 +53,7 @@ class Combination:
 
 
 @dataclass(frozen=True)
-class Gain:
+class PairedDifference:
     """By how much errors shrink from one combination to another on the same drives.
 
     Attributes
@@ -88,7 +88,7 @@ class Gain:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What changing one thing gains; see ``Gain``.
+    """What changing one thing gains; see ``PairedDifference``.
 
     Attributes
     ----------
@@ -104,8 +104,8 @@ class Comparison:
     spacing: float
     solver: Solver
     to: str
-    t: Gain | None
-    H: Gain | None
+    t: PairedDifference | None
+    H: PairedDifference | None
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def compared(
     return Comparison(*place, solver, changed, *gains)
 
 
-def gain(before: FloatArray, after: FloatArray) -> Gain | None:
+def gain(before: FloatArray, after: FloatArray) -> PairedDifference | None:
     """Return by how much errors shrank, shapes (R,); pairs with a NaN do not count."""
     # Paired: both calibrate the same drives, so that what a drive is worth cancels.
     less = before - after
@@ -221,4 +221,4 @@ def gain(before: FloatArray, after: FloatArray) -> Gain | None:
     if len(less) < FEWEST:
         return None
     margin = SURE * less.std(ddof=1) / np.sqrt(len(less))
-    return Gain(float(less.mean()), float(margin), float(np.mean(less > ROUNDING)))
+    return PairedDifference(float(less.mean()), float(margin), float(np.mean(less > ROUNDING)))
