@@ -31,10 +31,29 @@ from l2m_gtsam.data import FloatArray, IntArray
 MOST_UPDATES = 200
 ENOUGH = 0.02  # of a logarithm of likelihood: less than that in an update is no progress
 LARGEST = 1e6  # of the size of a process that says as much as a single reading
-STEPS = 12  # of a climb over the logarithms of all sizes
 ROUNDS = 3  # of sizes and noise; they settle in two
 LEAST_NOISE = 0.05  # of its variance
 NEGLIGIBLE = 1e-3  # of a single weight's information: what a process says that is nothing
+
+
+@dataclass(frozen=True)
+class Climb:
+    """How far to climb over the logarithms of all sizes.
+
+    Attributes
+    ----------
+    steps
+        The most of them.
+    tolerance
+        Relative rise of the likelihood in a step that ends it.
+    """
+
+    steps: int
+    tolerance: float
+
+
+SHORT = Climb(12, 1e-4)
+TO_THE_TOP = Climb(30, 1e-7)  # where it counts by how much a process is the best explanation
 
 
 @dataclass(frozen=True)
@@ -215,7 +234,10 @@ class WeightSystem:
 
 
 def shared_components(
-    systems: Sequence[WeightSystem], spectra: Sequence[FloatArray], squares: float | None
+    systems: Sequence[WeightSystem],
+    spectra: Sequence[FloatArray],
+    squares: float | None,
+    climb: Climb = SHORT,
 ) -> VarianceComponents:
     """Return the most likely sizes of K processes that several systems have, each with own weights.
 
@@ -229,6 +251,8 @@ def shared_components(
         Of the processes in each, shapes (K, m).
     squares
         As in ``WeightSystem.components_and_noise``; where absent, the noise is known.
+    climb
+        How far, in each of ``ROUNDS`` rounds.
     """
     felt = sum(d @ np.diag(each.information) for each, d in zip(systems, spectra, strict=True))
     count = sum(np.count_nonzero(d, axis=1) for d in spectra)
@@ -243,7 +267,7 @@ def shared_components(
             jac=True,
             method="L-BFGS-B",
             bounds=bounds,
-            options={"maxiter": STEPS, "ftol": 1e-4},
+            options={"maxiter": climb.steps, "ftol": climb.tolerance},
         )
         start = end.x
         sizes = np.where(start > unit + np.log(2 * NEGLIGIBLE), np.exp(start), 0.0)

@@ -11,6 +11,7 @@ from l2m_gtsam.calibration.joint_information import JointInformation, Rows
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.error_budget import DisturbanceKind
 from l2m_gtsam.solve.variance_components import (
+    TO_THE_TOP,
     VarianceComponents,
     WeightSystem,
     shared_components,
@@ -212,7 +213,7 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess
     at = np.flatnonzero(every.any(axis=0))
     every = every[:, at]
     system = known.system.among(at)
-    fit = shared_components([system], [every], known.squares)
+    fit = shared_components([system], [every], known.squares, TO_THE_TOP)
     system = system.whiter(fit.noise)
     kept = []
     for k, each in taken.items():
