@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from l2m_gtsam.batch import drives, reports, validation
+from l2m_gtsam.qa.report import localisation_page
 from tests.drives.fleet_runs import FleetRun, small_fleet
 from tests.support.command_line import Demo, l2m
 from tests.worlds.halls import SMALL_HALL
@@ -24,7 +25,7 @@ def without_pages() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reports, "calibration_page", empty)
-        patch.setattr(reports, "localisation_page", empty)
+        patch.setattr(localisation_page, "localisation_page", empty)
         patch.setattr(validation, "validation_page", empty)
         patch.setattr(drives, "save_figure", touched)
         yield
