@@ -12,7 +12,9 @@ concerned.
 
 Tiles share readings, so their errors are correlated. The part of ``beta`` that the survey's noise
 makes is ``-A_b(X)^T W n / sigma^2`` at the survey's places X; over the readings that two tiles
-share it gives their covariance. The other part, the prior's, counts as independent between tiles.
+share it gives their covariance. The other part, the prior's, counts as independent between tiles:
+it is a sixth of the variance in an office corridor, and what neighbours have of it in common moved
+no standard deviation of a calibrated place by one per cent.
 
 Errors of the sensors that surveyed are wrong readings, ``E eta``, with one eta for the whole map.
 They move the posterior mean of every tile by ``dw_b = L L^T F^T W E eta / sigma^2``, a field that
