@@ -32,6 +32,8 @@ MOST_CHUNK = 256 * MEBIBYTE
 MOST_TOGETHER = 384 * MEBIBYTE
 # A bag that is compressed as a whole is unpacked into a temporary file.
 MOST_UNPACKED = 64 * 1024 * MEBIBYTE
+# Unpacked at once: a decompressor's own buffer may be as large again, and is copied as it grows.
+MOST_AT_ONCE = 32 * MEBIBYTE
 MOST_DEFINITION = 200_000  # letters; those of ROS with all that they hold are under 20,000
 MOST_SEQUENCE = MOST_CHUNK  # of bytes, that is
 MOST_REPEATED = 1000  # of a message type in another one
@@ -65,15 +67,18 @@ def _unpacked(make: Callable[[], Any], data: bytes, size: int) -> bytes:
     most, parts = min(size, MOST_CHUNK), []
     while True:
         decompressor = make()
-        parts.append(decompressor.decompress(data, most + 1))
-        most -= len(parts[-1])
-        if most < 0:
-            raise UnpackingError(
-                f"a chunk unpacks to more than the {min(size, MOST_CHUNK):,} bytes that are "
-                "declared or accepted"
-            )
-        if not decompressor.eof:
-            raise UnpackingError("a compressed chunk ends too early")
+        while not decompressor.eof:
+            part = decompressor.decompress(data, MOST_AT_ONCE)
+            if not part and not decompressor.eof:
+                raise UnpackingError("a compressed chunk ends too early")
+            data = b""  # the decompressor has it
+            parts.append(part)
+            most -= len(part)
+            if most < 0:
+                raise UnpackingError(
+                    f"a chunk unpacks to more than the {min(size, MOST_CHUNK):,} bytes that are "
+                    "declared or accepted"
+                )
         data = decompressor.unused_data
         if not data:
             return parts[0] if len(parts) == 1 else b"".join(parts)

@@ -12,6 +12,7 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
 
 from l2m_gtsam.errors import BagError
+from l2m_gtsam.storage import rosbags_bounds
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.open_bag import typestore
@@ -86,6 +87,19 @@ def test_unpacking(packing: str) -> None:
         unpack(pack(b"content")[:-3])
     with pytest.raises(UnpackingError, match="unpacks to more than"):
         unpack(pack(ZEROS) * PIECES)
+
+
+@pytest.mark.parametrize("packing", PACK)
+@pytest.mark.parametrize("at_once", [1, 7, 64, 999, 1000, 1001])
+def test_what_is_larger_than_a_part_is_whole(
+    packing: str, at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rosbags_bounds, "MOST_AT_ONCE", at_once)
+    pack, unpack, content = PACK[packing], UNPACK[packing], bytes(range(250)) * 4
+    assert unpack(pack(content)) == content
+    assert unpack(pack(content[:600]) + pack(content[600:])) == content
+    with pytest.raises(UnpackingError, match="ends too early"):
+        unpack(pack(content)[:-3])
 
 
 @pytest.mark.parametrize("packing", ["bz2", "lz4"])
