@@ -41,6 +41,7 @@ from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
 from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
 from l2m_gtsam.calibration.view import (
+    REOBSERVE_M,
     QueryableMap,
     RememberedMap,
     View,
@@ -63,9 +64,6 @@ from l2m_gtsam.solve.rank import Determinacy
 # three rounds, and a set of readings that keeps hopping over the map's edge is cut off here.
 MAX_ROUNDS = 10
 SETTLED_M = 1e-5
-# The map's variance changes over decimetres: it is not asked again while all readings are as near
-# to where it was.
-REOBSERVE_M = 5e-3
 # A vehicle moves a tenth of a millimetre meanwhile.
 SETTLED_S = 1e-4
 

@@ -30,13 +30,12 @@ from l2m_gtsam.calibration.optimise import Ending, LinearSolver
 from l2m_gtsam.calibration.stated_sizes import leave_noise
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import NEAR_SIGMAS, UncertainProblem
-from l2m_gtsam.calibration.view import QueryableMap, View
+from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
 from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import StatedSize
 from l2m_gtsam.solve.rank import Determinacy
 
 MAX_ROUNDS = 6
-NEAR_M = 5e-3  # that the map's errors, which change over decimetres, are not asked for again
 SEARCHED = 0.6  # of the way, when it is known which processes a drive has
 SETTLED_SIGMAS = 0.1  # what such a step is at most in the last round
 
@@ -113,7 +112,7 @@ def solve_uncertain(
     by_parts = found.problem.by_parts(found.joint, found.estimate, scattered)
     if budget.found:
         moved = float(np.abs(found.estimate.t - near.t)[view.sensors].max())
-        if budget.poses is None and moved < NEAR_M:
+        if budget.poses is None and moved <= REOBSERVE_M:
             with_them = drive.beside(budget)
         else:
             with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)

@@ -17,6 +17,10 @@ from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.data import BoolArray, FieldSample, FloatArray, IntArray, Readings
 from l2m_gtsam.maps.field_map import optional_members
 
+# The map's errors change over decimetres: it is not asked for them again while all readings are as
+# near to where it was, metres.
+REOBSERVE_M = 5e-3
+
 
 class QueryableMap(Protocol):
     """What the solve asks of a map: the factors' view of it, and a query that knows its edge."""
