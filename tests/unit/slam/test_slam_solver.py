@@ -72,7 +72,7 @@ def test_where_cholesky_is_refused_descents_go_on_by_qr(
     """Poses away from where start and odometry have them come there."""
     graph, values, _ = chain(start, step)
     rng, begin = np.random.default_rng(2), gtsam.Values()
-    for key in values.keys():  # noqa: SIM118
+    for key in values.keys():  # noqa: SIM118 - GTSAM's values cannot be iterated
         begin.insert(key, values.atPose3(key).retract(0.1 * rng.normal(size=6)))
     found = levenberg_marquardt(graph, begin, colamd_ordering(graph), 50).values
     assert graph.error(found) < 1e-3
@@ -97,7 +97,7 @@ def in_steps(
 def test_step_by_step_it_is_the_same_descent(most: int) -> None:
     graph, values, _ = chain([0.1] * 6, [0.02] * 6)
     rng, begin = np.random.default_rng(4), gtsam.Values()
-    for key in values.keys():  # noqa: SIM118
+    for key in values.keys():  # noqa: SIM118 - GTSAM's values cannot be iterated
         begin.insert(key, values.atPose3(key).retract(0.3 * rng.normal(size=6)))
     found, pauses = in_steps(graph, begin, most)
     at_once = levenberg_marquardt(graph, begin, colamd_ordering(graph), most).values
