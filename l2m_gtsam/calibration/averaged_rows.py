@@ -20,7 +20,7 @@ from l2m_gtsam.calibration.sensor_columns import SENSOR
 from l2m_gtsam.calibration.view import QueryableMap, View, observe, places_of
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, Readings
 from l2m_gtsam.geometry import isotropic_covariance
-from l2m_gtsam.maps.sources.source import MarginalRows
+from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.options import Options
 from l2m_gtsam.solve.linear_algebra import lower_information_root, right_divided
 from l2m_gtsam.solve.robust import MEDIAN

@@ -11,8 +11,9 @@ from l2m_gtsam.calibration.coverage import KnowsSurvey
 from l2m_gtsam.calibration.explanation import explained
 from l2m_gtsam.calibration.moving_solve import MovingProblem
 from l2m_gtsam.calibration.one_key import OneKeySolution
-from l2m_gtsam.calibration.options import CalibrationOptions, priors_of
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
+from l2m_gtsam.calibration.prior_options import priors_of
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.start.global_start import find_starts
 from l2m_gtsam.calibration.trust import judged

@@ -7,8 +7,9 @@ import numpy as np
 from l2m_gtsam.calibration.explanation import from_priors, undetermined
 from l2m_gtsam.calibration.forecast import Forecast, forecast
 from l2m_gtsam.calibration.joint import SensorSolution
-from l2m_gtsam.calibration.options import CalibrationOptions, priors_of
+from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
+from l2m_gtsam.calibration.prior_options import priors_of
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.start.rigid_groups import placed
 from l2m_gtsam.calibration.view import Compilable, QueryableMap

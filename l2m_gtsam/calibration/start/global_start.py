@@ -13,13 +13,8 @@ from pydantic import Field
 from scipy.ndimage import minimum_filter
 
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.start.candidates import (
-    Basin,
-    Candidates,
-    NearestReadings,
-    StartProblem,
-    descend,
-)
+from l2m_gtsam.calibration.start.candidates import Candidates, NearestReadings
+from l2m_gtsam.calibration.start.descent import Basin, StartProblem, descend
 from l2m_gtsam.calibration.start.rigid_groups import Bounds, Rigid, bounded, pooled, rigid_groups
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, Readings

@@ -10,8 +10,9 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import Normal, normal_of
+from l2m_gtsam.maps.harmonic.fading import carried, likelihood, share_left
 from l2m_gtsam.maps.harmonic.family import UniformField
-from l2m_gtsam.maps.harmonic.history import STILL, TileStep, carried, likelihood, share_left
+from l2m_gtsam.maps.harmonic.history import STILL, TileStep
 from l2m_gtsam.maps.harmonic.learnt import Learnt
 from l2m_gtsam.maps.harmonic.modes import Modes
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise

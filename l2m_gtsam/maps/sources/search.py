@@ -15,14 +15,8 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
-from l2m_gtsam.maps.sources.source import (
-    HALF_AXIS,
-    MOMENT,
-    PARAMETERS,
-    UT_M3,
-    MarginalRows,
-    SourceShape,
-)
+from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.maps.sources.source import HALF_AXIS, MOMENT, PARAMETERS, UT_M3, SourceShape
 from l2m_gtsam.options import Options
 
 BATCH = 128  # candidates that are asked together

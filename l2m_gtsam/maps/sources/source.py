@@ -8,14 +8,11 @@ with nodes ``s_k`` and weights ``w_k`` of Gauss and Legendre's quadrature over t
 ``p - a`` to ``p + a``. The moment m is spread evenly along it.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
-from scipy.sparse import csr_array
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.harmonic.dipoles import add_dipoles, moment_features
 
 UT_M3 = 0.1  # field of 1 A m^2 at 1 m: mu_0 / (4 pi) in uT m^3 per A m^2
@@ -101,89 +98,3 @@ class SourceShape:
 
     def _places(self, s: FloatArray) -> FloatArray:
         return np.ascontiguousarray(self.position + np.outer(s, self.half_axis))
-
-
-@dataclass(frozen=True)
-class MarginalRows:
-    """N averaged readings and their noise, in the frame of the map.
-
-    Attributes
-    ----------
-    points
-        Where they were taken in metres, shape (N, 3).
-    residual
-        What they differ from the map by in uT, shape (N, 3).
-    whitening
-        V in 1/uT, block diagonal, shape (3 N, 3 N).
-    nuisance
-        V X, shape (3 N, K).
-    prior
-        Information of n before any reading, shape (K, K).
-    slot
-        Which readings share noise: their blocks of V, shape (N,).
-    """
-
-    points: FloatArray
-    residual: FloatArray
-    whitening: csr_array
-    nuisance: csr_array
-    prior: FloatArray
-    slot: IntArray
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    @cached_property
-    def _root(self) -> tuple[FloatArray, FloatArray]:
-        """Cholesky factor of the scaled information of n, and the scale."""
-        information = self.prior + (self.nuisance.T @ self.nuisance).toarray()
-        scale = 1 / np.sqrt(np.diag(information))
-        lower = cholesky(information * scale * scale[:, None], lower=True, check_finite=False)
-        return lower, scale
-
-    def projected(self, white: FloatArray) -> FloatArray:
-        """Return ``L^-1 X^T V^T`` times white columns, shape (3 N, M): (K, M)."""
-        lower, scale = self._root
-        seen = scale[:, None] * (self.nuisance.T @ white)
-        return np.asarray(solve_triangular(lower, seen, lower=True, check_finite=False))
-
-    def whitened(self, features: FloatArray) -> FloatArray:
-        """Return V times fields of M columns, shape (N, 3, M): (3 N, M)."""
-        return np.asarray(self.whitening @ features.reshape(3 * len(self), -1))
-
-    def information(self, features: FloatArray) -> FloatArray:
-        """Return the information of the amplitudes of fields, shape (N, 3, M): (M, M)."""
-        white = self.whitened(features)
-        seen = self.projected(white)
-        return np.asarray(white.T @ white - seen.T @ seen)
-
-    def pull(self, residual: FloatArray) -> tuple[FloatArray, float]:
-        """Return the precision times residuals in uT, shape (N, 3), and their squared length."""
-        lower, scale = self._root
-        white = self.whitened(residual)
-        seen = self.projected(white)
-        back = scale[:, None] * solve_triangular(
-            lower, seen, lower=True, trans="T", check_finite=False
-        )
-        left = white - self.nuisance @ back
-        pulled = (self.whitening.T @ left).reshape(-1, 3)
-        return np.asarray(pulled), float(white.ravel() @ left.ravel())
-
-    def near(self, keep: BoolArray) -> "MarginalRows":
-        """Return the readings of all slots of which some are to be kept, (N,), as views.
-
-        What the others know of the errors counts as before.
-        """
-        chosen = np.isin(self.slot, np.unique(self.slot[keep]))
-        at = np.flatnonzero(chosen)
-        rows = (3 * at[:, None] + np.arange(3)).ravel()
-        part = replace(
-            self,
-            points=self.points[at],
-            residual=self.residual[at],
-            whitening=self.whitening[rows][:, rows],
-            nuisance=self.nuisance[rows],
-            slot=self.slot[at],
-        )
-        part.__dict__["_root"] = self._root
-        return part

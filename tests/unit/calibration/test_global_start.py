@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from l2m_gtsam.calibration.start.candidates import Basin, Candidates
+from l2m_gtsam.calibration.start.candidates import Candidates
+from l2m_gtsam.calibration.start.descent import Basin
 from l2m_gtsam.calibration.start.global_start import (
     StartOptions,
     distinct,

@@ -9,8 +9,9 @@ from scipy.sparse import csr_array, eye_array
 
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
+from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
-from l2m_gtsam.maps.sources.source import MarginalRows, SourceShape
+from l2m_gtsam.maps.sources.source import SourceShape
 
 NOISE_UT = 0.1
 DIPOLE = SourceShape.dipole(np.array([1.0, 0.8, 0.5]), np.array([3.0, -2.0, 9.0]))
