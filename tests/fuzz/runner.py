@@ -35,7 +35,11 @@ def import_commands() -> None:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a case ended: a word of ``GOOD`` or ``BAD``, what it used and what it said."""
+    """How a case ended: a word of ``GOOD`` or ``BAD``, what it used and what it said.
+
+    ``peak_bytes`` is the memory at its peak beyond the heap that it was forked with: that one is as
+    large as what ran in the same process before.
+    """
 
     how: str
     said: str
@@ -57,16 +61,25 @@ def run_case(words: Sequence[str], folder: Path, out: Path, most_s: int = MOST_C
     most_s
         Seconds of a core that it may take.
     """
-    log = folder / "said.log"
+    log, inherited = folder / "said.log", heap_bytes()
     number = start_command(words, folder, log, most_s)
     status, usage, late = _awaited(number)
     said = log.read_text(encoding="utf-8", errors="replace")
     log.unlink()
-    cpu_s, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
+    cpu_s, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024 - inherited
     how = _judged(status, said, late or cpu_s > most_s, peak)
     if how in GOOD.values() and (left := _left_over(folder, out, status)):
         how, said = "left over", f"{left}\n{said}"
     return Ended(how, said, cpu_s, peak)
+
+
+def heap_bytes() -> int:
+    """Return the resident memory of this process without mapped files."""
+    try:
+        resident, shared = Path("/proc/self/statm").read_text().split()[1:3]
+    except OSError:  # no such file: the heap of a child counts as its own
+        return 0
+    return (int(resident) - int(shared)) * resource.getpagesize()
 
 
 def start_command(words: Sequence[str], folder: Path, log: Path, most_s: int) -> int:
