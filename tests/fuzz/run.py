@@ -75,7 +75,8 @@ def run(numbers: range, corpus: Sequence[Sound], out: Path) -> tuple[Counter[tup
     done = [ends[number] for number in numbers]
     peak = max(each.peak_bytes for each in done) / 2**20
     slowest = max(each.cpu_s for each in done)
-    took = f"{len(done):,} cases, peak {peak:.0f} MiB beside the program, slowest {slowest:.1f} s of a core"
+    most = f"peak {peak:.0f} MiB beside the program, slowest {slowest:.1f} s of a core"
+    took = f"{len(done):,} cases, {most}"
     counts = Counter((each.kind, each.how) for each in done)
     (out / "table.md").write_text(f"{took}\n\n{table(counts)}")
     return counts, took
