@@ -1,5 +1,6 @@
 """SLAM without a map, method by method: cells of the study, and what each makes of one drive."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -19,15 +20,25 @@ from l2m_gtsam.records.calibration import (
     Uncertainty,
 )
 from l2m_gtsam.slam.exploration import explore
+from l2m_gtsam.slam.online.replay import give, messages
+from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.studies.peers.reduced_rank_ekf import ReducedRankEkfOptions, reduced_rank_ekf
+from l2m_gtsam.studies.peers.fixed_lag import FixedLagOptions, fixed_lag_slam
+from l2m_gtsam.studies.peers.particle_slam import ParticleSlamOptions, particle_slam
+from l2m_gtsam.studies.peers.reduced_rank_ekf import (
+    FilteredPath,
+    ReducedRankEkfOptions,
+    reduced_rank_ekf,
+)
 from l2m_gtsam.studies.slam.recordings import (
+    HANDHELD,
     ROBOT,
     SHIP,
     DriftRecipe,
     Form,
     TrueDrive,
     drifted,
+    handheld_run,
     robot_run,
     ship_run,
 )
@@ -66,21 +77,45 @@ def odometry_row(drive: TrueDrive, odometry: Trajectory, rows: IntArray) -> Meth
     return MethodRow(rms(odometry.p[rows], drive.truth.p[rows]), None, 0.0)
 
 
-def filter_row(
-    drive: TrueDrive, odometry: Trajectory, rows: IntArray, options: ReducedRankEkfOptions
+def peer_row(
+    drive: TrueDrive, rows: IntArray, method: Callable[[FloatArray], FilteredPath]
 ) -> MethodRow:
-    """Return those of the reduced-rank Kalman filter, whose box is about the true path."""
+    """Return those of a peer, whose box is about the true path."""
     box = np.stack([drive.truth.p.min(axis=0), drive.truth.p.max(axis=0)])
     begun = process_time()
-    found = reduced_rank_ekf(odometry, drive.field, box, options)
+    found = method(box)
     taken = process_time() - begun
     estimate = Trajectory(
-        odometry.stamp_ns, found.R, found.p, "map", "lidar", covariance=found.covariance
+        drive.truth.stamp_ns, found.R, found.p, "map", "lidar", covariance=found.covariance
     )
     return MethodRow(
         rms(found.p[rows], drive.truth.p[rows]),
         mean_nees(estimate[rows], drive.truth[rows]),
         1e3 * taken / len(rows),
+    )
+
+
+def online_row(
+    drive: TrueDrive, odometry: Trajectory, options: SlamOptions, noise_ut: float
+) -> MethodRow:
+    """Return those of ``l2m slam --online`` without a map: each pose when it is made."""
+    begun = process_time()
+    slam = OnlineSlam(as_recorded(noise_ut), options)
+    poses = [pose for each in messages(drive.recording(odometry)) for pose in give(slam, each)]
+    last = slam.finish()
+    taken = process_time() - begun
+    poses = [*(each for each in poses if each.stamp_ns < last[0].stamp_ns), *last]
+    found = Trajectory(
+        np.array([each.stamp_ns for each in poses]),
+        np.stack([each.T_map_lidar.R for each in poses]),
+        np.stack([each.T_map_lidar.t for each in poses]),
+        "map",
+        "lidar",
+        covariance=np.stack([each.covariance for each in poses]),
+    )
+    truth = drive.truth[np.searchsorted(drive.truth.stamp_ns, found.stamp_ns)]
+    return MethodRow(
+        rms(found.p, truth.p), mean_nees(found, truth), 1e3 * taken / max(len(poses), 1)
     )
 
 
@@ -153,7 +188,7 @@ def mean_nees(estimate: Trajectory, truth: Trajectory) -> float | None:
     return float(nees(np.hstack([turn, shift])[1:], estimate.covariance[1:]).mean())
 
 
-SHIP_RUNS = ("ship-1", "ship-2")
+RECORDINGS = ("ship-1", "ship-2", "hand-0", "hand-1")
 WALK_TIMES = 10.0  # the drift of a step as noise of the walk: half a metre in 500 steps
 
 
@@ -169,9 +204,9 @@ class SlamStudyOptions(Options):
 
     data: str = "../shared/data"
     """Folder of the recordings, which are no part of this package."""
-    recordings: tuple[str, ...] = SHIP_RUNS
-    """Runs of the ship, and `robot-1` to `robot-4`: passes whose field has so much detail that a
-    drive takes ten minutes and more."""
+    recordings: tuple[str, ...] = RECORDINGS
+    """Runs of the ship and of a sensor in the hand, and `robot-1` to `robot-4`: passes whose field
+    has so much detail that a drive takes ten minutes and more."""
     seed: int = Field(default=0, ge=0)
     """The first;"""
     seeds: int = Field(default=2, ge=1)
@@ -182,17 +217,36 @@ class SlamStudyOptions(Options):
     """Errors of odometry. The random walk has none that all steps share, and ten times as much
     noise more."""
     filter: ReducedRankEkfOptions = ReducedRankEkfOptions()
-    """Parameters of the peer."""
+    """Field, noise and errors of steps that the peers assume."""
+    particles: ParticleSlamOptions = ParticleSlamOptions()
+    """Parameters of the particle filter,"""
+    fixed_lag: FixedLagOptions = FixedLagOptions()
+    """and of GTSAM's fixed-lag smoother."""
 
 
 @dataclass(frozen=True)
 class SlamCell:
-    """What the methods make of one drive with one odometry."""
+    """What the methods make of one drive with one odometry.
+
+    Attributes
+    ----------
+    path_m, key_poses
+        Length of the true path, and number of key poses of ``l2m slam``.
+    odometry
+        Odometry alone.
+    ekf, particles, fixed_lag
+        The peers.
+    online, ours
+        ``l2m slam`` on line and off line. On line steps are always as the vehicle sees them.
+    """
 
     path_m: float
     key_poses: int
     odometry: MethodRow
-    filter: MethodRow
+    ekf: MethodRow
+    particles: MethodRow
+    fixed_lag: MethodRow
+    online: MethodRow | None
     ours: MethodRow
 
 
@@ -212,12 +266,18 @@ def site_of(key: str) -> str:
     return "-".join(key.split("-")[:2])
 
 
+READERS = {
+    "ship": (ship_run, SHIP),
+    "hand": (handheld_run, HANDHELD),
+    "robot": (robot_run, ROBOT),
+}
+
+
 def read_drive(options: SlamStudyOptions, site: str) -> TrueDrive:
     """Return a recording with its true poses."""
-    vehicle, run = site.split("-")
-    if vehicle == "ship":
-        return ship_run(Path(options.data) / SHIP, int(run))
-    return robot_run(Path(options.data) / ROBOT, int(run))
+    carrier, run = site.split("-")
+    read, name = READERS[carrier]
+    return read(Path(options.data) / name, int(run))
 
 
 def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:
@@ -227,11 +287,22 @@ def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:
     odometry = drifted(drive.truth, recipe, Form(form), int(seed))
     stated = stated_drift(drive.truth, recipe, Form(form))
     ours, rows = our_row(drive, odometry, stated, options.noise_ut)
+    model, field = options.filter, drive.field
+    peers: tuple[Callable[[FloatArray], FilteredPath], ...] = (
+        lambda box: reduced_rank_ekf(odometry, field, box, model),
+        lambda box: particle_slam(odometry, field, box, model, options.particles, int(seed)),
+        lambda box: fixed_lag_slam(odometry, field, box, model, options.fixed_lag),
+    )
+    ekf, particles, fixed_lag = (peer_row(drive, rows, method) for method in peers)
+    as_seen = Form(form) is Form.VEHICLE
     return SlamCell(
         path_m=float(drive.path_m),
         key_poses=len(rows),
         odometry=odometry_row(drive, odometry, rows),
-        filter=filter_row(drive, odometry, rows, options.filter),
+        ekf=ekf,
+        particles=particles,
+        fixed_lag=fixed_lag,
+        online=online_row(drive, odometry, stated, options.noise_ut) if as_seen else None,
         ours=ours,
     )
 

@@ -15,7 +15,9 @@ from l2m_gtsam.options import Options
 
 SHIP = "model_ship_runs1-2.npz"
 ROBOT = "aalto_robot_runs1-4.npz"
-EVERY = 20  # of the robot's poses, at 50 Hz
+HANDHELD = "optitrack_handheld_2runs.npz"
+EVERY = 20  # of the robot's poses, at 50 Hz,
+EVERY_HANDHELD = 50  # and of those of the sensor in the hand, at 200 Hz
 EARTH_UT = 50.0
 """The ship's field is in a unit of about the Earth's strength, here this many microtesla."""
 SECOND = 1e9
@@ -97,6 +99,32 @@ def robot_run(path: Path, run: int) -> TrueDrive:
         ) from error
     stamps = np.round(SECOND * seconds).astype(np.int64)
     truth = Trajectory(stamps, R, p + R @ lever, "map", "lidar")
+    return TrueDrive(truth, field, SourceFile(str(path), sha256(content).hexdigest()))
+
+
+def handheld_run(path: Path, run: int) -> TrueDrive:
+    """Return a run of a magnetometer in the hand, as if it were at the tracked origin.
+
+    Raises
+    ------
+    ConfigError
+        There is no such file, or it has no such run.
+    """
+    try:
+        content = path.read_bytes()
+        with np.load(path, allow_pickle=False) as arrays:
+            rows = np.flatnonzero(arrays["run"] == run)[::EVERY_HANDHELD]
+            seconds, p = arrays["t"][rows], arrays["position"][rows].astype(np.float64)
+            quaternion = arrays["quaternion_wxyz"][rows].astype(np.float64)
+            field = arrays["mag_uT"][rows].astype(np.float64)
+        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    except (OSError, KeyError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: no run {run} of the sensor in the hand can be read; set `data` to the folder "
+            f"of {HANDHELD}"
+        ) from error
+    stamps = np.round(SECOND * seconds).astype(np.int64)
+    truth = Trajectory(stamps, R, p, "map", "lidar")
     return TrueDrive(truth, field, SourceFile(str(path), sha256(content).hexdigest()))
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from l2m_gtsam.studies.slam.methods import (
@@ -19,10 +20,26 @@ from l2m_gtsam.studies.slam.methods import (
 from l2m_gtsam.studies.slam.recordings import TrueDrive
 from l2m_gtsam.studies.study import Study
 
-METHODS = {"odometry": "odometry", "filter": "reduced-rank filter", "ours": "l2m slam"}
-COLOURS = {"odometry": "#999999", "filter": "#d55e00", "ours": "#0072b2"}
+METHODS = {
+    "odometry": "odometry",
+    "ekf": "reduced-rank filter",
+    "particles": "particle filter",
+    "fixed_lag": "fixed-lag smoother",
+    "online": "l2m slam --online",
+    "ours": "l2m slam",
+}
+PEERS = ("ekf", "particles", "fixed_lag")
+COLOURS = {
+    "odometry": "#999999",
+    "ekf": "#d55e00",
+    "particles": "#e69f00",
+    "fixed_lag": "#cc79a7",
+    "online": "#56b4e9",
+    "ours": "#0072b2",
+}
 LOWEST, HIGHEST = 3.0, 12.0  # NEES of whole poses, 6 where sigmas are right
-WIDTH = 0.26  # of a bar, where drives are one apart
+HIGHEST_BAR = 1.4  # times odometry's error: what is beyond is cut off
+WIDTH = 0.14  # of a bar, where drives are one apart
 
 
 @dataclass(frozen=True)
@@ -60,7 +77,10 @@ class SlamRow:
     path_m: float
     key_poses: int
     odometry: MethodFigures
-    filter: MethodFigures
+    ekf: MethodFigures
+    particles: MethodFigures
+    fixed_lag: MethodFigures
+    online: MethodFigures | None
     ours: MethodFigures
 
 
@@ -106,10 +126,14 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
         return SlamSummary(options, tuple(row_of(key, own) for key, own in groups.items()))
 
     def page_context(self, summary: SlamSummary) -> dict[str, Any]:
-        """Return what is lost: rows that the peer wins, wrong sigmas, drives without a gain."""
+        """Return what is lost: rows that a peer wins, wrong sigmas, drives without a gain."""
         rows = summary.rows
         return {
-            "lost": [named(row) for row in rows if row.filter.rms_m < row.ours.rms_m],
+            "methods": METHODS,
+            "lost": [f"{named(row)} ({', '.join(won)})" for row in rows if (won := winners(row))],
+            "worse": [
+                named(row) for row in rows if row.online is not None and not row.online.never_worse
+            ],
             "outside": [
                 named(row)
                 for row in rows
@@ -122,20 +146,36 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
 
     def figures(self, summary: SlamSummary) -> dict[str, Figure]:
         """Draw the errors of the methods, drive by drive."""
-        figure = Figure(figsize=(9.0, 4.6), layout="constrained", dpi=150)
-        axes, at = figure.add_subplot(), np.arange(len(summary.rows))
-        for place, (name, label) in enumerate(METHODS.items()):
-            own: list[MethodFigures] = [getattr(row, name) for row in summary.rows]
-            mean = np.array([each.rms_m for each in own])
-            worst = np.array([each.worst_m for each in own])
-            axes.bar(at + (place - 1) * WIDTH, mean, WIDTH, color=COLOURS[name], label=label)
-            axes.vlines(at + (place - 1) * WIDTH, mean, worst, color="black", linewidth=0.8)
-        names = [f"{row.site}\n{row.kind}\n{row.form}" for row in summary.rows]
-        axes.set_xticks(at, names, fontsize=5.5)
-        axes.set(ylabel="error (m); lines: worst seed", ylim=(0, None))
-        axes.grid(axis="y", alpha=0.3)
-        axes.legend()
+        sites = list(dict.fromkeys(row.site for row in summary.rows))
+        size = (9.0, 2.4 * len(sites) + 0.4)
+        figure = Figure(figsize=size, layout="constrained", dpi=150)
+        panels = figure.subplots(len(sites), squeeze=False)[:, 0]
+        for axes, site in zip(panels, sites, strict=True):
+            own = [row for row in summary.rows if row.site == site]
+            for place, name in enumerate(METHODS):
+                _draw_method(axes, own, name, (place - 0.5 * (len(METHODS) - 1)) * WIDTH)
+            names = [f"{row.kind}, {row.form}" for row in own]
+            axes.set_xticks(np.arange(len(own)), names)
+            most = max(row.odometry.worst_m for row in own)
+            axes.set(title=site, ylabel="error (m)", ylim=(0, HIGHEST_BAR * most))
+            axes.grid(axis="y", alpha=0.3)
+        panels[0].legend(ncols=3, fontsize=7)
         return {"slam": figure}
+
+
+def _draw_method(axes: Axes, rows: list[SlamRow], name: str, beside: float) -> None:
+    """Draw a method's bars, and lines to its worst seed."""
+    for place, row in enumerate(rows):
+        found: MethodFigures | None = getattr(row, name)
+        if found is not None:
+            label = METHODS[name] if place == len(rows) - 1 else None
+            axes.bar(place + beside, found.rms_m, WIDTH, color=COLOURS[name], label=label)
+            axes.vlines(place + beside, found.rms_m, found.worst_m, color="black", linewidth=0.8)
+
+
+def winners(row: SlamRow) -> list[str]:
+    """Return the peers whose error is smaller than that of ``l2m slam``."""
+    return [METHODS[name] for name in PEERS if getattr(row, name).rms_m < row.ours.rms_m]
 
 
 def named(row: SlamRow) -> str:
@@ -147,6 +187,7 @@ def row_of(key: str, cells: list[SlamCell]) -> SlamRow:
     """Return the figures of one group of seeds."""
     vehicle, run, kind, form = key.split("-")
     before = [each.odometry for each in cells]
+    online = [each.online for each in cells if each.online is not None]
     return SlamRow(
         site=f"{vehicle} {run}",
         kind=kind,
@@ -154,7 +195,10 @@ def row_of(key: str, cells: list[SlamCell]) -> SlamRow:
         path_m=cells[0].path_m,
         key_poses=cells[0].key_poses,
         odometry=figures_of(before, before),
-        filter=figures_of([each.filter for each in cells], before),
+        ekf=figures_of([each.ekf for each in cells], before),
+        particles=figures_of([each.particles for each in cells], before),
+        fixed_lag=figures_of([each.fixed_lag for each in cells], before),
+        online=figures_of(online, before) if len(online) == len(cells) else None,
         ours=figures_of([each.ours for each in cells], before),
     )
 

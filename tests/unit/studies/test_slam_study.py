@@ -10,16 +10,30 @@ def test_what_is_lost_is_on_the_page() -> None:
     assert len(keys) == len(set(keys)) == 8
     alone = MethodRow(2.0, None, 0.0)
     good, bad = MethodRow(0.5, 6.0, 50.0), MethodRow(2.5, 40.0, 50.0, unchanged=True)
-    peer = MethodRow(1.0, 9.0, 0.5)
+    peer, lost = MethodRow(1.0, 9.0, 0.5), MethodRow(3.0, 40.0, 20.0)
     cells = {
-        key: SlamCell(100.0, 300, alone, peer, bad if "walk-world" in key else good) for key in keys
+        key: SlamCell(
+            path_m=100.0,
+            key_poses=300,
+            odometry=alone,
+            ekf=peer,
+            particles=peer,
+            fixed_lag=lost,
+            online=lost if "vehicle" in key else None,
+            ours=bad if "walk-world" in key else good,
+        )
+        for key in keys
     }
     summary = SLAM.summarise(options, cells)
     assert [row.ours.removed for row in summary.rows] == [0.75, 0.75, -0.25, 0.75]
     assert [row.ours.never_worse for row in summary.rows] == [True, True, False, True]
     page = SLAM.page(summary)
-    assert "Where the filter's error is smaller: ship 1, walk, world." in page
+    won = "smaller: ship 1, walk, world (reduced-rank filter, particle filter)."
+    assert won in page
+    assert "worse than odometry: ship 1, published, vehicle; ship 1, walk, vehicle." in page
     assert "not within 3 to 12: ship 1, walk, world." in page
     assert "nothing was gained: ship 1, walk, world (2)." in page
     assert page.count("| 75 % |") == 3
+    # On line steps are as the vehicle sees them: two forms in two tables.
+    assert page.count("| - |") == 4
     assert set(SLAM.figures(summary)) == {"slam"}
