@@ -1,4 +1,4 @@
-r"""What readings say of a path in an unknown field, by second derivatives of its density.
+r"""What readings determine of a path in an unknown field, by second derivatives of its density.
 
 With xi the errors of odometry in units of their sigmas, c those of the sensor, and B the second
 derivatives of :math:`-\log p(z | X)` by both (see :mod:`.path_density`), the covariance of (xi, c)
@@ -9,16 +9,15 @@ is that of Laplace's approximation,
 
 with the eigenvalues l of B. Readings determine few directions, which Lanczos' iteration finds from
 products with B; all others stay as odometry has them (T. Bui-Thanh, O. Ghattas, J. Martin,
-G. Stadler, 2013, on such covariances). Where the estimate is not quite at the mode, some l are
-negative: there the readings are likelier further off on both sides, and nothing counts as known.
+G. Stadler, SIAM Journal on Scientific Computing 35, 2013). Where the estimate is not at the mode,
+some l are negative: readings hold the path nowhere along these directions, which stay, too.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import eigh_tridiagonal
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
 
@@ -33,28 +32,27 @@ from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances
 from l2m_gtsam.slam.unknown_field.path_density import PathDensity, PathReadings
 from l2m_gtsam.slam.unknown_field.sensor_noise import NS, NoiseInformation, SensorNoise
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
+from l2m_gtsam.solve.lanczos import eigenpairs
 from l2m_gtsam.solve.linear_algebra import covariance_root
 
-VECTORS = 120  # of Lanczos' iteration
+VECTORS = 120  # of Lanczos' iteration; with twice as many sigmas are 4 to 5 % smaller
 LEAST = 0.01  # eigenvalue: less of it would change a variance by 1 %
 SIDE = 1e-3  # of a finite difference, in sigmas
-DRAWN = 24  # of the iteration's first vector
-
-Product = Callable[[FloatArray], FloatArray]
+SEED = 24  # of the iteration's first vector
 
 
 @dataclass(frozen=True)
 class PathInformation:
-    """Covariances of a path and its sensor, by odometry less what readings determine.
+    """Covariances of a path and its sensor: by odometry, less what readings determine.
 
     Attributes
     ----------
     odometry
         Of the poses by odometry alone.
     learnt
-        Roots of what readings take from the covariance of K poses, shape (K, 6, q).
+        Root of what readings take from the covariance of K poses, shape (K, 6, q).
     sensor
-        The same of (t, C row by row, H), shape (15, q).
+        Root of what they take from that of (t, C row by row, H), shape (15, q).
     """
 
     odometry: Marginals
@@ -71,7 +69,7 @@ class PathInformation:
         own = self.learnt[step : step + 2].reshape(2 * POSE, -1)
         return np.asarray(self.odometry.joint([X(step), X(step + 1)]) - own @ own.T)
 
-    def variance_along(self, directions: Mapping[int, FloatArray]) -> float:
+    def variance_along(self, directions: Mapping[int, FloatArray], /) -> float:
         """Return ``d^T P d`` for a direction d in which poses move; see ``Marginals``."""
         along = np.zeros(self.learnt.shape[2])
         for k, own in enumerate(self.learnt):
@@ -88,7 +86,7 @@ def path_information(
     noise: SensorNoise,
     weights: FloatArray,
 ) -> PathInformation:
-    """Return what readings say of a path.
+    """Return what readings determine of a path.
 
     Parameters
     ----------
@@ -101,43 +99,74 @@ def path_information(
     weights
         Robust weight of each reading, positive, shape (N,).
     """
-    linear = odometry_graph(drive).linearize(values)
-    i, j, entry = linear.sparseJacobian_()
-    count = int(j.max()) - 1  # its last column is the right-hand side
-    left = j <= count
-    root = splu(csc_array((entry[left], (i[left] - 1, j[left] - 1)), shape=(count, count)))
-    others = count - POSE * len(poses)  # columns of the keys G or V, which come before X
-    motions = RelativeMotions.along(drive, poses)
-    readings, by_pose = path_readings(motions, poses)
-    density = PathDensity(
-        readings,
-        prior.field,
-        NoiseInformation(noise, NS * (drive.reading_ns - drive.stamp_ns[0]), weights),
+    near = PathNeighbourhood(drive, poses, values, prior, noise, weights)
+    here = near.slopes(np.zeros(near.size))
+    first = np.random.default_rng(SEED).normal(size=near.size)
+    found, vectors = eigenpairs(
+        lambda v: (near.slopes(SIDE * v) - here) / SIDE, first, min(VECTORS, near.size)
     )
-    sensors = drive.sensors
-    at = np.concatenate([sensors.t[0], sensors.distortion[0]])
-    by_sensor = covariance_root(sensors.covariance[0], np.sqrt(np.diag(sensors.covariance[0])))
+    known = found > LEAST
+    share = vectors[:, known] * np.sqrt(found[known] / (1 + found[known]))
+    return PathInformation(near.odometry, *near.moved_by(share))
 
-    def gradient(off: FloatArray) -> FloatArray:
-        moved = (by_pose @ root.solve(off[:count])[others:]).reshape(-1, POSE)
-        slopes = density.slopes(moved, at + by_sensor @ off[count:])
-        back = np.append(np.zeros(others), by_pose.T @ slopes.by_path.ravel())
-        return np.append(root.solve(back, trans="T"), by_sensor.T @ slopes.by_sensor)
 
-    here = gradient(np.zeros(count + len(at)))
-    first = np.random.default_rng(DRAWN).normal(size=len(here))
-    values_of, vectors = eigenpairs(
-        lambda v: (gradient(SIDE * v) - here) / SIDE, first, min(VECTORS, len(here))
-    )
-    known = values_of > LEAST
-    share = vectors[:, known] * np.sqrt(values_of[known] / (1 + values_of[known]))
-    learnt = root.solve(share[:count])[others:].reshape(len(poses), POSE, -1)
-    graph = odometry_graph(drive)
-    return PathInformation(
-        Marginals(graph.linearize(values), colamd_ordering(graph)),
-        learnt,
-        by_sensor @ share[count:],
-    )
+class PathNeighbourhood:
+    """The density of readings where odometry and sensor have other errors than estimated.
+
+    Parameters as of ``path_information``. Errors are those of odometry's steps, start and what they
+    have in common, then those of the sensor, all in units of their sigmas and relative to the
+    estimate.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        poses: list[gtsam.Pose3],
+        values: gtsam.Values,
+        prior: WholePrior,
+        noise: SensorNoise,
+        weights: FloatArray,
+    ) -> None:
+        graph = odometry_graph(drive)
+        linear = graph.linearize(values)
+        self.odometry = Marginals(linear, colamd_ordering(graph))
+        # As many errors as variables: those of the keys G and V come before those of the poses.
+        row, column, entry = linear.sparseJacobian_()
+        self._steps = int(column.max()) - 1  # the last column is the right-hand side
+        self._others = self._steps - POSE * len(poses)
+        left, shape = column <= self._steps, (self._steps, self._steps)
+        at = (row[left].astype(np.int64) - 1, column[left].astype(np.int64) - 1)
+        by_variables = csc_array((entry[left], at), shape=shape)
+        self._root, self._transposed = splu(by_variables), splu(csc_array(by_variables.T))
+        motions = RelativeMotions.along(drive, poses)
+        readings, self._by_pose = path_readings(motions, poses)
+        seconds = NS * (drive.reading_ns - drive.stamp_ns[0])
+        information = NoiseInformation(noise, seconds, weights)
+        self._density = PathDensity(readings, prior.field, information)
+        sensors = drive.sensors
+        self._sensor = np.concatenate([sensors.t[0], sensors.distortion[0]])
+        covariance = sensors.covariance[0]
+        self._by_sensor = covariance_root(covariance, np.sqrt(np.diag(covariance)))
+
+    @property
+    def size(self) -> int:
+        """Number n of errors."""
+        return self._steps + len(self._sensor)
+
+    def slopes(self, errors: FloatArray) -> FloatArray:
+        """Return the derivatives of minus the log density where errors are so, both (n,)."""
+        poses, sensor = self.moved_by(errors[:, None])
+        moved = (self._by_pose @ poses.ravel()).reshape(-1, POSE)
+        found = self._density.slopes(moved, self._sensor + sensor[:, 0])
+        back = np.append(np.zeros(self._others), self._by_pose.T @ found.by_path.ravel())
+        by_steps = np.asarray(self._transposed.solve(back))
+        return np.append(by_steps, self._by_sensor.T @ found.by_sensor)
+
+    def moved_by(self, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how q errors (n, q) move K poses, (K, 6, q), and the sensor, (15, q)."""
+        steps = np.asarray(self._root.solve(errors[: self._steps]))
+        poses = steps[self._others :].reshape(-1, POSE, errors.shape[1])
+        return poses, np.asarray(self._by_sensor @ errors[self._steps :])
 
 
 def path_readings(
@@ -149,54 +178,23 @@ def path_readings(
     shape (6 N, 6 K). A reading moves with both ends of its step, and against the frame.
     """
     readings, key = motions.readings, motions.readings.key_pose
-    relative = [poses[0].between(pose) for pose in poses]
-    R_key = np.stack([pose.rotation().matrix() for pose in relative])[key]
-    p_key = np.stack([pose.translation() for pose in relative])[key]
+    R_key, p_key = (each[key] for each in stacked([poses[0].between(pose) for pose in poses]))
     R = R_key @ readings.R_key_lidar
     p = np.einsum("nij,nj->ni", R_key, readings.p_key_lidar) + p_key
-    R_step = np.stack([step.rotation().matrix() for step in motions.steps])[key]
-    p_step = np.stack([step.translation() for step in motions.steps])[key]
+    R_step, p_step = (each[key] for each in stacked(motions.steps))
     by_end = readings.fraction[:, None, None] * motions.by_step
     by_key = carried_back(readings.R_key_lidar, readings.p_key_lidar)
     by_key -= by_end @ carried_back(R_step, p_step)
-    own = np.arange(POSE)
-    rows = POSE * np.arange(len(key))[:, None, None] + own[:, None] + np.zeros((1, 1, POSE), int)
-    columns = POSE * np.stack([key, key + 1, np.zeros_like(key)])[:, :, None, None] + own
     blocks = np.stack([by_key, by_end, -carried_back(R, p)])
+    own, of = np.arange(POSE), np.stack([key, key + 1, np.zeros_like(key)])
+    row = POSE * np.arange(len(key))[:, None, None] + own[:, None]
+    column = POSE * of[:, :, None, None] + own
+    at = tuple(np.broadcast_to(each, blocks.shape).ravel() for each in (row, column))
     shape = POSE * len(key), POSE * len(poses)
-    at = np.broadcast_to(rows, blocks.shape), np.broadcast_to(columns, blocks.shape)
-    by_pose = csr_array((blocks.ravel(), (at[0].ravel(), at[1].ravel())), shape=shape)
-    return PathReadings(R, p, readings.field), by_pose
+    return PathReadings(R, p, readings.field), csr_array((blocks.ravel(), at), shape=shape)
 
 
-def eigenpairs(product: Product, first: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return eigenvalues (q,) and eigenvectors (n, q) of a symmetric matrix on a Krylov space.
-
-    Lanczos' iteration with every vector kept orthogonal to all before (G. Golub, C. Van Loan,
-    "Matrix computations", 2013, 10.3). The largest eigenvalues are found first.
-
-    Parameters
-    ----------
-    product
-        Of the matrix with a vector.
-    first
-        Vector that the space begins with, shape (n,).
-    count
-        Dimension of the space, n at most.
-    """
-    basis = np.zeros((count, len(first)))
-    diagonal, beside = np.zeros(count), np.zeros(count)
-    vector = first / np.linalg.norm(first)
-    for j in range(count):
-        basis[j] = vector
-        vector = product(vector)
-        diagonal[j] = vector @ basis[j]
-        for _ in range(2):  # twice is enough for rounding
-            vector = vector - basis[: j + 1].T @ (basis[: j + 1] @ vector)
-        beside[j] = np.linalg.norm(vector)
-        if beside[j] <= np.finfo(float).eps * np.abs(diagonal).max():  # the space is invariant
-            count = j + 1
-            break
-        vector /= beside[j]
-    values, vectors = eigh_tridiagonal(diagonal[:count], beside[: count - 1])
-    return values, basis[:count].T @ vectors
+def stacked(poses: Sequence[gtsam.Pose3]) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (K, 3, 3) and positions (K, 3) in metres."""
+    R = np.stack([pose.rotation().matrix() for pose in poses])
+    return R, np.stack([pose.translation() for pose in poses])
