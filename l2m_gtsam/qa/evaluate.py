@@ -16,7 +16,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import spread
 from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.parallel.threads import in_threads, one_blas_thread, side_by_side
+from l2m_gtsam.parallel.threads import in_threads, one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, SeenSensors, map_picture, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
@@ -61,12 +61,9 @@ def evaluate(
     """
     evidence, maps = evidence_of(calibrated), maps_of(calibrated)
     seen = SeenSensors.of(calibrated.result, evidence, maps.along_drive)
-    # Parts are GTSAM's, who holds Python; the map leaves it alone.
-    repeats, picture = side_by_side(
-        lambda: repeats_of(recording, calibrated, options, qa, progress),
-        lambda: map_picture(maps.anywhere, seen.places),
-    )
+    repeats = repeats_of(recording, calibrated, options, qa, progress)
     progress(FIGURES, 0.0)
+    picture = map_picture(maps.anywhere, seen.places)  # by all cores
     metrics = metrics_of(calibrated.result, seen, recording, picture, repeats)
     progress(FIGURES, 0.5)
     return metrics
