@@ -174,8 +174,8 @@ def keep_map_file_up(
     check_outputs(out, suffix=".npz")
     if suite is None:
         raise MapError(
-            "--changes needs to know the vehicle: a sensor that is not calibrated cannot tell what "
-            "changed; give its calibration with --suite"
+            "--changes needs a calibrated vehicle: else steel of the place and of the vehicle are "
+            "confused; give the calibration of its sensors with --suite"
         )
     drives = _added(map_path, bags, config, suite, progress)
     progress("looking for what changed", 0.0)
