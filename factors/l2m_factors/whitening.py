@@ -14,7 +14,7 @@ import numpy as np
 
 from l2m_factors.field_map import FloatArray
 
-NOTHING = 1e-3  # of a variance: by so much less of it no sigma is told from another
+NOTHING = 1e-3  # of a variance: a smaller part of it changes no sigma noticeably
 
 
 @dataclass(frozen=True)

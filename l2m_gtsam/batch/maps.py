@@ -148,7 +148,7 @@ def keep_map_file_up(
     suite: Path | None,
     progress: Progress,
 ) -> BuiltMap:
-    """Add drives of a calibrated vehicle to a map, and tell what has changed since.
+    """Add drives of a calibrated vehicle to a map, and record what has changed since.
 
     Parameters
     ----------

@@ -222,12 +222,12 @@ def report_calibration(
     L2MError
         The report cannot be written, or the folder holds a localisation, too; one line.
     """
-    tell = progress or (lambda stage, fraction: None)
-    tell(STAGE, 0.0)
+    report = progress or (lambda stage, fraction: None)
+    report(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE)
     holds_localisation(folder)
-    verdict = write_report(folder, found.result, found.metrics, options, tell)
-    tell(STAGE, 1.0)
+    verdict = write_report(folder, found.result, found.metrics, options, report)
+    report(STAGE, 1.0)
     return verdict
 
 

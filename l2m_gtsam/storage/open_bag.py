@@ -262,7 +262,7 @@ def typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typ
     if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
         store = _default_typestore(is_ros1)
         if msgtype not in store.types:
-            raise ValueError("the bag holds none and ROS knows none; an mcap file would carry it")
+            raise ValueError("neither the bag nor ROS has one; an mcap file would carry it")
         return store
     if len(definition.data) > MOST_DEFINITION:
         raise ValueError(f"it has {len(definition.data):,} letters")
