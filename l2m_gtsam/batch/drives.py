@@ -80,10 +80,6 @@ def calibrate_bags(
     ----------
     bags
         Drives of one vehicle through the mapped place, which are calibrated together.
-    map_path
-        Map file.
-    config
-        Configuration.
     out
         Folder for the results, made if it is missing.
     progress
@@ -154,8 +150,6 @@ def plan_bag(
     ----------
     bag
         A drive through the mapped place.
-    map_path
-        Map file.
     config
         Configuration; `calibration.start` says where the bag's sensors are assumed.
     at

@@ -67,8 +67,6 @@ def verdict_notes(path: Path, result: CalibrationResult, despite_verdict: bool) 
 
     Parameters
     ----------
-    path, result
-        The calibration and its file.
     despite_verdict
         Whether a FAIL is to be used all the same.
 
@@ -182,8 +180,6 @@ class Reading:
 
         Parameters
         ----------
-        result
-            The calibration.
         path
             Its file, for messages.
 

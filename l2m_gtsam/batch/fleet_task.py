@@ -198,10 +198,6 @@ class FleetTask:
 
     Attributes
     ----------
-    drive
-        The drive.
-    config
-        Configuration.
     out
         Folder for its results.
     map_digest, config_digest

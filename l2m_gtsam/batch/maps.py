@@ -64,8 +64,6 @@ def build_map_file(
         One or several mapping bags.
     out
         Map file to write (`.npz`).
-    config
-        Configuration.
     suite
         File with the mapping suite's calibrations; ideal sensors at the lidar's origin if absent.
     progress
@@ -199,8 +197,6 @@ class _AddedDrives:
     ----------
     saved, field_map
         The file, and the map in it.
-    survey
-        The drives.
     suite
         File of their sensors' calibrations.
     """

@@ -216,8 +216,6 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
 
     Parameters
     ----------
-    path
-        The file.
     adapter
         Of its content.
     kind

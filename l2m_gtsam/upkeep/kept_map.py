@@ -74,8 +74,6 @@ def seen_sources(
         With their poses at the sensors' time offsets.
     known
         The S sensors, in the readings' order.
-    field_map
-        The map.
     options
         How to look.
     """

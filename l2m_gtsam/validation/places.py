@@ -83,8 +83,6 @@ class ShownSources:
     ----------
     rows, drive
         Averaged readings, the sensors free.
-    found
-        The sources.
     """
 
     rows: MarginalRows
@@ -162,8 +160,6 @@ def shown_sources(
     ----------
     readings
         Of S sensors, inside the map, at their calibrated time offsets.
-    field_map
-        The map.
     estimate
         The calibration.
     options

@@ -76,8 +76,6 @@ def calibration_page(
 
     Parameters
     ----------
-    result
-        The calibration.
     metrics
         Its figures.
     options
