@@ -40,7 +40,7 @@ METRICS_FILE = "metrics.json"
 
 
 @dataclass(frozen=True)
-class Appraised:
+class EvaluatedCalibration:
     """A calibration that was written, and the figures that it is judged by."""
 
     result: CalibrationResult
@@ -73,7 +73,7 @@ def calibrate_bags(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> Appraised:
+) -> EvaluatedCalibration:
     """Calibrate all magnetometers; write `calibration.yaml`, metrics and a picture.
 
     Parameters
@@ -114,7 +114,7 @@ def calibrate_drive(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> Appraised:
+) -> EvaluatedCalibration:
     """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bags`."""
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
@@ -134,7 +134,7 @@ def calibrate_drive(
 
         ensure_folder(view.parent)
         write_scene(view, scene_of(recording, found))
-    return Appraised(result, metrics)
+    return EvaluatedCalibration(result, metrics)
 
 
 def plan_bag(
