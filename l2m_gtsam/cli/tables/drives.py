@@ -57,7 +57,7 @@ def advice(plan: DrivePlan) -> str:
     best = plan.motions[0]
     if best.worst.badness >= plan.worst.badness:
         return "no motion that was tried helps"
-    change = f"{_known(plan.worst)}; with this motion {_known(best.worst)}"
+    change = f"{_known(plan.worst)}; with it {_known(best.worst)}"
     return f"helps {plan.worst.sensor} most: {best.motion} ({change})"
 
 
