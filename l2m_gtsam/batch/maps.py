@@ -173,7 +173,7 @@ def keep_map_file_up(
     if suite is None:
         raise MapError(
             "--changes needs a calibrated vehicle: else steel of the place and of the vehicle are "
-            "confused; give the calibration of its sensors with --suite"
+            "confused; give its calibration with --suite"
         )
     drives = _added(map_path, bags, config, suite, progress)
     progress("looking for what changed", 0.0)
