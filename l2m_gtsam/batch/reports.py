@@ -207,7 +207,7 @@ def calibration_results(out: Path) -> Iterator[Path]:
 
 
 def report_calibration(
-    folder: Path, found: EvaluatedCalibration, options: QaOptions, progress: Progress | None = None
+    folder: Path, found: EvaluatedCalibration, options: QaOptions, progress: Progress = silent
 ) -> Verdict:
     """Write `report.html` on what was just written to a folder, as `report_folder` would.
 
@@ -227,12 +227,11 @@ def report_calibration(
     L2MError
         The report cannot be written, or the folder holds a localisation, too; one line.
     """
-    report = progress or (lambda stage, fraction: None)
-    report(STAGE, 0.0)
+    progress(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE)
     holds_localisation(folder)
-    verdict = write_report(folder, found.result, found.metrics, options, report)
-    report(STAGE, 1.0)
+    verdict = write_report(folder, found.result, found.metrics, options, progress)
+    progress(STAGE, 1.0)
     return verdict
 
 
