@@ -105,11 +105,11 @@ def maps_of(calibrated: Calibrated) -> MapForms:
 def compared_halves(
     calibrated: Calibrated, options: CalibrationOptions, qa: QaOptions
 ) -> dict[str, Halves]:
-    """Compare what the first and the second half of a drive say of each sensor.
+    """Compare the first and the second half of a drive for each sensor.
 
-    The graph of the whole tells it of all readings that counted. Where many were rejected, as those
-    of one half if a sensor moved, both halves are calibrated anew; and where errors of the map are
-    not known to be shared, on few readings, of which neighbours are not as alike.
+    The graph of the whole gives it for all readings that counted. If many were rejected, as those
+    of one half if a sensor moved, both halves are calibrated anew. If the map does not model how
+    its errors are correlated, they are calibrated on few readings, whose errors are less alike.
 
     Parameters
     ----------

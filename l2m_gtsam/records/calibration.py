@@ -369,7 +369,7 @@ class CalibrationResult:
     pose_duration
         How long errors of poses last; none where these are taken for exact.
     sources
-        Of field that came, went or were moved since the place was mapped; the solve knows them.
+        Of field that came, went or were moved since the place was mapped; the solve includes them.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]

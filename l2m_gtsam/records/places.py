@@ -60,7 +60,7 @@ class ChangedSource:
     strongest
         Its strongest field at a reading in uT.
     passages
-        How often the drive came to where it is felt.
+        How often the drive came to where it changes readings.
     explanations
         What the readings there say of each cause, the best first.
     """
@@ -84,7 +84,7 @@ class ChangedSource:
 
     @property
     def length_m(self) -> float:
-        """Of a bar, end to end; zero of one that is too short to be told from a dipole."""
+        """Of a bar, end to end; zero of one that is too short to differ from a dipole."""
         whole = 2 * math.hypot(*self.half_axis)
         return whole if whole > LONG_M else 0.0
 

@@ -24,7 +24,7 @@ from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 
-TIE = "It cannot be told which"
+TIE = "The readings do not show which"
 Parts = tuple[CalibrationPart, ...]
 # Standard deviations of a part that changed, in its own units: anything.
 ANYTHING = {
@@ -83,8 +83,6 @@ class ShownSources:
     ----------
     rows, drive
         Averaged readings, the sensors free.
-    found
-        The sources.
     """
 
     rows: MarginalRows
@@ -162,8 +160,6 @@ def shown_sources(
     ----------
     readings
         Of S sensors, inside the map, at their calibrated time offsets.
-    field_map
-        The map.
     estimate
         The calibration.
     options

@@ -76,8 +76,6 @@ def calibration_page(
 
     Parameters
     ----------
-    result
-        The calibration.
     metrics
         Its figures.
     options
@@ -85,9 +83,9 @@ def calibration_page(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    tell = counter(STAGE, progress)
+    report = counter(STAGE, progress)
     steps = len(result.sensors) + 2
-    tell(0, steps)
+    report(0, steps)
     verdict, sections = judge(result, metrics, options), []
     with mpl.rc_context(SETTINGS):
         figures: dict[str, Figure | Drawing] = {
@@ -102,14 +100,14 @@ def calibration_page(
             path = np.array(metrics.drive.path)
             figures["changes"] = changes_figure(metrics.map, path, result.sources)
         for k, each in enumerate(result.sensors):
-            tell(k + 1, steps)
+            report(k + 1, steps)
             anchor, found = f"sensor-{k}", metrics.get(each.sensor)
             drawn = {} if found is None else _figures(each, found)
             own = verdict[each.sensor]
             beside = () if found is None else measured(each, found, options)
             section = SensorSection(anchor, each, found, own, pictures(drawn, anchor), beside)
             sections.append(section)
-        tell(steps - 1, steps)
+        report(steps - 1, steps)
         return render(
             "report.html.j2",
             result=result,

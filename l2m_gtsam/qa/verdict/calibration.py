@@ -42,8 +42,6 @@ def judge(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Ve
 
     Parameters
     ----------
-    result
-        The calibration.
     metrics
         Its figures.
     options

@@ -34,7 +34,7 @@ def cause_sentence(source: ChangedSource) -> str:
     best, *others = source.explanations
     if source.cause is not None or not others:
         return f"The readings say that {CAUSES[best.cause]}."
-    return f"It cannot be told whether {CAUSES[best.cause]} or {CAUSES[others[0].cause]}."
+    return f"The readings do not show whether {CAUSES[best.cause]} or {CAUSES[others[0].cause]}."
 
 
 def best_of(explanations: tuple[CauseGain, ...]) -> str:

@@ -50,8 +50,8 @@ def test_a_tie_is_called_a_tie() -> None:
     told = source_sentence(2, SECOND)
     assert "long" not in told
     assert told.endswith(
-        "It cannot be told whether the place changed or something on the vehicle was switched or "
-        "moved."
+        "The readings do not show whether the place changed or something on the vehicle was "
+        "switched or moved."
     )
 
 
