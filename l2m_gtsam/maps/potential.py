@@ -13,11 +13,12 @@ number. The uniform field ``u_0`` has three weights of its own.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.options import Options
 
 AXES = 3
@@ -106,6 +107,27 @@ class PotentialBasis:
             found[:, i, j, AXES:] = found[:, j, i, AXES:] = mixed
         return found
 
+    def by_points(self, points: FloatArray, by_features: FloatArray) -> FloatArray:
+        """Return the derivative of a scalar by points, shape (N, 3).
+
+        Parameters
+        ----------
+        points
+            In metres, shape (N, 3).
+        by_features
+            Its derivative by the features there, shape (N, 3, m).
+        """
+        S, C = self._sines(points)
+        by, w, found = by_features[:, :, AXES:], self.waves, np.empty_like(points)
+        product = S[:, 0] * S[:, 1] * S[:, 2]
+        for i in range(AXES):
+            found[:, i] = -(by[:, i] * product) @ w[:, i] ** 2
+        for i, j, k in PAIRS:
+            mixed = w[:, i] * w[:, j] * C[:, i] * C[:, j] * S[:, k]
+            found[:, j] += np.einsum("nm,nm->n", by[:, i], mixed)
+            found[:, i] += np.einsum("nm,nm->n", by[:, j], mixed)
+        return found
+
     def field_and_gradient(
         self, points: FloatArray, weights: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -114,9 +136,22 @@ class PotentialBasis:
 
     def _sines(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return normalised sines and cosines along each axis, shape (N, 3, n)."""
-        angle = (points - self.low)[:, :, None] * self.waves.T
-        norm = np.sqrt(2 / self.size)[:, None]
-        return norm * np.sin(angle), norm * np.cos(angle)
+        S = np.empty((len(points), AXES, len(self.waves)))
+        C = np.empty_like(S)
+        for axis, (numbers, own) in enumerate(self._distinct):
+            angle, norm = (
+                np.outer(points[:, axis] - self.low[axis], numbers),
+                np.sqrt(2 / self.size),
+            )
+            S[:, axis] = (norm[axis] * np.sin(angle))[:, own]
+            C[:, axis] = (norm[axis] * np.cos(angle))[:, own]
+        return S, C
+
+    @cached_property
+    def _distinct(self) -> tuple[tuple[FloatArray, IntArray], ...]:
+        """The distinct wave numbers along each axis, and which of them each eigenfunction has."""
+        pairs = (np.unique(own, return_inverse=True) for own in self.waves.T)
+        return tuple((numbers, which.ravel()) for numbers, which in pairs)
 
 
 def smallest_waves(size: FloatArray, count: int) -> FloatArray:

@@ -21,7 +21,7 @@ process with a segmentation fault in a section of 27 variables (GTSAM 4.3.0).
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import gtsam
 import numpy as np
@@ -161,6 +161,13 @@ def reported_ill_conditioning() -> Iterator[None]:
             "the covariances of the poses cannot be computed: those of odometry, start and "
             "calibration are too many orders of magnitude apart"
         ) from error
+
+
+class PoseCovariance(Protocol):
+    """The joint covariance of a drive's poses."""
+
+    def variance_along(self, directions: Mapping[int, FloatArray], /) -> float:
+        """Return ``d^T P d`` for a direction d in which poses move together."""
 
 
 class Marginals:

@@ -27,7 +27,7 @@ from l2m_factors import X
 from l2m_gtsam.data import BoolArray
 from l2m_gtsam.records.localisation import Gain
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.solver import Marginals
+from l2m_gtsam.slam.solver import PoseCovariance
 from l2m_gtsam.slam.unknown_field.linear_field import AXES
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 
@@ -38,9 +38,8 @@ NOISE = np.geomspace(0.1, 10.0, 41)  # factors of the stated noise that are trie
 def gain_of(
     poses: Sequence[gtsam.Pose3],
     odometry: Sequence[gtsam.Pose3],
-    marginals: Marginals,
+    marginals: PoseCovariance,
     likelier: float,
-    understated: float = 1.0,
 ) -> Gain:
     """Return what a correction of poses is worth.
 
@@ -52,8 +51,6 @@ def gain_of(
         Of the corrected ones.
     likelier
         The evidence in nats.
-    understated
-        By what factor errors are larger than their sigmas.
     """
     d = np.stack([a.translation() - b.translation() for a, b in zip(odometry, poses, strict=True)])
     squared = float(np.sum(d**2))
@@ -61,7 +58,7 @@ def gain_of(
         X(k): np.append(np.zeros(3), pose.rotation().matrix().T @ own)
         for k, (pose, own) in enumerate(zip(poses, d, strict=True))
     }
-    sigma = understated * np.sqrt(marginals.variance_along(along)) if squared else 0.0
+    sigma = np.sqrt(marginals.variance_along(along)) if squared else 0.0
     doubt = float(norm.cdf(-0.5 * squared / sigma)) if sigma else 0.5
     moved = float(np.sqrt(squared / len(d)))
     return Gain(likelier, moved, doubt, shown=likelier > 0 and doubt <= MOST_DOUBT)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from l2m_factors import N, SlowError, slow_bridge, slow_error_graph
 from l2m_gtsam.data import FloatArray, IntArray
@@ -12,6 +13,7 @@ from l2m_gtsam.solve.linear_algebra import covariance_root
 AXES = 3
 LEAST_WHITE = 0.09  # of the variance: what interpolation between key poses leaves is as large
 NS = 1e-9
+LEAST_S = 1e-6  # between two readings
 
 
 @dataclass(frozen=True)
@@ -95,3 +97,38 @@ class SlowErrors:
         for k in range(len(self._key_pose_s)):
             values.insert(N(k), np.zeros(AXES))
         return values
+
+
+class NoiseInformation:
+    """The inverse of the covariance of N readings' noise along one axis, in linear time.
+
+    With V the diagonal of the white part and Q the tridiagonal inverse of the other part's
+    covariance it is ``V^-1 - V^-1 (Q + V^-1)^-1 V^-1``.
+
+    Parameters
+    ----------
+    noise
+        Of the sensor; it is not all white.
+    seconds
+        Times of the readings in ascending order, shape (N,).
+    weights
+        By which the white part's variance is divided for each, shape (N,).
+    """
+
+    def __init__(self, noise: SensorNoise, seconds: FloatArray, weights: FloatArray) -> None:
+        self._white = weights / noise.white_ut**2
+        a = np.exp(-np.maximum(np.diff(seconds), LEAST_S) / noise.slow_s)
+        known = 1 / (noise.slow_ut**2 * (1 - a**2))
+        band = np.zeros((2, len(seconds)))  # lower form: the diagonal, and what is below it
+        band[0] = self._white
+        band[0, 0] += 1 / noise.slow_ut**2
+        band[0, :-1] += a**2 * known
+        band[0, 1:] += known
+        band[1, :-1] = -a * known
+        self._lower = cholesky_banded(band, lower=True)
+
+    def __call__(self, rows: FloatArray) -> FloatArray:
+        """Return the inverse times rows, shape (N, q)."""
+        white = self._white[:, None] * rows
+        slow = cho_solve_banded((self._lower, True), white)
+        return np.asarray(white - self._white[:, None] * slow)

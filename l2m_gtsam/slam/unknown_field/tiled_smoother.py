@@ -38,6 +38,7 @@ from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import (
     Marginals,
+    PoseCovariance,
     jump_covariances,
     levenberg_marquardt,
     odometry_scale,
@@ -73,7 +74,7 @@ class FieldSolution:
     returns
         Numbers of the key poses that revisit a tile.
     marginals
-        Of the poses.
+        Covariance of the poses.
     gain
         What the correction of odometry is worth, once that was asked; where nothing is shown to be
         gained the poses are odometry's.
@@ -84,7 +85,7 @@ class FieldSolution:
     solution: DriveSolution
     tiles: int
     returns: IntArray
-    marginals: Marginals
+    marginals: PoseCovariance
     gain: Gain | None = None
     noise: SensorNoise | None = None
 

@@ -62,6 +62,10 @@ class WholeField(LinearField):
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m."""
         return self.basis.field_and_gradient(points, self.scale * weights)
 
+    def by_points(self, points: FloatArray, by_features: FloatArray) -> FloatArray:
+        """Return the derivative of a scalar by points (N, 3), of one by features (N, 3, m)."""
+        return self.basis.by_points(points, by_features * self.scale)
+
     def unresolved(self, points: FloatArray) -> FloatArray:
         """Return none, shape (N, 3): what they do not hold is learnt with the noise."""
         return np.zeros((len(points), 3))

@@ -25,10 +25,11 @@ from l2m_gtsam.slam.drive import Drive, KnownSensors, as_pose
 from l2m_gtsam.slam.map_prediction import PlacedReadings, poses_in
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
-from l2m_gtsam.slam.solution import DriveSolution
+from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances, weights_last
 from l2m_gtsam.slam.unknown_field.forward_pass import FollowedDrive, followed
 from l2m_gtsam.slam.unknown_field.gain import gain_of
+from l2m_gtsam.slam.unknown_field.path_information import path_information
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.tiled_smoother import (
@@ -53,7 +54,6 @@ ROUNDS = (2, 2, 3)  # of each: readings are hung and weighed anew at the poses
 ITERATIONS = 4  # of each round
 CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
 HELD = 1e-3  # of odometry's sigmas: steps that are known so well leave the poses where they are
-UNDERSTATED = 2.0  # errors over their sigmas: 1.3 to 2.2 on the model ship
 SETTLED = 1.0  # movement of the poses in the last round, in their sigmas
 
 
@@ -105,19 +105,18 @@ def map_whole_drive(
     for stage, factor in enumerate(STAGES):
         progress("solving poses and field", stage / len(STAGES))
         noise = learnt.prior.spectrum.noise.floored().scaled(factor)
-        problem = stage_problem(free, learnt.prior, noise, options)
+        field = learnt.prior
+        problem = stage_problem(free, field, noise, options)
         solved = settled(problem, learnt.poses, with_noise(sensors, noise), ROUNDS[stage])
         sensors = solved.last.sensors
-        prior = learnt_prior(drive, solved.last.poses, whole, learnt.prior.spectrum)
+        prior = learnt_prior(drive, solved.last.poses, whole, field.spectrum)
         if prior is None:
             return None
         learnt = LearntPoses(solved.last.poses, prior)
-    found = problem.finished(solved.last)
+    found = with_information(problem.finished(solved.last), solved.last.values, field, noise)
     bent = 0.5 * found.solution.odometry_chi2 * 6 * len(drive)
     likelier = learnt.prior.spectrum.log_likelihood - first.spectrum.log_likelihood - bent
-    gain = gain_of(
-        found.solution.poses, drive.dead_reckoning(), found.marginals, likelier, UNDERSTATED
-    )
+    gain = gain_of(found.solution.poses, drive.dead_reckoning(), found.marginals, likelier)
     if gain.shown:
         ending = Ending.TOLERANCE if is_settled(solved, found.solution) else Ending.ITERATION_LIMIT
         found = replace(found, solution=replace(found.solution, ending=ending), noise=noise)
@@ -130,6 +129,31 @@ def map_whole_drive(
     p = np.stack([pose.translation() for pose in solution.poses])
     near = learnt.prior.spectrum.prior.length
     return replace(found, solution=solution, gain=gain, returns=returned(p, drive.steps.path, near))
+
+
+def with_information(
+    found: FieldSolution, values: gtsam.Values, prior: WholePrior, noise: SensorNoise
+) -> FieldSolution:
+    """Return a solved drive with the covariances of its density without weights.
+
+    Parameters
+    ----------
+    found, values
+        The solution of the graph of poses and weights.
+    prior, noise
+        Of the field and of the readings in that graph.
+    """
+    solution = found.solution
+    drive, weights = solution.drive, np.maximum(solution.weights, REJECTED_WEIGHT)
+    information = path_information(drive, solution.poses, values, prior, noise, weights)
+    jumps = [information.step_covariance(each.step) for each in drive.jumps]
+    solution = replace(
+        solution,
+        pose_covariance=information.pose_covariances(),
+        calibration_covariance=drive.sensors.covariance - information.sensor @ information.sensor.T,
+        step_covariance=np.reshape(jumps, solution.step_covariance.shape),
+    )
+    return replace(found, solution=solution, marginals=information)
 
 
 def as_calibrated(solution: DriveSolution, sensors: KnownSensors) -> DriveSolution:

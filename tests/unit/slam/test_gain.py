@@ -62,10 +62,6 @@ def test_a_gain_needs_evidence_and_a_correction_beyond_its_sigmas() -> None:
     assert not gain_of(poses, far, marginals, -1.0).shown
     assert not gain_of(poses, near, marginals, 1.0).shown
     assert not gain_of(poses, poses, marginals, 1.0).shown
-    # Where errors are larger than their sigmas, so are those of the correction.
-    doubts = [gain_of(poses, far, marginals, 1.0, times).doubt for times in (1.0, 2.0, 20.0)]
-    assert doubts == sorted(doubts)
-    assert not gain_of(poses, far, marginals, 1.0, 20.0).shown
 
 
 @pytest.mark.parametrize(("start", "step"), FAR_APART)

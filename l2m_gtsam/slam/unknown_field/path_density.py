@@ -1,0 +1,123 @@
+r"""How likely a path is by the readings of one sensor, with the field integrated out.
+
+With readings z on a path X, features F of the field's m weights, which are N(0, I), the distortion
+C, H of the sensor, and T the covariance of its noise,
+
+.. math::
+    -\log p(z | X) = \frac{1}{2} r^T K^{-1} r + \frac{1}{2} \log |K|, \quad r = z - H, \quad
+    K = \Phi \Phi^T + T, \quad \Phi_i = C R_i^T F(x_i)
+
+A path and its field that are moved together are as likely as before. In a graph of both the weights
+move along a circle then, and a tangent takes that for more weight: so a path seems to be known
+where nothing holds it. Here weights are no variables.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve, cholesky
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation
+from l2m_gtsam.slam.unknown_field.whole_field import WholeField
+
+AXES = 3
+
+
+@dataclass(frozen=True)
+class PathReadings:
+    """N readings of one sensor at an estimate of a path.
+
+    Attributes
+    ----------
+    R, p
+        The lidar at each reading in the frame of the field, (N, 3, 3) and (N, 3), metres.
+    z
+        What was read, along the axes of the sensor, uT, shape (N, 3).
+    """
+
+    R: FloatArray
+    p: FloatArray
+    z: FloatArray
+
+
+@dataclass(frozen=True)
+class DensitySlopes:
+    """The cost of a path, minus the logarithm of its density but for constants, and its slopes.
+
+    Attributes
+    ----------
+    cost
+        In nats.
+    by_path
+        Derivative by a right perturbation of the lidar at each reading, shape (N, 6).
+    by_sensor
+        By (t, C row by row, H), shape (15,).
+    """
+
+    cost: float
+    by_path: FloatArray
+    by_sensor: FloatArray
+
+
+class PathDensity:
+    """The density of readings on paths near an estimate.
+
+    Parameters
+    ----------
+    readings
+        At the estimate.
+    field
+        Of m weights.
+    noise
+        Of the readings.
+    """
+
+    def __init__(self, readings: PathReadings, field: WholeField, noise: NoiseInformation) -> None:
+        self._readings, self._field, self._noise = readings, field, noise
+
+    def slopes(self, moved: FloatArray, sensor: FloatArray) -> DensitySlopes:
+        """Return the cost and its slopes at a path beside the estimate.
+
+        Parameters
+        ----------
+        moved
+            Right perturbations of the lidar's poses, so small that their rotations add, (N, 6).
+        sensor
+            t, C row by row, and H, shape (15,).
+        """
+        at, N, m = self._readings, len(self._readings.z), len(self._field)
+        t, C, H = sensor[:3], sensor[3:12].reshape(3, 3), sensor[12:]
+        turn = moved[:, :3]
+        R = at.R @ Rotation.from_rotvec(turn).as_matrix()
+        x = at.p + np.einsum("nij,nj->ni", at.R, moved[:, 3:]) + R @ t
+        own = R.transpose(0, 2, 1) @ self._field.features(x)
+        features = C @ own
+        flat = features.reshape(AXES * N, m)
+        white = self._noise(features.reshape(N, -1)).reshape(AXES * N, m)
+        lower = cholesky(np.eye(m) + flat.T @ white, lower=True)
+        r = at.z - H
+        by_noise = self._noise(r).ravel()
+        pulled = flat.T @ by_noise
+        u = cho_solve((lower, True), pulled)
+        alpha = by_noise - white @ u  # K^-1 r
+        fit = 0.5 * (r.ravel() @ by_noise - pulled @ u)
+        # d cost = tr(W^T d Phi) with W = T^-1 Phi (I + Phi^T T^-1 Phi)^-1 - alpha u^T.
+        W = cho_solve((lower, True), white.T).T - np.outer(alpha, u)
+        by_features = W.reshape(N, AXES, m)
+        by_C = np.einsum("nam,nbm->ab", by_features, own)
+        by_own = C.T @ by_features
+        by_place = self._field.by_points(x, R @ by_own)
+        # A turn w takes b to b - w x b, and the sensor by R (w x t).
+        lever = np.einsum("nji,nj->ni", R, by_place)
+        by_turn = np.cross(by_own.transpose(0, 2, 1), own.transpose(0, 2, 1)).sum(axis=1)
+        by_turn += np.cross(t, lever)
+        by_turn += 0.5 * np.cross(turn, by_turn)  # d Exp(w), to first order in w
+        by_shift = np.einsum("nji,nj->ni", at.R, by_place)
+        by_H = -alpha.reshape(N, AXES).sum(axis=0)
+        return DensitySlopes(
+            cost=float(fit + np.log(np.diag(lower)).sum()),
+            by_path=np.hstack([by_turn, by_shift]),
+            by_sensor=np.concatenate([lever.sum(axis=0), by_C.ravel(), by_H]),
+        )

@@ -1,0 +1,200 @@
+r"""What readings determine of a path in an unknown field, by second derivatives of its density.
+
+With xi the errors of odometry in units of their sigmas, c those of the sensor, and B the second
+derivatives of :math:`-\log p(z | X)` by both (see :mod:`.path_density`), the covariance of (xi, c)
+is that of Laplace's approximation,
+
+.. math::
+    (I + B)^{-1} = I - U \, \mathrm{diag}(l / (1 + l)) \, U^T
+
+with the eigenvalues l of B. Readings determine few directions, which Lanczos' iteration finds from
+products with B; all others stay as odometry has them (T. Bui-Thanh, O. Ghattas, J. Martin,
+G. Stadler, SIAM Journal on Scientific Computing 35, 2013). Where the estimate is not at the mode,
+some l are negative: readings hold the path nowhere along these directions, which stay, too.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import splu
+
+from l2m_factors import X
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.geometry import carried_back
+from l2m_gtsam.slam.drive import Drive
+from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.pose_graph import odometry_graph
+from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances
+from l2m_gtsam.slam.unknown_field.path_density import PathDensity, PathReadings
+from l2m_gtsam.slam.unknown_field.sensor_noise import NS, NoiseInformation, SensorNoise
+from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
+from l2m_gtsam.solve.lanczos import eigenpairs
+from l2m_gtsam.solve.linear_algebra import covariance_root
+
+VECTORS = 120  # of Lanczos' iteration; with twice as many sigmas are 4 to 5 % smaller
+LEAST = 0.01  # eigenvalue: less of it would change a variance by 1 %
+SIDE = 1e-3  # of a finite difference, in sigmas
+SEED = 24  # of the iteration's first vector
+
+
+@dataclass(frozen=True)
+class PathInformation:
+    """Covariances of a path and its sensor: by odometry, less what readings determine.
+
+    Attributes
+    ----------
+    odometry
+        Of the poses by odometry alone.
+    learnt
+        Root of what readings take from the covariance of K poses, shape (K, 6, q).
+    sensor
+        Root of what they take from that of (t, C row by row, H), shape (15, q).
+    """
+
+    odometry: Marginals
+    learnt: FloatArray
+    sensor: FloatArray
+
+    def pose_covariances(self) -> FloatArray:
+        """Return covariances of right perturbations of the key poses, shape (K, 6, 6)."""
+        before = pose_covariances(self.odometry, len(self.learnt))
+        return np.asarray(before - self.learnt @ self.learnt.transpose(0, 2, 1))
+
+    def step_covariance(self, step: int) -> FloatArray:
+        """Return the joint covariance of the poses before and after a step, (12, 12)."""
+        own = self.learnt[step : step + 2].reshape(2 * POSE, -1)
+        return np.asarray(self.odometry.joint([X(step), X(step + 1)]) - own @ own.T)
+
+    def variance_along(self, directions: Mapping[int, FloatArray], /) -> float:
+        """Return ``d^T P d`` for a direction d in which poses move; see ``Marginals``."""
+        along = np.zeros(self.learnt.shape[2])
+        for k, own in enumerate(self.learnt):
+            if X(k) in directions:
+                along += directions[X(k)] @ own
+        return self.odometry.variance_along(directions) - float(along @ along)
+
+
+def path_information(
+    drive: Drive,
+    poses: list[gtsam.Pose3],
+    values: gtsam.Values,
+    prior: WholePrior,
+    noise: SensorNoise,
+    weights: FloatArray,
+) -> PathInformation:
+    """Return what readings determine of a path.
+
+    Parameters
+    ----------
+    drive
+        K key poses of one sensor, with its calibration at the estimate and the prior's covariance.
+    poses, values
+        The estimates, and with them those of odometry's steady drift or scale.
+    prior, noise
+        Of the field and of the readings.
+    weights
+        Robust weight of each reading, positive, shape (N,).
+    """
+    near = PathNeighbourhood(drive, poses, values, prior, noise, weights)
+    here = near.slopes(np.zeros(near.size))
+    first = np.random.default_rng(SEED).normal(size=near.size)
+    found, vectors = eigenpairs(
+        lambda v: (near.slopes(SIDE * v) - here) / SIDE, first, min(VECTORS, near.size)
+    )
+    known = found > LEAST
+    share = vectors[:, known] * np.sqrt(found[known] / (1 + found[known]))
+    return PathInformation(near.odometry, *near.moved_by(share))
+
+
+class PathNeighbourhood:
+    """The density of readings where odometry and sensor have other errors than estimated.
+
+    Parameters as of ``path_information``. Errors are those of odometry's steps, start and what they
+    have in common, then those of the sensor, all in units of their sigmas and relative to the
+    estimate.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        poses: list[gtsam.Pose3],
+        values: gtsam.Values,
+        prior: WholePrior,
+        noise: SensorNoise,
+        weights: FloatArray,
+    ) -> None:
+        graph = odometry_graph(drive)
+        linear = graph.linearize(values)
+        self.odometry = Marginals(linear, colamd_ordering(graph))
+        # As many errors as variables: those of the keys G and V come before those of the poses.
+        row, column, entry = linear.sparseJacobian_()
+        self._steps = int(column.max()) - 1  # the last column is the right-hand side
+        self._others = self._steps - POSE * len(poses)
+        left, shape = column <= self._steps, (self._steps, self._steps)
+        at = (row[left].astype(np.int64) - 1, column[left].astype(np.int64) - 1)
+        by_variables = csc_array((entry[left], at), shape=shape)
+        self._root, self._transposed = splu(by_variables), splu(csc_array(by_variables.T))
+        motions = RelativeMotions.along(drive, poses)
+        readings, self._by_pose = path_readings(motions, poses)
+        seconds = NS * (drive.reading_ns - drive.stamp_ns[0])
+        information = NoiseInformation(noise, seconds, weights)
+        self._density = PathDensity(readings, prior.field, information)
+        sensors = drive.sensors
+        self._sensor = np.concatenate([sensors.t[0], sensors.distortion[0]])
+        covariance = sensors.covariance[0]
+        self._by_sensor = covariance_root(covariance, np.sqrt(np.diag(covariance)))
+
+    @property
+    def size(self) -> int:
+        """Number n of errors."""
+        return self._steps + len(self._sensor)
+
+    def slopes(self, errors: FloatArray) -> FloatArray:
+        """Return the derivatives of minus the log density where errors are so, both (n,)."""
+        poses, sensor = self.moved_by(errors[:, None])
+        moved = (self._by_pose @ poses.ravel()).reshape(-1, POSE)
+        found = self._density.slopes(moved, self._sensor + sensor[:, 0])
+        back = np.append(np.zeros(self._others), self._by_pose.T @ found.by_path.ravel())
+        by_steps = np.asarray(self._transposed.solve(back))
+        return np.append(by_steps, self._by_sensor.T @ found.by_sensor)
+
+    def moved_by(self, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how q errors (n, q) move K poses, (K, 6, q), and the sensor, (15, q)."""
+        steps = np.asarray(self._root.solve(errors[: self._steps]))
+        poses = steps[self._others :].reshape(-1, POSE, errors.shape[1])
+        return poses, np.asarray(self._by_sensor @ errors[self._steps :])
+
+
+def path_readings(
+    motions: RelativeMotions, poses: list[gtsam.Pose3]
+) -> tuple[PathReadings, csr_array]:
+    """Return readings in the frame of the first key pose, and how the lidar moves with key poses.
+
+    The latter are derivatives of right perturbations at the N readings by those of K key poses,
+    shape (6 N, 6 K). A reading moves with both ends of its step, and against the frame.
+    """
+    readings, key = motions.readings, motions.readings.key_pose
+    R_key, p_key = (each[key] for each in stacked([poses[0].between(pose) for pose in poses]))
+    R = R_key @ readings.R_key_lidar
+    p = np.einsum("nij,nj->ni", R_key, readings.p_key_lidar) + p_key
+    R_step, p_step = (each[key] for each in stacked(motions.steps))
+    by_end = readings.fraction[:, None, None] * motions.by_step
+    by_key = carried_back(readings.R_key_lidar, readings.p_key_lidar)
+    by_key -= by_end @ carried_back(R_step, p_step)
+    blocks = np.stack([by_key, by_end, -carried_back(R, p)])
+    own, of = np.arange(POSE), np.stack([key, key + 1, np.zeros_like(key)])
+    row = POSE * np.arange(len(key))[:, None, None] + own[:, None]
+    column = POSE * of[:, :, None, None] + own
+    at = tuple(np.broadcast_to(each, blocks.shape).ravel() for each in (row, column))
+    shape = POSE * len(key), POSE * len(poses)
+    return PathReadings(R, p, readings.field), csr_array((blocks.ravel(), at), shape=shape)
+
+
+def stacked(poses: Sequence[gtsam.Pose3]) -> tuple[FloatArray, FloatArray]:
+    """Return rotations (K, 3, 3) and positions (K, 3) in metres."""
+    R = np.stack([pose.rotation().matrix() for pose in poses])
+    return R, np.stack([pose.translation() for pose in poses])
