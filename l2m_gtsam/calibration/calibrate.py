@@ -16,6 +16,7 @@ from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.prior_options import priors_of
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.start.global_start import find_starts
+from l2m_gtsam.calibration.stretch_causes import with_causes
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
 from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
@@ -139,12 +140,14 @@ def calibrated(
         covered = bool(np.mean(field_map.query(recording.trajectory.p).inside) > COVERED)
         raise CalibrationError(_nothing_solved(recording, map_source, sensors, covered))
     verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
+    stretches = disagreements(verdicts)
+    stretches = with_causes(stretches, solution, solver_map, options.changes)
     result = CalibrationResult(
         sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
-        disagreements=tuple(_in_own_time(each, recording) for each in disagreements(verdicts)),
+        disagreements=tuple(_in_own_time(each, recording) for each in stretches),
         bag=None if recording.drives else recording.source,
         map=map_source,
         options=options.model_dump(mode="json"),

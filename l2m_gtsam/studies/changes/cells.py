@@ -11,12 +11,11 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, Loads
 from l2m_gtsam.studies.honesty.drives import drive_seed
-from l2m_gtsam.studies.validation.drives import NO_STEEL, HallPath, path_of, recorded
+from l2m_gtsam.studies.validation.drives import NO_STEEL, SECONDS, HallPath, path_of, recorded
 
 NEAR_M = 0.5  # a source so near a change is that change
 FAR_M = 1.0  # a source so far from all changes is a false alarm
 INSIDE = 7.815  # squared distance within which 95 % of three normal numbers are
-SECONDS = 1e-9
 
 
 @dataclass(frozen=True)
