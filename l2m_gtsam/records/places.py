@@ -95,12 +95,15 @@ class ChangedSource:
 
 
 def clear_cause(explanations: tuple[CauseGain, ...]) -> Cause | None:
-    """Return the best cause, the first; none where another explains readings about as well."""
+    """Return the best cause, the first; none where another explains readings about as well.
+
+    Nor where it explains no more than its parameters do by chance.
+    """
     if not explanations:
         return None
     best, *others = explanations
     tied = any(best.gain - each.gain < CLEAR for each in others)
-    return None if tied else best.cause
+    return None if tied or best.gain < 0 else best.cause
 
 
 LONG_M = 0.1  # shorter bars are reported as points

@@ -56,9 +56,14 @@ SEEN = {
 }
 
 
+def is_explained(stretch: Disagreement) -> bool:
+    """Return whether any cause explains more of a stretch than its parameters do by chance."""
+    return any(each.gain > 0 for each in stretch.explanations)
+
+
 def stretch_head(stretch: Disagreement) -> str:
     """Return what a stretch of rejected readings is of; two that are about as likely are named."""
-    if not stretch.explanations:
+    if not is_explained(stretch):
         return PASSED[stretch.passed_again]
     best, *others = (DIFFERS[each.cause] for each in stretch.explanations)
     if stretch.cause is not None or not others:
@@ -68,7 +73,7 @@ def stretch_head(stretch: Disagreement) -> str:
 
 def stretch_tail(stretch: Disagreement) -> str:
     """Return what supports it: what each cause explains, or what another passage found."""
-    if stretch.explanations:
+    if is_explained(stretch):
         return f"What explains all readings there: {best_of(stretch.explanations)}"
     return SEEN[stretch.passed_again]
 
