@@ -81,7 +81,7 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
 
     name = "changes"
     title = "Places that change"
-    size = frozenset({"halls"})
+    size = frozenset({"halls", "unchanged"})
     options = ChangesStudyOptions
     cell = ChangesCell
     summary = ChangesSummary
