@@ -124,6 +124,9 @@ def calibrated(
         priors=priors,
     )
     changed = solve_changed(problem, solver_map, t_start, options.changes)
+    if changed.sources is not None and is_ambiguous(found, options):
+        # Steel that the search did not know of makes one place look like another.
+        found = _starts(alive, changed.taken_into(compiled), options, priors, progress)
     outcome, solver_map = changed.outcome, changed.solver_map
     solution = outcome.solution
     field_map = changed.taken_into(field_map)
@@ -199,6 +202,11 @@ def _starts(
     progress("global start", 1.0)
     names = zip(readings.sensors, found, strict=True)
     return [None if name in options.start else each for name, each in names]
+
+
+def is_ambiguous(found: list[FoundStart | None], options: CalibrationOptions) -> bool:
+    """Return whether readings leave it open where any sensor started."""
+    return any(each is not None and each.ambiguous(options.search.clear) for each in found)
 
 
 def _start_places(
