@@ -91,9 +91,19 @@ class ChangedSource:
     @property
     def cause(self) -> Cause | None:
         """The cause that is clearly the best; none where two explain it about as well."""
-        best, *others = self.explanations or (CauseGain(Cause.PLACE, 0.0, 0.0),)
-        tied = any(best.gain - each.gain < CLEAR for each in others)
-        return None if tied else best.cause
+        return clear_cause(self.explanations or (CauseGain(Cause.PLACE, 0.0, 0.0),))
+
+
+def clear_cause(explanations: tuple[CauseGain, ...]) -> Cause | None:
+    """Return the best cause, the first; none where another explains readings about as well.
+
+    Nor where it explains no more than its parameters do by chance.
+    """
+    if not explanations:
+        return None
+    best, *others = explanations
+    tied = any(best.gain - each.gain < CLEAR for each in others)
+    return None if tied or best.gain < 0 else best.cause
 
 
 LONG_M = 0.1  # shorter bars are reported as points
