@@ -93,8 +93,6 @@ def with_poses(
 
     Parameters
     ----------
-    config
-        The configuration.
     logs
         The drives.
     poses

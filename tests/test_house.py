@@ -1,6 +1,7 @@
-"""The order of the tests themselves: what they import, and where they stand."""
+"""The order of the code and of the tests: names, folders, and what tests import."""
 
 import ast
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -47,3 +48,20 @@ def test_folders_of_tests_are_packages_of_the_library(repository: Path, kind: st
     tested = {e: library / e.name.removeprefix("test_") for e in entries}
     wrong = [e for e, of in tested.items() if not (of.is_file() or (of / "__init__.py").is_file())]
     assert not wrong
+
+
+def test_no_class_name_stands_for_two_things(repository: Path) -> None:
+    defined: dict[str, list[str]] = defaultdict(list)
+    for folder in ("l2m_gtsam", "factors", "scripts"):
+        for file in sorted((repository / folder).rglob("*.py")):
+            for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ClassDef):
+                    defined[node.name].append(f"{file.relative_to(repository)}:{node.lineno}")
+    assert len(defined) > 100
+    assert not {name: places for name, places in defined.items() if len(places) > 1}
+
+
+def test_few_modules_lie_outside_of_packages(repository: Path) -> None:
+    """What belongs to a topic is in its package: the root has what all packages share."""
+    modules = {file.stem for file in (repository / "l2m_gtsam").glob("*.py")} - {"__init__"}
+    assert modules == {"config", "data", "errors", "geometry", "options", "progress"}

@@ -67,7 +67,7 @@ def U() -> int:
 
 
 def G() -> int:
-    """Return the key of the share by which all ways are longer than odometry has them: double."""
+    """Return the key of the share by which all distances exceed odometry's: double."""
     return int(gtsam.symbol("G", 0))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from l2m_factors.field_map import FloatArray
 
-NOTHING = 1e-3  # of a variance: by so much less of it no sigma is told from another
+NOTHING = 1e-3  # of a variance: a smaller part of it changes no sigma noticeably
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ class Whitening:
         """
         A = (own @ errors).reshape(3 * len(own), -1)
         values, vectors = np.linalg.eigh(A.T @ A)
-        telling = values > NOTHING
-        values, vectors = values[telling], vectors[:, telling]
+        informative = values > NOTHING
+        values, vectors = values[informative], vectors[:, informative]
         return cls(own, A @ (vectors * np.sqrt((1 - 1 / np.sqrt(1 + values)) / values)))
 
     def __call__(self, block: FloatArray) -> FloatArray:

@@ -179,7 +179,7 @@ def localise(
     options: SlamOptions | Values | None = None,
     progress: Progress = silent,
 ) -> LocalisedDrive:
-    """Estimate where a drive went: in a map, or in the field that it meets on its way.
+    """Estimate where a drive went: in a map, or in the unknown field along its path.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ METRICS_FILE = "metrics.json"
 
 
 @dataclass(frozen=True)
-class Appraised:
+class EvaluatedCalibration:
     """A calibration that was written, and the figures that it is judged by."""
 
     result: CalibrationResult
@@ -73,17 +73,13 @@ def calibrate_bags(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> Appraised:
+) -> EvaluatedCalibration:
     """Calibrate all magnetometers; write `calibration.yaml`, metrics and a picture.
 
     Parameters
     ----------
     bags
         Drives of one vehicle through the mapped place, which are calibrated together.
-    map_path
-        Map file.
-    config
-        Configuration.
     out
         Folder for the results, made if it is missing.
     progress
@@ -118,7 +114,7 @@ def calibrate_drive(
     progress: Progress,
     truth: tuple[KnownSensor, ...] = (),
     view: Path | None = None,
-) -> Appraised:
+) -> EvaluatedCalibration:
     """Calibrate a drive that was read, on a map that is open; the rest is as `calibrate_bags`."""
     check_names([each.sensor for each in recording.series], config.qa)
     found = calibrated(recording, opened.field_map, config.calibration, opened.source, progress)
@@ -138,7 +134,7 @@ def calibrate_drive(
 
         ensure_folder(view.parent)
         write_scene(view, scene_of(recording, found))
-    return Appraised(result, metrics)
+    return EvaluatedCalibration(result, metrics)
 
 
 def plan_bag(
@@ -154,8 +150,6 @@ def plan_bag(
     ----------
     bag
         A drive through the mapped place.
-    map_path
-        Map file.
     config
         Configuration; `calibration.start` says where the bag's sensors are assumed.
     at

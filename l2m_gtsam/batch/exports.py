@@ -67,25 +67,23 @@ def verdict_notes(path: Path, result: CalibrationResult, despite_verdict: bool) 
 
     Parameters
     ----------
-    path, result
-        The calibration and its file.
     despite_verdict
         Whether a FAIL is to be used all the same.
 
     Raises
     ------
     CalibrationError
-        It was judged FAIL, and nobody asked for it all the same.
+        It was judged FAIL, and is not to be used despite that.
     """
     if result.judgement is None:
         return (f"{path}: {NOT_JUDGED}; it holds no verdict",)
     verdict = result.judgement.verdict
     if verdict.level is Level.PASS:
         return tuple(f"{path}: {each}" for each in result.judgement.disagreeing)
-    told = f"{path}: its verdict is {verdict.level.upper()}: {_worst_reason(verdict)}"
+    warning = f"{path}: its verdict is {verdict.level.upper()}: {_worst_reason(verdict)}"
     if verdict.level is Level.FAIL and not despite_verdict:
-        raise CalibrationError(f"{told}; to use it all the same, say --despite-verdict")
-    return (told,)
+        raise CalibrationError(f"{warning}; to use it all the same, give --despite-verdict")
+    return (warning,)
 
 
 def _worst_reason(verdict: Verdict) -> str:
@@ -182,8 +180,6 @@ class Reading:
 
         Parameters
         ----------
-        result
-            The calibration.
         path
             Its file, for messages.
 

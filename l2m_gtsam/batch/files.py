@@ -67,8 +67,6 @@ def make_tiles(field_map: FieldMap, path: Path, progress: Progress) -> None:
 
     Parameters
     ----------
-    field_map, path
-        The map and its file.
     progress
         Called with a stage and the fraction of it that is done.
     """
@@ -118,8 +116,6 @@ class SavedMap:
 
     Attributes
     ----------
-    path
-        The file.
     state
         What it holds.
     """

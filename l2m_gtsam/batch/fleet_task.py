@@ -25,7 +25,6 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.qa.fleet import sensor_rows
 from l2m_gtsam.records.fleet import DATE, Computation, DriveOutcome, RowKey
 from l2m_gtsam.storage.drive_lists import (
-    FILES,
     ManifestEntry,
     find_bags,
     is_bag,
@@ -33,6 +32,7 @@ from l2m_gtsam.storage.drive_lists import (
     read_manifest,
 )
 from l2m_gtsam.storage.files import folder_names, printable, source_file, unwritten
+from l2m_gtsam.storage.log import DRIVES
 from l2m_gtsam.storage.parts import sweep
 from l2m_gtsam.storage.record_files import write_outcome
 from l2m_gtsam.storage.result_set import SET_FILE, finish, published
@@ -94,7 +94,7 @@ class FleetDrive:
     @property
     def name(self) -> str:
         """The bag's name for its folder."""
-        return self.bag.stem if self.bag.suffix.lower() in FILES else self.bag.name
+        return self.bag.stem if self.bag.suffix.lower() in DRIVES else self.bag.name
 
 
 def fleet_drives(order: FleetOrder) -> tuple[FleetDrive, ...]:
@@ -198,10 +198,6 @@ class FleetTask:
 
     Attributes
     ----------
-    drive
-        The drive.
-    config
-        Configuration.
     out
         Folder for its results.
     map_digest, config_digest

@@ -64,8 +64,6 @@ def build_map_file(
         One or several mapping bags.
     out
         Map file to write (`.npz`).
-    config
-        Configuration.
     suite
         File with the mapping suite's calibrations; ideal sensors at the lidar's origin if absent.
     progress
@@ -148,7 +146,7 @@ def keep_map_file_up(
     suite: Path | None,
     progress: Progress,
 ) -> BuiltMap:
-    """Add drives of a calibrated vehicle to a map, and tell what has changed since.
+    """Add drives of a calibrated vehicle to a map, and record what has changed since.
 
     Parameters
     ----------
@@ -174,8 +172,8 @@ def keep_map_file_up(
     check_outputs(out, suffix=".npz")
     if suite is None:
         raise MapError(
-            "--changes needs to know the vehicle: a sensor that is not calibrated cannot tell what "
-            "changed; give its calibration with --suite"
+            "--changes needs a calibrated vehicle: else steel of the place and of the vehicle are "
+            "confused; give its calibration with --suite"
         )
     drives = _added(map_path, bags, config, suite, progress)
     progress("looking for what changed", 0.0)
@@ -199,8 +197,6 @@ class _AddedDrives:
     ----------
     saved, field_map
         The file, and the map in it.
-    survey
-        The drives.
     suite
         File of their sensors' calibrations.
     """

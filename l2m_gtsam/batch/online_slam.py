@@ -95,8 +95,6 @@ def slam_online(
     ----------
     given
         What is read.
-    config
-        Configuration.
     out
         Folder for the results, made if it is missing.
     progress

@@ -11,7 +11,12 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, OVERVIEW_FILE, Appraised
+from l2m_gtsam.batch.drives import (
+    CALIBRATION_FILE,
+    METRICS_FILE,
+    OVERVIEW_FILE,
+    EvaluatedCalibration,
+)
 from l2m_gtsam.batch.files import check_outputs, saved_options
 from l2m_gtsam.config import load_config
 from l2m_gtsam.errors import ConfigError, OutputError
@@ -202,7 +207,7 @@ def calibration_results(out: Path) -> Iterator[Path]:
 
 
 def report_calibration(
-    folder: Path, found: Appraised, options: QaOptions, progress: Progress | None = None
+    folder: Path, found: EvaluatedCalibration, options: QaOptions, progress: Progress = silent
 ) -> Verdict:
     """Write `report.html` on what was just written to a folder, as `report_folder` would.
 
@@ -222,12 +227,11 @@ def report_calibration(
     L2MError
         The report cannot be written, or the folder holds a localisation, too; one line.
     """
-    tell = progress or (lambda stage, fraction: None)
-    tell(STAGE, 0.0)
+    progress(STAGE, 0.0)
     check_outputs(folder / REPORT_FILE)
     holds_localisation(folder)
-    verdict = write_report(folder, found.result, found.metrics, options, tell)
-    tell(STAGE, 1.0)
+    verdict = write_report(folder, found.result, found.metrics, options, progress)
+    progress(STAGE, 1.0)
     return verdict
 
 

@@ -74,8 +74,6 @@ def read_evidence(
         What was read of it: its poses are odometry.
     saved
         The map, if there is one.
-    config
-        Configuration.
     progress
         Called with a stage and the fraction of it that is done.
 
@@ -209,8 +207,6 @@ def slam_bag(given: SlamInput, config: Config, out: Path, progress: Progress) ->
     ----------
     given
         What is read.
-    config
-        Configuration.
     out
         Folder for the results, made if it is missing.
     progress

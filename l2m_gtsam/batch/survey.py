@@ -201,8 +201,6 @@ def calibrate_suite_file(
         One or several mapping bags of one suite.
     out
         Calibration to write (`.yaml`).
-    config
-        Configuration.
     known
         File with what is known of the sensors, if there is one.
     progress

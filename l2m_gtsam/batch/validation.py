@@ -125,7 +125,7 @@ def read_sound_calibration(path: Path) -> CalibrationResult:
     Raises
     ------
     CalibrationError
-        The file is missing or damaged, knows no sensor, or has a covariance that is none.
+        The file is missing or damaged, lists no sensor, or has a covariance that is none.
     """
     result = read_sensors(path)
     if not any(map(is_calibrated, result.sensors)):

@@ -13,7 +13,7 @@ from scipy.sparse import coo_array, csr_array
 
 from l2m_gtsam.calibration.budget.found import Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
-from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover
+from l2m_gtsam.calibration.coverage import Coverage, UncertainMap, cover, errors_over_stated
 from l2m_gtsam.calibration.factor_graph import Estimate, batch_readings
 from l2m_gtsam.calibration.pose_errors import pose_features
 from l2m_gtsam.calibration.sensor_columns import SENSOR
@@ -163,13 +163,20 @@ class AveragedDrive:
         The same as the solve looks at them.
     estimate
         Of their sensors.
-    noise
-        Roots of the noise of each slot: see ``slot_whitening``.
+    map_errors
+        How many times as large as it states the map's errors count: as large as those at readings
+        of its survey that were held out.
     """
 
     averages: Averages
     view: View
     estimate: Estimate
+    map_errors: float
+
+    @property
+    def map_variance(self) -> FloatArray:
+        """Variance of the map per axis at each average, uT^2, shape (N, 3)."""
+        return np.asarray(self.map_errors**2 * self.view.map_variance)
 
     @classmethod
     def of(cls, averages: Averages, field_map: QueryableMap, estimate: Estimate) -> "AveragedDrive":
@@ -182,7 +189,7 @@ class AveragedDrive:
             averages.counted[view.rows],
             averages.noise,
         )
-        return cls(kept, view, estimate)
+        return cls(kept, view, estimate, errors_over_stated(field_map))
 
     def marginal(
         self,
@@ -204,7 +211,7 @@ class AveragedDrive:
         """
         readings = self.view.readings
         exact = replace(self.view, readings=replace(readings, pose_root=None, regressors=None))
-        coverage = cover(exact, errors, self.estimate, 1.0)
+        coverage = cover(exact, errors, self.estimate, 1.0).with_larger_errors(self.map_errors)
         whitening = slot_whitening(self, field_map, coverage.rest, options)
         design, prior = nuisances(exact.readings, field_map, coverage, self.estimate, budget)
         return MarginalRows(

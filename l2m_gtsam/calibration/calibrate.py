@@ -16,6 +16,7 @@ from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.prior_options import priors_of
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.start.global_start import find_starts
+from l2m_gtsam.calibration.stretch_causes import with_causes
 from l2m_gtsam.calibration.trust import judged
 from l2m_gtsam.calibration.verdicts import SolvedDrive, sensor_verdicts
 from l2m_gtsam.calibration.view import Compilable, QueryableMap, RememberedMap
@@ -123,6 +124,9 @@ def calibrated(
         priors=priors,
     )
     changed = solve_changed(problem, solver_map, t_start, options.changes)
+    if changed.sources is not None and is_ambiguous(found, options):
+        # Steel that the search did not know of makes one place look like another.
+        found = _starts(alive, changed.taken_into(compiled), options, priors, progress)
     outcome, solver_map = changed.outcome, changed.solver_map
     solution = outcome.solution
     field_map = changed.taken_into(field_map)
@@ -139,12 +143,14 @@ def calibrated(
         covered = bool(np.mean(field_map.query(recording.trajectory.p).inside) > COVERED)
         raise CalibrationError(_nothing_solved(recording, map_source, sensors, covered))
     verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
+    stretches = disagreements(verdicts)
+    stretches = with_causes(stretches, solution, solver_map, options.changes)
     result = CalibrationResult(
         sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
         doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
-        disagreements=tuple(_in_own_time(each, recording) for each in disagreements(verdicts)),
+        disagreements=tuple(_in_own_time(each, recording) for each in stretches),
         bag=None if recording.drives else recording.source,
         map=map_source,
         options=options.model_dump(mode="json"),
@@ -196,6 +202,11 @@ def _starts(
     progress("global start", 1.0)
     names = zip(readings.sensors, found, strict=True)
     return [None if name in options.start else each for name, each in names]
+
+
+def is_ambiguous(found: list[FoundStart | None], options: CalibrationOptions) -> bool:
+    """Return whether readings leave it open where any sensor started."""
+    return any(each is not None and each.ambiguous(options.search.clear) for each in found)
 
 
 def _start_places(

@@ -17,7 +17,7 @@ from l2m_gtsam.calibration.averaged_rows import (
 )
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources, offset_gain
-from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
+from l2m_gtsam.calibration.coverage import UncertainMap, errors_over_stated
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of
@@ -37,6 +37,9 @@ CELL_M = 1.0  # edge of the cells that are suspected
 SURE = 0.999  # of cells with nothing but noise so many are not
 ENOUGH, UNLIKE = 10, 2.0  # readings of a cell, and their squares over those of most cells
 AXES = 3
+# Errors of a map over what it states, at held-out readings of its survey: with more of them its
+# model is not the place's. Up to this they count as large as they are.
+MOST_OVER_STATED = 3.0
 ROUNDS = 4  # of solving with sources and looking for them again
 SETTLED_SIGMAS = 0.3
 
@@ -93,15 +96,18 @@ def suspected(
 
     # Sensors share errors of poses: an average over cells of all of them is no better for it.
     sensors = len(np.unique(readings.sensor))
-    variance = (
-        mean(drive.view.map_variance) + mean(own) * sensors / np.maximum(count, sensors)[:, None]
-    )
+    variance = mean(drive.map_variance) + mean(own) * sensors / np.maximum(count, sensors)[:, None]
     left = drive.averages.residual
     wrong = np.sum(mean(left) ** 2 / variance, axis=1) > quantile(SURE, AXES)
-    single = mean(left**2 / (drive.view.map_variance + own)).sum(axis=1)
+    single = mean(left**2 / (drive.map_variance + own)).sum(axis=1)
     wrong |= (count >= ENOUGH) & (single > UNLIKE * np.median(single))
     wrong |= 1 - np.bincount(cell, drive.averages.counted) / count > 0.5
     return np.asarray(mean(places)[wrong])
+
+
+def is_place_of(field_map: QueryableMap) -> bool:
+    """Return whether what a map misses may be a change, and not that it is wrong everywhere."""
+    return errors_over_stated(field_map) <= MOST_OVER_STATED
 
 
 def search(
@@ -128,8 +134,7 @@ def search(
     """
     if not options.sources.most or not isinstance(field_map, UncertainMap) or not solution.solved:
         return None
-    # What a map misses that does not know its own errors is no change.
-    if not sigmas_hold(field_map):
+    if not is_place_of(field_map):
         return None
     drive = averaged_drive(solution, field_map, options.averaging)
     places = suspected(drive, field_map, options.averaging)

@@ -1,7 +1,7 @@
 """What the readings of a view share: the map's error in each tile, the poses' at each knot."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol, runtime_checkable
 
@@ -78,13 +78,18 @@ class KnowsItself(Protocol):
     """A map that was compared with readings that it had not read."""
 
     @property
-    def sigmas_hold(self) -> bool:
-        """Whether these were within what it states."""
+    def errors_over_stated(self) -> float:
+        """How many times what it states its errors at these were, 1 at least."""
 
 
 def sigmas_hold(field_map: object) -> bool:
     """Return whether nothing says that a map's errors are larger than it states."""
-    return not isinstance(field_map, KnowsItself) or field_map.sigmas_hold
+    return errors_over_stated(field_map) <= 1
+
+
+def errors_over_stated(field_map: object) -> float:
+    """Return how many times what it states a map's errors were, 1 where nothing is known of it."""
+    return field_map.errors_over_stated if isinstance(field_map, KnowsItself) else 1.0
 
 
 class NothingShared:
@@ -177,6 +182,10 @@ class Coverage:
     budget: Budget = NOTHING_FOUND
     spread: FloatArray = field(default_factory=lambda: np.empty(0))
     shift: FloatArray = field(default_factory=lambda: np.empty((3, 0)))
+
+    def with_larger_errors(self, times: float) -> "Coverage":
+        """Return the same of a map whose errors are so many times as large as it states."""
+        return replace(self, rest=times**2 * self.rest, lower=times * self.lower)
 
     @cached_property
     def root_information(self) -> FloatArray:

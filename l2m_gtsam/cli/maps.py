@@ -131,8 +131,8 @@ def map_update(
         bool,
         typer.Option(
             "--changes",
-            help="The place may have changed: tell what came, went or was moved, between which "
-            "dates, and forget what is no longer true. Needs a calibrated vehicle (--suite).",
+            help="The place may have changed: report what came, went or was moved, between which "
+            "dates, and drop what no longer holds. Needs a calibrated vehicle (--suite).",
         ),
     ] = False,
     tiles: TilesOption = True,
@@ -146,8 +146,7 @@ def map_update(
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import make_tiles
         from l2m_gtsam.batch.maps import keep_map_file_up, update_map_file
-        from l2m_gtsam.cli.tables.map_changes import changes_table, faded_lines
-        from l2m_gtsam.cli.tables.maps import map_table
+        from l2m_gtsam.cli.tables.maps import changes_table, faded_lines, map_table
         from l2m_gtsam.config import load_config, with_poses
 
         chosen = with_poses(load_config(config), bags, poses or (), times)
@@ -190,8 +189,7 @@ def map_info(map_path: MapArgument) -> None:
     with shown_progress() as progress:
         from l2m_gtsam.batch.files import doubts_of_origin
         from l2m_gtsam.batch.maps import describe_map_file
-        from l2m_gtsam.cli.tables.map_changes import changes_table, faded_lines
-        from l2m_gtsam.cli.tables.maps import map_table
+        from l2m_gtsam.cli.tables.maps import changes_table, faded_lines, map_table
 
         description = describe_map_file(map_path, progress)
     print_table(map_table(description))

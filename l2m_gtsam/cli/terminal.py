@@ -187,7 +187,7 @@ def shown_progress() -> "Iterator[Progress]":
         starting = [bars.add_task(STARTING, total=None)]
         bars.refresh()
 
-        def tell(stage: str, fraction: float) -> None:
+        def report(stage: str, fraction: float) -> None:
             if stage not in stages:
                 stages[stage] = bars.add_task(shown(stage, LONGEST_STAGE), total=1.0)
             bars.update(stages[stage], completed=fraction)
@@ -195,7 +195,7 @@ def shown_progress() -> "Iterator[Progress]":
                 bars.remove_task(starting.pop())
 
         try:
-            yield tell
+            yield report
         finally:
             while starting:
                 bars.remove_task(starting.pop())

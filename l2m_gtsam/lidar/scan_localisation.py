@@ -203,8 +203,8 @@ def _not_at_start(
     x, y, z = start.t
     return (
         f"the first scan does not fit the map's cloud at ({x:g}, {y:g}, {z:g}) m: {refusal} "
-        f"({found.share:.0%}, at least {options.least_share:.0%} is asked for, determining "
-        f"{found.directions} of 6 directions); say with `lidar.start` where the drive begins, or "
+        f"({found.share:.0%}, at least {options.least_share:.0%} is required, determining "
+        f"{found.directions} of 6 directions); set `lidar.start` to where the drive begins, or "
         "is it another place?"
     )
 
@@ -260,7 +260,7 @@ def find_start(
     if not found:
         raise LidarError(
             f"the first scan fits nowhere along the mapping drives ({len(mapped.p)} places were "
-            "tried): is it another place? Else say with `lidar.start` where the drive begins"
+            "tried): is it another place? Else set `lidar.start` to where the drive begins"
         )
     found.sort(key=lambda each: each.share, reverse=True)
     best = found[0]
@@ -268,7 +268,7 @@ def find_start(
     if others and others[0].share > best.share - options.lead:
         places = " and ".join(_place(each.T) for each in (best, others[0]))
         raise LidarError(
-            f"the first scan fits at several places, {places}; say with `lidar.start` where the "
+            f"the first scan fits at several places, {places}; set `lidar.start` to where the "
             "drive begins"
         )
     return best.T

@@ -36,7 +36,7 @@ class SuiteCalibrationOptions(Options):
     steps: int = Field(default=10, ge=1)
     """The most steps of the solve in one round."""
     searches: int = Field(default=2, ge=0)
-    """How often steel beside the way is searched for where waves do not explain the survey, at the
+    """How often steel beside the path is searched for where waves do not explain the survey, at the
     most: after the rounds, and again with the sensors that this gave. 0 searches nothing."""
 
 

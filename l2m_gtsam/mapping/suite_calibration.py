@@ -200,9 +200,9 @@ def _check_ending(
     if lost.any():
         k = int(np.flatnonzero(lost)[0])
         raise CalibrationError(
-            f"{names[k]}: the survey does not lead to this sensor: in {solution.rounds} rounds it "
-            f"came {away[k]:.2g} m from where it was assumed; give what is known of the sensors "
-            "with --suite (turned ones with `bag.axes`), or keep further from steel"
+            f"{names[k]}: the solve diverged: in {solution.rounds} rounds this sensor moved "
+            f"{away[k]:.2g} m from its assumed position; give what is known of the sensors with "
+            "--suite (turned ones with `bag.axes`), or keep further from steel"
         )
 
 

@@ -65,8 +65,6 @@ class PosedSurvey:
 
     Attributes
     ----------
-    last
-        The round.
     slopes, poses
         Of each window.
     prior

@@ -4,7 +4,7 @@ The drive's poses are known, the field is not. With a wrong position or distorti
 two fields at one place under two headings, and over the drive a field that no sources could make:
 both are unlikely. The likelihood is maximised by Fisher scoring; strength and depth of the sources
 are learnt again in each round. Where waves from below and above do not explain the readings, steel
-beside the way is searched for with the sensors that were found, and the rounds go on with it.
+beside the path is searched for with the sensors that were found, and the rounds go on with it.
 """
 
 from collections.abc import Callable, Sequence
@@ -204,7 +204,7 @@ class SuiteProblem:
         sensors
             To begin with, shape (S, 16).
         sources
-            Of steel beside the way.
+            Of steel beside the path.
         """
         readings = self._readings_at(sensors[:, -1])
         windows = windows_over(readings, sensors, sources, self._options)

@@ -58,7 +58,7 @@ def windows_over(
     sensors
         Parameters of S sensors, shape (S, 16).
     sources
-        Of steel beside the way, map frame, metres.
+        Of steel beside the path, map frame, metres.
     options
         How many windows.
 
@@ -109,7 +109,7 @@ def sources_in(
 ) -> Sources:
     """Return sources of steel that the readings of windows ask for; none if waves explain them.
 
-    Waves come from below and above. Steel at the height of the way has a field that none of them
+    Waves come from below and above. Steel at the height of the path has a field that none of them
     makes; taken for one of the floor it has another slope along z, and sensors that are a few
     centimetres higher or lower, or a percent stronger along z, explain that.
 

@@ -43,7 +43,8 @@ class MapSummary:
 OPTIONAL = (
     "errors_over",
     "sensors_uncertain",
-    "sigmas_hold",
+    "poses_uncertain",
+    "errors_over_stated",
     "compile",
     "summary",
     "readings",

@@ -198,7 +198,7 @@ def connected(options: ClusterOptions) -> "Iterator[Client]":
     # Whoever talks to a scheduler runs code as its owner: keys of this run alone, never on a disk,
     # keep out other users of the machine. Each worker has a core to itself, and one thread.
     one = {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, THREADS: 1}
-    # What Dask has to say of its own processes is told by results, or by one line at the end.
+    # Dask's messages on its own processes are left out: results, or one last line, report them.
     silent = {"DASK_LOGGING__DISTRIBUTED": "critical"}
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with (

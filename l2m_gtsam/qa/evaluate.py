@@ -16,7 +16,7 @@ from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.view import spread
 from l2m_gtsam.data import FloatArray, Readings, Recording
 from l2m_gtsam.errors import CalibrationError
-from l2m_gtsam.parallel.threads import in_threads, one_blas_thread, side_by_side
+from l2m_gtsam.parallel.threads import in_threads, one_blas_thread
 from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.qa.metrics.assemble import MapForms, Repeats, SeenSensors, map_picture, metrics_of
 from l2m_gtsam.qa.metrics.evidence import DriveEvidence
@@ -61,12 +61,9 @@ def evaluate(
     """
     evidence, maps = evidence_of(calibrated), maps_of(calibrated)
     seen = SeenSensors.of(calibrated.result, evidence, maps.along_drive)
-    # Parts are GTSAM's, who holds Python; the map leaves it alone.
-    repeats, picture = side_by_side(
-        lambda: repeats_of(recording, calibrated, options, qa, progress),
-        lambda: map_picture(maps.anywhere, seen.places),
-    )
+    repeats = repeats_of(recording, calibrated, options, qa, progress)
     progress(FIGURES, 0.0)
+    picture = map_picture(maps.anywhere, seen.places)  # by all cores
     metrics = metrics_of(calibrated.result, seen, recording, picture, repeats)
     progress(FIGURES, 0.5)
     return metrics
@@ -108,11 +105,11 @@ def maps_of(calibrated: Calibrated) -> MapForms:
 def compared_halves(
     calibrated: Calibrated, options: CalibrationOptions, qa: QaOptions
 ) -> dict[str, Halves]:
-    """Compare what the first and the second half of a drive say of each sensor.
+    """Compare the first and the second half of a drive for each sensor.
 
-    The graph of the whole tells it of all readings that counted. Where many were rejected, as those
-    of one half if a sensor moved, both halves are calibrated anew; and where errors of the map are
-    not known to be shared, on few readings, of which neighbours are not as alike.
+    The graph of the whole gives it for all readings that counted. If many were rejected, as those
+    of one half if a sensor moved, both halves are calibrated anew. If the map does not model how
+    its errors are correlated, they are calibrated on few readings, whose errors are less alike.
 
     Parameters
     ----------

@@ -197,7 +197,7 @@ def expected_deviation(value: FloatArray, sigma: FloatArray) -> FloatArray:
     """Return how far each of N values may well be from their median, shape (N,).
 
     The larger of the standard deviation of the difference, which holds where sigmas are true, and
-    of the values' spread, which is what drives differ by for reasons that no sigma knows. The
+    of the values' spread, which is what drives differ by for reasons that no sigma includes. The
     latter from the median absolute deviation, which half of all values cannot move.
     """
     # Of N normal values the median has pi / 2 times the variance of the mean.

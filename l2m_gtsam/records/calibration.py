@@ -22,7 +22,7 @@ from l2m_gtsam.records.error_budget import (
     Unmodelled,
     VarianceShare,
 )
-from l2m_gtsam.records.places import ChangedSource
+from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource, clear_cause
 from l2m_gtsam.records.record import Record
 from l2m_gtsam.records.sensor_models import ModelComparison, MovingField
 from l2m_gtsam.records.verdict import Judgement
@@ -206,6 +206,9 @@ class Disagreement:
         What was read at the same place at another time, in any drive.
     bag
         Path of its drive, where there are several.
+    explanations
+        How well each cause explains all readings at its places, the best first; none for a map
+        that does not know its errors.
     """
 
     sensors: tuple[str, ...]
@@ -218,6 +221,12 @@ class Disagreement:
     size: float
     passed_again: Return
     bag: str = ""
+    explanations: tuple[CauseGain, ...] = ()
+
+    @property
+    def cause(self) -> Cause | None:
+        """The cause that is clearly the best; none where two explain it about as well."""
+        return clear_cause(self.explanations)
 
 
 @dataclass(frozen=True)
@@ -369,7 +378,7 @@ class CalibrationResult:
     pose_duration
         How long errors of poses last; none where these are taken for exact.
     sources
-        Of field that came, went or were moved since the place was mapped; the solve knows them.
+        Of field that came, went or were moved since the place was mapped; the solve includes them.
     """
 
     sensors: Annotated[tuple[SensorCalibration, ...], KeyedBy("sensor")]

@@ -155,18 +155,16 @@ class StartCandidate:
 
 
 @dataclass(frozen=True)
-class StartSearch:
-    """Where in a map a drive began, looked for all over it.
+class StartFinding(Record):
+    """What a search for the start of a drive, over the whole map, resulted in.
 
     Attributes
     ----------
     verdict, message
-        What it came to, and a sentence about it.
-    candidates
-        Places that are apart, the likeliest first.
+        What was found, and a sentence about it.
     margin
-        By what natural logarithm the first is likelier than the second, tempered where the first
-        leaves more than noise; infinite without a second.
+        Log likelihood ratio of the first candidate and the second, tempered where the first leaves
+        more than noise. Without a second it is infinite, and NaN in a file.
     window_m, readings
         Length of the path that was searched in the end, metres, and number of readings on it.
     looked_at
@@ -175,11 +173,17 @@ class StartSearch:
 
     verdict: StartVerdict
     message: str
-    candidates: tuple[StartCandidate, ...]
     margin: float
     window_m: float
     readings: int
     looked_at: int
+
+
+@dataclass(frozen=True)
+class StartSearch(StartFinding):
+    """The finding with its candidates: places that are apart, the likeliest first."""
+
+    candidates: tuple[StartCandidate, ...]
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from l2m_gtsam.records.localisation import (
     OdometryScale,
     ScanUse,
     SensorUse,
-    StartVerdict,
+    StartFinding,
 )
 from l2m_gtsam.records.metrics import FitFigures, MapPicture, Normalised, Row, Rows, Series
 from l2m_gtsam.records.record import Record
@@ -245,27 +245,9 @@ class StartCandidateRecord(Record):
 
 
 @dataclass(frozen=True)
-class StartRecord(Record):
-    """A search for the start all over the map; see ``StartSearch``.
+class StartRecord(StartFinding):
+    """The finding with its candidates, the likeliest first; see ``StartSearch``."""
 
-    Attributes
-    ----------
-    verdict, message
-        What it came to.
-    margin
-        Natural logarithm of how much likelier the first place is than the second; NaN without one.
-    window_m, readings, looked_at
-        What it rests on.
-    candidates
-        The likeliest first.
-    """
-
-    verdict: StartVerdict
-    message: str
-    margin: float
-    window_m: float
-    readings: int
-    looked_at: int
     candidates: tuple[StartCandidateRecord, ...]
 
 

@@ -60,7 +60,7 @@ class ChangedSource:
     strongest
         Its strongest field at a reading in uT.
     passages
-        How often the drive came to where it is felt.
+        How often the drive came to where it changes readings.
     explanations
         What the readings there say of each cause, the best first.
     """
@@ -84,16 +84,26 @@ class ChangedSource:
 
     @property
     def length_m(self) -> float:
-        """Of a bar, end to end; zero of one that is too short to be told from a dipole."""
+        """Of a bar, end to end; zero of one that is too short to differ from a dipole."""
         whole = 2 * math.hypot(*self.half_axis)
         return whole if whole > LONG_M else 0.0
 
     @property
     def cause(self) -> Cause | None:
         """The cause that is clearly the best; none where two explain it about as well."""
-        best, *others = self.explanations or (CauseGain(Cause.PLACE, 0.0, 0.0),)
-        tied = any(best.gain - each.gain < CLEAR for each in others)
-        return None if tied else best.cause
+        return clear_cause(self.explanations or (CauseGain(Cause.PLACE, 0.0, 0.0),))
+
+
+def clear_cause(explanations: tuple[CauseGain, ...]) -> Cause | None:
+    """Return the best cause, the first; none where another explains readings about as well.
+
+    Nor where it explains no more than its parameters do by chance.
+    """
+    if not explanations:
+        return None
+    best, *others = explanations
+    tied = any(best.gain - each.gain < CLEAR for each in others)
+    return None if tied or best.gain < 0 else best.cause
 
 
 LONG_M = 0.1  # shorter bars are reported as points

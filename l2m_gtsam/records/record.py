@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
@@ -74,3 +74,8 @@ class Record:
                 return None
             found = getattr(found, part)
         return found
+
+
+def fields_of(record: Record, kind: type[Record]) -> dict[str, Any]:
+    """Return the fields of a record that it has from one of its base classes, by name."""
+    return {each.name: getattr(record, each.name) for each in fields(kind)}

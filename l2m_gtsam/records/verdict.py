@@ -156,8 +156,6 @@ class Judgement(Record):
 
     Attributes
     ----------
-    verdict
-        The verdict.
     thresholds
         The options `qa` that it was judged by, plain values.
     earlier

@@ -14,7 +14,7 @@ from l2m_gtsam.simulate.office_corridor import (
 LANES = 6  # of a survey at one height
 STEP_NS = 50_000_000
 LIDAR_M = 0.7  # height of the lidar over the floor
-WAY = np.array([HALF_LENGTH - 0.5, FREE_WIDTH - 0.3])  # of the lidar from the middle, metres
+REACH = np.array([HALF_LENGTH - 0.5, FREE_WIDTH - 0.3])  # of the lidar from the middle, metres
 ROCK = 0.02  # radians, standard deviation about x and y: the vehicle has springs
 MOUNTED = np.array([0.28, 0.28])  # of sensors from the lidar along x and y, metres
 
@@ -71,12 +71,12 @@ def office_drive(
 def poses_of(
     office: OfficeCorridor, rng: np.random.Generator, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (N, 3, 3) and places (N, 3) of the lidar along a closed way."""
+    """Return rotations (N, 3, 3) and places (N, 3) of the lidar along a closed path."""
     u = 2 * np.pi * np.arange(count) / count
     laps = int(rng.integers(2, 4))
     x = np.cos(laps * u + rng.uniform(-np.pi, np.pi)) + 0.25 * _swerves(rng, u, 5, 12)
     y = _swerves(rng, u, laps, 14)
-    xy = np.column_stack([each / np.abs(each).max() for each in (x, y)]) * WAY
+    xy = np.column_stack([each / np.abs(each).max() for each in (x, y)]) * REACH
     ahead = np.roll(xy, -1, axis=0) - np.roll(xy, 1, axis=0)
     up = office.normal(xy)
     forward = np.column_stack([ahead, np.zeros(count)])

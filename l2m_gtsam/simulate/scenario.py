@@ -161,7 +161,7 @@ def simulate(options: ScenarioOptions, progress: Progress = silent) -> Scenario:
     Parameters
     ----------
     progress
-        Told how far each of the two drives is.
+        Called with the share of each of the two drives that is done.
 
     Raises
     ------

@@ -9,7 +9,7 @@ from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.calibration import CalibrationResult
-from l2m_gtsam.records.localisation import Explored, Gain, LocalisationResult, LocalisationStatus
+from l2m_gtsam.records.localisation import Explored, LocalisationResult, LocalisationStatus
 from l2m_gtsam.records.scans import ScanEvidence
 from l2m_gtsam.slam.drive import EXACT_START, Drive
 from l2m_gtsam.slam.localisation import NO_SCANS, prepared
@@ -169,13 +169,6 @@ def where_gained(drive: Drive, mapped: FieldSolution, options: SlamOptions) -> F
     recorded = with_recorded_jumps(drive)
     odometry = without_field(recorded, options).poses
     return with_gain(mapped, recorded, odometry, prior, options)
-
-
-def gain_notes(gain: Gain | None) -> tuple[str, ...]:
-    """Return that poses are odometry's, and why; none where they are corrected."""
-    if gain is None or gain.shown:
-        return ()
-    return (f"{NOTHING_GAINED}: {gain.reason}",)
 
 
 def explored_result(result: LocalisationResult, explored: Explored) -> LocalisationResult:

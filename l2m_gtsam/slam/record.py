@@ -1,6 +1,6 @@
 """From a localisation to the record in slam.json that reports are drawn from. Pure."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -20,7 +20,12 @@ from l2m_gtsam.qa.metrics.fit import curves, fit_figures, normalised_figures, se
 from l2m_gtsam.qa.metrics.plain import row
 from l2m_gtsam.qa.metrics.pose_errors import ComparedTrajectories, truth_record
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
-from l2m_gtsam.records.localisation import LocalisationResult, SensorUse, StartSearch
+from l2m_gtsam.records.localisation import (
+    LocalisationResult,
+    SensorUse,
+    StartFinding,
+    StartSearch,
+)
 from l2m_gtsam.records.localisation_file import (
     LocalisationRecord,
     OdometryRecord,
@@ -31,6 +36,7 @@ from l2m_gtsam.records.localisation_file import (
     StartRecord,
     Timeline,
 )
+from l2m_gtsam.records.record import fields_of
 from l2m_gtsam.records.validation import ChiSquare, NamedSource
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.pose_graph import stated_information_root
@@ -140,13 +146,9 @@ def _poses(at: Trajectory) -> tuple[PoseRecord, ...]:
 
 
 def _start(search: StartSearch) -> StartRecord:
+    margin = search.margin if np.isfinite(search.margin) else float("nan")
     return StartRecord(
-        verdict=search.verdict,
-        message=search.message,
-        margin=search.margin if np.isfinite(search.margin) else float("nan"),
-        window_m=search.window_m,
-        readings=search.readings,
-        looked_at=search.looked_at,
+        **fields_of(replace(search, margin=margin), StartFinding),
         candidates=tuple(
             StartCandidateRecord(
                 p=row(each.T_map_lidar.t, DIGITS),

@@ -65,7 +65,8 @@ MODEL = {
     ),
     "disagreements": (
         "stretches over which readings fit neither map nor distortion and were rejected: stamps in "
-        "ns, the lidar's path from p_from to p_to in m in the map, median residual (size) in uT"
+        "ns, the lidar's path from p_from to p_to in m in the map, median residual (size) in uT; "
+        "explanations: as of sources, of all readings in the cells of 1 m that it goes through"
     ),
     "sources": (
         "steel that came, went or was moved since the place was mapped, found in the readings and "
@@ -142,7 +143,10 @@ def write_calibration(path: Path, result: CalibrationResult) -> None:
     """Write a calibration; `read_calibration` gives it back equal."""
     plain = _RESULT.dump_python(result, exclude={"sensors"})
     judged = {} if result.judgement is None else {"verdict": verdict_entry(result.judgement)}
-    disagreements = [_without_empty(each, "bag") for each in plain["disagreements"]]
+    disagreements = [
+        _without_empty(_without_empty(each, "bag"), "explanations")
+        for each in plain["disagreements"]
+    ]
     content = {
         "format": FORMAT,
         "version": VERSION,

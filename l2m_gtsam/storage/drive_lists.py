@@ -19,9 +19,9 @@ from pydantic_core import PydanticCustomError
 
 from l2m_gtsam.errors import BagError, ConfigError
 from l2m_gtsam.options import Options, words_of
+from l2m_gtsam.storage.log import DRIVES
 from l2m_gtsam.storage.yaml_file import read_yaml
 
-FILES = (".bag", ".mcap", ".db3", ".ulg")
 ROS2_HEADER = "metadata.yaml"
 
 
@@ -80,7 +80,7 @@ def _below(folder: Path, without: Path) -> Iterator[Path]:
 
 
 def _named(name: str) -> bool:
-    return Path(name).suffix.lower() in FILES
+    return Path(name).suffix.lower() in DRIVES
 
 
 def _cannot_be_listed(error: OSError) -> NoReturn:

@@ -253,8 +253,6 @@ def write_known_sensors(
     ----------
     path
         File to write.
-    sensors
-        The sensors.
     facts
         Plain values above them (seed, options).
     header

@@ -13,6 +13,13 @@ from l2m_gtsam.storage.bag_options import Stamps
 from l2m_gtsam.storage.messages import stamp_of
 from l2m_gtsam.storage.units import Unit
 
+BAGS = (".bag", ".mcap", ".db3")
+TABLES = (".csv", ".ulg")
+"""How the names of logs end that are no bags: they have no point clouds and cannot be copied."""
+DRIVES = (*BAGS, ".ulg")
+"""Files that count as drives in a folder: a table in CSV may be anything there."""
+ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3, .mcap, .csv or .ulg file"
+
 
 @dataclass(frozen=True)
 class Message:

@@ -79,11 +79,6 @@ def save_map(path: Path, state: MapState) -> None:
 def load_map(path: Path) -> MapState:
     """Return the map in a file.
 
-    Parameters
-    ----------
-    path
-        The file.
-
     Raises
     ------
     MapError

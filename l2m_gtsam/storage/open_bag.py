@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 from l2m_gtsam.errors import BagError
 from l2m_gtsam.progress import Count
 from l2m_gtsam.storage.bounded import is_there, require_regular
-from l2m_gtsam.storage.log import Message
+from l2m_gtsam.storage.log import ACCEPTED, TABLES, Message
 from l2m_gtsam.storage.messages import TF_TYPE, TF_TYPES
 from l2m_gtsam.storage.rosbags_bounds import (
     MOST_DEFINITION,
@@ -35,9 +35,6 @@ from l2m_gtsam.text.shown import shown
 
 bound_rosbags()
 
-ACCEPTED = "a ROS1 .bag, a ROS2 folder with metadata.yaml, a .db3, .mcap, .csv or .ulg file"
-TABLES = (".csv", ".ulg")
-"""How the names of logs end that are no bags."""
 # mcap counts nanoseconds unsigned, everything else in 63 bits.
 LATEST_NS = (1 << 63) - 1
 STORED = (".yaml", ".db3", ".mcap", ".zstd")  # what a folder's bag is read from
@@ -262,7 +259,7 @@ def typestore(is_ros1: bool, msgtype: str, definition: MessageDefinition) -> Typ
     if definition.format is not MessageDefinitionFormat.MSG or not definition.data.strip():
         store = _default_typestore(is_ros1)
         if msgtype not in store.types:
-            raise ValueError("the bag holds none and ROS knows none; an mcap file would carry it")
+            raise ValueError("the bag holds none, and ROS has none; an mcap file would carry it")
         return store
     if len(definition.data) > MOST_DEFINITION:
         raise ValueError(f"it has {len(definition.data):,} letters")

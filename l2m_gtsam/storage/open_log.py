@@ -1,6 +1,6 @@
 """Open a log of any kind: bags, tables in CSV, ULogs of PX4."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -8,9 +8,15 @@ from l2m_gtsam.errors import BagError
 from l2m_gtsam.storage.bag_options import ColumnOptions
 from l2m_gtsam.storage.bounded import require_regular
 from l2m_gtsam.storage.csv_log import read_csv_log
-from l2m_gtsam.storage.log import Log
-from l2m_gtsam.storage.open_bag import ACCEPTED, TABLES, open_bag
+from l2m_gtsam.storage.log import ACCEPTED, TABLES, Log
+from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.ulog import read_ulog
+
+READERS: dict[str, Callable[[Path, ColumnOptions], Log]] = {
+    ".csv": read_csv_log,
+    ".ulg": lambda path, _: read_ulog(path),
+}
+"""Of each of ``TABLES``: the whole file as a log."""
 
 
 def is_table(path: Path) -> bool:
@@ -35,11 +41,10 @@ def open_log(path: Path, columns: ColumnOptions | None = None) -> Iterator[Log]:
         No such file, of no kind that is read, damaged, or without messages.
     """
     if path.suffix.lower() in (".txt", ".dat", ".log", ".tsv") and path.is_file():
-        raise BagError(f"{path}: what it is does not follow from its name; call a table .csv")
+        raise BagError(f"{path}: its name does not state its format; call a table .csv")
     if not is_table(path):
         with open_bag(path) as bag:
             yield bag
         return
     require_regular(path, BagError, f"no such file; accepted: {ACCEPTED}")
-    is_ulog = path.suffix.lower() == ".ulg"
-    yield read_ulog(path) if is_ulog else read_csv_log(path, columns or ColumnOptions())
+    yield READERS[path.suffix.lower()](path, columns or ColumnOptions())

@@ -235,7 +235,7 @@ def _ply_tables(header: list[list[str]], order: str) -> list[Table]:
 
 def _ply_property(words: list[str], order: str) -> Property:
     if "list" in words[:2]:
-        raise ValueError("its vertices have a list, or stand behind an element that has one")
+        raise ValueError("its vertices have a list, or follow an element that has one")
     _, kind, name = _three(words)
     return Property(name, np.dtype(order + PLY_TYPES[kind]))
 

@@ -28,7 +28,7 @@ def read_poses(path: Path, options: PoseFileOptions) -> Trajectory:
     Parameters
     ----------
     path
-        TUM or KITTI, which are told apart by their columns, or ``.csv``.
+        TUM or KITTI, distinguished by their columns, or ``.csv``.
     options
         Times for KITTI, columns of CSV, and what is added to the times.
 

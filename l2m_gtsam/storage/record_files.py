@@ -4,10 +4,10 @@ Each file is a head with format and version, then the record. Files are read wit
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -17,7 +17,7 @@ from l2m_gtsam.options import first_fault
 from l2m_gtsam.records.fleet import DATE, VERDICTS, DriveOutcome, SensorRow
 from l2m_gtsam.records.localisation_file import LocalisationRecord
 from l2m_gtsam.records.metrics import Metrics
-from l2m_gtsam.records.record import Record
+from l2m_gtsam.records.record import Record, fields_of
 from l2m_gtsam.records.validation import Validation
 from l2m_gtsam.storage.bounded import read_content
 from l2m_gtsam.storage.files import atomic_path
@@ -134,7 +134,7 @@ def write_slam(path: Path, record: LocalisationRecord) -> None:
         The file cannot be written.
     """
     absent = {name for name in ("judgement", "gain") if getattr(record, name) is None}
-    file = _SlamFile("l2m-slam", 4, LEGEND, **_parts(record))
+    file = _SlamFile("l2m-slam", 4, LEGEND, **fields_of(record, LocalisationRecord))
     _write(path, _SLAM.dump_json(file, exclude=absent))
 
 
@@ -146,7 +146,8 @@ def read_slam(path: Path) -> LocalisationRecord:
     CalibrationError
         The file is missing, damaged or something else.
     """
-    found = LocalisationRecord(**_parts(_read(path, _SLAM, "localisation", "`l2m slam` writes it")))
+    file = _read(path, _SLAM, "localisation", "`l2m slam` writes it")
+    found = LocalisationRecord(**fields_of(file, LocalisationRecord))
     if odd := _odd_poses(found):
         raise CalibrationError(f"{path}: not a localisation file of this program: {odd}")
     return found
@@ -159,10 +160,6 @@ def _odd_poses(record: LocalisationRecord) -> str:
     p = [each.p for part in (record.poses, record.odometry) for each in part]
     q = [each.quaternion_xyzw for part in (record.poses, record.odometry) for each in part]
     return odd_poses(np.array(p), np.array(q))
-
-
-def _parts(record: LocalisationRecord) -> dict[str, Any]:
-    return {each.name: getattr(record, each.name) for each in fields(LocalisationRecord)}
 
 
 def write_outcome(path: Path, outcome: DriveOutcome) -> None:
@@ -219,8 +216,6 @@ def _read(path: Path, adapter: TypeAdapter[Content], kind: str, writer: str) -> 
 
     Parameters
     ----------
-    path
-        The file.
     adapter
         Of its content.
     kind

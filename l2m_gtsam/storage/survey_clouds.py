@@ -78,7 +78,7 @@ def _check_chunks(path: Path, start: int, points: int) -> None:
     with opened(path, MapError) as file:
         file.seek(start)
         (table,) = struct.unpack("<q", file.read(8))
-        if table <= 0:  # written by a stream: the place stands at the end
+        if table <= 0:  # written by a stream: the place is at the end
             file.seek(-8, SEEK_END)
             (table,) = struct.unpack("<q", file.read(8))
         file.seek(max(table, 0))

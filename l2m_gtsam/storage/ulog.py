@@ -114,7 +114,7 @@ def _values(topic: _Topic, group: dict[int, str]) -> Sequence[Any]:
 
 
 def _type_of(topic: _Topic) -> str:
-    """Return the type by which PX4's bridge to ROS 2 knows a topic."""
+    """Return the type that PX4's bridge to ROS 2 gives a topic."""
     if topic.name.endswith("_odometry") and {"position[0]", "q[0]"} <= set(topic.columns):
         return PX4_POSE_TYPE
     if topic.name == "sensor_combined" and "magnetometer_ga[0]" in topic.columns:

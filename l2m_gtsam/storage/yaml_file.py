@@ -176,8 +176,6 @@ def read_yaml(path: Path, error: type[L2MError]) -> Any:
 
     Parameters
     ----------
-    path
-        The file.
     error
         What to raise, with one line that names the file, if it cannot be read.
     """
@@ -227,8 +225,6 @@ def checked(
 
     Parameters
     ----------
-    path
-        The file.
     plain
         Its content, see ``read_yaml``.
     adapter

@@ -1,6 +1,6 @@
 """Program for the environment of `magyc`: calibrates drives from one file into another.
 
-It is run by the Python of that environment, which knows numpy and magyc but nothing of this
+It is run by the Python of that environment, which has numpy and magyc but nothing of this
 project: ``python -I magyc_program.py drives.npz results.npz``. Fields are in gauss, the unit that
 magyc is made for, turn rates in rad/s, times in seconds.
 """

@@ -152,7 +152,7 @@ def bound_at(
         The map does not know how its errors are correlated.
     """
     if not isinstance(field_map, UncertainMap):
-        raise MapError("a bound needs a map that knows how its errors are correlated: harmonic")
+        raise MapError("a bound needs a map that models how its errors are correlated: harmonic")
     view = observe(readings, field_map, truth, options.min_readings)
     if not view.sensors:
         return np.full((16, 16), np.nan)

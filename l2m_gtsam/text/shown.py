@@ -40,7 +40,7 @@ def shown_lines(text: str) -> str:
 def shown_value(value: Any) -> str:
     """Return a value as Python writes it, within ``LONGEST_VALUE`` letters and with few steps.
 
-    A number of thousands of digits, or a list of lists of lists, is told by what it is.
+    A number of thousands of digits, or a list of lists of lists, is described by its kind.
     """
     if isinstance(value, str):
         return shown(repr(value[: LONGEST_VALUE + 1]), LONGEST_VALUE)

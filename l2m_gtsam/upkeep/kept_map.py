@@ -74,8 +74,6 @@ def seen_sources(
         With their poses at the sensors' time offsets.
     known
         The S sensors, in the readings' order.
-    field_map
-        The map.
     options
         How to look.
     """
@@ -138,8 +136,8 @@ def kept_up(
     """
     if not isinstance(field_map, HarmonicMap):
         raise MapError(
-            f"a map of kind {field_map.kind} does not know what of it can change; --changes needs "
-            "one of kind harmonic"
+            f"a map of kind {field_map.kind} keeps no readings of its survey; --changes needs one "
+            "of kind harmonic"
         )
     drives = [(dated(each), each) for each in recordings]
     for drive, recording in sorted(drives, key=lambda each: str(each[0].begun)):
@@ -194,8 +192,8 @@ def dated(recording: Recording) -> MapDrive:
         begun = int(recording.trajectory.stamp_ns.min()) // 10**9
         raise MapError(
             f"{recording.source.path}: its stamps begin at {begun} s, which is no date of this "
-            "century: --changes tells what changed between which dates; record with a clock that "
-            "is set, or leave --changes out"
+            "century: --changes dates what changed; record with a clock that is set, or leave "
+            "--changes out"
         )
     return drive
 
@@ -206,5 +204,5 @@ def check_order(recording: Recording, drive: MapDrive, diary: MapDiary) -> None:
     if known and drive.begun is not None and drive.begun < max(known):
         raise MapError(
             f"{recording.source.path} was driven at {drive.begun}, the map is of {max(known)}: "
-            "what changed is told drive by drive; give drives in the order of their dates"
+            "changes are dated drive by drive; give drives in the order of their dates"
         )

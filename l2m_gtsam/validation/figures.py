@@ -58,8 +58,6 @@ def sensor_figures(
     ----------
     drive
         Its readings.
-    field_map
-        The map.
     sensor
         Its calibration.
     found

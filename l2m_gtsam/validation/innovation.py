@@ -137,8 +137,6 @@ def change_likelihood(
     readings
         Of one sensor, all inside the map, with their poses at the known time offset; what follows
         recorded numbers is taken off.
-    field_map
-        The map.
     known
         The calibration, whose own errors do not count here.
     correlation_s

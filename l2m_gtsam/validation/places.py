@@ -13,8 +13,8 @@ import numpy as np
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged, with_calibration
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources
-from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
-from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
+from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, suspected
+from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
@@ -24,7 +24,7 @@ from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
 
-TIE = "It cannot be told which"
+TIE = "The readings do not show which"
 Parts = tuple[CalibrationPart, ...]
 # Standard deviations of a part that changed, in its own units: anything.
 ANYTHING = {
@@ -83,8 +83,6 @@ class ShownSources:
     ----------
     rows, drive
         Averaged readings, the sensors free.
-    found
-        The sources.
     """
 
     rows: MarginalRows
@@ -162,8 +160,6 @@ def shown_sources(
     ----------
     readings
         Of S sensors, inside the map, at their calibrated time offsets.
-    field_map
-        The map.
     estimate
         The calibration.
     options
@@ -183,11 +179,11 @@ def shown_sources(
 
 
 def is_searched(field_map: QueryableMap, options: ChangesOptions) -> bool:
-    """Return whether steel is looked for: what a map misses that does not know itself is none."""
+    """Return whether steel is looked for: what a map misses that is wrong everywhere is none."""
     return (
         bool(options.sources.most)
         and isinstance(field_map, UncertainMap)
-        and sigmas_hold(field_map)
+        and is_place_of(field_map)
     )
 
 

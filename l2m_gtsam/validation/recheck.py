@@ -99,8 +99,6 @@ def recheck(
     ----------
     drive
         Readings of the sensor.
-    field_map
-        The map.
     known, covariance
         The calibration; infinite variances for what it leaves open, shape (16, 16).
     options

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from l2m_gtsam.cli.tables.map_changes import changes_table
+from l2m_gtsam.cli.tables.maps import changes_table
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES

@@ -149,7 +149,7 @@ class Commands(RuleBasedStateMachine):
     def refused(self, run: Finished, out: Path, despite: bool) -> bool:
         """Check that a FAIL is refused, but where it was asked for, and return whether it was."""
         if self.level is Level.FAIL and not despite:
-            assert "say --despite-verdict" in one_line(run)
+            assert "give --despite-verdict" in one_line(run)
             assert not out.exists()
             return True
         assert run.code == 0

@@ -6,10 +6,10 @@ from rich.table import Table
 
 from l2m_gtsam.cli.tables import add_numbers, new_table, plain_table
 from l2m_gtsam.data import FloatArray, KnownSensor
+from l2m_gtsam.qa.verdict.places import stretch_head
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     Disagreement,
-    Return,
     SensorCalibration,
     SensorStatus,
     TimeOffset,
@@ -110,18 +110,14 @@ def _status(sensor: SensorCalibration) -> str:
 def disagreement_note(stretch: Disagreement) -> str:
     """Return where, when and by how much readings and map disagree, as a sentence."""
     (x0, y0), (x1, y1) = stretch.p_from[:2], stretch.p_to[:2]
-    meaning = {
-        Return.NEVER: "not passed again, so that a passing source and a changed place look alike",
-        Return.AS_MAPPED: "passed again it was as mapped: something moved by",
-        Return.DIFFERS: "passed again it differed too: the field has changed there",
-    }[stretch.passed_again]
+    head = stretch_head(stretch)
     where = f"{stretch.bag}: " if stretch.bag else ""
     return (
         f"{where}{', '.join(stretch.sensors)}: {stretch.readings} readings fit neither map nor "
         f"distortion and do not count, {1e-9 * stretch.start_ns:.2f} to "
         f"{1e-9 * stretch.end_ns:.2f} s, "
         f"{stretch.length:.1f} m from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m, "
-        f"{stretch.size:.2g} uT off; {meaning}"
+        f"{stretch.size:.2g} uT off; {head[:1].lower()}{head[1:]}"
     )
 
 

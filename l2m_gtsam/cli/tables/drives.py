@@ -40,11 +40,11 @@ def held_plan_note(plan: DrivePlan) -> str:
 
 
 def motion_table(plan: DrivePlan) -> Table:
-    """Return one row per extra motion for the sensor that is known least, the best first."""
+    """Return one row per extra motion for the sensor that is determined least, the best first."""
     title = f"What an extra motion would add for {escape(plan.worst.sensor)}, by itself"
     table = plain_table(title)
     add_text(table, "motion")
-    for heading in ("parameters not determined", "known least", "its sigma"):
+    for heading in ("parameters not determined", "least determined", "its sigma"):
         table.add_column(heading)
     table.add_row("(the drive as it is)", *_worst_cells(plan.worst))
     for each in plan.motions:
@@ -64,7 +64,7 @@ def advice(plan: DrivePlan) -> str:
 def _known(worst: Worst) -> str:
     left, parameter, sigma = _worst_cells(worst)
     unknown = f"{left} parameters not determined" if worst.undetermined else ""
-    least = f"known least {parameter}, sigma {sigma}" if worst.parameter else ""
+    least = f"least determined: {parameter}, sigma {sigma}" if worst.parameter else ""
     return ", ".join(part for part in (unknown, least) if part)
 
 

@@ -1,13 +1,15 @@
-"""Magnetic maps in the terminal: what one is made of, and kinds of maps beside each other."""
+"""Magnetic maps in the terminal: content of one, its changes, and kinds of maps compared."""
 
 from typing import Any
 
+import numpy as np
 from rich.markup import escape
 from rich.table import Table
 
 from l2m_gtsam.batch.maps import MapDescription
 from l2m_gtsam.cli.tables import add_numbers, add_text, plain_table
 from l2m_gtsam.maps.compare import KindFigures, KindResult, MapComparison
+from l2m_gtsam.records.map_diary import MapDiary, between, doubtful, words_of
 
 HEADINGS = (
     "log-likelihood",
@@ -20,6 +22,7 @@ HEADINGS = (
     "shared rmse (uT)",
     "x y z (uT)",
 )
+CHANGE_HEADINGS = ("x y z (m)", "+- (m)", "A m2", "+-", "at most (uT)")
 
 
 def comparison_table(comparison: MapComparison) -> Table:
@@ -100,3 +103,43 @@ def _bags(provenance: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the bags in a map file, which may have been tampered with."""
     bags = provenance.get("bags")
     return [each for each in bags if isinstance(each, dict)] if isinstance(bags, list) else []
+
+
+def changes_table(diary: MapDiary) -> Table:
+    """Return one row for each source that came or went, the last first."""
+    drives = len(diary.drives) - 1
+    drive = "one drive" if drives == 1 else f"{drives} drives"
+    since = f"{drive} since the survey ({diary.drives[0].day})"
+    caption = doubtful(diary)
+    if not diary.changes:
+        caption = "nothing came or went that the drives noticed"
+    table = plain_table(f"What changed: {since}", caption)
+    for heading in ("what", "between"):
+        table.add_column(heading, no_wrap=True)
+    add_numbers(table, CHANGE_HEADINGS)
+    for number in reversed(range(len(diary.changes))):
+        source = diary.changes[number].source
+        table.add_row(
+            f"{number + 1} {words_of(diary, number)}",
+            between(diary, number),
+            " ".join(f"{value:.2f}" for value in source.position),
+            f"{float(np.max(source.position_sigma)):.2f}",
+            f"{float(np.linalg.norm(source.moment)):.1f}",
+            f"{float(np.linalg.norm(source.moment_sigma)):.1f}",
+            f"{source.strongest:.1f}",
+        )
+    return table
+
+
+def faded_lines(diary: MapDiary) -> list[str]:
+    """Return where earlier readings count less, drive by drive, a line each."""
+    lines = []
+    for drive in sorted({each.drive for each in diary.faded}, reverse=True):
+        own = [each for each in diary.faded if each.drive == drive]
+        places = ", ".join(
+            f"({each.middle[0]:.1f}, {each.middle[1]:.1f}) {100 * each.kept:.0f} %" for each in own
+        )
+        lines.append(
+            f"{diary.drives[drive].day}: earlier readings count less about (x, y in m): {places}"
+        )
+    return lines

@@ -65,6 +65,11 @@ class Explanation:
         return not (self.spread > MOST_SPREAD or self.worst > MOST_SPREAD_OF_ONE)
 
     @property
+    def errors_over_stated(self) -> float:
+        """How many times what the map states its errors are: 1 where nothing speaks against it."""
+        return 1.0 if self.sigmas_hold else max(self.spread, self.worst)
+
+    @property
     def reasons(self) -> list[str]:
         """Return what speaks against the map."""
         reasons = []

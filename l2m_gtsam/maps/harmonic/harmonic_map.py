@@ -238,9 +238,9 @@ class HarmonicMap:
         return self.learnt.poses is not None
 
     @property
-    def sigmas_hold(self) -> bool:
-        """Whether held-out readings of the survey are within what the map states."""
-        return self.learnt.origin.explanation.sigmas_hold
+    def errors_over_stated(self) -> float:
+        """How many times what the map states the errors at held-out readings are, 1 at least."""
+        return self.learnt.origin.explanation.errors_over_stated
 
     @property
     def summary(self) -> MapSummary:

@@ -89,8 +89,6 @@ def metrics_of(
 
     Parameters
     ----------
-    result
-        The calibration.
     seen
         Its readings.
     recording
@@ -167,8 +165,6 @@ def slice_map(
 
     Parameters
     ----------
-    field_map
-        The map.
     low, high
         Corners of the grid, x and y in metres, shape (2,).
     height

@@ -87,8 +87,6 @@ def compare_calibrations(
 
     Parameters
     ----------
-    new, old
-        The calibrations.
     chance
         A change is named where chance alone makes as much in a smaller share of all sensors.
     """

@@ -1,4 +1,4 @@
-"""C and H in terms that a person knows: gains, angles, axes."""
+"""C and H in terms of the mounting: gains, angles, axes."""
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment

@@ -21,7 +21,7 @@ from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import Measured, judge, measured
-from l2m_gtsam.qa.verdict.places import best_of, cause_sentence
+from l2m_gtsam.qa.verdict.places import best_of, cause_sentence, stretch_head
 from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
@@ -76,8 +76,6 @@ def calibration_page(
 
     Parameters
     ----------
-    result
-        The calibration.
     metrics
         Its figures.
     options
@@ -85,9 +83,9 @@ def calibration_page(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    tell = counter(STAGE, progress)
+    report = counter(STAGE, progress)
     steps = len(result.sensors) + 2
-    tell(0, steps)
+    report(0, steps)
     verdict, sections = judge(result, metrics, options), []
     with mpl.rc_context(SETTINGS):
         figures: dict[str, Figure | Drawing] = {
@@ -102,14 +100,14 @@ def calibration_page(
             path = np.array(metrics.drive.path)
             figures["changes"] = changes_figure(metrics.map, path, result.sources)
         for k, each in enumerate(result.sensors):
-            tell(k + 1, steps)
+            report(k + 1, steps)
             anchor, found = f"sensor-{k}", metrics.get(each.sensor)
             drawn = {} if found is None else _figures(each, found)
             own = verdict[each.sensor]
             beside = () if found is None else measured(each, found, options)
             section = SensorSection(anchor, each, found, own, pictures(drawn, anchor), beside)
             sections.append(section)
-        tell(steps - 1, steps)
+        report(steps - 1, steps)
         return render(
             "report.html.j2",
             result=result,
@@ -121,6 +119,7 @@ def calibration_page(
             length=np.linalg.norm,
             what_else=best_of,
             cause=cause_sentence,
+            cause_of_stretch=stretch_head,
             shares=shares_in_words,
             what_helps=what_helps,
             strongest_correlation=statistics.strongest_correlation,

@@ -51,8 +51,6 @@ def localisation_page(record: LocalisationRecord, options: QaOptions) -> str:
 
     Parameters
     ----------
-    record
-        The localisation.
     options
         Thresholds of the verdict.
     """

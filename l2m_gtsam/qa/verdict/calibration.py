@@ -8,14 +8,13 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.qa.options import Limit, QaOptions
 from l2m_gtsam.qa.verdict.mounting import mounting
-from l2m_gtsam.qa.verdict.places import source_reasons
+from l2m_gtsam.qa.verdict.places import source_reasons, stretch_head, stretch_tail
 from l2m_gtsam.qa.verdict.repeatability import furthest, repeat
 from l2m_gtsam.qa.verdict.sensor import WRONG_MAP, Case, clock, ending, fit, misfit, precision
 from l2m_gtsam.qa.verdict.uncertainty import disturbance_reasons, stated_wrongly
 from l2m_gtsam.records.calibration import (
     CalibrationResult,
     Disagreement,
-    Return,
     SensorCalibration,
     SensorStatus,
 )
@@ -23,16 +22,6 @@ from l2m_gtsam.records.error_budget import DurationSource
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
 from l2m_gtsam.records.verdict import Judgement, Level, Reason, SensorVerdict, Verdict
 
-HEADS = {
-    Return.NEVER: "The environment has changed, or something passed by",
-    Return.AS_MAPPED: "Something passed by",
-    Return.DIFFERS: "The environment has changed since it was mapped",
-}
-TAILS = {
-    Return.NEVER: "It was not passed again, which would decide",
-    Return.AS_MAPPED: "Passed again the place was as mapped",
-    Return.DIFFERS: "Passed again it differed, too: map it anew",
-}
 OPEN = (SensorStatus.UNDETERMINED, SensorStatus.NOT_CONVERGED, SensorStatus.NO_READINGS)
 MANY = 4  # stretches that are listed one by one
 
@@ -42,8 +31,6 @@ def judge(result: CalibrationResult, metrics: Metrics, options: QaOptions) -> Ve
 
     Parameters
     ----------
-    result
-        The calibration.
     metrics
         Its figures.
     options
@@ -167,11 +154,11 @@ def _changed(stretch: Disagreement, result: CalibrationResult) -> str:
     when = f", {after:.0f} s after the first" if after >= 1 else ""
     drive = f" in {Path(stretch.bag).name}" if stretch.bag else ""
     return (
-        f"{HEADS[stretch.passed_again]}: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on "
+        f"{stretch_head(stretch)}: from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m on "
         f"the map{drive}{when}, {stretch.length:.1f} m long, "
         f"{count} sensor{'s' if count > 1 else ''} differ{'' if count > 1 else 's'} by "
         f"{stretch.size:.2g} µT. "
-        f"{TAILS[stretch.passed_again]}. These {stretch.readings} readings do not count."
+        f"{stretch_tail(stretch)}. These {stretch.readings} readings do not count."
     )
 
 

@@ -33,8 +33,6 @@ def judge_localisation(record: LocalisationRecord, options: QaOptions) -> Verdic
 
     Parameters
     ----------
-    record
-        The localisation.
     options
         Thresholds.
     """

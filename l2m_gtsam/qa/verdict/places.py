@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from l2m_gtsam.records.calibration import Disagreement, Return
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 from l2m_gtsam.records.verdict import Level, Reason
 
@@ -34,7 +35,47 @@ def cause_sentence(source: ChangedSource) -> str:
     best, *others = source.explanations
     if source.cause is not None or not others:
         return f"The readings say that {CAUSES[best.cause]}."
-    return f"It cannot be told whether {CAUSES[best.cause]} or {CAUSES[others[0].cause]}."
+    return f"The readings do not show whether {CAUSES[best.cause]} or {CAUSES[others[0].cause]}."
+
+
+PASSED = {
+    Return.NEVER: "The environment has changed, or something passed by",
+    Return.AS_MAPPED: "Something passed by",
+    Return.DIFFERS: "The environment has changed since it was mapped",
+}
+DIFFERS = {
+    Cause.PLACE: "The environment has changed since it was mapped",
+    Cause.MOMENT: "Something passed by",
+    Cause.VEHICLE: "Something on the vehicle was switched or moved",
+    Cause.SENSOR: "Something at one sensor was switched or moved",
+}
+SEEN = {
+    Return.NEVER: "It was not passed again",
+    Return.AS_MAPPED: "Passed again the place was as mapped",
+    Return.DIFFERS: "Passed again it differed, too",
+}
+
+
+def is_explained(stretch: Disagreement) -> bool:
+    """Return whether any cause explains more of a stretch than its parameters do by chance."""
+    return any(each.gain > 0 for each in stretch.explanations)
+
+
+def stretch_head(stretch: Disagreement) -> str:
+    """Return what a stretch of rejected readings is of; two that are about as likely are named."""
+    if not is_explained(stretch):
+        return PASSED[stretch.passed_again]
+    best, *others = (DIFFERS[each.cause] for each in stretch.explanations)
+    if stretch.cause is not None or not others:
+        return best
+    return f"{best}, or {others[0][0].lower()}{others[0][1:]}"
+
+
+def stretch_tail(stretch: Disagreement) -> str:
+    """Return what supports it: what each cause explains, or what another passage found."""
+    if is_explained(stretch):
+        return f"What explains all readings there: {best_of(stretch.explanations)}"
+    return SEEN[stretch.passed_again]
 
 
 def best_of(explanations: tuple[CauseGain, ...]) -> str:

@@ -117,7 +117,7 @@ def disturbance_reasons(result: CalibrationResult) -> list[Reason]:
 
 
 def _share(found: Disturbance, result: CalibrationResult) -> float:
-    """Return the largest share of a process in a variance of t, C or H; all, where none is told."""
+    """Return the largest share of a process in a variance of t, C or H; 1 if none is known."""
     sensors = [each for each in result.sensors if found.sensor in (None, each.sensor)]
     if not any(each.variance_shares for each in sensors):
         return 1.0
@@ -151,7 +151,7 @@ def disturbance_sentence(found: Disturbance) -> str:
         case DisturbanceKind.FIELD:
             return (
                 f"The field differs from the map's by {size}, for all sensors alike: steel or "
-                "currents near by changed, or the survey missed what is along the way. Sigmas "
+                "currents near by changed, or the survey missed what is along the path. Sigmas "
                 "hold it; survey more densely, or again."
             )
         case DisturbanceKind.WARP:

@@ -74,8 +74,10 @@ def judge_validation(
         if comparison.same_bag:
             shared.append(Reason(Level.WARN, "One drive took part in both calibrations."))
         for name in comparison.failed:
-            told = f"The {name} calibration itself was judged FAIL: its calibration.yaml says why."
-            shared.append(Reason(Level.WARN, told))
+            warning = (
+                f"The {name} calibration itself was judged FAIL: its calibration.yaml says why."
+            )
+            shared.append(Reason(Level.WARN, warning))
         for each in comparison.sensors:
             found.setdefault(each.sensor, []).extend(_on_comparison(each, options))
         _add_missing(found, comparison.missing)

@@ -7,7 +7,6 @@ from enum import StrEnum
 class EventKind(StrEnum):
     """Of an event."""
 
-    BEGUN = "begun"
     RESUMED = "resumed"
     UNUSABLE = "unusable"
     OUT_OF_ORDER = "out_of_order"

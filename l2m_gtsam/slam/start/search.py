@@ -61,7 +61,7 @@ def search_result(
         least = options.least_readings
         message = f"{len(window)} readings do not determine a place, {least} may: {REMEDY}"
     summary = f"over the first {window.path_m:.1f} m of the drive {message}"
-    return StartSearch(verdict, summary, candidates, margin, window.path_m, len(window), looked_at)
+    return StartSearch(verdict, summary, margin, window.path_m, len(window), looked_at, candidates)
 
 
 def verdict_of(

@@ -142,8 +142,6 @@ def export_of(
 
     Parameters
     ----------
-    result
-        The calibration.
     fault
         What keeps a sensor out of the format.
     lidar_frame

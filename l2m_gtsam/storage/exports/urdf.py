@@ -81,7 +81,7 @@ def roll_pitch_yaw(R: FloatArray) -> FloatArray:
 
 
 def comment_text(line: str) -> str:
-    """Return a line as it may stand in a comment, which knows no two hyphens."""
+    """Return a line as a comment may contain it: without two hyphens."""
     return re.sub("-(?=-)", "- ", line).rstrip("-")
 
 

@@ -11,12 +11,11 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, Loads
 from l2m_gtsam.studies.honesty.drives import drive_seed
-from l2m_gtsam.studies.validation.drives import NO_STEEL, path_of, recorded
+from l2m_gtsam.studies.validation.drives import NO_STEEL, SECONDS, HallPath, path_of, recorded
 
 NEAR_M = 0.5  # a source so near a change is that change
 FAR_M = 1.0  # a source so far from all changes is a false alarm
 INSIDE = 7.815  # squared distance within which 95 % of three normal numbers are
-SECONDS = 1e-9
 
 
 @dataclass(frozen=True)
@@ -59,20 +58,20 @@ class SensorErrors:
 
 @dataclass(frozen=True)
 class ChangesCell:
-    """One path through a hall, with five changes and without.
+    """One path through a hall, with five changes and without, or without alone.
 
     Attributes
     ----------
     hall
         Its seed.
     changes
-        The five.
+        The five; none if it was driven without alone.
     false_with, false_without
         Sources that are found far from all changes, and without any.
-    hours
-        That the path takes.
+    hours_with, hours_without
+        That it was driven with changes, and without.
     sensors
-        Errors of each.
+        Errors of each where it was driven both with changes and without.
     rejected
         Largest share of a sensor's readings that do not count, with changes.
     """
@@ -81,7 +80,8 @@ class ChangesCell:
     changes: tuple[TrueChange, ...]
     false_with: int
     false_without: int
-    hours: float
+    hours_with: float
+    hours_without: float
     sensors: tuple[SensorErrors, ...]
     rejected: float
 
@@ -95,17 +95,41 @@ def cell_of(options: ChangesStudyOptions, place: LoadedHall, number: int) -> Cha
         recorded(options, place.hall, path, place.sensors, each) for each in (NO_STEEL, steel)
     ]
     clean, changed = (calibrate(each, place.field_map, CalibrationOptions()) for each in recordings)
-    stamps = path.trajectory.stamp_ns
+    hours = hours_of(path)
     points = read_at(recordings[1], place.sensors)
     return ChangesCell(
         hall=place.seed,
         changes=found_changes(changes, changed.sources, points, options),
         false_with=false_alarms(changed.sources, changes.positions),
         false_without=len(clean.sources),
-        hours=float(stamps[-1] - stamps[0]) * SECONDS / 3600,
+        hours_with=hours,
+        hours_without=hours,
         sensors=tuple(errors_of(each, clean, changed) for each in place.sensors),
         rejected=max(each.rejected for each in changed.sensors) / options.readings,
     )
+
+
+def unchanged_cell(options: ChangesStudyOptions, place: LoadedHall, number: int) -> ChangesCell:
+    """Calibrate on one path on which nothing has changed."""
+    path = path_of(options, place.hall, drive_seed(place.seed, number))
+    recording = recorded(options, place.hall, path, place.sensors, NO_STEEL)
+    found = calibrate(recording, place.field_map, CalibrationOptions())
+    return ChangesCell(
+        hall=place.seed,
+        changes=(),
+        false_with=0,
+        false_without=len(found.sources),
+        hours_with=0.0,
+        hours_without=hours_of(path),
+        sensors=(),
+        rejected=0.0,
+    )
+
+
+def hours_of(path: HallPath) -> float:
+    """Return how long a path takes."""
+    stamps = path.trajectory.stamp_ns
+    return float(stamps[-1] - stamps[0]) * SECONDS / 3600
 
 
 def read_at(recording: Recording, sensors: tuple[KnownSensor, ...]) -> FloatArray:

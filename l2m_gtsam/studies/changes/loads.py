@@ -33,6 +33,8 @@ class ChangesStudyOptions(ValidationStudyOptions):
     """Of the first hall; the others follow it one by one."""
     paths: int = Field(default=2, ge=1, le=2)
     """Through each hall, each driven with and without changes."""
+    unchanged: int = Field(default=6, ge=0)
+    """Further drives through each hall in which nothing has changed: for false alarms."""
     sensors: int = Field(default=2, ge=1)
     """Of a vehicle, at random places and with random distortions."""
     moment: tuple[float, float] = (1.0, 50.0)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.changes.cells import NEAR_M, ChangesCell, TrueChange, cell_of
+from l2m_gtsam.studies.changes.cells import NEAR_M, ChangesCell, TrueChange, cell_of, unchanged_cell
 from l2m_gtsam.studies.changes.loads import ChangesStudyOptions, LoadedHall, loaded_hall
 from l2m_gtsam.studies.statistics import Share
 from l2m_gtsam.studies.study import Study
@@ -46,7 +46,7 @@ class ChangesSummary:
         Changes by moment (rows) and distance of the nearest reading (columns); None for none.
     by_strength
         By their strongest field at a reading.
-    false_with, false_without, hours
+    false_with, false_without, hours_with, hours_without
         False alarms on drives with changes and without, and how long each of these took together.
     clean_m, changed_m
         Root mean squares of the error of t.
@@ -63,7 +63,8 @@ class ChangesSummary:
     went: ShareFound | None
     false_with: int
     false_without: int
-    hours: float
+    hours_with: float
+    hours_without: float
     clean_m: float
     changed_m: float
     undetermined: int
@@ -73,22 +74,23 @@ class ChangesSummary:
 
 
 class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
-    """Detection of changes and errors of t; a cell is one path, with changes and without."""
+    """Detection of changes and errors of t; a cell is one path, with changes and without.
+
+    Further cells are paths without changes alone.
+    """
 
     name = "changes"
     title = "Places that change"
-    size = frozenset({"halls"})
+    size = frozenset({"halls", "unchanged"})
     options = ChangesStudyOptions
     cell = ChangesCell
     summary = ChangesSummary
 
     def keys(self, options: ChangesStudyOptions) -> tuple[str, ...]:
-        """Return the paths, hall by hall."""
-        return tuple(
-            f"hall-{hall:03d}-path-{path}"
-            for hall in range(options.halls)
-            for path in range(options.paths)
-        )
+        """Return the paths, hall by hall, then further ones without changes."""
+        kinds = [f"path-{path}" for path in range(options.paths)]
+        kinds += [f"unchanged-{options.paths + each}" for each in range(options.unchanged)]
+        return tuple(f"hall-{hall:03d}-{kind}" for hall in range(options.halls) for kind in kinds)
 
     def site(self, options: ChangesStudyOptions, key: str) -> str:
         """Return the number of the hall."""
@@ -100,7 +102,9 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
 
     def compute(self, options: ChangesStudyOptions, key: str, shared: LoadedHall) -> ChangesCell:
         """Calibrate on one path."""
-        return cell_of(options, shared, int(key.split("-")[3]))
+        _, _, kind, number = key.split("-")
+        cell = unchanged_cell if kind == "unchanged" else cell_of
+        return cell(options, shared, int(number))
 
     def summarise(
         self, options: ChangesStudyOptions, cells: Mapping[str, ChangesCell]
@@ -126,7 +130,8 @@ class ChangesStudy(Study[ChangesStudyOptions, ChangesCell, ChangesSummary]):
             went=found_of([each for each in changes if not each.came]),
             false_with=sum(cell.false_with for cell in every),
             false_without=sum(cell.false_without for cell in every),
-            hours=sum(cell.hours for cell in every),
+            hours_with=sum(cell.hours_with for cell in every),
+            hours_without=sum(cell.hours_without for cell in every),
             clean_m=rms([each.clean_m for each in sensors]),
             changed_m=rms([each.changed_m for each in sensors]),
             undetermined=sum(each.changed_m is None for each in sensors),

@@ -81,6 +81,8 @@ class ValidationStudyOptions(Options):
     """How the map is made of the survey, and of the structure that the LiDAR saw."""
 
 
+FASTEST_M_S = 1.0
+SECONDS = 1e-9
 NO_STEEL = brought_steel(np.zeros((0, 3)), np.zeros((0, 3)), np.ones(3))
 
 
@@ -142,10 +144,22 @@ class HallPath:
 
 
 def path_of(options: ValidationStudyOptions, hall: SteelHall, seed: int) -> HallPath:
-    """Return a path through a hall."""
+    """Return a path through a hall, as fast as a vehicle that bends around what is in its way."""
     span = min(options.heights), max(options.heights)
     drive = calibration_drive(hall, seed, span, options.noise, 1, options.readings)
-    return HallPath(drive.trajectory, seed)
+    return HallPath(driven_at(drive.trajectory, FASTEST_M_S), seed)
+
+
+def driven_at(poses: Trajectory, fastest: float) -> Trajectory:
+    """Return poses with stamps later where a step takes longer at a speed in m/s.
+
+    Poses that are pushed out of a structure jump from one side of it to the other: in the time of
+    one step that would be 30 m/s, and the clock of a sensor would hang on these poses alone.
+    """
+    step = np.diff(poses.stamp_ns)
+    least = np.linalg.norm(np.diff(poses.p, axis=0), axis=1) / fastest / SECONDS
+    longer = np.maximum(step, np.ceil(least).astype(np.int64))
+    return replace(poses, stamp_ns=poses.stamp_ns[0] + np.cumsum(np.append(0, longer)))
 
 
 def recorded(

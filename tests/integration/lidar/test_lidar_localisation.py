@@ -140,7 +140,7 @@ def test_an_ambiguous_start_is_refused() -> None:
     steps = list(
         follow(scans(hall, rows(DRIVE, [3]), np.random.default_rng(2)), ScanOdometryOptions())
     )
-    with pytest.raises(LidarError, match=r"fits at several places, .* and .*; say with `lidar.st"):
+    with pytest.raises(LidarError, match=r"fits at several places, .* and .*; set `lidar.st"):
         find_start(
             steps[0].surface,
             cloud_of(hall),

@@ -13,7 +13,8 @@ from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import calibration_page
 from l2m_gtsam.qa.report.figures.changes import added_field
-from l2m_gtsam.qa.verdict.places import source_sentence
+from l2m_gtsam.qa.verdict.places import source_sentence, stretch_head, stretch_tail
+from l2m_gtsam.records.calibration import Disagreement, Return
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 from tests.drives.verdict import changed_place
 
@@ -50,9 +51,41 @@ def test_a_tie_is_called_a_tie() -> None:
     told = source_sentence(2, SECOND)
     assert "long" not in told
     assert told.endswith(
-        "It cannot be told whether the place changed or something on the vehicle was switched or "
-        "moved."
+        "The readings do not show whether the place changed or something on the vehicle was "
+        "switched or moved."
     )
+
+
+def stretch(passed_again: Return, *gains: tuple[Cause, float]) -> Disagreement:
+    return Disagreement(
+        ("a", "b"), 0, 10**9, np.zeros(3), np.ones(3), 1.7, 20, 3.0, passed_again,
+        explanations=tuple(CauseGain(cause, gain, 2.0) for cause, gain in gains),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("gains", "head"),
+    [
+        (((Cause.PLACE, 80.0), (Cause.MOMENT, 20.0)), "The environment has changed since it was"),
+        (((Cause.VEHICLE, 80.0), (Cause.PLACE, 20.0)), "Something on the vehicle was switched"),
+        (((Cause.SENSOR, 80.0), (Cause.PLACE, 20.0)), "Something at one sensor was switched"),
+        (
+            ((Cause.MOMENT, 80.0), (Cause.PLACE, 79.0)),
+            "Something passed by, or the environment has changed",
+        ),
+        # No more than by chance: what was read at another time is all that is known.
+        (((Cause.SENSOR, -5.0), (Cause.PLACE, -18.0)), "Something passed by"),
+        ((), "Something passed by"),
+    ],
+)
+def test_a_stretch_is_named_after_what_explains_its_places(
+    gains: tuple[tuple[Cause, float], ...], head: str
+) -> None:
+    """Whatever was rejected on another passage."""
+    found = stretch(Return.AS_MAPPED, *gains)
+    assert stretch_head(found).startswith(head)
+    known = any(gain > 0 for _, gain in gains)
+    assert stretch_tail(found).startswith("What explains" if known else "Passed again the place")
 
 
 def test_a_drive_feels_what_a_dipole_adds() -> None:

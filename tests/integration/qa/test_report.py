@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, Appraised
+from l2m_gtsam.batch.drives import CALIBRATION_FILE, METRICS_FILE, EvaluatedCalibration
 from l2m_gtsam.batch.reports import (
     REPORT_FILE,
     SLAM_FILE,
@@ -100,7 +100,7 @@ def test_what_was_just_written_is_reported_without_being_read(
     made: Made, reported: tuple[Level, str], tmp_path: Path
 ) -> None:
     """The same page as of its folder, and the same refusal beside a localisation."""
-    found = Appraised(read_calibration(made.folder / CALIBRATION_FILE), made.metrics)
+    found = EvaluatedCalibration(read_calibration(made.folder / CALIBRATION_FILE), made.metrics)
     assert report_calibration(tmp_path, found, QaOptions()).level is reported[0]
     assert (tmp_path / REPORT_FILE).read_text() == reported[1]
     for name in (METRICS_FILE, SLAM_FILE):

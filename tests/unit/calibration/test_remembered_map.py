@@ -137,7 +137,7 @@ def test_it_goes_to_another_process_without_its_memory() -> None:
 class Knowing(Counting):
     """The same with what some maps know beside it."""
 
-    sigmas_hold = False
+    errors_over_stated = 1.5
 
     def errors_over(self, points: FloatArray, /) -> FloatArray:
         return points
@@ -147,7 +147,7 @@ def test_what_its_map_has_is_there_for_a_static_look() -> None:
     """Since Python 3.12 ``isinstance`` with a protocol does not ask ``__getattr__``."""
     for known, expected in ((Knowing(), True), (Counting(), False)):
         remembered = RememberedMap(known)
-        for name in ("errors_over", "sigmas_hold"):
+        for name in ("errors_over", "errors_over_stated"):
             found = getattr_static(remembered, name, None)
             assert (found is not None) is expected
         assert isinstance(remembered, UncertainMap) is expected

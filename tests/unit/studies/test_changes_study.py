@@ -77,20 +77,32 @@ def test_found_is_what_is_near_with_its_moment() -> None:
     assert false_alarms(sources, changes.positions) == 1
 
 
+def test_drives_without_changes_are_cells_of_their_own() -> None:
+    keys = CHANGES.keys(ChangesStudyOptions(halls=2, paths=1, unchanged=2))
+    assert keys == tuple(
+        f"hall-{hall:03d}-{kind}"
+        for hall in range(2)
+        for kind in ("path-0", "unchanged-1", "unchanged-2")
+    )
+
+
 def test_the_page_counts_what_is_found() -> None:
     found, missed = (
         TrueChange(5, True, 0.9, 1.5, 0.1, 0.9),
         TrueChange(2, False, 1.8, 0.15, None, None),
     )
     cell = ChangesCell(
-        1, (found, missed), 1, 0, 0.5, (SensorErrors(0.003, 0.004, True, False),) * 2, 0.1
+        1, (found, missed), 1, 0, 0.5, 0.5, (SensorErrors(0.003, 0.004, True, False),) * 2, 0.1
     )
-    summary = CHANGES.summarise(ChangesStudyOptions(halls=1, paths=2), {"a": cell, "b": cell})
+    unchanged = ChangesCell(1, (), 0, 1, 0.0, 2.0, (), 0.0)
+    options = ChangesStudyOptions(halls=1, paths=2)
+    summary = CHANGES.summarise(options, {"a": cell, "b": cell, "c": unchanged})
     page = CHANGES.page(summary)
     assert "| 3 to 10 |  | 2 of 2 |  |  |" in page
     assert "| 1 to 2 | 2 of 2 | 0.10 | 10 % |" in page
     assert "| 0.1 to 0.2 | 0 of 2 | | |" in page
     assert "2 of 2; 0 of 2" in page  # what came, what went
+    assert "| false alarms without changes | 1 in 3.0 hours |" in page
     assert "| 2 in 1.0 hours |" in page
     assert "| 3.0 mm; 4.0 mm |" in page
     assert set(CHANGES.figures(summary)) == {"changes"}

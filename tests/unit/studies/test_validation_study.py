@@ -7,10 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from l2m_gtsam.data import Trajectory
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.simulate.hall_drives import calibration_drive
 from l2m_gtsam.simulate.steel_hall import steel_hall
-from l2m_gtsam.studies.validation.drives import TrueCause, ValidationStudyOptions, altered
+from l2m_gtsam.studies.validation.drives import (
+    TrueCause,
+    ValidationStudyOptions,
+    altered,
+    driven_at,
+)
 from l2m_gtsam.studies.validation.study import VALIDATION, ValidationCell, change_of, is_right
 
 OPTIONS = ValidationStudyOptions()
@@ -106,3 +112,14 @@ def test_the_page_counts_what_is_right_and_tells_what_is_not() -> None:
     assert "| place | 1 | 0 | 1 | 0 | 0.40 |" in page
     assert "| 900 | place | It cannot be told Parts: -; - | warn |" in page
     assert set(VALIDATION.figures(summary)) == {"validation"}
+
+
+def test_a_path_around_structures_is_no_faster_than_a_vehicle() -> None:
+    """Steps that are short keep their time; one of 2 m takes two seconds."""
+    p = np.array([[0.0, 0, 0], [0.01, 0, 0], [2.01, 0, 0], [2.02, 0, 0]])
+    stamps = 10**9 + 50_000_000 * np.arange(4)
+    poses = Trajectory(stamps, np.tile(np.eye(3), (4, 1, 1)), p, "map", "lidar")
+    found = driven_at(poses, 1.0)
+    np.testing.assert_allclose(np.diff(found.stamp_ns), [50_000_000, 2_000_000_000, 50_000_000])
+    assert found.stamp_ns[0] == stamps[0]
+    np.testing.assert_array_equal(found.p, p)

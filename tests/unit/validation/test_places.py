@@ -82,8 +82,8 @@ def test_a_tie_is_called_a_tie(behind: float, tied: bool) -> None:
     found = judged(100.0, 100.0 - behind)
     assert found.tied is tied
     start = (
-        "It cannot be told which: the place changed, not the vehicle, or the vehicle changed, not "
-        "the place, by"
+        "The readings do not show which: the place changed, not the vehicle, or the vehicle "
+        "changed, not the place, by"
     )
     assert found.sentence.startswith(start) is tied
 

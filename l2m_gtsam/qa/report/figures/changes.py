@@ -1,4 +1,4 @@
-"""What changed where, at a glance: steel on the floor of the map, and where a drive feels it."""
+"""What changed where, at a glance: steel on the floor of the map, and where it acts on a drive."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from l2m_gtsam.qa.report.figures.map import BELOW, draw_source, mark, wide
 from l2m_gtsam.records.metrics import MapPicture
 from l2m_gtsam.records.places import ChangedSource
 
-FELT_UT = 0.2  # weaker it is not drawn
+LEAST_UT = 0.2  # weaker it is not drawn
 MARGIN_M = 0.5  # about what is drawn
 
 
@@ -40,10 +40,16 @@ def changes_figure(
     axes.imshow(floor, vmax=10.0, **style)
     axes.plot(*path[:, :2].T, color="0.45", linewidth=1.0)
     added = added_field(path, sources)
-    felt = added > FELT_UT
-    top_ut = max(float(added[felt].max(initial=0.0)), 2 * FELT_UT)
+    affected = added > LEAST_UT
+    top_ut = max(float(added[affected].max(initial=0.0)), 2 * LEAST_UT)
     drawn = axes.scatter(
-        path[felt, 0], path[felt, 1], c=added[felt], s=26, cmap="YlOrRd", vmin=0.0, vmax=top_ut
+        path[affected, 0],
+        path[affected, 1],
+        c=added[affected],
+        s=26,
+        cmap="YlOrRd",
+        vmin=0.0,
+        vmax=top_ut,
     )
     mark(axes, path[0, :2], "start")
     for number, source in enumerate(sources, start=1):

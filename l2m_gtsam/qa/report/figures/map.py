@@ -75,7 +75,7 @@ def draw_source(axes: Axes, source: ChangedSource, name: str) -> None:
 
 
 def sigma_figure(metrics: Metrics) -> Figure:
-    """Draw how well the map knows its field along the drive."""
+    """Draw the map's standard deviation along the drive."""
     label = "standard deviation per axis (µT)"
     figure, axes = _map(metrics.map, metrics.map.sigma, label, "cividis")
     _drive(axes, metrics)

@@ -174,8 +174,8 @@ def correlation_figure(sensor: SensorCalibration) -> Drawing:
         bar.text(SCALE.right + 5, float(bar.down(value)) + 3.5, words, letters("start"))
     figure = Drawing(HEIGHT_OF_MATRIX, (matrix, bar))
     below = np.nonzero(np.tril(np.isfinite(rho)))  # the same as above the diagonal
-    told = [f"{NAMES[j]} and {NAMES[i]}: {rho[i, j]:+.2f}" for i, j in zip(*below, strict=True)]
-    cells(figure, matrix, np.column_stack([below[1], 14 - below[0]]).astype(float), told)
+    labels = [f"{NAMES[j]} and {NAMES[i]}: {rho[i, j]:+.2f}" for i, j in zip(*below, strict=True)]
+    cells(figure, matrix, np.column_stack([below[1], 14 - below[0]]).astype(float), labels)
     return figure
 
 

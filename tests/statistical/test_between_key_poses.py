@@ -1,4 +1,4 @@
-"""Whether sigmas of poses are true where odometry errs on the ways between key poses."""
+"""Whether sigmas of poses are consistent where odometry errs between key poses."""
 
 from dataclasses import dataclass
 
