@@ -101,7 +101,7 @@ def polish(
     params = gtsam.GaussNewtonParams()
     _limit(params, steps, solver, TOLERANCE)
     engine = gtsam.GaussNewtonOptimizer(graph, values, params)
-    worst = (1 + SEAM_RISE) * engine.error() + SEAM_RISE
+    worst = most_after_step(engine.error())
     try:
         for _ in range(steps):
             engine.iterate()
@@ -111,6 +111,11 @@ def polish(
         return Optimised(values, Ending.SINGULAR)
     good = engine.error() <= worst  # which the engine knows: readings are not asked again
     return Optimised(engine.values() if good else values, Ending.TOLERANCE)
+
+
+def most_after_step(error: float) -> float:
+    """Return the most that an error may be after a step that is not refused."""
+    return (1 + SEAM_RISE) * error + SEAM_RISE
 
 
 def refused(error: RuntimeError) -> bool:

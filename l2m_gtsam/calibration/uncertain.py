@@ -21,6 +21,7 @@ import numpy as np
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
+from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched
 from l2m_gtsam.calibration.cluster_robust import ByParts
 from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
@@ -29,7 +30,7 @@ from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver
 from l2m_gtsam.calibration.stated_sizes import leave_noise
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
-from l2m_gtsam.calibration.uncertain_graph import NEAR_SIGMAS, UncertainProblem
+from l2m_gtsam.calibration.uncertain_graph import ROUND_SIGMAS, THERE_SIGMAS, UncertainProblem
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
 from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import StatedSize
@@ -105,23 +106,21 @@ def solve_uncertain(
     # What a map leaves that does not know its own errors is no process of the drive.
     searched = found.ending is not Ending.SINGULAR and sigmas_hold(errors)
     searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
-    budget, scattered = side_by_side(
-        lambda: found.problem.searched(found.joint) if searched else NOTHING_FOUND,
+    shown, scattered = side_by_side(
+        lambda: found.problem.searched(found.joint) if searched else NOTHING_SEARCHED,
         lambda: found.problem.scattered(found.joint),
     )
     by_parts = found.problem.by_parts(found.joint, found.estimate, scattered)
-    if budget.found:
+    if shown.found:
         moved = float(np.abs(found.estimate.t - near.t)[view.sensors].max())
-        if budget.poses is None and moved <= REOBSERVE_M:
-            with_them = drive.beside(budget)
-        else:
-            with_them = UncertainDrive.of(view, field_map, errors, found.estimate, options, budget)
+        start = start_with(found, shown, field_map, errors, options, again=moved > REOBSERVE_M)
         found = settle_by_any(
-            with_them,
-            found.estimate,
+            start.drive,
+            start.estimate,
             tests,
             options,
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
+            start.values,
         )
         scattered = found.problem.scattered(found.joint)
     problem, joint = found.problem, found.joint
@@ -130,8 +129,72 @@ def solve_uncertain(
     solved = problem.halved(joint, solved)
     progress(1.0)
     return UncertainSolution(
-        found.estimate, solved, found.ending, found.settled, budget, stated, by_parts
+        found.estimate, solved, found.ending, found.settled, found.drive.budget, stated, by_parts
     )
+
+
+@dataclass(frozen=True)
+class ProcessStart:
+    """Where a graph with processes of the drive begins.
+
+    Attributes
+    ----------
+    drive
+        What readings share, the processes with it.
+    estimate
+        All sensors, with the noise that the processes leave.
+    values
+        All variables; absent where they are not those of the graph before.
+    """
+
+    drive: UncertainDrive
+    estimate: Estimate
+    values: gtsam.Values | None
+
+
+def start_with(
+    found: "Settled",
+    shown: Searched,
+    field_map: QueryableMap,
+    errors: UncertainMap,
+    options: OneKeyOptions,
+    *,
+    again: bool,
+) -> ProcessStart:
+    """Return where the rounds begin with processes that a graph without them has shown.
+
+    Parameters
+    ----------
+    found
+        That graph at its optimum.
+    shown
+        The processes.
+    field_map, errors, options
+        As in ``solve_uncertain``.
+    again
+        Whether the map has to be asked again where sensors are.
+    """
+    budget, estimate = Budget(shown.found), found.estimate
+    if options.sensor_noise_ut is None:
+        estimate = replace(estimate, noise=estimate.noise * np.sqrt(shown.noise))
+    if budget.poses is None and not again:
+        values = with_processes(found, budget, shown)
+        estimate = estimate.updated(values, found.drive.view.sensors)
+        return ProcessStart(found.drive.beside(budget), estimate, values)
+    given = (found.drive.view, field_map, errors, estimate, options, budget)
+    return ProcessStart(UncertainDrive.of(*given), estimate, None)
+
+
+def with_processes(found: "Settled", budget: Budget, shown: Searched) -> gtsam.Values:
+    """Return where the optimum is with processes that are no errors of poses, to first order."""
+    delta = gtsam.VectorValues()
+    for key, at in found.joint.columns.items():
+        delta.insert(key, shown.moved[at])
+    values = found.values.retract(delta)
+    # Each has a variable of its own.
+    for key, weights in zip(budget.variables, shown.weights, strict=True):
+        values.insert(key, weights)
+    return values
 
 
 def settle_by_any(
@@ -140,11 +203,16 @@ def settle_by_any(
     tests: Mapping[int, Determinacy],
     options: OneKeyOptions,
     progress: Callable[[float], None],
+    predicted: gtsam.Values | None = None,
 ) -> "Settled":
-    """Solve by Cholesky, and where that is refused by QR."""
-    values = starting_values(near, drive.view.sensors, drive.prior.coverage)
+    """Solve by Cholesky, and where that is refused by QR; ``predicted`` is where the optimum is."""
+    if predicted is None:
+        zero = starting_values(near, drive.view.sensors, drive.prior.coverage)
+        begin = Beginning(zero, near=False)
+    else:
+        begin = Beginning(predicted, near=True)
     for solver in (LinearSolver.CHOLESKY, LinearSolver.QR):
-        found = settle(drive, near, values, tests, options, solver, progress)
+        found = settle(drive, near, begin, tests, options, solver, progress)
         if found.ending is not Ending.SINGULAR:
             break
     return found
@@ -178,6 +246,22 @@ def step_uncertain(
 
 
 @dataclass(frozen=True)
+class Beginning:
+    """Where the rounds of the graph begin.
+
+    Attributes
+    ----------
+    values
+        All variables.
+    near
+        Whether the optimum is so near that no descent is needed.
+    """
+
+    values: gtsam.Values
+    near: bool
+
+
+@dataclass(frozen=True)
 class Settled:
     """Where the rounds ended.
 
@@ -207,7 +291,7 @@ class Settled:
 def settle(
     drive: UncertainDrive,
     estimate: Estimate,
-    values: gtsam.Values,
+    begin: Beginning,
     tests: Mapping[int, Determinacy],
     options: OneKeyOptions,
     solver: LinearSolver,
@@ -219,7 +303,7 @@ def settle(
     ----------
     drive
         Readings and what they share.
-    estimate, values
+    estimate, begin
         Where to start.
     tests
         Rank test of each sensor.
@@ -230,7 +314,8 @@ def settle(
     progress
         Called with the fraction that is done.
     """
-    sensors, settled, near = drive.view.sensors, False, False
+    sensors, settled = drive.view.sensors, False
+    values, near = begin.values, begin.near
     ending = Ending.TOLERANCE
     for round_ in range(MAX_ROUNDS):
         problem = UncertainProblem(drive, estimate, tests, options.factors)
@@ -240,12 +325,12 @@ def settle(
             return Settled(drive, problem, joint, values, estimate, arrived.ending, settled=False)
         if not near:  # then it was a descent
             ending = arrived.ending
-        near = joint.furthest(sensors) < NEAR_SIGMAS
+        near = joint.furthest(sensors) < ROUND_SIGMAS
         after = estimate.updated(values, sensors)
         if options.sensor_noise_ut is None:
             after = replace(after, noise=problem.noise(joint, values, estimate))
         # The weights of the first round are those of the optimum with independent errors.
-        at_rest = joint.furthest(sensors) < SETTLED_SIGMAS
+        at_rest = joint.furthest(sensors) < SETTLED_SIGMAS and joint.decrement < THERE_SIGMAS
         settled = at_rest and problem.same_noise(after, estimate) and round_ > 0
         estimate = after
         if settled:

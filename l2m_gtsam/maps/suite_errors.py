@@ -19,6 +19,27 @@ SHIFT = 6  # of a reading: its position, then its field
 
 
 @dataclass(frozen=True)
+class FoundErrors:
+    """What the errors of S sensors were found to be by the survey itself.
+
+    Attributes
+    ----------
+    mean
+        By so much readings are corrected, shape (16 S,); of positions and clocks zero.
+    stated
+        Covariance before the survey was asked, shape (16 S, 16 S).
+    """
+
+    mean: FloatArray
+    stated: FloatArray
+
+    def followed_by(self, other: "FoundErrors") -> "FoundErrors":
+        """Return the same of these sensors and of others."""
+        mean = np.concatenate([self.mean, other.mean])
+        return FoundErrors(mean, block_diag(self.stated, other.stated))
+
+
+@dataclass(frozen=True)
 class SuiteErrors:
     """How readings of S sensors hang on the sensors' errors.
 
@@ -36,6 +57,9 @@ class SuiteErrors:
     shift
         What a unit of each error does to position and field of the reading, both in the map frame,
         m and uT, shape (P, 6, 16).
+    found
+        What the errors were found to be; the covariance is that of what is left beside it. Absent
+        where readings are as they were taken.
     """
 
     sensors: tuple[str, ...]
@@ -43,11 +67,22 @@ class SuiteErrors:
     reading: IntArray
     sensor: IntArray
     shift: FloatArray
+    found: FoundErrors | None = None
 
     @property
     def stated(self) -> bool:
         """Whether any error is."""
         return bool(self.covariance.any())
+
+    @property
+    def calibrated_together(self) -> bool:
+        """Whether sensors have errors in common, as those that a survey has calibrated.
+
+        If it was this very survey it fits them better than their sigmas, which are right
+        nevertheless: it must not be asked twice.
+        """
+        own = np.kron(np.eye(len(self.sensors)), np.ones((SIZE, SIZE)))
+        return bool(self.covariance[own == 0].any())
 
     def averaged(self, owner: IntArray, weight: FloatArray) -> "SuiteErrors":
         """Return the errors of averages over readings.
@@ -82,6 +117,23 @@ class SuiteErrors:
         same = self.sensors == other.sensors
         return replace(self, covariance=other.covariance) if same else None
 
+    def as_found_by(self, other: "SuiteErrors | None") -> "SuiteErrors":
+        """Return the same with what others found of the same sensors, stated to be as accurate."""
+        if other is None or other.found is None or self.sensors != other.sensors:
+            return self
+        if not np.array_equal(self.covariance, other.found.stated):
+            return self
+        return replace(self, covariance=other.covariance, found=other.found)
+
+    def corrected(self, field: FloatArray) -> FloatArray:
+        """Return what N readings as they were taken, (N, 3) in uT, are without what was found."""
+        if self.found is None:
+            return field
+        own = self.found.mean.reshape(-1, SIZE)[self.sensor]
+        change = np.zeros_like(field)
+        np.add.at(change, self.reading, np.einsum("pij,pj->pi", self.shift[:, 3:], own))
+        return np.asarray(field - change)
+
     def from_reading(self, first: int) -> "SuiteErrors":
         """Return the same of readings that begin with this number."""
         return replace(self, reading=self.reading + first)
@@ -95,7 +147,11 @@ class SuiteErrors:
         same = self.sensors == other.sensors
         if same and np.array_equal(self.covariance, other.covariance):
             sensors, covariance, shifted = self.sensors, self.covariance, other.sensor
+            found = self.found
         else:
+            found = None
+            if self.found is not None or other.found is not None:
+                found = self._as_found().followed_by(other._as_found())
             sensors = (*self.sensors, *other.sensors)
             covariance = block_diag(self.covariance, other.covariance)
             shifted = other.sensor + len(self.sensors)
@@ -105,7 +161,12 @@ class SuiteErrors:
             np.concatenate([self.reading, other.reading + first]),
             np.concatenate([self.sensor, shifted]),
             np.concatenate([self.shift, other.shift]),
+            found,
         )
+
+    def _as_found(self) -> FoundErrors:
+        """Return what was found of the sensors: nothing, where readings are as they were taken."""
+        return self.found or FoundErrors(np.zeros(len(self.covariance)), self.covariance)
 
     def mean_shift(self, weight: FloatArray) -> FloatArray:
         """Return how far a unit of each error moves readings of these weights, (N,), on average.

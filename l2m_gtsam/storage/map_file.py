@@ -25,7 +25,8 @@ from l2m_gtsam.storage.files import atomic_path
 FORMAT = "l2m-map"
 VERSION = 3
 FORMER = 2  # of maps that have nothing of what came with the present version
-LATER = frozenset({"steps", "pose_pairs"})  # arrays of maps that are kept up, or know wrong poses
+# Arrays of maps that are kept up, know wrong poses, or are corrected by what their suite is.
+LATER = frozenset({"steps", "pose_pairs", "suite_mean"})
 READ = (FORMER, VERSION)
 HEADER, CHECKSUM, ARRAYS = "header.npy", "checksum.npy", "arrays/"
 LIDAR = "lidar/"

@@ -1,7 +1,7 @@
 """Which processes a drive has, and how large: by the likelihood of what all else leaves."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +20,7 @@ from l2m_gtsam.solve.variance_components import (
 # Twice a logarithm of likelihood. Where a process is not there, half of all drives give zero, and
 # 0.7 % more than this (a mixture of chi-square distributions, Self and Liang, JASA 82, 1987).
 LEAST_GAIN = 6.0
+NO_WEIGHTS = np.empty(0, dtype=np.int64)
 BATCH = 4000  # readings whose processes are held at once: 30 MB
 HARDLY = 1.5  # standard deviations of a score: no more is not worth a likelihood
 
@@ -53,6 +54,31 @@ class FoundProcess:
 
 
 @dataclass(frozen=True)
+class Searched:
+    """The processes that were found, and where the graph's optimum is with them.
+
+    Attributes
+    ----------
+    found
+        The processes.
+    noise
+        Share of the noise's variance that they leave.
+    weights
+        The most likely weights of each in units of their sigmas, shapes (m,).
+    moved
+        How far these move all n variables of the graph that has none of them, shape (n,).
+    """
+
+    found: tuple[FoundProcess, ...] = ()
+    noise: float = 1.0
+    weights: tuple[FloatArray, ...] = ()
+    moved: FloatArray = field(default_factory=lambda: np.empty(0))
+
+
+NOTHING_SEARCHED = Searched()
+
+
+@dataclass(frozen=True)
 class Felt:
     """What white readings say of the weights of several processes.
 
@@ -66,12 +92,31 @@ class Felt:
         All weights together, with everything else taken out.
     squares
         Sum of squares of the white residuals.
+    joint, across
+        All n variables of the graph, and their information with the weights, shape (n, M).
     """
 
     processes: Sequence[Process]
     columns: Sequence[IntArray]
     system: WeightSystem
     squares: float
+    joint: JointInformation
+    across: FloatArray
+
+    def searched(self, found: Sequence[FoundProcess], noise: float) -> Searched:
+        """Return processes with the weights that are most likely beside so much of the noise."""
+        own = [self.columns[self.processes.index(each.process)] for each in found]
+        at = np.concatenate([NO_WEIGHTS, *own])
+        root = np.sqrt(np.concatenate([np.empty(0), *(each.variances for each in found)]))
+        fit = self.system.among(at).whiter(noise).fit(root**2)
+        white = root * fit.rest
+        # Weights take degrees of freedom; white squares are as many as there were.
+        noise *= self.squares / (self.squares - float(fit.share.sum()))
+        pull = self.across[:, at] @ (root * white)
+        moved = self.joint.loose @ (self.joint.loose.T @ pull)
+        moved -= self.joint.every.times(pull[:, None])[:, 0]
+        ends = np.cumsum([len(each) for each in own])[:-1]
+        return Searched(tuple(found), noise, tuple(np.split(white, ends)), moved)
 
 
 def felt(
@@ -121,7 +166,7 @@ def felt(
     information = own - joint.every.around(across) + loose.T @ loose
     system = WeightSystem(0.5 * (information + information.T), pull)
     squares = sum(float(each.residual @ each.residual) for each in rows)
-    return Felt(processes, columns, system, squares)
+    return Felt(processes, columns, system, squares, joint, across)
 
 
 def batches(
@@ -148,7 +193,7 @@ def _times(W: FloatArray, Z: FloatArray) -> FloatArray:
     return np.asarray((W @ Z.reshape(len(W), 3, -1)).reshape(Z.shape))
 
 
-def search(known: Felt) -> tuple[FoundProcess, ...]:
+def search(known: Felt) -> Searched:
     """Return the processes without which a drive is much less likely.
 
     The kind that explains most is taken first, for all sensors that show it; the others have to
@@ -198,10 +243,10 @@ def _price(process: Process) -> float:
     return 2 * float(np.log(len(process.forms)))
 
 
-def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess, ...]:
+def _together(known: Felt, taken: dict[int, FoundProcess]) -> Searched:
     """Return processes with the sizes that are most likely for all of them at once."""
     if not taken:
-        return ()
+        return NOTHING_SEARCHED
     spectra, owner = [], []
     for k, found in taken.items():
         for part in found.process.forms[found.form]:
@@ -226,4 +271,4 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> tuple[FoundProcess
         gain = 2 * likely - _price(each.process)
         if gain > LEAST_GAIN:
             kept.append(FoundProcess(each.process, each.form, sizes, gain))
-    return tuple(kept)
+    return known.searched(kept, fit.noise) if kept else NOTHING_SEARCHED

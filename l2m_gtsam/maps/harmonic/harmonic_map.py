@@ -15,6 +15,7 @@ from l2m_gtsam.maps.harmonic.learnt import ErrorOptions, HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.pose_sizes import with_pose_errors
 from l2m_gtsam.maps.harmonic.state import learnt_from_state, learnt_to_state
 from l2m_gtsam.maps.harmonic.structure import NO_SOURCES, candidate_sources
+from l2m_gtsam.maps.harmonic.suite_found import with_errors_found
 from l2m_gtsam.maps.harmonic.suite_sizes import sized, stated_doubts, suite_sizes
 from l2m_gtsam.maps.harmonic.summary import summary_of
 from l2m_gtsam.maps.harmonic.teaching import explained, learn_map
@@ -35,7 +36,6 @@ from l2m_gtsam.progress import Count
 from l2m_gtsam.records.map_diary import MapDiary
 
 EXACT = 1e-9  # share of the variance between points that may be left out
-
 SHARES = 4  # that points are divided into, for as many threads at most
 PIECE = 65_536  # about the most points of a share
 BLOCK = 0.5  # metres: what a map knows of a square of this size fits the processor's cache
@@ -121,6 +121,9 @@ class HarmonicMap:
             ours = cls.condition(learnt, options)
         else:
             ours = cls.surveyed_by(learnt, options, suite.averaged(owner, readings.weight))
+            if suite.stated and not suite.calibrated_together:
+                learnt = with_errors_found(ours.learnt, readings, suite, sources, options)
+                ours = cls.condition(learnt, options)
         return ours if poses is None else ours.posed(poses.averaged(owner, readings.weight))
 
     @classmethod
@@ -138,8 +141,7 @@ class HarmonicMap:
             return exact
         learnt = replace(learnt, suite=sized(suite, sizes))
         # The tiles are the same: errors of sensors enter what is asked of them.
-        found = cls(learnt, options, Tiles(learnt, exact.tiles.solved))
-        return found.doubted((sizes.doubt,))
+        return cls(learnt, options, Tiles(learnt, exact.tiles.solved)).doubted((sizes.doubt,))
 
     def posed(self, poses: SurveyPoses) -> "HarmonicMap":
         """Return the map with the errors of its poses: stated, or as the survey shows them."""
@@ -153,8 +155,7 @@ class HarmonicMap:
 
     def errors_over(self, points: FloatArray, /) -> ErrorModes:
         """Return the map's error over places, shape (N, 3) in metres, as correlated numbers."""
-        points, options = checked_points(points), self.options.errors
-        return error_modes(self.learnt, self.tiles, points, options)
+        return error_modes(self.learnt, self.tiles, checked_points(points), self.options.errors)
 
     def updated(
         self,

@@ -221,6 +221,7 @@ class Learnt:
         """
         if self.history is not None:  # readings of two drives are not averaged: see ``followed_by``
             return self.followed_by(new, options, suite, UNDATED)
+        new, suite = self.as_found(new, suite)
         together = joined(self.readings, new)
         owner = cubes_of(together.points, options.merge)
         errors = errors_together(self.suite, suite, len(self.readings))
@@ -253,6 +254,7 @@ class Learnt:
             When it was.
         """
         history = self.history or History.of_survey(len(self.readings), UNDATED)
+        new, suite = self.as_found(new, suite)
         owner = cubes_of(new.points, options.merge)
         own = None if suite is None else suite.averaged(owner, new.weight)
         errors = errors_together(self.suite, own, len(self.readings))
@@ -261,6 +263,15 @@ class Learnt:
         # Steel that came between two drives is no fault of a survey: each is doubted by itself.
         learnt = self._of(together, errors, new, len(new), options)
         return replace(learnt, history=history.followed_by(len(added), drive))
+
+    def as_found(
+        self, new: TrainingSet, suite: SuiteErrors | None
+    ) -> tuple[TrainingSet, SuiteErrors | None]:
+        """Return new readings and their errors without what this survey found of the sensors."""
+        if suite is None:
+            return new, None
+        suite = suite.as_found_by(self.suite)
+        return replace(new, field=suite.corrected(new.field)), suite
 
     def only(self, keep: BoolArray, options: HarmonicOptions) -> "Learnt":
         """Return the same with some of the readings, (N,), and the tiles that they need."""

@@ -15,7 +15,7 @@ from l2m_gtsam.maps.harmonic.history import History
 from l2m_gtsam.maps.harmonic.learnt import ORIGIN, HarmonicOptions, Learnt, reach_of
 from l2m_gtsam.maps.harmonic.structure import MOST_SOURCES, Sources
 from l2m_gtsam.maps.harmonic.tiling import LEAST_CORE, Resolution, Tiling, blend_of
-from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
+from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, FoundErrors, SuiteErrors
 from l2m_gtsam.maps.survey_poses import POSE, SurveyPoses
 from l2m_gtsam.maps.trained import first_complaint, options_from_state, state_array
 from l2m_gtsam.maps.training import FURTHEST, TrainingSet, training_set
@@ -54,6 +54,8 @@ def learnt_to_state(kind: str, learnt: Learnt, options: HarmonicOptions) -> MapS
             "suite_pairs": np.stack([suite.reading, suite.sensor]),
             "suite_shift": suite.shift.astype(np.float32),
         }
+        if suite.found is not None:
+            arrays |= {"suite_mean": suite.found.mean, "suite_stated": suite.found.stated}
         origin |= {"suite_sensors": list(suite.sensors)}
     if (history := learnt.history) is not None:
         arrays |= {
@@ -192,12 +194,30 @@ def suite_from_state(state: MapState, count: int) -> SuiteErrors | None:
     most = np.array([[count], [len(names)]])
     if not ((numbers >= 0).all() and (numbers < most).all() and (numbers == pairs).all()):
         raise damaged("suite is", "its readings or sensors do not exist")
-    finite = np.isfinite(covariance).all() and np.isfinite(shift).all()
-    if not (finite and np.array_equal(covariance, covariance.T)):
-        raise damaged("suite is", "its covariance is none or an effect is not finite")
+    if not np.isfinite(shift).all():
+        raise damaged("suite is", "an effect is not finite")
+    check_covariance(covariance)
+    found = found_from_state(state, size)
+    return SuiteErrors(tuple(names), covariance, numbers[0], numbers[1], shift, found)
+
+
+def found_from_state(state: MapState, size: int) -> FoundErrors | None:
+    """Return what so many errors of sensors were found to be, after checks; none in most maps."""
+    if "suite_mean" not in state.arrays:
+        return None
+    mean, stated = state_array(state, "suite_mean"), state_array(state, "suite_stated")
+    if mean.shape != (size,) or stated.shape != (size, size) or not np.isfinite(mean).all():
+        raise damaged("suite is", "what was found of it does not have the shape needed")
+    check_covariance(stated)
+    return FoundErrors(mean, stated)
+
+
+def check_covariance(covariance: FloatArray) -> None:
+    """Raise an error unless a square matrix is a covariance."""
+    if not (np.isfinite(covariance).all() and np.array_equal(covariance, covariance.T)):
+        raise damaged("suite is", "its covariance is none")
     if np.linalg.eigvalsh(covariance).min() < -ROUNDING * np.abs(covariance).max():
         raise damaged("suite is", "its covariance has a negative direction")
-    return SuiteErrors(tuple(names), covariance, numbers[0], numbers[1], shift)
 
 
 def history_from_state(state: MapState, count: int, structures: int) -> History | None:

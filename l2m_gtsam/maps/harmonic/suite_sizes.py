@@ -131,19 +131,10 @@ def stated_size(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> StatedSize:
     return StatedSize(ErrorCause.SUITE, max(float(np.sqrt(found.sizes[0])), SMALLEST), gain)
 
 
-def calibrated_together(suite: SuiteErrors) -> bool:
-    """Return whether sensors have errors in common, as those that a survey has calibrated.
-
-    If it was this very survey it fits them better than their sigmas, which are right nevertheless.
-    """
-    own = np.kron(np.eye(len(suite.sensors)), np.ones((SIZE, SIZE)))
-    return bool(suite.covariance[own == 0].any())
-
-
 def stated_doubts(learnt: Learnt, tiles: Tiles, suite: SuiteErrors) -> tuple[str, ...]:
     """Return what is wrong with sigmas that were stated of a survey's sensors, a sentence."""
     found = stated_size(learnt, tiles, suite)
-    if not found.is_wrong or (found.ratio < 1 and calibrated_together(suite)):
+    if not found.is_wrong or (found.ratio < 1 and suite.calibrated_together):
         return ()
     wrong = "too small" if found.ratio > 1 else "too large"
     return (

@@ -11,6 +11,7 @@ from l2m_gtsam.data import FloatArray, MapState
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
+from l2m_gtsam.maps.harmonic.suite_found import shown
 from l2m_gtsam.maps.reading_errors import errors_together
 from l2m_gtsam.maps.suite_errors import SHIFT, SIZE, SuiteErrors
 from l2m_gtsam.maps.training import cubes_of, merged, training_set
@@ -192,3 +193,86 @@ def test_a_damaged_suite_is_refused_in_one_line(
     with np.errstate(invalid="ignore"), pytest.raises(MapError, match="suite is") as refused:
         map_from_state(damage(state, **{name: change(state.arrays[name])}))
     assert "\n" not in str(refused.value)
+
+
+@pytest.fixture(scope="module")
+def wrong_by() -> FloatArray:
+    """Errors of C and H of two sensors, each an independent draw of its sigmas, shape (32,)."""
+    sigma = np.where(np.arange(SIZE) < 3, 0.0, SIGMA) * (np.arange(SIZE) < SIZE - 1)
+    return np.asarray(np.random.default_rng(3).standard_normal(2 * SIZE) * np.tile(sigma, 2))
+
+
+@pytest.fixture(scope="module")
+def found(wrong_by: FloatArray) -> HarmonicMap:
+    """The map of two sensors that are off, whose sigmas are stated."""
+    points, field = readings()
+    suite = independent(len(points))
+    return HarmonicMap.fit(points, field + read_by(suite, wrong_by), OPTIONS, POST, suite)
+
+
+def independent(count: int) -> SuiteErrors:
+    """Return errors of C and H, which move no reading, that no two sensors have in common."""
+    suite = errors(count)
+    sigma = np.where(np.arange(SIZE) < 3, 0.0, SIGMA) * (np.arange(SIZE) < SIZE - 1)
+    still = np.concatenate([0 * suite.shift[:, :3], suite.shift[:, 3:]], axis=1)
+    return replace(suite, covariance=np.diag(np.tile(sigma**2, 2)), shift=still)
+
+
+def read_by(suite: SuiteErrors, wrong: FloatArray) -> FloatArray:
+    """Return what errors add to readings, uT, shape (N, 3)."""
+    count = len(suite.reading)
+    return np.asarray(effect(suite, count, np.zeros((count, 3, 3))) @ wrong)
+
+
+def test_a_survey_finds_stated_errors_of_its_sensors(
+    found: HarmonicMap, wrong_by: FloatArray
+) -> None:
+    suite = found.learnt.suite
+    assert suite is not None
+    assert suite.found is not None
+    sizes, turned = np.linalg.eigh(shown(2))
+    turned = turned[:, sizes > 0.5]
+    left = turned.T @ (wrong_by - suite.found.mean)
+    P = turned.T @ suite.covariance @ turned
+    # Nine differences of C and six of H: 99.9 % of chi-square lie below 37.7, 0.1 % below 3.5.
+    assert 3.5 < left @ np.linalg.solve(P, left) < 37.7
+    # What a sensor has in common with others is not found, and stays as it was stated.
+    common = np.full(2, np.sqrt(0.5))[:, None, None] * np.eye(SIZE)[:, 3:12]
+    common = common.reshape(2 * SIZE, 9)
+    np.testing.assert_allclose(
+        common.T @ suite.covariance @ common, common.T @ suite.found.stated @ common, atol=1e-15
+    )
+
+
+def test_later_readings_are_corrected_alike(found: HarmonicMap, wrong_by: FloatArray) -> None:
+    points, field = readings()
+    later = independent(len(points))
+    wrong = field + read_by(later, wrong_by)
+    one, both = found.learnt.suite, found.updated(points + 0.01, wrong, later).learnt.suite
+    assert one is not None
+    assert one.found is not None
+    assert both is not None
+    # Their errors are the same two sensors', not those of two more.
+    np.testing.assert_array_equal(both.covariance, one.covariance)
+    corrected = later.as_found_by(one).corrected(wrong)
+    np.testing.assert_allclose(corrected, wrong - read_by(later, one.found.mean), atol=1e-12)
+    strange = independent(len(points))
+    strange = replace(strange, covariance=2 * strange.covariance)
+    assert strange.as_found_by(one) is strange
+
+
+def test_a_map_keeps_what_was_found(found: HarmonicMap) -> None:
+    again = map_from_state(found.to_state())
+    assert isinstance(again, HarmonicMap)
+    one, other = found.learnt.suite, again.learnt.suite
+    assert one is not None
+    assert other is not None
+    assert one.found is not None
+    assert other.found is not None
+    np.testing.assert_array_equal(other.found.mean, one.found.mean)
+    np.testing.assert_array_equal(other.found.stated, one.found.stated)
+
+
+def test_errors_that_a_survey_has_calibrated_are_not_found_twice(uncertain: HarmonicMap) -> None:
+    assert uncertain.learnt.suite is not None
+    assert uncertain.learnt.suite.found is None
