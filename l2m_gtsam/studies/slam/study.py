@@ -159,7 +159,8 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
             most = max(row.odometry.worst_m for row in own)
             axes.set(title=site, ylabel="error (m)", ylim=(0, HIGHEST_BAR * most))
             axes.grid(axis="y", alpha=0.3)
-        panels[0].legend(ncols=3, fontsize=7)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, ncols=len(METHODS), fontsize=7, loc="outside upper center")
         return {"slam": figure}
 
 
