@@ -21,6 +21,7 @@ class EventKind(StrEnum):
     FIELD_LEARNT = "field_learnt"
     START_FOUND = "start_found"
     START_OPEN = "start_open"
+    ONE_SENSOR = "one_sensor"
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,10 @@ from l2m_gtsam.slam.unknown_field.explorer import Explorer
 MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
 LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
 LEAST_READINGS = 40  # where these have so many
+WEAKLY_HELD = (
+    "one sensor in an unknown field: tiles of its readings hold the path weakly, and poses may be "
+    "worse than odometry's; localise the recorded drive off line, or give a map"
+)
 REFUSED, FITS = 0.4, 0.6  # share that is explained, below which it is reported, and above again
 
 
@@ -195,6 +199,8 @@ class OnlineSlam:
             if start_options.position is None and start_options.quaternion_xyzw is None:
                 start = replace(start, covariance=EXACT_START)
             self.estimator = Explorer(start, self.sensors, self.options)
+            if len(self.sensors.names) == 1:
+                self._report(EventKind.ONE_SENSOR, WEAKLY_HELD)
             return
         self.estimator = self._follower(start)
 

@@ -5,7 +5,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
+from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.mapping.map_building import map_recordings
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -18,24 +20,34 @@ OPTIONS, SEED = TroublesOptions(survey_readings=900), 742
 
 @cache
 def surveyed(times: float) -> HarmonicMap:
-    """Return the map of a hall whose suite is stated so many times too large."""
+    """Return the map of a hall whose suite is stated so many times too large; with 0 not at all."""
     place, right = place_of(World.HALL, SEED), known_suite(OPTIONS)
     recorded = survey_of(place, OPTIONS).recorded(right, place, OPTIONS, off=True)
-    stated = {}
-    for name, each in right.items():
-        assert each.covariance is not None
-        stated[name] = replace(each, covariance=times**2 * each.covariance)
+    stated = {
+        name: replace(each, covariance=times**2 * covariance_of(each) if times else None)
+        for name, each in right.items()
+    }
     found = map_recordings([recorded], stated, MappingOptions(model=OPTIONS.map), place.cloud())
     assert isinstance(found, HarmonicMap)
     return found
 
 
+def covariance_of(sensor: KnownSensor) -> FloatArray:
+    """Return what is stated of a sensor of the studies."""
+    assert sensor.covariance is not None
+    return sensor.covariance
+
+
 def doubts(times: float, *, together: bool = False) -> tuple[str, ...]:
-    """Return what that map would say of such a suite, whose sensors may have errors in common."""
-    found = surveyed(1.0)
+    """Return what a map of readings as they were taken says of a suite that is stated so.
+
+    Its sensors may have errors in common.
+    """
+    found = surveyed(0.0)
     suite = found.learnt.suite
     assert suite is not None
-    covariance = times**2 * suite.covariance
+    own = known_suite(OPTIONS)
+    covariance = times**2 * block_diag(*(covariance_of(own[each]) for each in suite.sensors))
     if together:  # heights of all sensors
         heights = np.arange(2, len(covariance), 16)
         covariance[np.ix_(heights, heights)] += 1e-6
