@@ -142,9 +142,7 @@ def calibrated(
     if not solution.solved:
         covered = bool(np.mean(field_map.query(recording.trajectory.p).inside) > COVERED)
         raise CalibrationError(_nothing_solved(recording, map_source, sensors, covered))
-    verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
-    stretches = disagreements(verdicts)
-    stretches = with_causes(stretches, solution, solver_map, options.changes)
+    stretches = _rejected_stretches(solution, solver_map, options)
     result = CalibrationResult(
         sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
         iterations=solution.steps,
@@ -165,6 +163,14 @@ def calibrated(
         sources=changed.records,
     )
     return Calibrated(result, solution, field_map, solver_map)
+
+
+def _rejected_stretches(
+    solution: OneKeySolution, solver_map: QueryableMap, options: CalibrationOptions
+) -> tuple[Disagreement, ...]:
+    """Return the stretches of rejected readings with what explains them."""
+    verdicts = judged(solution.readings, solver_map, solution.estimate, solution.rejected)
+    return with_causes(disagreements(verdicts), solution, solver_map, options.changes)
 
 
 def taken_for_exact(readings: Readings, field_map: QueryableMap, budget: Budget) -> tuple[str, ...]:

@@ -52,9 +52,7 @@ def fixed_lag_slam(
     options
         Lag and linearisation.
     """
-    basis = PotentialBasis.over(
-        box[0] - model.margin_m, box[1] + model.margin_m, model.prior, model.functions
-    )
+    basis = model.basis_about(box)
     smoother = _smoother(options)
     seconds = SECOND * (odometry.stamp_ns - odometry.stamp_ns[0])
     pose = gtsam.Pose3(gtsam.Rot3(odometry.R[0]), odometry.p[0])

@@ -10,7 +10,6 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, Trajectory
-from l2m_gtsam.maps.potential import PotentialBasis
 from l2m_gtsam.options import Options
 from l2m_gtsam.studies.peers.reduced_rank_ekf import POSE, FilteredPath, ReducedRankEkfOptions
 
@@ -52,9 +51,7 @@ def particle_slam(
         Of its draws.
     """
     rng, count = np.random.default_rng(seed), options.particles
-    basis = PotentialBasis.over(
-        box[0] - model.margin_m, box[1] + model.margin_m, model.prior, model.functions
-    )
+    basis = model.basis_about(box)
     weights = np.zeros((count, len(basis)))
     P = np.broadcast_to(np.diag(basis.variance), (count, len(basis), len(basis))).copy()
     p = np.broadcast_to(odometry.p[0], (count, AXES)).copy()

@@ -37,6 +37,11 @@ class ReducedRankEkfOptions(Options):
     turn_variance: float = Field(default=1e-5, ge=0)
     """and of its turn about each axis, rad^2."""
 
+    def basis_about(self, box: FloatArray) -> PotentialBasis:
+        """Return the field's functions in a box about a path with these corners, shape (2, 3)."""
+        low, high = box[0] - self.margin_m, box[1] + self.margin_m
+        return PotentialBasis.over(low, high, self.prior, self.functions)
+
 
 @dataclass(frozen=True)
 class FilteredPath:
@@ -71,8 +76,7 @@ def reduced_rank_ekf(
     options
         Parameters of the filter.
     """
-    margin = options.margin_m
-    basis = PotentialBasis.over(box[0] - margin, box[1] + margin, options.prior, options.functions)
+    basis = options.basis_about(box)
     weights = np.zeros(len(basis))
     P = np.zeros((POSE + len(basis), POSE + len(basis)))
     P[POSE:, POSE:] = np.diag(basis.variance)

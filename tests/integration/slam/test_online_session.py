@@ -352,7 +352,7 @@ def test_without_a_map_it_is_the_explorer_and_it_resumes() -> None:
         assert run.nees(recorded.truth).mean() < 12
 
 
-def test_one_sensor_in_an_unknown_field_is_told_at_once() -> None:
+def test_one_sensor_in_an_unknown_field_is_reported_at_once() -> None:
     """On a recorded ship such poses end further off than odometry's: docs/studies/slam."""
     sensors = random_sensors(2, 1)
     recorded = slam_drive(dipole_world(2), sensors, laps(3, (1.9, 1.4)), np.random.default_rng(2))

@@ -22,14 +22,10 @@ from l2m_gtsam.studies.peers.particle_slam import (
     systematic,
 )
 from l2m_gtsam.studies.peers.reduced_rank_ekf import ReducedRankEkfOptions, reduced_rank_ekf
-from l2m_gtsam.studies.slam.methods import mean_nees
+from l2m_gtsam.studies.slam.methods import rms
 from l2m_gtsam.studies.slam.recordings import SHIP, DriftRecipe, Form, drifted, ship_run
 
 MODEL = ReducedRankEkfOptions()
-
-
-def rms(p: FloatArray, truth: Trajectory) -> float:
-    return float(np.sqrt(np.mean(np.sum((p - truth.p) ** 2, axis=1))))
 
 
 def box_of(truth: Trajectory) -> FloatArray:
@@ -80,19 +76,12 @@ def test_without_errors_of_steps_peers_follow_the_filter(shared_data: Path, meth
     np.testing.assert_allclose(other.p, found.p, atol=1e-4)
 
 
-def test_particles_on_the_ship_err_as_was_published(shared_data: Path) -> None:
-    """Published are 0.72 to 1.52 m over runs 1 to 4, with fewer particles or a coarser field."""
+def test_particles_remove_drift_on_the_ship(shared_data: Path) -> None:
     drive = ship_run(shared_data / SHIP, 2)
     odometry = drifted(drive.truth, DriftRecipe(), Form.WORLD, 0)
-    box = box_of(drive.truth)
-    options = ParticleSlamOptions(particles=100)
+    box, options = box_of(drive.truth), ParticleSlamOptions(particles=100)
     found = particle_slam(odometry, drive.field, box, MODEL, options, seed=0)
-    estimate = Trajectory(
-        odometry.stamp_ns, found.R, found.p, "map", "lidar", covariance=found.covariance
-    )
-    nees = mean_nees(estimate, drive.truth)
-    assert nees is not None
-    # 0.55 m was seen; a third of odometry's error has to be gone, and no more than was published.
-    assert rms(found.p, drive.truth) < min(1.52, 2 / 3 * rms(odometry.p, drive.truth))
+    # Seeds 0 to 2 leave 0.55 to 0.68 m of 1.32 to 1.38 m: half of the drift, with a margin.
+    assert rms(found.p, drive.truth.p) < 2 / 3 * rms(odometry.p, drive.truth.p)
     again = particle_slam(odometry, drive.field, box, MODEL, options, seed=0)
     np.testing.assert_array_equal(again.p, found.p)
