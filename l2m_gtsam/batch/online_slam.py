@@ -32,6 +32,7 @@ from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import Usage
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
+from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 from l2m_gtsam.storage.listed_sensors import read_sensors
 from l2m_gtsam.storage.online_log import (
     LogLine,
@@ -228,7 +229,7 @@ def _write_map_so_far(
     slam: OnlineSlam, recording: Recording, config: Config, out: Path, progress: Progress
 ) -> None:
     """Write the field that was found as a map, if there is enough of it."""
-    if not isinstance(slam.estimator, Explorer):
+    if not isinstance(slam.estimator, Explorer | OneFieldExplorer):
         return
     points, field = slam.estimator.field_along_path()
     if len(points) < LEAST_POINTS:

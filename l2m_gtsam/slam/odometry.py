@@ -26,6 +26,22 @@ NEIGHBOURHOOD_NS = 1_000_000_000  # of odometry before and after a scan, for its
 
 
 @dataclass(frozen=True)
+class FixedStep:
+    """A step whose odometry knows turn and shift about the axes of the first key pose.
+
+    Attributes
+    ----------
+    turn
+        Shape (3, 3).
+    shift
+        Metres, shape (3,).
+    """
+
+    turn: FloatArray
+    shift: FloatArray
+
+
+@dataclass(frozen=True)
 class OdometrySteps:
     """Odometry from each key pose to the next.
 

@@ -149,8 +149,8 @@ class DriftOptions(Options):
     axes: StepAxes = StepAxes.VEHICLE
     """Along which axes steps and turns are known: `vehicle`, as by wheels or scans, where an error
     of the heading turns all later steps; or `fixed`, as by beacons, where it turns none, and an
-    error of a tilt does not tilt the axis of later turns. The latter works off line and without a
-    map."""
+    error of a tilt does not tilt the axis of later turns. The latter works without a map,
+    on line with one sensor."""
     stated: Usage = Usage.USED
     """Whether covariances that a recording states of its odometry count instead, where they grow
     along the drive."""

@@ -17,12 +17,12 @@ from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import Links
-from l2m_gtsam.slam.odometry import odometry_steps
+from l2m_gtsam.slam.odometry import FixedStep, odometry_steps
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep, suspect_step, velocity
 from l2m_gtsam.slam.online.sensor_buffer import SensorBuffer
-from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.options import SlamOptions, StepAxes
 
 MOST_SCANS = 8
 MOST_POSES = 512  # that wait for a key pose
@@ -57,6 +57,8 @@ class IntakeState:
         Of the last step, usual or not.
     disordered
         Whether poses out of order were reported and none has come in order since.
+    first_R
+        Rotation of the first key pose, by odometry, shape (3, 3).
     """
 
     poses: list[OdometryPose] = field(default_factory=list)
@@ -66,6 +68,7 @@ class IntakeState:
     velocity: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     last_velocity: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     disordered: bool = False
+    first_R: FloatArray = field(default_factory=lambda: np.eye(3))
 
 
 class Intake:
@@ -183,6 +186,8 @@ class Intake:
         """Report a step over a gap, or one that the motion before does not explain."""
         state = self.state
         found = suspect_step(before, pose, state.velocity, self._options)
+        if self._options.drift.axes is StepAxes.FIXED and found is not None and not found.is_gap:
+            found = None  # a step that went on with the motion before would shift all that follow
         step = velocity(before, pose)
         # A turn that goes on looks like a jump once: its next step is like the one before it.
         again = found is not None and found.kind is EventKind.ODOMETRY_JUMP
@@ -235,23 +240,29 @@ class Intake:
         if number == 0:
             for buffer in state.sensors:
                 buffer.take(stamp)
+            state.first_R = poses[row].T.R
             return ArrivedKeyPose.first(stamp, Links.none())
+        waiting = self._taken(stamp)
+        key_pose = recorded = self._between(poses, row, number, waiting)
         if suspect is not None:
             moved = replace(poses[row], T=suspect.end)
             poses = [*poses[:row], moved]
-        key_pose = self._between(poses, row, number)
-        if suspect is not None:
+            key_pose = self._between(poses, row, number, waiting)
             covariance = key_pose.covariance + suspect.covariance
             key_pose = replace(key_pose, covariance=covariance, lost=suspect.lost)
+            if suspect.replaced:
+                key_pose = replace(key_pose, recorded=recorded)
         key_pose = replace(key_pose, scans=scans_at(taken, trajectory_of(poses), row))
         self._check_sensors(stamp, moved=key_pose.length_m >= self._options.key_poses.distance_m)
         return key_pose
 
-    def _between(self, poses: list[OdometryPose], row: int, number: int) -> ArrivedKeyPose:
+    def _between(
+        self, poses: list[OdometryPose], row: int, number: int, waiting: Readings
+    ) -> ArrivedKeyPose:
         """Return the key pose at a row of poses that begin at the one before."""
         trajectory, rows = trajectory_of(poses), np.array([0, row])
         options = self._options
-        taken = self._taken(trajectory, poses[row].stamp_ns)
+        taken = self._placed(waiting, trajectory)
         readings = thinned_readings(taken, trajectory, rows, options.key_poses.readings)
         steps = odometry_steps(trajectory, rows, options.drift).as_walk(options.drift.over_m)
         of_key_pose = key_pose_readings(readings, trajectory, rows)
@@ -264,21 +275,33 @@ class Intake:
             replace(of_key_pose, key_pose=np.full(len(readings), number - 1)),
             readings.stamp_ns,
             Links.none(),
+            fixed=self._fixed(poses[0].T, poses[row].T),
         )
 
-    def _taken(self, trajectory: Trajectory, until_ns: int) -> Readings:
-        """Return the waiting readings up to a time, with poses of odometry that are no gap."""
+    def _fixed(self, before: RigidTransform, after: RigidTransform) -> FixedStep | None:
+        """Return a step about the axes of the first key pose, where odometry knows it so."""
+        if self._options.drift.axes is not StepAxes.FIXED:
+            return None
+        back = self.state.first_R.T
+        return FixedStep(back @ after.R @ before.R.T @ back.T, back @ (after.t - before.t))
+
+    def _taken(self, until_ns: int) -> Readings:
+        """Return the waiting readings up to a time, without poses."""
         parts = [buffer.take(until_ns) for buffer in self.state.sensors]
         sensor = np.repeat(np.arange(len(parts)), [len(stamps) for stamps, _ in parts])
         stamps = np.concatenate([stamps for stamps, _ in parts])
         field = np.concatenate([values for _, values in parts])
-        offset, none = self._known.offset, np.empty((len(stamps), 3))
-        at = stamps + np.round(offset[sensor] / NS).astype(np.int64)
-        there = has_pose(trajectory, at, self._options.max_pose_gap_s)
-        bare = Readings(
+        none = np.empty((len(stamps), 3))
+        return Readings(
             self._known.names, sensor, stamps, np.empty((len(stamps), 3, 3)), none, field
         )
-        return with_offsets(bare[np.flatnonzero(there)], trajectory, offset)
+
+    def _placed(self, waiting: Readings, trajectory: Trajectory) -> Readings:
+        """Return readings at poses of odometry, those in gaps of it left out."""
+        offset = self._known.offset
+        at = waiting.stamp_ns + np.round(offset[waiting.sensor] / NS).astype(np.int64)
+        there = has_pose(trajectory, at, self._options.max_pose_gap_s)
+        return with_offsets(waiting[np.flatnonzero(there)], trajectory, offset)
 
     def _check_sensors(self, stamp_ns: int, *, moved: bool) -> None:
         silent_ns = round((self._online.silent_s + self._online.delay_s) / NS)

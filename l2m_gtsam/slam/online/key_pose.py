@@ -15,7 +15,7 @@ from l2m_gtsam.data import FloatArray, IntArray, RigidTransform
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose
 from l2m_gtsam.slam.key_pose_readings import joined_readings, no_readings
 from l2m_gtsam.slam.links import Links
-from l2m_gtsam.slam.odometry import OdometrySteps
+from l2m_gtsam.slam.odometry import FixedStep, OdometrySteps
 
 POSE = 6
 
@@ -60,6 +60,11 @@ class ArrivedKeyPose:
         Whether odometry has lost the motion to it.
     scans
         That are not registered yet.
+    fixed
+        The step along fixed axes, where odometry knows it so.
+    recorded
+        The same key pose by the step that odometry recorded, where this one goes on with the motion
+        before, for the recorded step is far from it.
     """
 
     number: int
@@ -72,6 +77,8 @@ class ArrivedKeyPose:
     links: Links
     lost: bool = False
     scans: tuple[ScanAtKeyPose, ...] = ()
+    fixed: FixedStep | None = None
+    recorded: "ArrivedKeyPose | None" = None
 
     @property
     def step(self) -> gtsam.Pose3:
@@ -144,4 +151,5 @@ def renumbered(key_pose: ArrivedKeyPose, by: int) -> ArrivedKeyPose:
     number = key_pose.number - by
     readings = replace(key_pose.readings, key_pose=key_pose.readings.key_pose - by)
     links = replace(key_pose.links, key_pose=key_pose.links.key_pose - by)
-    return replace(key_pose, number=number, readings=readings, links=links)
+    recorded = None if key_pose.recorded is None else renumbered(key_pose.recorded, by)
+    return replace(key_pose, number=number, readings=readings, links=links, recorded=recorded)

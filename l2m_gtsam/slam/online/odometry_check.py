@@ -66,6 +66,8 @@ class SuspectStep:
         Added to the step's, shape (6, 6).
     lost
         Whether the vehicle may be anywhere near: it had moved, and odometry stood still.
+    replaced
+        Whether the motion before goes on instead of the recorded step.
     """
 
     kind: EventKind
@@ -73,6 +75,12 @@ class SuspectStep:
     end: RigidTransform
     covariance: FloatArray
     lost: bool = False
+    replaced: bool = False
+
+    @property
+    def is_gap(self) -> bool:
+        """Whether odometry was silent."""
+        return self.kind is EventKind.ODOMETRY_GAP
 
 
 def velocity(before: OdometryPose, after: OdometryPose) -> FloatArray:
@@ -127,7 +135,7 @@ def suspect_step(
         end = as_pose(before.T).compose(expected)
         T = RigidTransform(end.rotation().matrix(), end.translation())
         covariance = isotropic_covariance(most_deg, most_m) + np.outer(d, d)
-        return SuspectStep(EventKind.ODOMETRY_JUMP, text, T, covariance)
+        return SuspectStep(EventKind.ODOMETRY_JUMP, text, T, covariance, replaced=True)
     text = (
         f"odometry jumps by {shift:.2f} m and {turn:.1f} deg: a slip or a pivot, the step is as "
         "uncertain"

@@ -12,6 +12,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
+from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -63,6 +64,17 @@ def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
         "links": np.array([len(each.links) for each in key_poses], dtype=np.int64),
         **named("reading", {name: getattr(readings, name) for name in READINGS}),
         **named("link", {name: getattr(links, name) for name in LINKS}),
+        **named("fixed", _packed_fixed(key_poses)),
+    }
+
+
+def _packed_fixed(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
+    """Return steps along fixed axes, not finite where there is none."""
+    none = FixedStep(np.full((3, 3), np.nan), np.full(3, np.nan))
+    steps = [none if each.fixed is None else each.fixed for each in key_poses]
+    return {
+        "turn": np.reshape([each.turn for each in steps], (-1, 3, 3)),
+        "shift": np.reshape([each.shift for each in steps], (-1, 3)),
     }
 
 
@@ -73,11 +85,13 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
     readings = KeyPoseReadings(key, sensor, R, p, fraction, field)
     of_links = under("link", arrays)
     links = Links(*(of_links[name] for name in LINKS))
+    fixed = under("fixed", arrays)
     found, reading, link = [], 0, 0
     for k in range(len(arrays["number"])):
         rows = np.arange(reading, reading + int(arrays["count"][k]))
         own = np.arange(link, link + int(arrays["links"][k]))
         reading, link = reading + len(rows), link + len(own)
+        step = FixedStep(fixed["turn"][k], fixed["shift"][k])
         found.append(
             ArrivedKeyPose(
                 int(arrays["number"][k]),
@@ -88,6 +102,7 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
                 readings[rows],
                 arrays["reading_ns"][rows],
                 links[own],
+                fixed=step if np.isfinite(step.shift).all() else None,
             )
         )
     return found

@@ -18,6 +18,7 @@ from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.follower import Follower, LastBelief
 from l2m_gtsam.slam.online.intake import Intake, IntakeState
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep
+from l2m_gtsam.slam.online.packed_one_field import packed_one_field, unpacked_one_field
 from l2m_gtsam.slam.online.packing import (
     Arrays,
     named,
@@ -35,10 +36,12 @@ from l2m_gtsam.slam.online.session import OnlineSlam, StartSearchState
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExplorerState, MarginalizedPose
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile
+from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile
 from l2m_gtsam.storage.online_log import SavedState
 
-FOLLOWING, EXPLORING, SEARCHING, WAITING = "following", "exploring", "searching", "waiting"
+FOLLOWING, EXPLORING, ONE_FIELD = "following", "exploring", "one_field"
+SEARCHING, WAITING = "searching", "waiting"
 SENSORS = ("t", "distortion", "covariance")
 OTHER = "the saved state is of another calibration, map or configuration: begin without --resume"
 # What a file that was changed by hand may raise where arrays become objects.
@@ -64,6 +67,10 @@ def saved_state(slam: OnlineSlam) -> SavedState:
     elif isinstance(estimator, Explorer):
         facts["stage"] = EXPLORING
         arrays |= named("explorer", _packed_explorer(estimator, facts))
+    elif isinstance(estimator, OneFieldExplorer):
+        facts["stage"] = ONE_FIELD
+        arrays |= named("start", _packed_start(estimator.start))
+        arrays |= named("one_field", packed_one_field(estimator.state()))
     elif search is not None:
         facts["stage"] = SEARCHING
         arrays |= named("waiting", packed_key_poses(search.waiting))
@@ -118,6 +125,7 @@ def _resume(slam: OnlineSlam, state: SavedState) -> None:
     stages: dict[str, Callable[[], None]] = {
         FOLLOWING: lambda: _resume_following(slam, under("belief", arrays)),
         EXPLORING: lambda: _resume_exploring(slam, under("explorer", arrays), facts),
+        ONE_FIELD: lambda: _resume_one_field(slam, arrays),
         SEARCHING: lambda: _resume_searching(slam, arrays),
         WAITING: lambda: None,
     }
@@ -202,6 +210,12 @@ def _resume_exploring(slam: OnlineSlam, arrays: Arrays, facts: dict[str, Any]) -
     slam.estimator = Explorer.resumed(state, start, slam.sensors, slam.options)
 
 
+def _resume_one_field(slam: OnlineSlam, arrays: Arrays) -> None:
+    start = _unpacked_start(under("start", arrays))
+    state = unpacked_one_field(under("one_field", arrays))
+    slam.estimator = OneFieldExplorer.resumed(state, start, slam.sensors, slam.options)
+
+
 def _unpacked_memory(slam: OnlineSlam, arrays: Arrays, field: dict[str, Any]) -> ExplorerState:
     floor, ceiling = (float(each) for each in field["resolution"])
     hyperparameters = Hyperparameters.model_validate(field["hyperparameters"])
@@ -231,9 +245,11 @@ def _packed_intake(state: IntakeState) -> Arrays:
         ),
         "number": np.array([state.number, state.disordered], dtype=np.int64),
         "velocity": np.stack([state.velocity, state.last_velocity]),
+        "first_R": state.first_R,
     }
     for stamp, each in state.suspect.items():
         own = {"R": each.end.R, "p": each.end.t, "covariance": each.covariance}
+        own["flags"] = np.array([each.lost, each.replaced], dtype=np.int64)
         arrays |= named(f"suspect.{stamp}", own)
     for i, buffer in enumerate(state.sensors):
         flags = [buffer.last_ns, buffer.same, buffer.silent, buffer.stuck, buffer.disordered]
@@ -258,7 +274,10 @@ def _unpacked_intake(arrays: Arrays, texts: dict[str, Any], intake: Intake) -> I
     for stamp, (kind, text) in texts.items():
         own = under(f"suspect.{stamp}", arrays)
         end = RigidTransform(own["R"], own["p"])
-        suspect[int(stamp)] = SuspectStep(EventKind(kind), str(text), end, own["covariance"])
+        flags = (bool(each) for each in own["flags"])
+        suspect[int(stamp)] = SuspectStep(
+            EventKind(kind), str(text), end, own["covariance"], *flags
+        )
     sensors = []
     for i in range(len(intake.state.sensors)):
         own = under(f"sensor.{i}", arrays)
@@ -277,4 +296,6 @@ def _unpacked_intake(arrays: Arrays, texts: dict[str, Any], intake: Intake) -> I
         )
     number, disordered = arrays["number"].tolist()
     usual, last = arrays["velocity"]
-    return IntakeState(poses, sensors, number, suspect, usual, last, bool(disordered))
+    return IntakeState(
+        poses, sensors, number, suspect, usual, last, bool(disordered), arrays["first_R"]
+    )

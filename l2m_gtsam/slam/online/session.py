@@ -6,7 +6,7 @@ key pose relative to its tile.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from l2m_gtsam.calibration.view import Compilable, QueryableMap
@@ -32,13 +32,15 @@ from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
+from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
+from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 
 MOST_WAITING = 2000  # key poses of a start search: of a vehicle that turns on the spot
 LAST_KEY_POSES = 20  # over which it is counted how many readings the map explains,
 LEAST_READINGS = 40  # where these have so many
 WEAKLY_HELD = (
-    "one sensor in an unknown field: tiles of its readings hold the path weakly, and poses may be "
-    "worse than odometry's; localise the recorded drive off line, or give a map"
+    "one sensor in an unknown field holds the path weakly: poses come to be better only where the "
+    "vehicle returns; localise the recorded drive off line for the best, or give a map"
 )
 REFUSED, FITS = 0.4, 0.6  # share that is explained, below which it is reported, and above again
 
@@ -120,16 +122,16 @@ class OnlineSlam:
         field_map: QueryableMap | None = None,
         matcher: ScanMatcher | None = None,
     ) -> None:
-        check_options(options, has_map=field_map is not None)
         usable = tuple(each for each in calibration.sensors if is_determined(each))
         usable = tuple(each for each in usable if not each.moving)
         if not usable:
             raise CalibrationError("no sensor has a calibration that can be used")
+        check_options(options, has_map=field_map is not None, sensors=len(usable))
         self.options, self.sensors = options, known_sensors(usable)
         self._map = field_map.compile() if isinstance(field_map, Compilable) else field_map
         self._matcher = matcher
         self.intake = Intake(self.sensors, options)
-        self.estimator: Follower | Explorer | None = None
+        self.estimator: Follower | Explorer | OneFieldExplorer | None = None
         self.search: StartSearchState | None = None
         self.base, self.stamp_ns = 0, 0  # number of the first key pose, time of the last
         self._counts: deque[tuple[int, int]] = deque(maxlen=LAST_KEY_POSES)
@@ -198,9 +200,11 @@ class OnlineSlam:
         if self._map is None:
             if start_options.position is None and start_options.quaternion_xyzw is None:
                 start = replace(start, covariance=EXACT_START)
-            self.estimator = Explorer(start, self.sensors, self.options)
             if len(self.sensors.names) == 1:
+                self.estimator = OneFieldExplorer(start, self.sensors, self.options)
                 self._report(EventKind.ONE_SENSOR, WEAKLY_HELD)
+            else:
+                self.estimator = Explorer(start, self.sensors, self.options)
             return
         self.estimator = self._follower(start)
 
@@ -258,13 +262,8 @@ class OnlineSlam:
 
     def _estimated(self, key_pose: ArrivedKeyPose) -> OnlinePose:
         estimator, self.stamp_ns = self.estimator, key_pose.stamp_ns
-        if isinstance(estimator, Explorer):
-            learnt = estimator.is_learnt
-            belief = estimator.add(key_pose)
-            if estimator.is_learnt and not learnt:
-                text = "strength and depth of the field's sources are learnt: poses are corrected"
-                self._report(EventKind.FIELD_LEARNT, text)
-            return OnlinePose.of(key_pose.stamp_ns, belief)
+        if isinstance(estimator, Explorer | OneFieldExplorer):
+            return OnlinePose.of(key_pose.stamp_ns, self._explored(estimator, key_pose))
         if estimator is None:
             raise ConfigError("the drive has not begun")
         seen, used, refused = estimator.seen, estimator.used, estimator.fixes_refused
@@ -276,6 +275,23 @@ class OnlineSlam:
             self._report(EventKind.SCAN_REFUSED, text)
         self._count(estimator.seen - seen, estimator.used - used)
         return OnlinePose.of(key_pose.stamp_ns, belief)
+
+    def _explored(self, explorer: Explorer | OneFieldExplorer, key_pose: ArrivedKeyPose) -> Belief:
+        """Return what is known of a key pose without a map."""
+        learnt = explorer.is_learnt
+        belief = explorer.add(key_pose)
+        if isinstance(explorer, OneFieldExplorer):
+            for each in explorer.decisions():
+                self._report(EventKind.JUMP_DECIDED, decision_text(each, explorer.key_poses))
+            if explorer.has_more_detail:
+                tiled = Explorer(explorer.start, self.sensors, self.options)
+                beliefs = [tiled.add(each) for each in explorer.key_poses]
+                self.estimator = explorer = tiled
+                belief = beliefs[-1]
+        if explorer.is_learnt and not learnt:
+            text = "strength and depth of the field's sources are learnt: poses are corrected"
+            self._report(EventKind.FIELD_LEARNT, text)
+        return belief
 
     def _with_fixes(self, before: Belief, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
         """Return a key pose with what its scans say of its place in the map."""
@@ -337,17 +353,27 @@ class OnlineSlam:
         self._events.append(OnlineEvent(self.stamp_ns, kind, text))
 
 
-def check_options(options: SlamOptions, *, has_map: bool) -> None:
+def decision_text(decision: JumpDecision, key_poses: Sequence[ArrivedKeyPose]) -> str:
+    """Return what the readings say of a jump of odometry."""
+    seconds = 1e-9 * key_poses[decision.number].stamp_ns
+    was = "motion, as recorded" if decision.was_motion else "a slip: the motion before went on"
+    return f"the jump of odometry at {seconds:.3f} s was {was}, by the readings"
+
+
+def check_options(options: SlamOptions, *, has_map: bool, sensors: int) -> None:
     """Refuse what works off line only.
 
     Raises
     ------
     ConfigError
-        Odometry knows its steps along fixed axes; or, without a map, the start is to be searched
-        for or calibrations are to be refined.
+        Odometry knows its steps along fixed axes, in a map or with several sensors; or, without a
+        map, the start is to be searched for or calibrations are to be refined.
     """
-    if options.drift.axes is StepAxes.FIXED:
-        raise ConfigError("`slam.drift.axes: fixed` works off line; on line give `vehicle`")
+    if options.drift.axes is StepAxes.FIXED and (has_map or sensors > 1):
+        raise ConfigError(
+            "`slam.drift.axes: fixed` works off line, and on line with one sensor and no map; give "
+            "`vehicle`"
+        )
     if has_map:
         return
     if options.start.anywhere:

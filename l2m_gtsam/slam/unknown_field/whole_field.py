@@ -130,14 +130,26 @@ def learnt_prior(
     -------
     The prior; None where the field has more detail than so many eigenfunctions hold.
     """
+    return prior_about(drive, poses, options, spectrum_at(drive, poses, options, first))
+
+
+def spectrum_at(
+    drive: Drive,
+    poses: list[gtsam.Pose3],
+    options: WholeFieldOptions,
+    first: FieldSpectrum | None = None,
+) -> FieldSpectrum:
+    """Learn what field and noise are like at an estimate of the poses.
+
+    Parameters as of ``learnt_prior``.
+    """
     where = placed(drive, poses)
     x, R = where.x, where.readings.R_map_lidar
     few = np.linspace(0, len(x) - 1, min(len(x), LEARNT_FROM)).round().astype(int)
     corrected = np.einsum("nji,nj->ni", R, where.field(drive.sensors))
     seconds = 1e-9 * (drive.reading_ns - drive.stamp_ns[0])
     readings = LearntReadings(x[few], R[few], corrected[few], seconds[few])
-    spectrum = learnt_spectrum(readings, options.distortion, options.offset, first)
-    return prior_about(drive, poses, options, spectrum)
+    return learnt_spectrum(readings, options.distortion, options.offset, first)
 
 
 def prior_about(
@@ -153,6 +165,22 @@ def prior_about(
     if waves > options.waves:
         return None
     return WholePrior(spectrum, low - margin, high + margin, waves)
+
+
+def box_prior(low: FloatArray, high: FloatArray, spectrum: FieldSpectrum, most: int) -> WholePrior:
+    """Return the prior of a field in a given box, of what was learnt.
+
+    Parameters
+    ----------
+    low, high
+        Corners in the frame of the first key pose in metres, shape (3,).
+    spectrum
+        What was learnt.
+    most
+        Limit of eigenfunctions; what shorter waves hold counts as noise.
+    """
+    waves = min(waves_for(high - low, spectrum.prior.length), most)
+    return WholePrior(spectrum, low, high, waves)
 
 
 def placed(drive: Drive, poses: list[gtsam.Pose3]) -> PlacedReadings:

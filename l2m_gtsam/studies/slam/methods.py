@@ -237,7 +237,7 @@ class SlamCell:
     ekf, particles, fixed_lag
         The peers.
     online, ours
-        ``l2m slam`` on line and off line. On line steps are always as the vehicle sees them.
+        ``l2m slam`` on line and off line; on line None in cells of earlier versions.
     """
 
     path_m: float
@@ -294,7 +294,6 @@ def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:
         lambda box: fixed_lag_slam(odometry, field, box, model, options.fixed_lag),
     )
     ekf, particles, fixed_lag = (peer_row(drive, rows, method) for method in peers)
-    as_seen = Form(form) is Form.VEHICLE
     return SlamCell(
         path_m=float(drive.path_m),
         key_poses=len(rows),
@@ -302,7 +301,7 @@ def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:
         ekf=ekf,
         particles=particles,
         fixed_lag=fixed_lag,
-        online=online_row(drive, odometry, stated, options.noise_ut) if as_seen else None,
+        online=online_row(drive, odometry, stated, options.noise_ut),
         ours=ours,
     )
 

@@ -1,0 +1,157 @@
+"""What a drive may be where its odometry jumps, each followed by a filter of its own.
+
+A step far from the motion before it is a slip, or motion that odometry caught up with, as after a
+gap of the poses. Fields between both ends say nothing about either, so that each is followed apart,
+and the likelihood of the readings decides.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
+from l2m_gtsam.slam.relative_motion import from_end
+from l2m_gtsam.slam.slips import SLIPPED
+from l2m_gtsam.slam.unknown_field.field_filter import (
+    NO_DRIFT,
+    FieldFilter,
+    FilterState,
+    FilterStep,
+)
+
+MOST = 4  # hypotheses: of two jumps that nothing has decided yet
+CERTAIN = 7.0  # nats, a thousand to one
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One way that a drive may be.
+
+    Attributes
+    ----------
+    state
+        At the last key pose.
+    poses
+        All key poses, in the frame of the field.
+    recorded
+        Numbers of the key poses to which the step was as recorded, of those with two ways.
+    """
+
+    state: FilterState
+    poses: tuple[gtsam.Pose3, ...]
+    recorded: frozenset[int]
+
+    @property
+    def log_odds(self) -> float:
+        """Log likelihood, and what speaks for recorded steps before any reading."""
+        return self.state.log_likelihood + SLIPPED * len(self.recorded)
+
+
+@dataclass(frozen=True)
+class JumpDecision:
+    """What a jump of odometry was.
+
+    Attributes
+    ----------
+    number
+        Of the key pose behind it.
+    was_motion
+        Whether the vehicle moved as odometry recorded.
+    """
+
+    number: int
+    was_motion: bool
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """All that are followed, the likeliest first.
+
+    Attributes
+    ----------
+    all
+        One at least.
+    """
+
+    all: tuple[Hypothesis, ...]
+
+    @classmethod
+    def begun(cls, follows: FieldFilter) -> "Hypotheses":
+        """Return the one at the first key pose."""
+        state = follows.start()
+        return cls((Hypothesis(state, (state.pose,), frozenset()),))
+
+    @property
+    def best(self) -> Hypothesis:
+        """The likeliest."""
+        return self.all[0]
+
+    def after(
+        self,
+        key_pose: ArrivedKeyPose,
+        follows: FieldFilter,
+        was_motion: bool | None,
+    ) -> "Hypotheses":
+        """Return what they are at the next key pose.
+
+        Parameters
+        ----------
+        key_pose
+            The next.
+        follows
+            The filter.
+        was_motion
+            Of its step, where it has two ways: what was decided before, None if nothing.
+        """
+        ways = [step_of(key_pose)]
+        recorded = [False]
+        if key_pose.recorded is not None and was_motion is not False:
+            ways.append(step_of(key_pose.recorded))
+            recorded.append(True)
+        if was_motion:
+            ways, recorded = ways[1:], recorded[1:]
+        found = []
+        for each in self.all:
+            for step, is_recorded in zip(ways, recorded, strict=True):
+                chosen = each.recorded | {key_pose.number} if is_recorded else each.recorded
+                state = follows.after(each.state, step)
+                found.append(Hypothesis(state, (*each.poses, state.pose), chosen))
+        return Hypotheses(tuple(likely(found)))
+
+    def decided(self, numbers: Sequence[int]) -> tuple[JumpDecision, ...]:
+        """Return those of some jumps in which all agree."""
+        found = []
+        for number in numbers:
+            said = {number in each.recorded for each in self.all}
+            if len(said) == 1:
+                found.append(JumpDecision(number, said.pop()))
+        return tuple(found)
+
+    def pose_covariance(self) -> FloatArray:
+        """Return the covariance of the likeliest pose, with what speaks for others, (6, 6)."""
+        odds = np.array([each.log_odds for each in self.all])
+        share = np.exp(odds - odds.max())
+        share = share / share.sum()
+        total = np.zeros((6, 6))
+        for weight, each in zip(share, self.all, strict=True):
+            apart = gtsam.Pose3.Logmap(self.best.state.pose.between(each.state.pose))
+            total += weight * (each.state.pose_covariance + np.outer(apart, apart))
+        return total
+
+
+def likely(found: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the hypotheses that are worth following, the likeliest first."""
+    ranked = sorted(found, key=lambda each: -each.log_odds)
+    least = ranked[0].log_odds - CERTAIN
+    return [each for each in ranked[:MOST] if each.log_odds >= least]
+
+
+def step_of(key_pose: ArrivedKeyPose) -> FilterStep:
+    """Return the step to a key pose with its readings."""
+    readings = key_pose.readings
+    if len(readings):
+        readings = from_end(readings, key_pose.R, key_pose.p)
+    return FilterStep(key_pose.step, key_pose.covariance, readings, NO_DRIFT, key_pose.fixed)

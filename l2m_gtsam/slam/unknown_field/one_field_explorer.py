@@ -1,0 +1,306 @@
+"""On-line SLAM of one sensor in an unknown field: one field for all of the drive so far.
+
+A filter follows the drive key pose by key pose. What field and noise are like is learnt again each
+time that the path has grown by a quarter, at the poses found so far, and the drive is followed anew
+with it from its start. The box of the field grows with the path. That work is spread over the key
+poses that come meanwhile. All key poses with their readings are kept, about a kilobyte of each.
+
+To smooth the path by Levenberg-Marquardt each time, and to linearise the readings there when it is
+followed anew, was tried: errors on a model ship became half as large or twice as large by chance,
+and sigmas smaller.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from l2m_gtsam.data import FloatArray
+from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.online.belief import POSE, Belief
+from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
+from l2m_gtsam.slam.unknown_field.field_filter import FieldFilter, dead_reckoned
+from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
+    Hypotheses,
+    JumpDecision,
+    step_of,
+)
+from l2m_gtsam.slam.unknown_field.spectrum import MARGIN, FieldSpectrum
+from l2m_gtsam.slam.unknown_field.whole_field import (
+    WholePrior,
+    box_prior,
+    placed,
+    prior_about,
+    spectrum_at,
+)
+
+NOISE_FACTOR = 2.0  # of the filter, as of its first pass off line
+GROWN = 1.25  # path, after which field and noise are learnt again
+ROOM = 0.1  # of the drive's extent, by which the box is wider than the margin, to be left seldom
+LEAST_ROOM = 0.5  # lengths of the field: a wider box needs more waves
+PIECE = 20  # key poses that are followed anew while one comes
+
+
+@dataclass(frozen=True)
+class OneFieldState:
+    """What an explorer with one field has to keep.
+
+    Attributes
+    ----------
+    key_poses
+        All so far.
+    prior
+        Of the field; None where it is not learnt yet.
+    learnt_m
+        Path at which it was learnt, metres.
+    decisions
+        What jumps of odometry were.
+    """
+
+    key_poses: tuple[ArrivedKeyPose, ...]
+    prior: WholePrior | None
+    learnt_m: float
+    decisions: tuple[JumpDecision, ...]
+
+
+@dataclass(frozen=True)
+class FollowedField:
+    """The field, the filter in it, and what the drive may be."""
+
+    prior: WholePrior
+    follows: FieldFilter
+    hypotheses: Hypotheses
+
+
+class OneFieldExplorer:
+    """Estimates poses and one field on line from the readings of one sensor.
+
+    Parameters
+    ----------
+    start, sensors
+        Prior of the first key pose, and the sensor.
+    options
+        As of a localisation.
+
+    Raises
+    ------
+    ConfigError
+        Calibrations are to be refined.
+    """
+
+    def __init__(self, start: StartPose, sensors: KnownSensors, options: SlamOptions) -> None:
+        if options.calibration is CalibrationUse.REFINED:
+            raise ConfigError(
+                "`slam.calibration: refined` works off line where there is no map; on line give "
+                "`fixed`"
+            )
+        self.start, self._sensors, self._options = start, sensors, options
+        self._origin = as_pose(start.T_map_lidar)
+        self._key_poses: list[ArrivedKeyPose] = []
+        self._path_m, self._learnt_m = 0.0, 0.0
+        # By odometry alone, in the frame of the first key pose: until the field is learnt.
+        self._pose, self._covariance = gtsam.Pose3(), np.zeros((POSE, POSE))
+        self._now: FollowedField | None = None
+        self._work: Iterator[FollowedField | None] | None = None
+        self._open: list[int] = []  # jumps that are not decided
+        self._decisions: dict[int, JumpDecision] = {}
+        self._news: list[JumpDecision] = []
+        self.has_more_detail = False
+        self._can_be_tiled = options.drift.axes is StepAxes.VEHICLE
+
+    @property
+    def is_learnt(self) -> bool:
+        """Whether the prior of the field is learnt; until then poses are those of odometry."""
+        return self._now is not None
+
+    @property
+    def key_poses(self) -> Sequence[ArrivedKeyPose]:
+        """All so far."""
+        return self._key_poses
+
+    def add(self, key_pose: ArrivedKeyPose) -> Belief:
+        """Add the next key pose, and return its posterior.
+
+        Where the field has more detail than one basis holds, ``has_more_detail`` says so, and the
+        posterior is odometry's: tiles can do better. There are none for steps along fixed axes.
+        """
+        self._key_poses.append(key_pose)
+        if key_pose.number > 0:
+            self._path_m += key_pose.length_m
+        if key_pose.recorded is not None:
+            self._open.append(key_pose.number)
+        now = self._now
+        if now is None:
+            self._dead_reckon(key_pose)
+            if self._path_m >= self._options.tiles.learn_over_m and not self.has_more_detail:
+                self._begin()
+            return self._known()
+        self._now = now = self._after(now, key_pose)
+        self._decide(now.hypotheses)
+        if self._work is not None:
+            self._go_on()
+        elif self._path_m >= GROWN * self._learnt_m:
+            self._work = self._learning(now)
+        elif not _is_inside(now):
+            self._work = self._following(self._boxed(now.prior.spectrum))
+        if self._now is not None and not _is_inside(self._now):
+            self._complete()
+        return self._known()
+
+    def finish(self) -> Belief:
+        """Return the posterior of the last key pose, with all work done that has begun."""
+        if self._now is None and len(self._key_poses) > 1 and not self.has_more_detail:
+            self._begin()
+        self._complete()
+        return self._known()
+
+    def poses(self) -> list[gtsam.Pose3]:
+        """Return all key poses, each by the readings until then."""
+        if self._now is None:
+            return drive_of(self._key_poses, self.start, self._sensors).dead_reckoning()
+        return [self._origin.compose(each) for each in self._now.hypotheses.best.poses]
+
+    def field_along_path(self) -> tuple[FloatArray, FloatArray]:
+        """Return the key poses, m, and the field there, uT, shapes (N, 3)."""
+        if self._now is None:
+            return np.empty((0, 3)), np.empty((0, 3))
+        best, R = self._now.hypotheses.best, self._origin.rotation().matrix()
+        points = np.stack([each.translation() for each in best.poses])
+        field = self._now.prior.field.field_and_gradient(points, best.state.weights)[0]
+        return points @ R.T + self._origin.translation(), field @ R.T
+
+    def decisions(self) -> tuple[JumpDecision, ...]:
+        """Return what jumps of odometry were, of those decided since the last call."""
+        found, self._news = self._news, []
+        return tuple(found)
+
+    def state(self) -> OneFieldState:
+        """Do all work that has begun, and return what is to be kept."""
+        self._complete()
+        prior = None if self._now is None else self._now.prior
+        decisions = tuple(self._decisions.values())
+        return OneFieldState(tuple(self._key_poses), prior, self._learnt_m, decisions)
+
+    @classmethod
+    def resumed(
+        cls, state: OneFieldState, start: StartPose, sensors: KnownSensors, options: SlamOptions
+    ) -> "OneFieldExplorer":
+        """Return an explorer that goes on from a state; other parameters as of the class."""
+        own = cls(start, sensors, options)
+        own._decisions = {each.number: each for each in state.decisions}
+        if state.prior is None:
+            for each in state.key_poses:
+                own.add(each)
+            return own
+        own._key_poses = list(state.key_poses)
+        jumps = [each.number for each in state.key_poses if each.recorded is not None]
+        own._open = [number for number in jumps if number not in own._decisions]
+        own._path_m = sum(each.length_m for each in state.key_poses[1:])
+        own._learnt_m = state.learnt_m
+        own._work = own._following(state.prior)
+        own._complete()
+        own._news = []
+        return own
+
+    def _dead_reckon(self, key_pose: ArrivedKeyPose) -> None:
+        if key_pose.number > 0:
+            step = step_of(key_pose)
+            self._pose, self._covariance = dead_reckoned(self._pose, self._covariance, step)
+
+    def _known(self) -> Belief:
+        """Return the posterior of the last key pose, in the map."""
+        pose, covariance = self._pose, self._covariance
+        if self._now is not None:
+            hypotheses = self._now.hypotheses
+            pose, covariance = hypotheses.best.state.pose, hypotheses.pose_covariance()
+        # The first pose is given in the frame of the field; its own doubt comes along.
+        back = pose.inverse().AdjointMap()
+        covariance = covariance + back @ self.start.covariance @ back.T
+        return Belief(self._origin.compose(pose), self._sensors, covariance)
+
+    def _drive(self) -> Drive:
+        """Return the drive so far, jumps as they are likeliest to be."""
+        recorded = frozenset[int]()
+        if self._now is not None:
+            recorded = self._now.hypotheses.best.recorded
+        chosen = [
+            each if each.recorded is None or each.number not in recorded else each.recorded
+            for each in self._key_poses
+        ]
+        return drive_of(chosen, self.start, self._sensors)
+
+    def _begin(self) -> None:
+        """Learn field and noise at odometry's poses, and follow the drive so far."""
+        self._learnt_m = self._path_m
+        drive, poses, options = self._drive(), self.poses(), self._options.whole_field
+        spectrum = spectrum_at(drive, poses, options)
+        if self._can_be_tiled and prior_about(drive, poses, options, spectrum) is None:
+            self.has_more_detail = True
+            return
+        self._work = self._following(self._boxed(spectrum))
+        self._complete()
+
+    def _learning(self, now: FollowedField) -> Iterator[FollowedField | None]:
+        """Learn field and noise at the poses found so far, and follow the drive anew, in pieces."""
+        self._learnt_m = self._path_m
+        options = self._options.whole_field
+        spectrum = spectrum_at(self._drive(), self.poses(), options, now.prior.spectrum)
+        yield None
+        yield from self._following(self._boxed(spectrum))
+
+    def _boxed(self, spectrum: FieldSpectrum) -> WholePrior:
+        """Return a prior with a box about the path so far, and room for what comes."""
+        length, x = spectrum.prior.length, placed(self._drive(), self.poses()).x
+        low, high = x.min(axis=0), x.max(axis=0)
+        room = MARGIN * length + np.maximum(ROOM * (high - low), LEAST_ROOM * length)
+        most = self._options.whole_field.waves
+        return box_prior(low - room, high + room, spectrum, most)
+
+    def _following(self, prior: WholePrior) -> Iterator[FollowedField | None]:
+        """Follow all key poses from the start, in pieces; yield nothing, and at last the result."""
+        options = self._options
+        sensors = self._sensors.loosened(0.0, options.whole_field.offset)
+        noise = np.array([NOISE_FACTOR * prior.spectrum.noise.ut])
+        follows = FieldFilter(prior.field, replace(sensors, noise=noise), options.robust.largest)
+        anew = FollowedField(prior, follows, Hypotheses.begun(follows))
+        done = 1
+        while done < len(self._key_poses):
+            anew = self._after(anew, self._key_poses[done])
+            done += 1
+            if done % PIECE == 0:
+                yield None
+        yield anew
+
+    def _after(self, now: FollowedField, key_pose: ArrivedKeyPose) -> FollowedField:
+        decision = self._decisions.get(key_pose.number)
+        was_motion = None if decision is None else decision.was_motion
+        return replace(now, hypotheses=now.hypotheses.after(key_pose, now.follows, was_motion))
+
+    def _go_on(self) -> None:
+        """Do a piece of the work, if there is any."""
+        found = None if self._work is None else next(self._work)
+        if found is not None:
+            self._now, self._work = found, None
+            self._decide(found.hypotheses)
+
+    def _complete(self) -> None:
+        """Do all work that has begun."""
+        while self._work is not None:
+            self._go_on()
+
+    def _decide(self, hypotheses: Hypotheses) -> None:
+        """Keep what all hypotheses agree on."""
+        for each in hypotheses.decided(self._open):
+            self._open.remove(each.number)
+            self._decisions[each.number] = each
+            self._news.append(each)
+
+
+def _is_inside(now: FollowedField) -> bool:
+    """Return whether the vehicle is so far inside of the box that its faces do not matter."""
+    margin = MARGIN * now.prior.spectrum.prior.length
+    place = now.hypotheses.best.state.pose.translation()
+    return bool(np.all(place > now.prior.low + margin) and np.all(place < now.prior.high - margin))

@@ -1,0 +1,151 @@
+"""One sensor in an unknown field, on line: a recorded model ship, drifted as published."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from l2m_gtsam.data import Trajectory
+from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.slam.online.events import EventKind
+from l2m_gtsam.slam.online.replay import give, messages
+from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
+from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.unknown_field.explorer import Explorer
+from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
+from l2m_gtsam.studies.slam.methods import as_recorded, online_row, rms, stated_drift
+from l2m_gtsam.studies.slam.recordings import (
+    ROBOT,
+    SHIP,
+    DriftRecipe,
+    Form,
+    TrueDrive,
+    drifted,
+    robot_run,
+    ship_run,
+)
+from tests.drives.slam import calibrated
+from tests.worlds.exact import dipole_world, random_sensors
+
+SEED, STATED_UT = 3, 5.0
+
+
+@pytest.fixture(scope="module")
+def all_of_it(shared_data: Path) -> TrueDrive:
+    return ship_run(shared_data / SHIP, 2)
+
+
+@pytest.fixture(scope="module")
+def ship(all_of_it: TrueDrive) -> TrueDrive:
+    """The first 55 m, in which its poses pause twice."""
+    drive = all_of_it
+    rows, truth = slice(round(0.6 * len(drive.truth))), drive.truth
+    part = Trajectory(truth.stamp_ns[rows], truth.R[rows], truth.p[rows], "map", "lidar")
+    return replace(drive, truth=part, field=drive.field[rows])
+
+
+def odometry_of(drive: TrueDrive, form: Form) -> tuple[Trajectory, SlamOptions]:
+    recipe = DriftRecipe()
+    return drifted(drive.truth, recipe, form, SEED), stated_drift(drive.truth, recipe, form)
+
+
+@pytest.fixture(scope="module")
+def whole(ship: TrueDrive) -> tuple[OnlineSlam, list[OnlinePose]]:
+    """The drive on line, steps as the vehicle sees them."""
+    odometry, options = odometry_of(ship, Form.VEHICLE)
+    slam = OnlineSlam(as_recorded(STATED_UT), options)
+    poses = [pose for each in messages(ship.recording(odometry)) for pose in give(slam, each)]
+    return slam, poses
+
+
+def test_half_of_a_ships_drift_goes_as_it_drives(all_of_it: TrueDrive) -> None:
+    """Each pose when it is made, along fixed axes; docs/studies/slam has all drives."""
+    odometry, options = odometry_of(all_of_it, Form.WORLD)
+    row = online_row(all_of_it, odometry, options, STATED_UT)
+    assert row.rms_m < 0.6 * rms(odometry.p, all_of_it.truth.p)
+    # Poses of one drive err together, and the filter linearises each reading once.
+    assert row.nees is not None
+    assert row.nees < 24
+
+
+def test_it_is_one_field_and_jumps_of_the_recording_are_motion(
+    ship: TrueDrive, whole: tuple[OnlineSlam, list[OnlinePose]]
+) -> None:
+    """Twice the poses of the recording pause while the ship goes on, by 1.5 to 1.7 m."""
+    slam, poses = whole
+    assert isinstance(slam.estimator, OneFieldExplorer)
+    events = slam.events()
+    kinds = [each.kind for each in events]
+    assert kinds.count(EventKind.ODOMETRY_JUMP) == kinds.count(EventKind.JUMP_DECIDED) == 2
+    for each in events:
+        if each.kind is EventKind.JUMP_DECIDED:
+            assert each.text.endswith("was motion, as recorded, by the readings")
+    stamps = np.array([each.stamp_ns for each in poses])
+    truth = ship.truth.p[np.searchsorted(ship.truth.stamp_ns, stamps)]
+    odometry, _ = odometry_of(ship, Form.VEHICLE)
+    drift = odometry.p[np.searchsorted(odometry.stamp_ns, stamps)]
+    # The sooner the drive ends the less has odometry drifted.
+    assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.8 * rms(drift, truth)
+
+
+@pytest.mark.parametrize("share", [0.15, 0.7], ids=["before the field is learnt", "after"])
+def test_a_saved_drive_goes_on_as_it_would_have(
+    ship: TrueDrive, whole: tuple[OnlineSlam, list[OnlinePose]], share: float
+) -> None:
+    odometry, options = odometry_of(ship, Form.VEHICLE)
+    given = list(messages(ship.recording(odometry)))
+    at = round(share * len(given))
+    slam = OnlineSlam(as_recorded(STATED_UT), options)
+    first = [pose for each in given[:at] for pose in give(slam, each)]
+    slam = resumed_slam(saved_state(slam), as_recorded(STATED_UT), options)
+    rest = [pose for each in given[at:] for pose in give(slam, each)]
+    _, expected = whole
+    assert [each.stamp_ns for each in (*first, *rest)] == [each.stamp_ns for each in expected]
+    for one, other in zip(rest, expected[len(first) :], strict=True):
+        np.testing.assert_allclose(one.T_map_lidar.t, other.T_map_lidar.t, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_the_field_along_the_path_is_that_of_the_readings(
+    ship: TrueDrive, whole: tuple[OnlineSlam, list[OnlinePose]]
+) -> None:
+    """Turned to the vehicle's axes it is what was read, but for a tenth of its 50 uT."""
+    estimator = whole[0].estimator
+    assert isinstance(estimator, OneFieldExplorer)
+    points, field = estimator.field_along_path()
+    poses = estimator.poses()
+    np.testing.assert_allclose(points, [each.translation() for each in poses], atol=1e-9)
+    stamps = [each.stamp_ns for each in estimator.key_poses]
+    read = ship.field[np.searchsorted(ship.truth.stamp_ns, stamps)]
+    turned = np.stack(
+        [each.rotation().matrix().T @ b for each, b in zip(poses, field, strict=True)]
+    )
+    off = np.linalg.norm((turned - turned.mean(axis=0)) - (read - read.mean(axis=0)), axis=1)
+    assert np.median(off) < 5.0
+
+
+def test_where_the_field_has_more_detail_it_is_described_by_tiles(shared_data: Path) -> None:
+    """In a room whose field changes within 0.4 m: 136 waves hold it, for a robot's first 8 m."""
+    drive = robot_run(shared_data / ROBOT, 1)
+    options = SlamOptions.model_validate(
+        {
+            "key_poses": {"distance_m": 0.3, "angle_deg": 30},
+            "tiles": {"modes": 60, "learn_over_m": 8.0},
+            "whole_field": {"waves": 50},
+        }
+    )
+    slam = OnlineSlam(as_recorded(STATED_UT), options)
+    for message in messages(drive.recording(drive.truth)):
+        give(slam, message)
+    assert isinstance(slam.estimator, Explorer)
+    assert EventKind.FIELD_LEARNT in [each.kind for each in slam.events()]
+
+
+def test_steps_along_fixed_axes_need_one_sensor_and_no_map() -> None:
+    options = SlamOptions.model_validate({"drift": {"axes": "fixed"}})
+    with pytest.raises(ConfigError, match="with one sensor and no map"):
+        OnlineSlam(calibrated(random_sensors(2, 2)), options)
+    with pytest.raises(ConfigError, match="with one sensor and no map"):
+        OnlineSlam(calibrated(random_sensors(2, 1)), options, dipole_world(1))
