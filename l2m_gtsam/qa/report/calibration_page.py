@@ -21,7 +21,7 @@ from l2m_gtsam.qa.report.figures.vehicle import SIDE, TOP, vehicle_figure
 from l2m_gtsam.qa.report.page import Picture, pictures, render, roll_pitch_yaw
 from l2m_gtsam.qa.report.svg import SETTINGS
 from l2m_gtsam.qa.verdict.calibration import Measured, judge, measured
-from l2m_gtsam.qa.verdict.places import best_of, cause_sentence, stretch_head
+from l2m_gtsam.qa.verdict.places import best_of, cause_in_short, stretch_head
 from l2m_gtsam.qa.verdict.uncertainty import shares_in_words, what_helps
 from l2m_gtsam.records.calibration import CalibrationResult, SensorCalibration
 from l2m_gtsam.records.metrics import Metrics, SensorMetrics
@@ -118,7 +118,7 @@ def calibration_page(
             sections=sections,
             length=np.linalg.norm,
             what_else=best_of,
-            cause=cause_sentence,
+            cause=cause_in_short,
             cause_of_stretch=stretch_head,
             shares=shares_in_words,
             what_helps=what_helps,

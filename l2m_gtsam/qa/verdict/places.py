@@ -13,6 +13,23 @@ CAUSES = {
     Cause.SENSOR: "one sensor changed",
 }
 
+SHORT = {
+    Cause.PLACE: "the place",
+    Cause.MOMENT: "one passage",
+    Cause.VEHICLE: "the vehicle",
+    Cause.SENSOR: "one sensor",
+}
+
+
+def cause_in_short(source: ChangedSource) -> str:
+    """Return what the change is of in a few words, for a column."""
+    if not source.explanations:
+        return "-"
+    best, *others = source.explanations
+    if source.cause is not None or not others:
+        return SHORT[best.cause]
+    return f"{SHORT[best.cause]} or {SHORT[others[0].cause]}"
+
 
 def source_sentence(number: int, source: ChangedSource) -> str:
     """Return where steel came, went or was moved, how large it is, and what else it may be."""

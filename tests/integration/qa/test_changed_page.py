@@ -13,7 +13,7 @@ from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.report.calibration_page import calibration_page
 from l2m_gtsam.qa.report.figures.changes import added_field
-from l2m_gtsam.qa.verdict.places import source_sentence, stretch_head, stretch_tail
+from l2m_gtsam.qa.verdict.places import cause_in_short, source_sentence, stretch_head, stretch_tail
 from l2m_gtsam.records.calibration import Disagreement, Return
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 from tests.drives.verdict import changed_place
@@ -54,6 +54,11 @@ def test_a_tie_is_called_a_tie() -> None:
         "The readings do not show whether the place changed or something on the vehicle was "
         "switched or moved."
     )
+
+
+def test_a_column_tells_the_cause_in_few_words() -> None:
+    told = [cause_in_short(each) for each in (FIRST, SECOND, source(1.0))]
+    assert told == ["the place", "the place or the vehicle", "-"]
 
 
 def stretch(passed_again: Return, *gains: tuple[Cause, float]) -> Disagreement:
