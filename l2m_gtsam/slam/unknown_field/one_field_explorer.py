@@ -37,7 +37,9 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
     spectrum_at,
 )
 
-NOISE_FACTOR = 2.0  # of the filter, as of its first pass off line
+# Of the filter's noise, for readings are linearised once. On the model ship 2 and 3 give errors of
+# 0.57 and 0.60 m in the mean of twelve drives, NEES of 15 and 11.
+NOISE_FACTOR = 3.0
 GROWN = 1.25  # path, after which field and noise are learnt again
 ROOM = 0.1  # of the drive's extent, by which the box is wider than the margin, to be left seldom
 LEAST_ROOM = 0.5  # lengths of the field: a wider box needs more waves
