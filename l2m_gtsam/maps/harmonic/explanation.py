@@ -78,7 +78,8 @@ class Explanation:
         elif self.worst > MOST_SPREAD_OF_ONE:
             reasons.append(f"errors in one region are {self.worst:.2g} times their sigmas")
         if self.surprises > MOST_SURPRISES:
-            reasons.append(f"{self.surprises:.1%} of the errors at held-out places exceed three sigmas")
+            share = f"{self.surprises:.1%} of the errors at held-out places"
+            reasons.append(f"{share} exceed three sigmas")
         if self.sensor_noise is not None and self.noise > MOST_NOISE * self.sensor_noise:
             cause = UNCALIBRATED if self.noise > FAR_NOISE * self.sensor_noise else ""
             reasons.append(

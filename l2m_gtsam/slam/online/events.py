@@ -22,6 +22,7 @@ class EventKind(StrEnum):
     FIELD_LEARNT = "field_learnt"
     START_FOUND = "start_found"
     START_OPEN = "start_open"
+    CORRECTION_REFUSED = "correction_refused"
     ONE_SENSOR = "one_sensor"
 
 

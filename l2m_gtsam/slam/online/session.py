@@ -42,6 +42,10 @@ WEAKLY_HELD = (
     "one sensor in an unknown field holds the path weakly: poses come to be better only where the "
     "vehicle returns; localise the recorded drive off line for the best, or give a map"
 )
+IMPOSSIBLE = (
+    "readings put the vehicle further from odometry than its drift, as stated, can have: poses "
+    "follow odometry until the field is learnt anew"
+)
 REFUSED, FITS = 0.4, 0.6  # share that is explained, below which it is reported, and above again
 
 
@@ -283,11 +287,8 @@ class OnlineSlam:
         if isinstance(explorer, OneFieldExplorer):
             for each in explorer.decisions():
                 self._report(EventKind.JUMP_DECIDED, decision_text(each, explorer.key_poses))
-            if explorer.has_more_detail:
-                tiled = Explorer(explorer.start, self.sensors, self.options)
-                beliefs = [tiled.add(each) for each in explorer.key_poses]
-                self.estimator = explorer = tiled
-                belief = beliefs[-1]
+            if explorer.has_refused():
+                self._report(EventKind.CORRECTION_REFUSED, IMPOSSIBLE)
         if explorer.is_learnt and not learnt:
             text = "strength and depth of the field's sources are learnt: poses are corrected"
             self._report(EventKind.FIELD_LEARNT, text)

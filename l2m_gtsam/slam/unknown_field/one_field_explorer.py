@@ -4,6 +4,11 @@ A filter follows the drive key pose by key pose. What field and noise are like i
 time that the path has grown by a quarter, at the poses found so far, and the drive is followed anew
 with it from its start. The box of the field grows with the path. That work is spread over the key
 poses that come meanwhile. All key poses with their readings are kept, about a kilobyte of each.
+Detail beyond the limit of eigenfunctions counts as noise.
+
+Where the field changes within less than the pose is known to, the filter may go astray. A pose that
+odometry excludes is refused, and the drive goes on by odometry until field and noise are learnt
+again.
 
 To smooth the path by Levenberg-Marquardt each time, and to linearise the readings there when it is
 followed anew, was tried: errors on a model ship became half as large or twice as large by chance,
@@ -15,13 +20,14 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.unknown_field.field_filter import FieldFilter, dead_reckoned
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     Hypotheses,
@@ -33,7 +39,6 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
     WholePrior,
     box_prior,
     placed,
-    prior_about,
     spectrum_at,
 )
 
@@ -43,6 +48,7 @@ NOISE_FACTOR = 3.0
 GROWN = 1.25  # path, after which field and noise are learnt again
 ROOM = 0.1  # of the drive's extent, by which the box is wider than the margin, to be left seldom
 LEAST_ROOM = 0.5  # lengths of the field: a wider box needs more waves
+IMPOSSIBLE = float(chi2.isf(1e-6, POSE))  # squared distance from odometry in its sigmas
 PIECE = 20  # key poses that are followed anew while one comes
 
 
@@ -103,15 +109,14 @@ class OneFieldExplorer:
         self._origin = as_pose(start.T_map_lidar)
         self._key_poses: list[ArrivedKeyPose] = []
         self._path_m, self._learnt_m = 0.0, 0.0
-        # By odometry alone, in the frame of the first key pose: until the field is learnt.
+        # By odometry alone, in the frame of the first key pose.
         self._pose, self._covariance = gtsam.Pose3(), np.zeros((POSE, POSE))
         self._now: FollowedField | None = None
         self._work: Iterator[FollowedField | None] | None = None
         self._open: list[int] = []  # jumps that are not decided
         self._decisions: dict[int, JumpDecision] = {}
         self._news: list[JumpDecision] = []
-        self.has_more_detail = False
-        self._can_be_tiled = options.drift.axes is StepAxes.VEHICLE
+        self._has_refused = False
 
     @property
     def is_learnt(self) -> bool:
@@ -124,39 +129,32 @@ class OneFieldExplorer:
         return self._key_poses
 
     def add(self, key_pose: ArrivedKeyPose) -> Belief:
-        """Add the next key pose, and return its posterior.
-
-        Where the field has more detail than one basis holds, ``has_more_detail`` says so, and the
-        posterior is odometry's: tiles can do better. There are none for steps along fixed axes.
-        """
+        """Add the next key pose, and return its posterior."""
         self._key_poses.append(key_pose)
         if key_pose.number > 0:
             self._path_m += key_pose.length_m
         if key_pose.recorded is not None:
             self._open.append(key_pose.number)
-        now = self._now
-        if now is None:
-            self._dead_reckon(key_pose)
-            if self._path_m >= self._options.tiles.learn_over_m and not self.has_more_detail:
-                self._begin()
-            return self._known()
-        self._now = now = self._after(now, key_pose)
-        self._decide(now.hypotheses)
-        if self._work is not None:
-            self._go_on()
-        elif self._path_m >= GROWN * self._learnt_m:
-            self._work = self._learning(now)
-        elif not _is_inside(now):
-            self._work = self._following(self._boxed(now.prior.spectrum))
+        self._dead_reckon(key_pose)
+        if self._now is not None:
+            self._now = self._after(self._now, key_pose)
+            self._decide(self._now.hypotheses)
+        if self._work is None:
+            self._work = self._due(self._now)
+        self._go_on()
         if self._now is not None and not _is_inside(self._now):
             self._complete()
+        if self._now is not None and not self._is_possible(self._now):
+            self._refuse()
         return self._known()
 
     def finish(self) -> Belief:
         """Return the posterior of the last key pose, with all work done that has begun."""
-        if self._now is None and len(self._key_poses) > 1 and not self.has_more_detail:
-            self._begin()
+        if self._now is None and self._work is None and len(self._key_poses) > 1:
+            self._work = self._learning(None)
         self._complete()
+        if self._now is not None and not self._is_possible(self._now):
+            self._refuse()
         return self._known()
 
     def poses(self) -> list[gtsam.Pose3]:
@@ -179,6 +177,11 @@ class OneFieldExplorer:
         found, self._news = self._news, []
         return tuple(found)
 
+    def has_refused(self) -> bool:
+        """Return whether a correction was impossible by odometry since the last call."""
+        found, self._has_refused = self._has_refused, False
+        return found
+
     def state(self) -> OneFieldState:
         """Do all work that has begun, and return what is to be kept."""
         self._complete()
@@ -192,18 +195,17 @@ class OneFieldExplorer:
     ) -> "OneFieldExplorer":
         """Return an explorer that goes on from a state; other parameters as of the class."""
         own = cls(start, sensors, options)
+        for each in state.key_poses:
+            own._dead_reckon(each)
         own._decisions = {each.number: each for each in state.decisions}
-        if state.prior is None:
-            for each in state.key_poses:
-                own.add(each)
-            return own
         own._key_poses = list(state.key_poses)
         jumps = [each.number for each in state.key_poses if each.recorded is not None]
         own._open = [number for number in jumps if number not in own._decisions]
         own._path_m = sum(each.length_m for each in state.key_poses[1:])
         own._learnt_m = state.learnt_m
-        own._work = own._following(state.prior)
-        own._complete()
+        if state.prior is not None:
+            own._work = own._following(state.prior)
+            own._complete()
         own._news = []
         return own
 
@@ -234,24 +236,33 @@ class OneFieldExplorer:
         ]
         return drive_of(chosen, self.start, self._sensors)
 
-    def _begin(self) -> None:
-        """Learn field and noise at odometry's poses, and follow the drive so far."""
-        self._learnt_m = self._path_m
-        drive, poses, options = self._drive(), self.poses(), self._options.whole_field
-        spectrum = spectrum_at(drive, poses, options)
-        if self._can_be_tiled and prior_about(drive, poses, options, spectrum) is None:
-            self.has_more_detail = True
-            return
-        self._work = self._following(self._boxed(spectrum))
-        self._complete()
+    def _due(self, now: FollowedField | None) -> Iterator[FollowedField | None] | None:
+        """Return work that is due, to be done in pieces."""
+        if self._path_m >= max(self._options.tiles.learn_over_m, GROWN * self._learnt_m):
+            return self._learning(now)
+        if now is not None and not _is_inside(now):
+            return self._following(self._boxed(now.prior.spectrum))
+        return None
 
-    def _learning(self, now: FollowedField) -> Iterator[FollowedField | None]:
+    def _learning(self, now: FollowedField | None) -> Iterator[FollowedField | None]:
         """Learn field and noise at the poses found so far, and follow the drive anew, in pieces."""
         self._learnt_m = self._path_m
         options = self._options.whole_field
-        spectrum = spectrum_at(self._drive(), self.poses(), options, now.prior.spectrum)
+        first = None if now is None else now.prior.spectrum
+        spectrum = spectrum_at(self._drive(), self.poses(), options, first)
         yield None
         yield from self._following(self._boxed(spectrum))
+
+    def _is_possible(self, now: FollowedField) -> bool:
+        """Return whether odometry, with the drift that is stated, can have been so far off."""
+        away = gtsam.Pose3.Logmap(self._pose.between(now.hypotheses.best.state.pose))
+        return bool(away @ np.linalg.solve(self._covariance, away) <= IMPOSSIBLE)
+
+    def _refuse(self) -> None:
+        """Follow odometry, until field and noise are learnt again at its poses."""
+        self._now = self._work = None
+        self._learnt_m = self._path_m
+        self._has_refused = True
 
     def _boxed(self, spectrum: FieldSpectrum) -> WholePrior:
         """Return a prior with a box about the path so far, and room for what comes."""

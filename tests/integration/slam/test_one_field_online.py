@@ -13,7 +13,6 @@ from l2m_gtsam.slam.online.replay import give, messages
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
 from l2m_gtsam.studies.slam.methods import as_recorded, online_row, rms, stated_drift
 from l2m_gtsam.studies.slam.recordings import (
@@ -126,21 +125,43 @@ def test_the_field_along_the_path_is_that_of_the_readings(
     assert np.median(off) < 5.0
 
 
-def test_where_the_field_has_more_detail_it_is_described_by_tiles(shared_data: Path) -> None:
+def test_detail_beyond_the_limit_of_waves_counts_as_noise(shared_data: Path) -> None:
     """In a room whose field changes within 0.4 m: 136 waves hold it, for a robot's first 8 m."""
     drive = robot_run(shared_data / ROBOT, 1)
     options = SlamOptions.model_validate(
         {
             "key_poses": {"distance_m": 0.3, "angle_deg": 30},
-            "tiles": {"modes": 60, "learn_over_m": 8.0},
+            "tiles": {"learn_over_m": 8.0},
             "whole_field": {"waves": 50},
         }
     )
     slam = OnlineSlam(as_recorded(STATED_UT), options)
-    for message in messages(drive.recording(drive.truth)):
-        give(slam, message)
-    assert isinstance(slam.estimator, Explorer)
+    poses = [pose for each in messages(drive.recording(drive.truth)) for pose in give(slam, each)]
     assert EventKind.FIELD_LEARNT in [each.kind for each in slam.events()]
+    at = np.searchsorted(drive.truth.stamp_ns, [each.stamp_ns for each in poses])
+    found = np.stack([each.T_map_lidar.t for each in poses])
+    sigma = np.sqrt([np.trace(each.covariance[3:, 3:]) for each in poses])
+    # Odometry is the truth here, so that all errors are the field's.
+    assert np.all(np.linalg.norm(found - drive.truth.p[at], axis=1) < 4 * sigma + 0.01)
+
+
+def test_a_pose_that_odometry_excludes_is_refused(ship: TrueDrive) -> None:
+    """As if odometry were a hundred times better known at one key pose."""
+    odometry, options = odometry_of(ship, Form.VEHICLE)
+    slam = OnlineSlam(as_recorded(STATED_UT), options)
+    refused = None
+    for each in messages(ship.recording(odometry)):
+        found = give(slam, each)
+        explorer = slam.estimator
+        if not found or not isinstance(explorer, OneFieldExplorer) or not explorer.is_learnt:
+            continue
+        if refused is None:
+            explorer._covariance /= 1e4
+        refused = found if refused is None else refused
+    kinds = [each.kind for each in slam.events()]
+    assert kinds.count(EventKind.CORRECTION_REFUSED) == 1
+    # Learnt again at odometry's poses, a quarter of the path later.
+    assert kinds.count(EventKind.FIELD_LEARNT) == 2
 
 
 def test_steps_along_fixed_axes_need_one_sensor_and_no_map() -> None:
