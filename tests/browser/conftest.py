@@ -37,6 +37,12 @@ def hostile_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def looked(browser: str, hostile_report: Path, tmp_path_factory: pytest.TempPathFactory) -> Looked:
+def screenshots(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the screenshots of the hostile report."""
+    return tmp_path_factory.mktemp("screenshots")
+
+
+@pytest.fixture(scope="session")
+def looked(browser: str, hostile_report: Path, screenshots: Path) -> Looked:
     """The hostile report, looked at."""
-    return look(browser, hostile_report / REPORT_FILE, tmp_path_factory.mktemp("screenshots"))
+    return look(browser, hostile_report / REPORT_FILE, screenshots)

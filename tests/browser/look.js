@@ -1,5 +1,5 @@
 // Opens a page in a browser that is installed and tells what it finds, as JSON:
-//   node look.js PAGE.html OUTPUT_FOLDER
+//   node look.js PAGE.html [FOLDER_OF_SCREENSHOTS]
 // Errors on the console, requests, figures and their sizes, faults of accessibility, and whether
 // the page is wider than its window, on a light desk and on a dark phone. No style depends on both
 // the width and the scheme (a test reads them), so that these two show what four would.
@@ -50,6 +50,11 @@ function smallest_text() {
   );
 }
 
+// What is inside of a figure is one picture with one name: axe-core would read thousands of parts.
+function empty_figures() {
+  document.querySelectorAll("figure svg").forEach((each) => each.replaceChildren());
+}
+
 async function look(browser, { name, scheme, ...size }) {
   const page = await browser.newPage();
   const found = { window: name, scheme, errors: [], requests: [] };
@@ -81,6 +86,8 @@ async function look(browser, { name, scheme, ...size }) {
   found.background = await page.evaluate(() => getComputedStyle(document.body).backgroundColor);
   found.text = await page.evaluate(() => document.body.innerText);
   found.title = await page.title();
+  if (folder) await page.screenshot({ path: join(folder, `${name}.png`), fullPage: true });
+  await page.evaluate(empty_figures);
   await page.evaluate(() => document.querySelectorAll("details").forEach((each) => (each.open = true)));
   // Runs outside of the page's policy, which allows no script.
   const world = await page.createCDPSession();
@@ -92,16 +99,13 @@ async function look(browser, { name, scheme, ...size }) {
   await world.send("Runtime.evaluate", { expression: axe, contextId: executionContextId });
   const { result } = await world.send("Runtime.evaluate", {
     expression:
-      // what is inside of a figure is one picture with one name
-      "axe.run({ exclude: [['figure svg > *']] }).then((r) => JSON.stringify(r.violations.map((v) => " +
+      "axe.run().then((r) => JSON.stringify(r.violations.map((v) => " +
       "({ id: v.id, impact: v.impact, help: v.help, nodes: v.nodes.map((n) => n.html.slice(0, 200)) }))))",
     contextId: executionContextId,
     awaitPromise: true,
     returnByValue: true,
   });
   found.accessibility = JSON.parse(result.value);
-  await page.evaluate(() => document.querySelectorAll("details").forEach((each) => (each.open = false)));
-  await page.screenshot({ path: join(folder, `${name}.png`), fullPage: true });
   await page.close();
   return found;
 }

@@ -71,8 +71,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def looked(browser: str, page: Path, tmp_path_factory: pytest.TempPathFactory) -> Looked:
-    return look(browser, page, tmp_path_factory.mktemp("screenshots"))
+def looked(browser: str, page: Path) -> Looked:
+    return look(browser, page)
 
 
 @pytest.fixture(scope="module")

@@ -50,7 +50,7 @@ def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
     folder: Path = tmp_path_factory.mktemp("localisation")
     page = folder / "report.html"
     page.write_text(localisation_page(hostile(), QaOptions()), encoding="utf-8")
-    return look(browser, page, folder)
+    return look(browser, page)
 
 
 def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:

@@ -55,7 +55,7 @@ def looked(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Looked:
     folder: Path = tmp_path_factory.mktemp("validation")
     page = folder / "validation.html"
     page.write_text(validation_page(found), encoding="utf-8")
-    return look(browser, page, folder)
+    return look(browser, page)
 
 
 def test_nothing_is_reported_on_the_console_or_loaded(looked: Looked) -> None:

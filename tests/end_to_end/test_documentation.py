@@ -6,19 +6,25 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
 
 from l2m_gtsam.api import calls
 from l2m_gtsam.api.results import JudgedCalibration
-from l2m_gtsam.batch import maps
+from l2m_gtsam.batch import drives, maps
 from l2m_gtsam.batch.simulation import simulate_bags
+from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
+from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.config import load_options
-from l2m_gtsam.data import FloatArray, KnownSensor, Recording
+from l2m_gtsam.data import FloatArray, KnownSensor, Recording, SourceFile
 from l2m_gtsam.mapping.map_building import map_recordings
 from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.field_map import FieldMap, Summarised
+from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
@@ -70,6 +76,42 @@ def _a_map_is_built_once() -> Iterator[None]:
         for module in (calls, maps):
             patch.setattr(module, "map_recordings", once)
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _a_drive_is_calibrated_once() -> Iterator[None]:
+    """Several pages calibrate the same drive on the same map: the first does it for all."""
+    found: dict[str, Calibrated] = {}
+
+    def once(
+        recording: Recording,
+        field_map: QueryableMap,
+        options: CalibrationOptions,
+        map_source: SourceFile | None = None,
+        progress: Progress = silent,
+    ) -> Calibrated:
+        assert isinstance(field_map, Summarised)
+        key = repr((readings_of(recording), field_map.summary, options))
+        if key not in found:
+            found[key] = calibrated(recording, field_map, options, map_source, progress)
+        result = replace(found[key].result, bag=recording.source, map=map_source)
+        return replace(found[key], result=result)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (calls, drives):
+            patch.setattr(module, "calibrated", once)
+        yield
+
+
+def readings_of(recording: Recording) -> str:
+    """Return a sum over what was read and where, whoever read it from a bag."""
+    poses, told = recording.trajectory, hashlib.sha256()
+    arrays = [poses.stamp_ns, poses.R, poses.p]
+    arrays += [each for one in recording.series for each in (one.stamp_ns, one.field)]
+    for each in arrays:
+        told.update(each.tobytes())
+    names = [each.sensor for each in recording.series]
+    return f"{names} {poses.covariance is None} {told.hexdigest()}"
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +194,7 @@ def test_blocks_that_do_not_run_are_counted() -> None:
     assert {page: count for page, count in counts.items() if count} == NOT_RUN
 
 
+@cache
 def said_by_the_program() -> list[str]:
     """Return every string of the program but docstrings, with … where something is put in."""
     found = []

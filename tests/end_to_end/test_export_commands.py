@@ -1,8 +1,5 @@
 """`l2m export` and `l2m apply` on what `l2m calibrate` wrote."""
 
-import re
-import shlex
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +8,7 @@ import pytest
 from l2m_gtsam.records.calibration import SensorStatus
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.exports.formats import FORMATS
-from tests.drives.yard import T_LIDAR_MAG, C, CalibratedYard, calibrated, calibrated_yard, written
+from tests.drives.yard import T_LIDAR_MAG, C, CalibratedYard, calibrated, calibrated_yard
 from tests.support.command_line import complaint_here, l2m
 
 
@@ -59,23 +56,6 @@ def test_every_format_is_written(name: str, calibration: Path, tmp_path: Path) -
     assert line.startswith(f"l2m: warning: {calibration}: its verdict is WARN: Of the map: ")
     assert "imu_mag" in out.read_text()
     assert "sha256 " in out.read_text() or 'sha256"' in out.read_text()
-
-
-def test_the_commands_of_the_page_run(
-    calibration: Path, tmp_path: Path, repository: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In a folder with what they read, they write what they name."""
-    page = (repository / "docs" / "export.md").read_text()
-    (block,) = re.findall(r"```bash\n(.*?)```", page, re.DOTALL)
-    shutil.copy(calibration, tmp_path / "calibration.yaml")
-    (tmp_path / "robot.urdf").write_text('<robot name="r"><link name="velodyne"/></robot>')
-    written(tmp_path, "ros1")
-    monkeypatch.chdir(tmp_path)
-    for command in block.splitlines():
-        name, *arguments = shlex.split(command)
-        assert name == "l2m"
-        l2m(*arguments)
-        assert Path(arguments[-1]).is_file()
 
 
 def test_a_robot_gets_the_sensor(calibration: Path, tmp_path: Path) -> None:

@@ -23,11 +23,10 @@ SMALLEST_PX = 9.0  # text in figures; below it labels are not read on a phone
 
 @dataclass(frozen=True)
 class Looked:
-    """What a browser found: everything that ``look.js`` tells, and the folder of screenshots."""
+    """What a browser found: everything that ``look.js`` tells."""
 
     looks: list[dict[str, Any]]
     tabbed: list[dict[str, Any]]
-    folder: Path
 
 
 def find_tools() -> str:
@@ -65,10 +64,13 @@ def told_by(program: str, browser: str, *arguments: str | Path) -> dict[str, Any
     return told
 
 
-def look(browser: str, page: Path, folder: Path) -> Looked:
-    """Open a page on a light desk and on a dark phone, and tell what is found."""
-    told = told_by("look.js", browser, page, folder)
-    return Looked(told["looks"], told["tabbed"], folder)
+def look(browser: str, page: Path, *screenshots: Path) -> Looked:
+    """Open a page on a light desk and on a dark phone, and tell what is found.
+
+    Screenshots, which take seconds each, go to a folder if there is one.
+    """
+    told = told_by("look.js", browser, page, *screenshots)
+    return Looked(told["looks"], told["tabbed"])
 
 
 def check_silence(looked: Looked) -> None:
