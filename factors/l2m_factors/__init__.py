@@ -2,7 +2,11 @@
 
 from l2m_factors.any_pose import magnetic_pose_factor
 from l2m_factors.check import assert_jacobians_match
-from l2m_factors.complexity import ComplexityPenalty, effective_parameters, effective_parameters_factor
+from l2m_factors.complexity import (
+    ComplexityPenalty,
+    effective_parameters,
+    effective_parameters_factor,
+)
 from l2m_factors.field_map import DifferentiableMap
 from l2m_factors.fixed_axes_step import fixed_axes_step_factor
 from l2m_factors.joint_residual import Residual, joint_residual
@@ -32,7 +36,14 @@ from l2m_factors.shared_errors import (
 from l2m_factors.slow_error import SlowBridge, SlowError, slow_bridge, slow_error_graph
 from l2m_factors.steady_drift import drift_weights, drifting_fixed_axes_step, drifting_step
 from l2m_factors.step import StepError, scaled_step_factor
-from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor, tile_residual
+from l2m_factors.tile import (
+    TileBatch,
+    TileField,
+    TilePlaces,
+    WeightedField,
+    tile_factor,
+    tile_residual,
+)
 from l2m_factors.whitening import Whitening
 
 __all__ = [
