@@ -35,9 +35,9 @@ from l2m_gtsam.solve.linear_algebra import information_root
 EXACT = 1e-9  # m, uT, or of an entry of C: sigma of parameters that are stated as exact
 ROUNDING = 1e-9  # of a variance: smaller ones are those of a file's last digits
 DRIFT = 6  # components of a steady drift
-# Successive key poses whose residuals in Python are one factor. Four iterations on 353 key poses with
-# one tile took 4.5 s of a processor with a factor for each residual, 2.6 with 4 and with 8 key poses
-# in a factor, 2.8 with 16 and 4.1 with 32.
+# Successive key poses whose residuals in Python are one factor. Four iterations on 353 key poses
+# with one tile took 4.5 s of a processor with a factor for each residual, 2.6 with 4 and with 8 key
+# poses in a factor, 2.8 with 16 and 4.1 with 32.
 TOGETHER = 8
 HALF = 0.5  # a link that weighs more is believed; in the end weights are nearly 0 or 1
 
