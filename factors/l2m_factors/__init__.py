@@ -2,9 +2,14 @@
 
 from l2m_factors.any_pose import magnetic_pose_factor
 from l2m_factors.check import assert_jacobians_match
-from l2m_factors.complexity import ComplexityPenalty, effective_parameters_factor
+from l2m_factors.complexity import (
+    ComplexityPenalty,
+    effective_parameters,
+    effective_parameters_factor,
+)
 from l2m_factors.field_map import DifferentiableMap
 from l2m_factors.fixed_axes_step import fixed_axes_step_factor
+from l2m_factors.joint_residual import Residual, joint_residual
 from l2m_factors.key_pose_readings import (
     Calibrations,
     KeyPoseReadings,
@@ -29,13 +34,16 @@ from l2m_factors.shared_errors import (
     uncertain_reading_factor,
 )
 from l2m_factors.slow_error import SlowBridge, SlowError, slow_bridge, slow_error_graph
-from l2m_factors.steady_drift import (
-    drift_weights,
-    drifting_fixed_axes_factor,
-    drifting_step_factor,
-)
+from l2m_factors.steady_drift import drift_weights, drifting_fixed_axes_step, drifting_step
 from l2m_factors.step import StepError, scaled_step_factor
-from l2m_factors.tile import TileBatch, TileField, TilePlaces, WeightedField, tile_factor
+from l2m_factors.tile import (
+    TileBatch,
+    TileField,
+    TilePlaces,
+    WeightedField,
+    tile_factor,
+    tile_residual,
+)
 from l2m_factors.whitening import Whitening
 
 __all__ = [
@@ -57,6 +65,7 @@ __all__ = [
     "PoseMotion",
     "Q",
     "ReadingResiduals",
+    "Residual",
     "S",
     "SharedError",
     "SlowBridge",
@@ -79,12 +88,14 @@ __all__ = [
     "distance_prior",
     "distortion_prior",
     "drift_weights",
-    "drifting_fixed_axes_factor",
-    "drifting_step_factor",
+    "drifting_fixed_axes_step",
+    "drifting_step",
+    "effective_parameters",
     "effective_parameters_factor",
     "field_rate",
     "fixed_axes_step_factor",
     "held_directions",
+    "joint_residual",
     "key_pose_factor",
     "key_pose_residuals",
     "magnetic_pose_factor",
@@ -102,6 +113,7 @@ __all__ = [
     "slow_bridge",
     "slow_error_graph",
     "tile_factor",
+    "tile_residual",
     "uncertain_block_factor",
     "uncertain_reading_factor",
 ]

@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from l2m_factors.field_map import FloatArray, Jacobians
+from l2m_factors.joint_residual import Residual
 from l2m_factors.tile import TileBatch
 
 
@@ -68,6 +69,17 @@ def effective_parameters_factor(
 ) -> gtsam.CustomFactor | None:
     """Return the penalty's factor of a key pose's n readings; None where it has no variables.
 
+    Parameters as of ``effective_parameters``.
+    """
+    residual = effective_parameters(batch, key_pose, penalty)
+    return None if residual is None else residual.factor()
+
+
+def effective_parameters(
+    batch: TileBatch, key_pose: int, penalty: ComplexityPenalty
+) -> Residual | None:
+    """Return the residual of that factor, shape (n,); None where it has no variables.
+
     Parameters
     ----------
     batch
@@ -81,13 +93,13 @@ def effective_parameters_factor(
     if not keys:
         return None
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+    def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         where = batch.places(values, key_pose)
         if jacobians is not None:
-            for slot, block in enumerate(batch.place_jacobians(key_pose, where)):
+            for slot, block in enumerate(batch.place_jacobians(values, key_pose, where)):
                 jacobians[slot] = np.einsum("ni,nij->nj", penalty.slope, block)
         return np.asarray(
             penalty.value + np.einsum("ni,ni->n", penalty.slope, where.x - penalty.at)
         )
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(penalty.value)), keys, error)
+    return Residual(keys, len(penalty.value), error)

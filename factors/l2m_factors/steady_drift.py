@@ -18,14 +18,15 @@ import numpy as np
 
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.fixed_axes_step import fixed_axes_residual
+from l2m_factors.joint_residual import Residual
 from l2m_factors.keys import V, X
 from l2m_factors.motion import skew
 
 
-def drifting_step_factor(
-    key_pose: int, step: gtsam.Pose3, weights: FloatArray, noise: gtsam.noiseModel.Base
-) -> gtsam.CustomFactor:
+def drifting_step(key_pose: int, step: gtsam.Pose3, weights: FloatArray) -> Residual:
     """Return what odometry says of a step from ``X(k)`` to ``X(k+1)``, but for its drift ``V()``.
+
+    It is a right perturbation of the step, rotation (rad) before translation (m).
 
     Parameters
     ----------
@@ -36,12 +37,10 @@ def drifting_step_factor(
     weights
         Metres that one unit of the drift with time, and of that with distance, adds to the step,
         shape (2,).
-    noise
-        Of a right perturbation of the step, rotation (rad) before translation (m).
     """
     R, W = step.rotation(), drift_weights(weights)
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+    def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         before, after = values.atPose3(X(key_pose)), values.atPose3(X(key_pose + 1))
         back = before.rotation().matrix().T
         drift = back @ W @ values.atVector(V())
@@ -50,41 +49,36 @@ def drifting_step_factor(
             by_off = gtsam.Pose3.LogmapDerivative(off)
             # The drift as a right perturbation of the step.
             by_drift = (-by_off @ off.inverse().AdjointMap())[:, 3:] @ -R.matrix().T
-            jacobians[0] = -by_off @ before.between(after).inverse().AdjointMap()
-            jacobians[0][:, :3] += by_drift @ skew(drift[None])[0]
-            jacobians[1] = by_off
-            jacobians[2] = by_drift @ back @ W
+            by_before = -by_off @ before.between(after).inverse().AdjointMap()
+            by_before[:, :3] += by_drift @ skew(drift[None])[0]
+            jacobians[0], jacobians[1], jacobians[2] = by_before, by_off, by_drift @ back @ W
         return np.asarray(gtsam.Pose3.Logmap(off))
 
-    return gtsam.CustomFactor(noise, [X(key_pose), X(key_pose + 1), V()], error)
+    return Residual([X(key_pose), X(key_pose + 1), V()], 6, error)
 
 
-def drifting_fixed_axes_factor(
-    key_pose: int,
-    turn: gtsam.Rot3,
-    way: FloatArray,
-    weights: FloatArray,
-    noise: gtsam.noiseModel.Base,
-) -> gtsam.CustomFactor:
+def drifting_fixed_axes_step(
+    key_pose: int, turn: gtsam.Rot3, way: FloatArray, weights: FloatArray
+) -> Residual:
     """Return the same of odometry that knows its steps along fixed axes.
 
     Parameters
     ----------
-    key_pose, turn, way, noise
+    key_pose, turn, way
         As of ``fixed_axes_step_factor``; the way is with the drift.
     weights
-        As of ``drifting_step_factor``.
+        As of ``drifting_step``.
     """
     W = drift_weights(weights)
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+    def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         poses = [values.atPose3(X(key_pose + end)) for end in (0, 1)]
         if jacobians is not None:
             back = poses[1].rotation().matrix().T
             jacobians[2] = np.vstack([np.zeros((3, 6)), back @ W])
         return fixed_axes_residual(poses, turn, way - W @ values.atVector(V()), jacobians)
 
-    return gtsam.CustomFactor(noise, [X(key_pose), X(key_pose + 1), V()], error)
+    return Residual([X(key_pose), X(key_pose + 1), V()], 6, error)
 
 
 def drift_weights(weights: FloatArray) -> FloatArray:

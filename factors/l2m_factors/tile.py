@@ -20,8 +20,10 @@ from typing import Protocol
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
 
 from l2m_factors.field_map import DifferentiableMap, FloatArray, Jacobians
+from l2m_factors.joint_residual import Residual
 from l2m_factors.key_pose_batch import KeyPoseBatch
 from l2m_factors.key_pose_readings import (
     Calibrations,
@@ -61,12 +63,12 @@ class WeightedField:
 
 @dataclass(frozen=True)
 class TilePlaces:
-    """Where n readings on a key pose are in the frame of a tile's anchor.
+    """Where n readings are in the frame of a tile's anchor.
 
     Attributes
     ----------
-    T_anchor_key
-        Key pose.
+    R_anchor_key
+        Rotation of each one's key pose, shape (n, 3, 3).
     R_key_lidar, t_key
         The lidar's rotation at each reading, (n, 3, 3), and the sensor's place in metres, (n, 3),
         both from the key pose.
@@ -74,10 +76,15 @@ class TilePlaces:
         Places in the anchor's frame in metres, shape (n, 3).
     """
 
-    T_anchor_key: gtsam.Pose3
+    R_anchor_key: FloatArray
     R_key_lidar: FloatArray
     t_key: FloatArray
     x: FloatArray
+
+    def __getitem__(self, rows: npt.NDArray[np.int64]) -> "TilePlaces":
+        return TilePlaces(
+            self.R_anchor_key[rows], self.R_key_lidar[rows], self.t_key[rows], self.x[rows]
+        )
 
 
 class TileBatch(KeyPoseBatch):
@@ -107,6 +114,8 @@ class TileBatch(KeyPoseBatch):
         self._number, self._anchor, self._tile = number, anchor, field
         self._point: tuple[FloatArray, FloatArray, Calibrations]  # of the last evaluation
         self._by_weights: dict[int, FloatArray] = {}  # what no factor has taken yet
+        self._places: TilePlaces | None = None  # where they were asked for last
+        self._placed: dict[int, bytes] = {}
 
     def keys_of(self, key_pose: int) -> list[int]:
         """Return the keys that the readings on a key pose depend on.
@@ -131,29 +140,35 @@ class TileBatch(KeyPoseBatch):
         return [by_key, -by_key @ relative.inverse().AdjointMap(), *blocks]
 
     def places(self, values: gtsam.Values, key_pose: int) -> TilePlaces:
-        """Return where the readings on a key pose are."""
-        rows = self._rows[key_pose]
-        readings, relative = self._readings[rows], self._pose(values, key_pose)
-        known = self._variables.calibrations(values, self._sensors[key_pose])
-        R_key_lidar, p = readings.lidar_at(known.offset)
-        t_key = np.einsum("nij,nj->ni", R_key_lidar, known.t[readings.sensor]) + p
-        x = t_key @ relative.rotation().matrix().T + relative.translation()
-        return TilePlaces(relative, R_key_lidar, t_key, x)
+        """Return where the readings on a key pose are, without a query of the field."""
+        stamp = self._stamp(values, key_pose)
+        if self._places is None or self._placed.get(key_pose) != stamp:
+            if self._seen.get(key_pose) == stamp:
+                point, self._placed = self._point, self._seen
+            else:
+                present = [k for k in self._rows if self._is_present(values, k)]
+                point = self._evaluation_point(values, present)
+                self._placed = {k: self._stamp(values, k) for k in present}
+            self._places = self._places_at(*point)
+        return self._places[self._rows[key_pose]]
 
     def place_keys_of(self, key_pose: int) -> list[int]:
         """Return the keys that ``places`` depend on, but for time offsets."""
         poses = [] if key_pose == self._anchor else [X(key_pose), X(self._anchor)]
         return [*poses, *self._variables.place_keys(self._sensors[key_pose])]
 
-    def place_jacobians(self, key_pose: int, where: TilePlaces) -> list[FloatArray]:
+    def place_jacobians(
+        self, values: gtsam.Values, key_pose: int, where: TilePlaces
+    ) -> list[FloatArray]:
         """Return derivatives of n places by each of ``place_keys_of``, each of shape (n, 3, .)."""
-        R, n = where.T_anchor_key.rotation().matrix(), len(where.x)
+        R = where.R_anchor_key
         blocks = self._variables.place_jacobians(R @ where.R_key_lidar, self._rows[key_pose])
         if key_pose == self._anchor:
             return blocks
         # R exp(w) t = R t - R [t]_x w; a right shift goes along the axes of the key pose.
-        by_key = np.concatenate([-R @ skew(where.t_key), np.tile(R, (n, 1, 1))], axis=2)
-        return [by_key, -by_key @ where.T_anchor_key.inverse().AdjointMap(), *blocks]
+        by_key = np.concatenate([-R @ skew(where.t_key), R], axis=2)
+        relative = self._pose(values, key_pose)
+        return [by_key, -by_key @ relative.inverse().AdjointMap(), *blocks]
 
     def _evaluated(self, values: gtsam.Values, present: list[int]) -> KeyPoseResiduals:
         self._point = R, p, sensors = self._evaluation_point(values, present)
@@ -173,12 +188,16 @@ class TileBatch(KeyPoseBatch):
 
     def _derivatives_by_weights(self) -> FloatArray:
         """Return derivatives by the weights where all N residuals were evaluated, (N, 3, m)."""
-        (R, p, known), readings = self._point, self._readings
-        R_key_lidar, p_key_lidar = readings.lidar_at(known.offset)
-        t_key = np.einsum("nij,nj->ni", R_key_lidar, known.t[readings.sensor]) + p_key_lidar
-        x = np.einsum("nij,nj->ni", R, t_key) + p
-        C = known.distortion[readings.sensor, :9].reshape(-1, 3, 3)
-        return np.asarray(C @ (R @ R_key_lidar).transpose(0, 2, 1) @ self._tile.features(x))
+        where, known = self._places_at(*self._point), self._point[2]
+        C = known.distortion[self._readings.sensor, :9].reshape(-1, 3, 3)
+        turned = C @ (where.R_anchor_key @ where.R_key_lidar).transpose(0, 2, 1)
+        return np.asarray(turned @ self._tile.features(where.x))
+
+    def _places_at(self, R: FloatArray, p: FloatArray, known: Calibrations) -> TilePlaces:
+        """Return where all N readings are, from the key pose of each and the sensors."""
+        R_key_lidar, p_key_lidar = self._readings.lidar_at(known.offset)
+        t_key = np.einsum("nij,nj->ni", R_key_lidar, known.t[self._readings.sensor]) + p_key_lidar
+        return TilePlaces(R, R_key_lidar, t_key, np.einsum("nij,nj->ni", R, t_key) + p)
 
     def _pose(self, values: gtsam.Values, key_pose: int) -> gtsam.Pose3:
         if key_pose == self._anchor:
@@ -210,7 +229,19 @@ def tile_factor(
 
     It is on ``X(k)``, the anchor ``X(a)``, the weights ``M(b)``, on the calibrations unless the
     batch has them fixed, and, if its readings are known to lie between two key poses, on
-    ``X(k+1)``; with a slow error on ``N(k)`` and ``N(k+1)``.
+    ``X(k+1)``; with a slow error on ``N(k)`` and ``N(k+1)``. Parameters as of ``tile_residual``.
+    """
+    return tile_residual(batch, key_pose, whitening, step, slow).factor()
+
+
+def tile_residual(
+    batch: TileBatch,
+    key_pose: int,
+    whitening: Whitening,
+    step: StepError | None = None,
+    slow: SlowError | None = None,
+) -> Residual:
+    """Return the residual of that factor.
 
     Parameters
     ----------
@@ -229,7 +260,7 @@ def tile_factor(
     terms = [each for each in (step, slow) if each is not None]
     slots = Slots([*batch.keys_of(key_pose), *(key for each in terms for key in each.keys)])
 
-    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+    def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
         residuals = batch.residuals(values, key_pose)
         e = residuals.reading.residual[rows]
         for each in terms:
@@ -240,4 +271,4 @@ def tile_factor(
             slots.fill(jacobians, whitening, blocks)
         return whitening(e[:, :, None]).ravel()
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(3 * len(rows)), slots.keys, error)
+    return Residual(slots.keys, 3 * len(rows), error)

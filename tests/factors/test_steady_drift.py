@@ -10,8 +10,8 @@ from l2m_factors import (
     X,
     assert_jacobians_match,
     drift_weights,
-    drifting_fixed_axes_factor,
-    drifting_step_factor,
+    drifting_fixed_axes_step,
+    drifting_step,
     fixed_axes_step_factor,
 )
 from l2m_factors.field_map import FloatArray
@@ -34,10 +34,10 @@ def drawn(seed: int) -> tuple[gtsam.Pose3, FloatArray, gtsam.Values]:
 @settings(deadline=None, max_examples=30)
 def test_derivatives_are_those_of_finite_differences(seed: int) -> None:
     step, weights, values = drawn(seed)
-    assert_jacobians_match(drifting_step_factor(4, step, weights, NOISE), values)
+    assert_jacobians_match(drifting_step(4, step, weights).factor(NOISE), values)
     way = step.translation()
     assert_jacobians_match(
-        drifting_fixed_axes_factor(4, step.rotation(), way, weights, NOISE), values
+        drifting_fixed_axes_step(4, step.rotation(), way, weights).factor(NOISE), values
     )
 
 
@@ -50,13 +50,13 @@ def test_a_step_without_its_drift_is_the_plain_one(seed: int) -> None:
     own = values.atPose3(X(4)).rotation().unrotate(added)
     still = gtsam.Pose3(step.rotation(), step.translation() - own)
     plain = gtsam.BetweenFactorPose3(X(4), X(5), still, NOISE)
-    ours = drifting_step_factor(4, step, weights, NOISE)
+    ours = drifting_step(4, step, weights).factor(NOISE)
     np.testing.assert_allclose(
         ours.unwhitenedError(values), plain.unwhitenedError(values), atol=1e-9
     )
     way, turn = step.translation(), step.rotation()
     fixed = fixed_axes_step_factor(4, turn, way - added, NOISE)
-    drifting = drifting_fixed_axes_factor(4, turn, way, weights, NOISE)
+    drifting = drifting_fixed_axes_step(4, turn, way, weights).factor(NOISE)
     np.testing.assert_allclose(
         drifting.unwhitenedError(values), fixed.unwhitenedError(values), atol=1e-12
     )

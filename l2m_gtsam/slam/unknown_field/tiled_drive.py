@@ -1,6 +1,7 @@
 """A drive's readings partitioned into tiles of an unknown field, at an estimate of its poses."""
 
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import gtsam
 import numpy as np
@@ -10,12 +11,14 @@ from l2m_factors import (
     ComplexityPenalty,
     M,
     TileBatch,
-    effective_parameters_factor,
-    tile_factor,
+    effective_parameters,
+    joint_residual,
+    tile_residual,
 )
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
+from l2m_gtsam.slam.pose_graph import TOGETHER
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field.linear_field import AXES, LinearField
@@ -215,15 +218,17 @@ class TiledDrive:
             if len(rows):
                 readings = motions.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
-                for k in batch.key_poses:
-                    own = rows[batch.rows_of(k)]
-                    lasting, left = (None, None) if slow is None else slow.of(k, own)
-                    white = motions.whitening(own, whitening[own], by_lidar[own], left)
-                    step = motions.step_error(own, by_lidar[own])
-                    graph.add(tile_factor(batch, k, white, step, lasting))
-                    factor = effective_parameters_factor(batch, k, penalty[batch.rows_of(k)])
-                    if factor is not None:
-                        graph.add(factor)
+                for _, together in groupby(batch.key_poses, lambda k: k // TOGETHER):
+                    residuals = []
+                    for k in together:
+                        own = rows[batch.rows_of(k)]
+                        lasting, left = (None, None) if slow is None else slow.of(k, own)
+                        white = motions.whitening(own, whitening[own], by_lidar[own], left)
+                        step = motions.step_error(own, by_lidar[own])
+                        residuals.append(tile_residual(batch, k, white, step, lasting))
+                        doubt = effective_parameters(batch, k, penalty[batch.rows_of(k)])
+                        residuals += [] if doubt is None else [doubt]
+                    graph.add(joint_residual(residuals).factor())
         if slow is not None:
             graph.push_back(slow.graph())
         return graph
