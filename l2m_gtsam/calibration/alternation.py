@@ -10,7 +10,7 @@ from l2m_factors import T
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, reading_graph
 from l2m_gtsam.calibration.optimise import Optimizer, optimise
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
-from l2m_gtsam.calibration.view import QueryableMap, View, observe
+from l2m_gtsam.calibration.view import QueryableMap, View, observe, seen_from
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import Progress
@@ -24,6 +24,8 @@ from l2m_gtsam.solve.robust import RobustOptions
 DISTORTION = 12  # parameters of C and H
 # Readings of a sensor without which no step of the alternation is taken: five have 15 components.
 FEWEST = 5
+# The map's errors change over decimetres: to come near, variances from so near by do, metres.
+NEAR_M = 0.03
 # Weak tie of each T(i) to where it is, for directions without any gradient: metres.
 TIE_M = 10.0
 
@@ -117,20 +119,23 @@ def alternate(
 ) -> Alternated:
     """Alternate closed form and translation graph until no sensor moves further than settled.
 
-    It only has to come near: `alternation_readings` of each sensor are enough.
+    It only has to come near: `alternation_readings` of each sensor are enough, with variances of
+    the map that are asked for anew only where sensors have moved.
     """
     estimate, furthest = start, options.settled_m
-    asked, step = estimate.t, 0
-    while step < options.max_steps:
-        view, asked, step = observe(readings, field_map, estimate, FEWEST), estimate.t, step + 1
-        if not view.sensors:
-            break
+    view, asked, step = observe(readings, field_map, start, FEWEST), start.t, 0
+    while view.sensors and step < options.max_steps:
+        step += 1
         moved = move_sensors(view, field_map, fit_distortions(view, estimate, options), options)
         move = float(np.abs(moved.t - estimate.t).max())
         estimate, furthest = moved, max(furthest, move)
         progress("alternation", _share_done(move, furthest, options.settled_m))
         if move <= options.settled_m:
             break
+        if np.abs(estimate.t - asked).max() <= NEAR_M:
+            view = seen_from(view, field_map, estimate)
+        else:
+            view, asked = observe(readings, field_map, estimate, FEWEST), estimate.t
     return Alternated(estimate, asked, step)
 
 

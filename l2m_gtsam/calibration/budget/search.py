@@ -154,11 +154,13 @@ def felt(
         readings = np.concatenate([each.readings for each, _ in groups])
         F = np.concatenate([processes[k].features(readings) for k in here], axis=2)
         Z, first = (C[readings] @ F).reshape(3 * len(readings), -1), 0
+        part = np.zeros((len(across), len(at)))  # whole rows of it are added to: they lie together
         for each, W in groups:
             white = slice(first, first + len(each.residual))
             Z[white] = _times(W, Z[white])
-            across[np.ix_(each.columns, at)] += each.jacobian.T @ Z[white]
+            part[each.columns] += each.jacobian.T @ Z[white]
             first = white.stop
+        across[:, at] += part
         own[np.ix_(at, at)] += Z.T @ Z
         pull[at] -= Z.T @ np.concatenate([each.residual for each, _ in groups])
     # The residuals are those of the system itself, which holds the survey's sensors tighter.

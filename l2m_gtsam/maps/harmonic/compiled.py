@@ -1,8 +1,9 @@
 """The tiles of a harmonic map for solvers: the same field, hundreds of times faster."""
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from threading import Lock
 from typing import Any
 
@@ -11,16 +12,17 @@ import numpy as np
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.compiled_tile import CompiledTile, compile_tile, sources_of
-from l2m_gtsam.maps.harmonic.entries import compiled_entry, finite, floats, integers, solved_entry
+from l2m_gtsam.maps.harmonic.entries import compiled_entry, finite, floats, integers
+from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions, Learnt
 from l2m_gtsam.maps.harmonic.near_sources import NearSources
-from l2m_gtsam.maps.harmonic.places import Places
+from l2m_gtsam.maps.harmonic.places import AlongX, Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_shares import Blend
 from l2m_gtsam.maps.harmonic.tiles import Tiles
-from l2m_gtsam.maps.tile_store import Arrays
+from l2m_gtsam.maps.tile_store import Arrays, Entry
 from l2m_gtsam.parallel.threads import in_threads
 from l2m_gtsam.progress import Count
 
@@ -61,7 +63,7 @@ class CompiledTiles:
         with self.locks[index]:
             found = self.made.get(index)
             if found is None:
-                found = self.compiled(index, self.tiles[index])
+                found = self.compiled(index, partial(self.tiles.__getitem__, index))
                 with self.locks[-1]:
                     self.made[index] = found
                     self._forget()
@@ -70,21 +72,38 @@ class CompiledTiles:
                     self.made.move_to_end(index)
         return found
 
-    def compiled(self, index: int, tile: Tile) -> CompiledTile | Tile:
-        """Return a tile as it was kept, else compiled and kept, without holding it in memory."""
+    def compiled(self, index: int, solved: Callable[[], Tile]) -> CompiledTile | Tile:
+        """Return a tile as it was kept, else compiled and kept, without holding it in memory.
+
+        Parameters
+        ----------
+        index
+            Of the tile.
+        solved
+            Gives its exact form, which is asked for only where it is needed.
+        """
         store, places = self.tiles.store, self.places(index)
-        entry = compiled_entry(self.learnt, index, places)
-        found = store.recall(entry, partial(compiled_from_arrays, tile))
+        entry, frame = self.entry(index, places), self.learnt.frame(index)
+        found = store.recall(entry, partial(compiled_from_arrays, frame, solved))
         if found is None:
-            found = compile_tile(tile, places)
+            found = compile_tile(solved(), places)
             store.keep(entry, compiled_to_arrays(found))
         return found
+
+    @cached_property
+    def readings(self) -> AlongX:
+        """Where the map was surveyed."""
+        return AlongX.of(self.learnt.readings.points)
+
+    def entry(self, index: int, places: Places) -> Entry:
+        """Return what a compiled tile is kept as."""
+        return compiled_entry(self.learnt, index, self.tiles.entry(index), places)
 
     def places(self, index: int) -> Places:
         """Return where a tile is evaluated."""
         tiling = self.learnt.tiling
         return Places.around(
-            self.learnt.readings.points,
+            self.readings,
             self.options.reach,
             tiling.grid.centres[index],
             0.5 * tiling.grid.size + tiling.blend,
@@ -107,15 +126,16 @@ class CompiledTiles:
             How many tiles the store has.
         """
         indices, lock, done = range(len(self.tiles)), Lock(), 0
-        solved = [solved_entry(self.learnt, index) for index in indices]
-        compiled = [compiled_entry(self.learnt, index, self.places(index)) for index in indices]
+        solved = [self.tiles.entry(index) for index in indices]
+        compiled = [self.entry(index, self.places(index)) for index in indices]
         self.tiles.store.sweep([*solved, *compiled])
 
         def make(index: int) -> bool:
             nonlocal done
             if not self.tiles.store.takes_more:
                 return False
-            self.compiled(index, self.tiles.made(index))
+            tile = self.tiles.made(index)
+            self.compiled(index, lambda: tile)
             with lock:
                 done += 1
                 progress(done, len(indices))
@@ -149,6 +169,7 @@ def compiled_to_arrays(compiled: CompiledTile | Tile) -> Arrays:
         return {}
     grid, near = compiled.grid, compiled.near
     return {
+        "walls": np.stack(compiled.walls),
         "lower": grid.lower,
         "spacing": np.array([grid.spacing]),
         "coefficients": grid.coefficients,
@@ -159,8 +180,17 @@ def compiled_to_arrays(compiled: CompiledTile | Tile) -> Arrays:
     }
 
 
-def compiled_from_arrays(tile: Tile, arrays: Arrays) -> CompiledTile | Tile:
-    """Return what ``compiled_to_arrays`` took apart, with the solved tile that it belongs to.
+def compiled_from_arrays(
+    frame: TileFrame, solved: Callable[[], Tile], arrays: Arrays
+) -> CompiledTile | Tile:
+    """Return what ``compiled_to_arrays`` took apart.
+
+    Parameters
+    ----------
+    frame, solved
+        Of the solved tile that it belongs to: its box, and what gives the whole.
+    arrays
+        Of the compiled tile.
 
     Raises
     ------
@@ -168,9 +198,15 @@ def compiled_from_arrays(tile: Tile, arrays: Arrays) -> CompiledTile | Tile:
         If an array is missing, of the wrong shape, or makes no sense.
     """
     if not arrays:
-        return tile
+        return solved()
+    low, high = finite(arrays, "walls", (2, 3))
     grid, near = grid_from_arrays(arrays), near_from_arrays(arrays)
-    return CompiledTile(tile, grid, near, TermSum.of(tile, sources_of(tile)))
+    return CompiledTile(frame, (low, high), grid, near, lambda: all_terms(solved()))
+
+
+def all_terms(tile: Tile) -> TermSum:
+    """Return all terms of a tile."""
+    return TermSum.of(tile, sources_of(tile))
 
 
 def grid_from_arrays(arrays: Arrays) -> PotentialGrid:

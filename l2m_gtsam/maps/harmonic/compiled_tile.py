@@ -1,5 +1,6 @@
 """A tile made fast: its smooth part on a grid, its near sources one by one."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, runtime_checkable
@@ -49,25 +50,34 @@ class CompiledTile:
 
     Attributes
     ----------
-    tile
-        Tile with its posterior, of which this is the fast form.
+    frame
+        The tile's box in the map frame.
+    walls
+        Lowest and highest coordinates of evaluation in the tile's frame, metres, shape (3,).
     grid
         The smooth part of the potential in the tile's frame.
     near
         Near parts of the sources that the grid leaves out, tile frame, uT m^3.
-    terms
-        All of the exact tile; they answer where the grid does not reach.
+    exact
+        Gives all terms of the exact tile. They answer where the grid does not reach; most tiles are
+        never asked there, and their posterior stays on the disk.
     """
 
-    tile: Tile
+    frame: TileFrame
+    walls: tuple[FloatArray, FloatArray]
     grid: PotentialGrid
     near: NearSources
-    terms: TermSum
+    exact: Callable[[], TermSum]
 
     @cached_property  # added up over all tiles whenever one is made
     def nbytes(self) -> int:
-        """Memory in bytes."""
-        return self.grid.coefficients.nbytes + self.near.nbytes + self.terms.nbytes
+        """Memory of grid and near sources in bytes; the terms are far less."""
+        return self.grid.coefficients.nbytes + self.near.nbytes
+
+    @cached_property
+    def terms(self) -> TermSum:
+        """All terms of the exact tile."""
+        return self.exact()
 
     def field_and_gradient(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the map frame."""
@@ -87,14 +97,14 @@ class CompiledTile:
         rows, share
             Indices of the tile's points and its share in each, shape (K,).
         """
-        frame, grid, near = self.tile.basis.frame, self.grid, self.near
+        frame, grid, near = self.frame, self.grid, self.near
         missing = np.empty(len(rows), dtype=np.int64)
         count = add_compiled(
             points,
             rows,
             share,
             (frame.corner, frame.R_map_tile),
-            self.tile.walls,
+            self.walls,
             (grid.lower, grid.spacing, grid.coefficients),
             (near.corner, near.shape, near.starts, near.table),
             blend.field,
@@ -103,7 +113,8 @@ class CompiledTile:
         )
         if count:
             left = missing[:count]
-            local = self.tile.clipped(frame.localise(points[rows[left]]))
+            local = frame.localise(points[rows[left]])
+            clip_rows(local, *self.walls, local)
             values = in_map(frame, *self.terms.field_and_gradient(local))
             blend.add(rows[left], share[left], values)
 
@@ -225,7 +236,7 @@ def with_grid(tile: Tile, terms: TermSum, places: Places, fineness: Fineness) ->
     grid = potential_grid(potential, readings, places.reach, spacing, places.box(frame))
     upper = grid.lower + spacing * np.array(grid.coefficients.shape)
     near = near_sources(sources, grid.lower, upper, radius)
-    return CompiledTile(tile, grid, near, terms)
+    return CompiledTile(frame, tile.walls, grid, near, lambda: terms)
 
 
 @njit(cache=True, nogil=True)

@@ -52,7 +52,7 @@ def _checked(arrays: Arrays, name: str, shape: Shape, dtype: np.dtype[Any]) -> n
     return found
 
 
-ALGORITHM = 2
+ALGORITHM = 3
 """To be raised with every change to what is solved, compiled or kept of the same readings."""
 
 
@@ -101,10 +101,10 @@ def _of_poses(learnt: Learnt, index: int) -> list[FloatArray]:
     return [np.array([poses.lasting_s]), sizes, when, poses.shift[mine]]
 
 
-def compiled_entry(learnt: Learnt, index: int, places: Places) -> Entry:
+def compiled_entry(learnt: Learnt, index: int, solved: Entry, places: Places) -> Entry:
     """Return what a compiled tile is kept as: it follows from the solved one and its places."""
     facts: dict[str, object] = {
-        "solved": solved_entry(learnt, index).fingerprint,
+        "solved": solved.fingerprint,
         "reach": places.reach,
         "half": places.half,
     }

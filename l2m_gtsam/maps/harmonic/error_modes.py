@@ -38,7 +38,7 @@ from l2m_gtsam.maps.harmonic.tiles import Tiles
 from l2m_gtsam.maps.suite_errors import SuiteErrors
 from l2m_gtsam.parallel.threads import in_threads
 
-NEGLIGIBLE = 1e-15  # share of the variance at places
+NEGLIGIBLE = 1e-11  # share of the variance at places
 LINEAR = 0.002  # metres over which a field that varies over decimetres is linear
 FELT = 0.01  # of the noise, root mean square over a drive: what matters to ten thousand readings
 

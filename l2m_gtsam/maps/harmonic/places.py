@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.potential_grid import Box
 
@@ -31,14 +31,9 @@ class Places:
     half: float
 
     @classmethod
-    def around(
-        cls, readings: FloatArray, reach: float, centre: FloatArray, half: float
-    ) -> "Places":
+    def around(cls, readings: "AlongX", reach: float, centre: FloatArray, half: float) -> "Places":
         """Return the places of a square near readings, which may lie anywhere."""
-        # Axis by axis: a maximum over rows of two takes ten times as long.
-        near = np.abs(readings[:, 0] - centre[0]) <= half + reach
-        near &= np.abs(readings[:, 1] - centre[1]) <= half + reach
-        return cls(readings[near], reach, centre, half)
+        return cls(readings.points[readings.within(centre, half + reach)], reach, centre, half)
 
     def box(self, frame: TileFrame) -> Box:
         """Return the box in the tile's frame that holds all places."""
@@ -59,3 +54,31 @@ class Places:
         offset = rng.uniform(-1, 1, (count, 3)) * self.reach
         places = self.readings[rng.integers(0, len(self.readings), count)] + offset
         return np.asarray(places[np.abs(places[:, :2] - self.centre).max(axis=1) <= self.half])
+
+
+@dataclass(frozen=True)
+class AlongX:
+    """Readings in the order of x, so that a square is found without looking at all of them.
+
+    Attributes
+    ----------
+    points
+        Positions in the map frame in metres, shape (N, 3).
+    order
+        Their indices from the lowest x to the highest, shape (N,).
+    """
+
+    points: FloatArray
+    order: IntArray
+
+    @classmethod
+    def of(cls, points: FloatArray) -> "AlongX":
+        """Return readings at these positions."""
+        return cls(points, np.argsort(points[:, 0], kind="stable"))
+
+    def within(self, centre: FloatArray, half: float) -> IntArray:
+        """Return the rows in a square about a centre in x and y, shape (2,), in order, (K,)."""
+        edges = centre[0] + half * np.array([-1, 1])
+        start, stop = np.searchsorted(self.points[:, 0], edges, sorter=self.order)
+        rows = np.sort(self.order[start:stop])
+        return np.asarray(rows[np.abs(self.points[rows, 1] - centre[1]) <= half])

@@ -37,11 +37,6 @@ class TermSum:
         others = ((f, tile.weights.mean[at]) for f, at in families if not isinstance(f, Dipoles))
         return cls(sources, tuple(others))
 
-    @property
-    def nbytes(self) -> int:
-        """Memory in bytes, beside that of the tile."""
-        return self.sources.positions.nbytes + self.sources.moments.nbytes
-
     def field_and_gradient(self, local: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return field (N, 3) in uT and gradient (N, 3, 3) in uT/m in the tile's frame."""
         field, gradient = np.zeros((len(local), 3)), np.zeros((len(local), 3, 3))

@@ -20,7 +20,7 @@ from l2m_gtsam.maps.harmonic.local import local_hyperparameters
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_sums import tile_normal
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor, count
-from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, TileStore
+from l2m_gtsam.maps.tile_store import NO_STORE, Arrays, Entry, TileStore
 from l2m_gtsam.maps.trained import first_complaint
 
 MEMORY = 2_000_000_000  # bytes of the tiles' covariances that are kept
@@ -50,6 +50,7 @@ class Tiles:
         self._learnt = learnt
         self._solved: OrderedDict[int, Tile] = OrderedDict(kept or {})
         self._held = sum(tile.nbytes for tile in self._solved.values())
+        self._entries: dict[int, Entry] = {}
         self._lock = Lock()
 
     def __reduce__(self) -> tuple[type["Tiles"], tuple[Learnt, None, TileStore]]:
@@ -78,11 +79,18 @@ class Tiles:
 
     def made(self, index: int) -> Tile:
         """Return a tile as it was kept, else solved and kept, without holding it in memory."""
-        entry = solved_entry(self._learnt, index)
+        entry = self.entry(index)
         found = self.store.recall(entry, partial(solved_from_arrays, self._learnt, index))
         if found is None:
             found = solved_tile(self._learnt, index)
             self.store.keep(entry, solved_to_arrays(found))
+        return found
+
+    def entry(self, index: int) -> Entry:
+        """Return what a tile is kept as."""
+        found = self._entries.get(index)
+        if found is None:  # two threads at once find the same
+            found = self._entries[index] = solved_entry(self._learnt, index)
         return found
 
     @property

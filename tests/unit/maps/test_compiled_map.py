@@ -16,7 +16,7 @@ from l2m_gtsam.maps.harmonic.family import Hyperparameters, UniformField
 from l2m_gtsam.maps.harmonic.frame import TileFrame
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
-from l2m_gtsam.maps.harmonic.places import Places
+from l2m_gtsam.maps.harmonic.places import AlongX, Places
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
@@ -110,7 +110,7 @@ def test_the_error_is_within_what_is_promised(case: Case) -> None:
     for visit in case.exact.learnt.tiling.by_tile(points):
         tile = case.compiled.compiled.tile(visit.tile)
         assert isinstance(tile, CompiledTile)
-        local = tile.tile.basis.frame.localise(points[visit.rows])
+        local = tile.frame.localise(points[visit.rows])
         assert np.isfinite(tile.grid.field_and_gradient(local)[0]).all()
 
 
@@ -254,9 +254,11 @@ def test_a_grid_that_errs_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     field, _ = fast.field_and_gradient(points)
     true_field, _ = exact.field_and_gradient(points)
     assert np.abs(field - true_field).max() < FIELD_TOLERANCE
-    tiles = [tile for tile in fast.compiled.made.values() if isinstance(tile, CompiledTile)]
+    made = fast.compiled.made
+    tiles = [tile for tile in made.values() if isinstance(tile, CompiledTile)]
     assert tiles
-    coarse = compiled_tile.fineness_for(tiles[0].tile, compiled_tile.sources_of(tiles[0].tile))
+    solved = exact.tiles[next(iter(made))]
+    coarse = compiled_tile.fineness_for(solved, compiled_tile.sources_of(solved))
     assert max(tile.grid.spacing for tile in tiles) < coarse.spacing
 
 
@@ -270,7 +272,7 @@ def plain_tile() -> Tile:
 
 def test_a_tile_without_waves_and_sources_is_compiled_too() -> None:
     readings = np.random.default_rng(0).uniform(0, 4, (50, 3))
-    tile = compile_tile(plain_tile(), Places.around(readings, 0.5, np.full(2, 2.0), 2.0))
+    tile = compile_tile(plain_tile(), Places.around(AlongX.of(readings), 0.5, np.full(2, 2.0), 2.0))
     assert isinstance(tile, CompiledTile)
     field, gradient = tile.field_and_gradient(readings)
     # Rounding, 1e-16, of a potential of some 1000 uT m on a wide grid, some ten times over in the
@@ -282,4 +284,7 @@ def test_a_tile_without_waves_and_sources_is_compiled_too() -> None:
 @pytest.mark.parametrize("where", [[50.0, 50.0, 0.0], [4.4999999, 4.4999999, 0.5]])
 def test_a_tile_with_hardly_a_reading_nearby_stays_as_it_is(where: list[float]) -> None:
     tile = plain_tile()
-    assert compile_tile(tile, Places.around(np.array([where]), 0.5, np.full(2, 2.0), 2.0)) is tile
+    assert (
+        compile_tile(tile, Places.around(AlongX.of(np.array([where])), 0.5, np.full(2, 2.0), 2.0))
+        is tile
+    )
