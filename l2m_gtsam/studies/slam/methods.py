@@ -237,7 +237,7 @@ class SlamCell:
     ekf, particles, fixed_lag
         The peers.
     online, ours
-        ``l2m slam`` on line and off line; on line None in cells of earlier versions.
+        ``l2m slam`` on line and off line.
     """
 
     path_m: float
@@ -246,7 +246,7 @@ class SlamCell:
     ekf: MethodRow
     particles: MethodRow
     fixed_lag: MethodRow
-    online: MethodRow | None
+    online: MethodRow
     ours: MethodRow
 
 

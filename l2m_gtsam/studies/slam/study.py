@@ -80,7 +80,7 @@ class SlamRow:
     ekf: MethodFigures
     particles: MethodFigures
     fixed_lag: MethodFigures
-    online: MethodFigures | None
+    online: MethodFigures
     ours: MethodFigures
 
 
@@ -131,9 +131,7 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
         return {
             "methods": METHODS,
             "lost": [f"{named(row)} ({', '.join(won)})" for row in rows if (won := winners(row))],
-            "worse": [
-                named(row) for row in rows if row.online is not None and not row.online.never_worse
-            ],
+            "worse": [named(row) for row in rows if not row.online.never_worse],
             "outside": [
                 named(row)
                 for row in rows
@@ -167,11 +165,10 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
 def _draw_method(axes: Axes, rows: list[SlamRow], name: str, beside: float) -> None:
     """Draw a method's bars, and lines to its worst seed."""
     for place, row in enumerate(rows):
-        found: MethodFigures | None = getattr(row, name)
-        if found is not None:
-            label = METHODS[name] if place == len(rows) - 1 else None
-            axes.bar(place + beside, found.rms_m, WIDTH, color=COLOURS[name], label=label)
-            axes.vlines(place + beside, found.rms_m, found.worst_m, color="black", linewidth=0.8)
+        found: MethodFigures = getattr(row, name)
+        label = METHODS[name] if place == len(rows) - 1 else None
+        axes.bar(place + beside, found.rms_m, WIDTH, color=COLOURS[name], label=label)
+        axes.vlines(place + beside, found.rms_m, found.worst_m, color="black", linewidth=0.8)
 
 
 def winners(row: SlamRow) -> list[str]:
@@ -188,7 +185,6 @@ def row_of(key: str, cells: list[SlamCell]) -> SlamRow:
     """Return the figures of one group of seeds."""
     vehicle, run, kind, form = key.split("-")
     before = [each.odometry for each in cells]
-    online = [each.online for each in cells if each.online is not None]
     return SlamRow(
         site=f"{vehicle} {run}",
         kind=kind,
@@ -199,7 +195,7 @@ def row_of(key: str, cells: list[SlamCell]) -> SlamRow:
         ekf=figures_of([each.ekf for each in cells], before),
         particles=figures_of([each.particles for each in cells], before),
         fixed_lag=figures_of([each.fixed_lag for each in cells], before),
-        online=figures_of(online, before) if len(online) == len(cells) else None,
+        online=figures_of([each.online for each in cells], before),
         ours=figures_of([each.ours for each in cells], before),
     )
 
