@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
-from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.maps.sources.marginal import AXES, MarginalRows
 from l2m_gtsam.maps.sources.source import HALF_AXIS, MOMENT, PARAMETERS, UT_M3, SourceShape
 from l2m_gtsam.options import Options
 
@@ -36,6 +36,7 @@ FIRST_HALF_M = (0.3, 0.8)  # where the length of a bar is started, near a dipole
 STANDING = np.array([[0.0, 0.0, 1.0]])
 LYING = np.array([[0.92, 0.39, 0.0], [-0.39, 0.92, 0.0]])
 DIPOLE = 6  # parameters
+MOST_WRONG = 20  # readings; with more of them it is not single ones that are wrong
 
 
 class SourceSearchOptions(Options):
@@ -69,12 +70,15 @@ class FoundSources:
         shape (K,).
     left
         Squared length of what all of them leave, white.
+    wrong
+        Readings that are wrong by themselves, which no source explains: they did not count.
     """
 
     shapes: tuple[SourceShape, ...]
     root: FloatArray
     gains: FloatArray
     left: float
+    wrong: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.shapes)
@@ -125,7 +129,7 @@ def find_sources(
     known
         Where to begin: sources that were found before, if any.
     """
-    found = refined(rows, known.shapes) if known else nothing_found(rows)
+    found, wrong = apart(rows, known.shapes if known else (), options), list[int]()
     grid = SourcePlaces.over(rows, suspected, options)
     trials = 2 * float(np.log(max(len(grid), 1)))  # Bonferroni, on the scale of the gain
     while len(found) < options.most and len(grid):
@@ -134,10 +138,50 @@ def find_sources(
             break
         better = best_of(rows, found, starts.shapes)
         least = price(rows, better.parameters - found.parameters) + trials
-        if found.left - better.left < least or too_near(better, rows, options):
+        if found.left - better.left < least:
+            break
+        alone = wrong_reading(rows, better, least)
+        if alone is not None and len(wrong) < MOST_WRONG:
+            # What was known of moments on the grid without it is a little too much; it begins only.
+            rows = rows.without([alone])
+            wrong.append(alone)
+            found = refined(rows, found.shapes)
+            continue
+        if alone is not None or too_near(better, rows, options):
             break
         found = better
-    return pruned(rows, found, price(rows, DIPOLE) + trials)
+    found = pruned(rows, found, price(rows, DIPOLE) + trials)
+    return replace(found, wrong=tuple(wrong))
+
+
+def wrong_reading(rows: MarginalRows, found: FoundSources, least: float) -> int | None:
+    """Return the reading that is wrong by itself where the last source found explains only that.
+
+    A clock that is off in a turn on the spot, or a spike, makes one reading wrong; a source beside
+    it takes most of that. That one reading is wrong has as many parameters as it has axes, and
+    there are as many such explanations as readings. If that one is the better, the source has to
+    explain enough beside it.
+
+    Parameters
+    ----------
+    rows
+        Readings.
+    found
+        Sources, of which all but the last are known.
+    least
+        What the last one has to explain.
+    """
+    field, _ = found.shapes[-1].field_and_gradient(rows.points)
+    pulled, _ = rows.pull(rows.residual - found.field(rows.points) + field)
+    most = int(np.argmax(np.einsum("ni,ni->n", field, pulled)))
+    features = np.zeros((len(rows), AXES, 1 + AXES))
+    features[:, :, 0], features[most, :, 1:] = field, np.eye(AXES)
+    F, g = rows.information(features), np.einsum("nim,ni->m", features, pulled)
+    source = g[0] ** 2 / F[0, 0]
+    reading = float(g[1:] @ np.linalg.solve(F[1:, 1:], g[1:]))
+    both = float(g @ np.linalg.lstsq(F, g, rcond=1e-10)[0])
+    worth = reading - price(rows, AXES) - 2 * float(np.log(len(rows)))
+    return most if worth > source - least and both - reading < least else None
 
 
 @dataclass(frozen=True)
@@ -414,7 +458,19 @@ def pruned(rows: MarginalRows, found: FoundSources, least: float) -> FoundSource
     return nothing_found(rows)
 
 
+def apart(
+    rows: MarginalRows, shapes: tuple[SourceShape, ...], options: SourceSearchOptions
+) -> FoundSources:
+    """Return the most likely sources near some, without those that end where a sensor was."""
+    found = refined(rows, shapes)
+    while len(found) and too_near(found, rows, options):
+        away, _ = cKDTree(rows.points).query([each.position for each in found.shapes])
+        nearest = int(np.argmin(away))
+        found = refined(rows, found.shapes[:nearest] + found.shapes[nearest + 1 :])
+    return found
+
+
 def too_near(found: FoundSources, rows: MarginalRows, options: SourceSearchOptions) -> bool:
-    """Return whether the last source found lies where a sensor was."""
-    away, _ = cKDTree(rows.points).query(found.shapes[-1].position)
-    return bool(away < 0.5 * options.nearest)
+    """Return whether a source lies where a sensor was."""
+    away, _ = cKDTree(rows.points).query([each.position for each in found.shapes])
+    return bool(away.min() < 0.5 * options.nearest)
