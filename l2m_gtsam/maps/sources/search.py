@@ -17,6 +17,7 @@ from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
 from l2m_gtsam.maps.sources.marginal import AXES, MarginalRows
 from l2m_gtsam.maps.sources.source import HALF_AXIS, MOMENT, PARAMETERS, UT_M3, SourceShape
+from l2m_gtsam.maps.sources.wrong_reading import wrong_reading
 from l2m_gtsam.options import Options
 
 BATCH = 128  # candidates that are asked together
@@ -140,7 +141,9 @@ def find_sources(
         least = price(rows, better.parameters - found.parameters) + trials
         if found.left - better.left < least:
             break
-        alone = wrong_reading(rows, better, least)
+        field, _ = better.shapes[-1].field_and_gradient(rows.points)
+        beside = rows.residual - better.field(rows.points) + field
+        alone = wrong_reading(rows, beside, field, least, price(rows, AXES))
         if alone is not None and len(wrong) < MOST_WRONG:
             # What was known of moments on the grid without it is a little too much; it begins only.
             rows = rows.without([alone])
@@ -152,36 +155,6 @@ def find_sources(
         found = better
     found = pruned(rows, found, price(rows, DIPOLE) + trials)
     return replace(found, wrong=tuple(wrong))
-
-
-def wrong_reading(rows: MarginalRows, found: FoundSources, least: float) -> int | None:
-    """Return the reading that is wrong by itself where the last source found explains only that.
-
-    A clock that is off in a turn on the spot, or a spike, makes one reading wrong; a source beside
-    it takes most of that. That one reading is wrong has as many parameters as it has axes, and
-    there are as many such explanations as readings. If that one is the better, the source has to
-    explain enough beside it.
-
-    Parameters
-    ----------
-    rows
-        Readings.
-    found
-        Sources, of which all but the last are known.
-    least
-        What the last one has to explain.
-    """
-    field, _ = found.shapes[-1].field_and_gradient(rows.points)
-    pulled, _ = rows.pull(rows.residual - found.field(rows.points) + field)
-    most = int(np.argmax(np.einsum("ni,ni->n", field, pulled)))
-    features = np.zeros((len(rows), AXES, 1 + AXES))
-    features[:, :, 0], features[most, :, 1:] = field, np.eye(AXES)
-    F, g = rows.information(features), np.einsum("nim,ni->m", features, pulled)
-    source = g[0] ** 2 / F[0, 0]
-    reading = float(g[1:] @ np.linalg.solve(F[1:, 1:], g[1:]))
-    both = float(g @ np.linalg.lstsq(F, g, rcond=1e-10)[0])
-    worth = reading - price(rows, AXES) - 2 * float(np.log(len(rows)))
-    return most if worth > source - least and both - reading < least else None
 
 
 @dataclass(frozen=True)
@@ -463,14 +436,18 @@ def apart(
 ) -> FoundSources:
     """Return the most likely sources near some, without those that end where a sensor was."""
     found = refined(rows, shapes)
-    while len(found) and too_near(found, rows, options):
-        away, _ = cKDTree(rows.points).query([each.position for each in found.shapes])
-        nearest = int(np.argmin(away))
+    while too_near(found, rows, options):
+        nearest = int(np.argmin(away(found, rows)))
         found = refined(rows, found.shapes[:nearest] + found.shapes[nearest + 1 :])
     return found
 
 
 def too_near(found: FoundSources, rows: MarginalRows, options: SourceSearchOptions) -> bool:
     """Return whether a source lies where a sensor was."""
-    away, _ = cKDTree(rows.points).query([each.position for each in found.shapes])
-    return bool(away.min() < 0.5 * options.nearest)
+    return bool((away(found, rows) < 0.5 * options.nearest).any())
+
+
+def away(found: FoundSources, rows: MarginalRows) -> FloatArray:
+    """Return the distance of the nearest reading to each source, metres, shape (K,)."""
+    places = np.array([each.position for each in found.shapes]).reshape(-1, 3)
+    return np.asarray(cKDTree(rows.points).query(places)[0])
