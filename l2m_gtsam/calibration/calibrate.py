@@ -147,7 +147,10 @@ def calibrated(
         sensors=tuple(_with_missing(each, alive, recording) for each in sensors),
         iterations=solution.steps,
         uncertainty=solution.uncertainty,
-        doubts=field_map.summary.doubts if isinstance(field_map, Summarised) else (),
+        doubts=(
+            *(field_map.summary.doubts if isinstance(field_map, Summarised) else ()),
+            *changed.doubts,
+        ),
         disagreements=tuple(_in_own_time(each, recording) for each in stretches),
         bag=None if recording.drives else recording.source,
         map=map_source,

@@ -18,6 +18,7 @@ from l2m_gtsam.calibration.averaged_rows import (
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources, offset_gain
 from l2m_gtsam.calibration.coverage import UncertainMap, errors_over_stated
+from l2m_gtsam.calibration.missed_steel import missed_by_map
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of
@@ -55,10 +56,21 @@ class ChangesOptions(Options):
 
 @dataclass(frozen=True)
 class ChangedSources:
-    """Sources as a graph takes them, and as they are reported."""
+    """Sources as a graph takes them, and as they are reported.
+
+    Attributes
+    ----------
+    found
+        All of them.
+    records
+        Those that changed since the survey.
+    missed
+        Places of those that stood there already and are not in the map, metres, shape (M, 3).
+    """
 
     found: FoundSources
     records: tuple[ChangedSource, ...]
+    missed: FloatArray
 
 
 def averaged_drive(
@@ -145,10 +157,17 @@ def search(
     budget = NOTHING_FOUND if known is None else solution.budget
     rows = drive.marginal(field_map, field_map, budget, options.averaging)
     found = find_sources(rows, places, options.sources, known)
+    rows = rows.without(found.wrong)
     gained = rows.pull(rows.residual)[1] - found.left - price(rows, found.parameters)
     if not len(found) or gained < offset_gain(rows, drive):
         return None
-    return ChangedSources(found, changed_sources(rows, drive, found))
+    missed = missed_by_map(found.shapes, field_map)
+    records = changed_sources(rows, drive, found)
+    return ChangedSources(
+        found,
+        tuple(each for each, was in zip(records, missed, strict=True) if not was),
+        np.array([each.position for each in found.shapes])[missed],
+    )
 
 
 @dataclass(frozen=True)
@@ -173,6 +192,15 @@ class ChangedSolve:
     def records(self) -> tuple[ChangedSource, ...]:
         """The sources as they are reported."""
         return () if self.sources is None else self.sources.records
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What speaks against the map, a sentence each."""
+        missed = () if self.sources is None else self.sources.missed
+        return tuple(
+            f"it lacks steel at ({x:.1f}, {y:.1f}, {z:.1f}) m, which its survey shows as this drive"
+            for x, y, z in missed
+        )
 
     def taken_into(self, surveyed: QueryableMap) -> QueryableMap:
         """Return a map as it was surveyed with the sources that came, went or were moved."""

@@ -11,6 +11,7 @@ from l2m_gtsam.calibration.causes import changed_sources, vehicle_gain
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
 from l2m_gtsam.calibration.coverage import sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.missed_steel import missed_by_map
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import SurveyReadings, suite_readings
@@ -88,8 +89,12 @@ def seen_sources(
     free = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
     rows = with_calibration(free, covariances(known))
     found = find_sources(rows, places, options.sources, None)
+    rows = rows.without(found.wrong)
     gain = rows.pull(rows.residual)[1] - found.left - price(rows, found.parameters)
-    return SeenSources(changed_sources(rows, drive, found), gain, vehicle_gain(rows, drive))
+    missed = missed_by_map(found.shapes, field_map)
+    seen = zip(changed_sources(rows, drive, found), missed, strict=True)
+    changed = tuple(each for each, was in seen if not was)
+    return SeenSources(changed, gain, vehicle_gain(rows, drive))
 
 
 def covariances(known: Sequence[KnownSensor]) -> FloatArray:

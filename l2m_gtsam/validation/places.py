@@ -16,6 +16,7 @@ from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, suspected
 from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
+from l2m_gtsam.calibration.missed_steel import missed_by_map
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.maps.sources.marginal import MarginalRows
@@ -175,6 +176,10 @@ def shown_sources(
         return None
     rows = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
     found = find_sources(rows, places, options.sources, None)
+    rows, missed = rows.without(found.wrong), missed_by_map(found.shapes, field_map)
+    if missed.any():
+        kept = tuple(each for each, was in zip(found.shapes, missed, strict=True) if not was)
+        found = replace(refined(rows, kept), gains=found.gains[~missed])
     return ShownSources(rows, drive, found) if len(found) else None
 
 

@@ -9,14 +9,18 @@ prior (of the map, of sensors, of the suite that surveyed) and white noise,
 the precision of e without n is that of Woodbury's identity: no matrix of all readings is formed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
-from scipy.sparse import csr_array
+from scipy.linalg import block_diag, cholesky, solve_triangular
+from scipy.sparse import csr_array, hstack
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+
+AXES = 3
+ANYTHING_UT = 1e4  # that a wrong reading may be off by
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,18 @@ class MarginalRows:
         left = white - self.nuisance @ back
         pulled = (self.whitening.T @ left).reshape(-1, 3)
         return np.asarray(pulled), float(white.ravel() @ left.ravel())
+
+    def without(self, readings: Sequence[int]) -> "MarginalRows":
+        """Return the same where some readings may be wrong by anything: they say nothing more."""
+        if not len(readings):
+            return self
+        columns = (AXES * np.array(readings, dtype=int)[:, None] + np.arange(AXES)).ravel()
+        own = csr_array(self.whitening[:, columns])
+        return replace(
+            self,
+            nuisance=hstack([self.nuisance, own], format="csr"),
+            prior=block_diag(self.prior, ANYTHING_UT**-2 * np.eye(len(columns))),
+        )
 
     def near(self, keep: BoolArray) -> "MarginalRows":
         """Return the readings of all slots of which some are to be kept, (N,), as views.

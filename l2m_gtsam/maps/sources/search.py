@@ -15,8 +15,9 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
-from l2m_gtsam.maps.sources.marginal import MarginalRows
+from l2m_gtsam.maps.sources.marginal import AXES, MarginalRows
 from l2m_gtsam.maps.sources.source import HALF_AXIS, MOMENT, PARAMETERS, UT_M3, SourceShape
+from l2m_gtsam.maps.sources.wrong_reading import wrong_reading
 from l2m_gtsam.options import Options
 
 BATCH = 128  # candidates that are asked together
@@ -36,6 +37,7 @@ FIRST_HALF_M = (0.3, 0.8)  # where the length of a bar is started, near a dipole
 STANDING = np.array([[0.0, 0.0, 1.0]])
 LYING = np.array([[0.92, 0.39, 0.0], [-0.39, 0.92, 0.0]])
 DIPOLE = 6  # parameters
+MOST_WRONG = 20  # readings; with more of them it is not single ones that are wrong
 
 
 class SourceSearchOptions(Options):
@@ -69,12 +71,15 @@ class FoundSources:
         shape (K,).
     left
         Squared length of what all of them leave, white.
+    wrong
+        Readings that are wrong by themselves, which no source explains: they did not count.
     """
 
     shapes: tuple[SourceShape, ...]
     root: FloatArray
     gains: FloatArray
     left: float
+    wrong: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         return len(self.shapes)
@@ -125,7 +130,7 @@ def find_sources(
     known
         Where to begin: sources that were found before, if any.
     """
-    found = refined(rows, known.shapes) if known else nothing_found(rows)
+    found, wrong = apart(rows, known.shapes if known else (), options), list[int]()
     grid = SourcePlaces.over(rows, suspected, options)
     trials = 2 * float(np.log(max(len(grid), 1)))  # Bonferroni, on the scale of the gain
     while len(found) < options.most and len(grid):
@@ -134,10 +139,22 @@ def find_sources(
             break
         better = best_of(rows, found, starts.shapes)
         least = price(rows, better.parameters - found.parameters) + trials
-        if found.left - better.left < least or too_near(better, rows, options):
+        if found.left - better.left < least:
+            break
+        field, _ = better.shapes[-1].field_and_gradient(rows.points)
+        beside = rows.residual - better.field(rows.points) + field
+        alone = wrong_reading(rows, beside, field, least, price(rows, AXES))
+        if alone is not None and len(wrong) < MOST_WRONG:
+            # What was known of moments on the grid without it is a little too much; it begins only.
+            rows = rows.without([alone])
+            wrong.append(alone)
+            found = refined(rows, found.shapes)
+            continue
+        if alone is not None or too_near(better, rows, options):
             break
         found = better
-    return pruned(rows, found, price(rows, DIPOLE) + trials)
+    found = pruned(rows, found, price(rows, DIPOLE) + trials)
+    return replace(found, wrong=tuple(wrong))
 
 
 @dataclass(frozen=True)
@@ -414,7 +431,23 @@ def pruned(rows: MarginalRows, found: FoundSources, least: float) -> FoundSource
     return nothing_found(rows)
 
 
+def apart(
+    rows: MarginalRows, shapes: tuple[SourceShape, ...], options: SourceSearchOptions
+) -> FoundSources:
+    """Return the most likely sources near some, without those that end where a sensor was."""
+    found = refined(rows, shapes)
+    while too_near(found, rows, options):
+        nearest = int(np.argmin(away(found, rows)))
+        found = refined(rows, found.shapes[:nearest] + found.shapes[nearest + 1 :])
+    return found
+
+
 def too_near(found: FoundSources, rows: MarginalRows, options: SourceSearchOptions) -> bool:
-    """Return whether the last source found lies where a sensor was."""
-    away, _ = cKDTree(rows.points).query(found.shapes[-1].position)
-    return bool(away < 0.5 * options.nearest)
+    """Return whether a source lies where a sensor was."""
+    return bool((away(found, rows) < 0.5 * options.nearest).any())
+
+
+def away(found: FoundSources, rows: MarginalRows) -> FloatArray:
+    """Return the distance of the nearest reading to each source, metres, shape (K,)."""
+    places = np.array([each.position for each in found.shapes]).reshape(-1, 3)
+    return np.asarray(cKDTree(rows.points).query(places)[0])

@@ -47,6 +47,7 @@ class ChangesStudyOptions(ValidationStudyOptions):
     """Of steel outside of the area: over its border, from and to in metres."""
 
 
+FLOOR_M, AROUND_M = 0.1, 1.0  # between points of the floor; beyond the area
 # Of the loads on timber, those that stand there when the hall is surveyed.
 STANDING = (1, 2, 4)
 # What happens to loads before each path: comes, goes, is moved outside, comes outside.
@@ -104,8 +105,8 @@ def loaded_hall(options: ChangesStudyOptions, number: int) -> LoadedHall:
     stood = Loads(inside.positions[standing], inside.moments[standing]).steel(options)
     hall = replace(bare, world=joined(bare.world, stood))
     read = survey(hall, seed, options.heights, options.noise, options.survey_readings)
-    seen = hall_cloud(bare, CloudVariant.ACCURATE, seed)
-    cloud = np.concatenate([seen, *(surface(options, at) for at in inside.positions[standing])])
+    seen = hall_cloud(bare, CloudVariant.ACCURATE, seed), floor_cloud(bare)
+    cloud = np.concatenate([*seen, *(surface(options, at) for at in inside.positions[standing])])
     learnt = build_map(read.points, read.field, options.map, cloud)
     span = min(options.heights), max(options.heights)
     return LoadedHall(
@@ -130,6 +131,17 @@ def five_changes(
     m = loads.moments
     moments = [m[comes], -m[goes], -m[moves], m[moves], *drawn(options, 1, rng)]
     return Loads(np.concatenate([loads.positions[[comes, goes, moves]], out]), np.array(moments))
+
+
+def floor_cloud(hall: SteelHall) -> FloatArray:
+    """Return what a LiDAR sees of the floor of the area and around, metres, shape (P, 3).
+
+    Without it a map takes the lowest that it knows of for floor: a load half a metre high beside
+    readings at 0.4 m, which is then no structure.
+    """
+    x, y = (np.arange(-half, half + FLOOR_M / 2, FLOOR_M) for half in HALF_AREA + AROUND_M)
+    xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    return np.column_stack([xy, hall.floor.height(xy)])
 
 
 def surface(options: ChangesStudyOptions, position: FloatArray) -> FloatArray:
