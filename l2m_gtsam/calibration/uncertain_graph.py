@@ -17,7 +17,8 @@ from l2m_factors import (
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import spread_of_H
-from l2m_gtsam.calibration.budget.processes import ReadingPlaces, processes
+from l2m_gtsam.calibration.budget.looked_for import processes
+from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.calibration.budget.search import Searched, felt, search
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
