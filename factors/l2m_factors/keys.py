@@ -51,6 +51,11 @@ def W(sensor: int) -> int:
     return int(gtsam.symbol("W", sensor))
 
 
+def K(sensor: int) -> int:
+    """Return the key of how this sensor's clock drifts on a drive: Vector, unit variance each."""
+    return int(gtsam.symbol("K", sensor))
+
+
 def B() -> int:
     """Return the key of how the field differs from the map's in time: Vector, unit variance."""
     return int(gtsam.symbol("B", 0))

@@ -36,15 +36,10 @@ and the ratio is a mean of :math:`\rho \nu` squares. Errors of an estimate go th
 squared distance in n dimensions, over n times the ratio, is about Fisher's with nu and
 :math:`\rho \nu` degrees of freedom (Box, Annals of Mathematical Statistics 25, 1954).
 
-An offset that wanders is none that more parts know better: H of any moment of the drive is as far
-from its mean as parts are. With w_b what a unit of H in a part adds to H of the whole, parts whose
-H scatters by s sigmas add :math:`s^2 \sum_b w_b P w_b^T` to what is found. That s counts beside
-the variance of the mean.
-
 An error that is the same in all parts, as a shift of the whole map, is not seen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -104,28 +99,6 @@ class Excess:
 
 
 @dataclass(frozen=True)
-class ByParts:
-    """A sensor by the check alone: no process is in its graph, whatever the drive has.
-
-    Attributes
-    ----------
-    sensor
-        Index of the sensor.
-    vector
-        (t, C row by row, H) in m and uT, shape (15,).
-    covariance
-        Of noise, map and stated errors, shape (15, 15).
-    scatters
-        How its parameters scatter over parts of the drive: by time and by place, of two sizes.
-    """
-
-    sensor: int
-    vector: FloatArray
-    covariance: FloatArray
-    scatters: "tuple[Scatter, ...]"
-
-
-@dataclass(frozen=True)
 class VarianceRatio:
     """A variance found over that expected.
 
@@ -140,12 +113,15 @@ class VarianceRatio:
         How many squares the scatter has in each direction, B - 1.
     directions
         How many directions differ by the scatter itself, whatever the errors are.
+    shown
+        Which share of the variance by errors as modelled the scatter is expected to show.
     """
 
     value: float
     freedom: float
     parts: int
     directions: float
+    shown: float
 
     def beyond_chance(self, false_alarms: float) -> float:
         """Return the ratio, one where chance explains the excess."""
@@ -153,7 +129,7 @@ class VarianceRatio:
         return self.value if self.value > limit else 1.0
 
 
-UNKNOWN = VarianceRatio(1.0, np.inf, 1, np.inf)
+UNKNOWN = VarianceRatio(1.0, np.inf, 1, np.inf, 1.0)
 
 
 @dataclass(frozen=True)
@@ -166,9 +142,6 @@ class Scatter:
         Variances of estimates over those expected.
     whole
         The same of t, C and H together.
-    spread_of_H
-        Mean square of H in a part about H of the whole, beyond that expected, over the variance of
-        H as the model has it; not below zero.
     """
 
     t: VarianceRatio
@@ -176,7 +149,6 @@ class Scatter:
     H: VarianceRatio
     offset: VarianceRatio
     whole: VarianceRatio
-    spread_of_H: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -189,13 +161,10 @@ class Scores:
         Shape (B, 16).
     expected
         Their covariances if all errors are as modelled, shape (B, 16, 16).
-    share
-        What a unit of each parameter in one part adds to all of the whole, shape (B, 16, 16).
     """
 
     found: FloatArray
     expected: FloatArray
-    share: FloatArray
 
     def ratio(self, covariance: FloatArray, block: slice) -> VarianceRatio:
         """Return the variance found over that expected.
@@ -217,22 +186,8 @@ class Scores:
             return UNKNOWN
         squares, freedom = len(scores) - 1, 2 * expected**2 / spread
         directions = min(directions_of(scores), freedom / squares)
-        return VarianceRatio(found / expected, freedom, squares, directions)
-
-    def spread(self, covariance: FloatArray, block: slice) -> float:
-        """Return the mean square of parameters in parts beyond that expected, over their variance.
-
-        Parameters
-        ----------
-        covariance, block
-            As in ``ratio``.
-        """
-        white = whitening_of(covariance[block, block])
-        scores = self.found[:, block] @ white.T
-        expected = float(np.einsum("ij,bjk,ik->", white, self.expected[:, block, block], white))
-        share = np.linalg.solve(white.T, (white @ self.share[:, block, block]).transpose(0, 2, 1))
-        beyond = float((scores**2).sum()) - expected
-        return max(beyond, 0.0) / max(float((share**2).sum()), TINY)
+        shown = expected / len(white)
+        return VarianceRatio(found / expected, freedom, squares, directions, shown)
 
 
 def whitening_of(covariance: FloatArray) -> FloatArray:
@@ -267,20 +222,33 @@ def scatters(
     covariance
         Of all n variables.
     """
-    used = np.unique(np.concatenate([each.readings for each in rows])) if rows else np.empty(0)
-    if len(used) < 2**HALVINGS:
-        return ()
     P, found = covariance.among(own), []
-    labels = np.full(len(readings), -1)
-    for axes in (readings.stamp_ns[used, None].astype(np.float64), readings.p_map_lidar[used]):
-        labels[used] = halved(axes, HALVINGS)
+    for labels in divisions(readings, rows):
         white = gathered(rows, labels, own, covariance)
         for merged in (white, white.paired()):
-            scores = merged.scores(own, covariance)
+            scores = merged.scores(covariance)
             ratios = {name: scores.ratio(P, block) for name, block in BLOCKS.items()}
-            whole, spread = scores.ratio(P, WHOLE), scores.spread(P, BLOCKS["H"])
-            found.append(Scatter(**ratios, whole=whole, spread_of_H=spread))
+            found.append(Scatter(**ratios, whole=scores.ratio(P, WHOLE)))
     return tuple(found)
+
+
+def divisions(readings: Readings, rows: Sequence[Rows]) -> Iterator[IntArray]:
+    """Return the part of each reading, shape (N,), by time and then by place; none of few readings.
+
+    Parameters
+    ----------
+    readings
+        All N that took part.
+    rows
+        Of those that are divided; the others are in no part, -1.
+    """
+    used = np.unique(np.concatenate([NONE, *(each.readings for each in rows)]))
+    if len(used) < 2**HALVINGS:
+        return
+    for axes in (readings.stamp_ns[used, None].astype(np.float64), readings.p_map_lidar[used]):
+        labels = np.full(len(readings), -1)
+        labels[used] = halved(axes, HALVINGS)
+        yield labels
 
 
 def unmodelled(
@@ -363,15 +331,14 @@ class Gathered:
         sums = (each[::2] + each[1::2] for each in (self.found, self.brought, self.crossed))
         return Gathered(*sums)
 
-    def scores(self, own: IntArray, covariance: HalfCovariance) -> Scores:
-        """Return scores of sixteen parameters among all, and what is expected of them."""
+    def scores(self, covariance: HalfCovariance) -> Scores:
+        """Return scores of sixteen parameters among all variables, and what is expected of them."""
         expected = self.brought.copy()
         for at, crossed in zip(expected, self.crossed, strict=True):
             # Of thousands of variables a part touches hundreds.
             touched = np.flatnonzero(crossed.any(axis=1))
             at -= covariance.across(touched, crossed[touched])
-        share = self.crossed[:, own].transpose(0, 2, 1)
-        return Scores(self.found, expected, share)
+        return Scores(self.found, expected)
 
 
 def gathered(

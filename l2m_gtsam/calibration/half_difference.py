@@ -62,16 +62,28 @@ class WhiteGroup:
     rows: Rows
     whitening: FloatArray
 
-    def split(self, sign: FloatArray, own: IntArray) -> FloatArray:
-        """Return Z of this sensor, shape (3 n, 15), for the sign of each reading's half, (n,)."""
+    def following(self, values: FloatArray, own: IntArray) -> FloatArray:
+        """Return what parameters do that follow functions of the readings, shape (3 n, J k).
+
+        Parameters
+        ----------
+        values
+            J functions at the readings, shape (n, J).
+        own
+            Where k parameters stand among all variables, shape (k,).
+        """
         order = np.argsort(self.rows.columns)
         at = order[np.searchsorted(self.rows.columns, own, sorter=order)]
-        J, each = self.rows.jacobian[:, at], np.repeat(0.5 * sign, 3)[:, None]
+        J, each = self.rows.jacobian[:, at], np.repeat(values, 3, axis=0)[:, :, None]
         if self.whitening.ndim == 3:
-            return np.asarray(each * J)
-        # A white row holds what its reading adds to those before it, of either half.
+            return np.asarray((each * J[:, None]).reshape(len(J), -1))
+        # A white row holds what its reading adds to those before it, of other values.
         raw = solve_triangular(self.whitening, J, lower=True)
-        return np.asarray(self.whitening @ (each * raw))
+        return np.asarray(self.whitening @ (each * raw[:, None]).reshape(len(J), -1))
+
+    def split(self, sign: FloatArray, own: IntArray) -> FloatArray:
+        """Return Z of this sensor, shape (3 n, 15), for the sign of each reading's half, (n,)."""
+        return self.following(0.5 * sign[:, None], own)
 
 
 def second_half(readings: Readings) -> BoolArray:

@@ -24,7 +24,6 @@ from l2m_gtsam.calibration.alternation import (
     start_estimate,
 )
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
-from l2m_gtsam.calibration.cluster_robust import ByParts
 from l2m_gtsam.calibration.coverage import NothingShared, UncertainMap
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import (
@@ -36,10 +35,16 @@ from l2m_gtsam.calibration.joint import (
     sensor_solutions,
 )
 from l2m_gtsam.calibration.optimise import Ending
+from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.calibration.pose_durations import duration_of_poses
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.trust import NOTHING, Trusted, plausible, trusted
-from l2m_gtsam.calibration.uncertain import UncertainSolution, solve_uncertain, step_uncertain
+from l2m_gtsam.calibration.uncertain import (
+    UncertainSolution,
+    check_by_parts,
+    solve_uncertain,
+    step_uncertain,
+)
 from l2m_gtsam.calibration.view import (
     REOBSERVE_M,
     QueryableMap,
@@ -99,7 +104,7 @@ class OneKeySolution:
     pose_duration
         How long errors of poses last; none where these are taken for exact, or no map was asked.
     by_parts
-        The sensors by the scatter of parts of the drive alone, where shared errors are counted.
+        The sensors by the scatter of parts of the drive alone, where that is asked for.
     """
 
     readings: Readings
@@ -179,6 +184,25 @@ def solve_part(
     """
     finish = Finish(sensor_solutions, partial(step_uncertain, budget=budget))
     return _solved(readings, field_map, t_start, options, silent, None, NO_PRIORS, finish)
+
+
+def solve_by_parts(
+    readings: Readings, field_map: QueryableMap, t_start: FloatArray, options: OneKeyOptions
+) -> tuple[ByParts, ...]:
+    """Return what the scatter of parts of a drive says of sensors, without looking for processes.
+
+    Nothing where the map does not know its errors.
+
+    Parameters
+    ----------
+    readings, field_map, options
+        As of ``solve_one_key``.
+    t_start
+        Where sensors were found, metres, shape (S, 3).
+    """
+    finish = Finish(sensor_solutions, check_by_parts)
+    found = _solved(readings, field_map, t_start, options, silent, None, NO_PRIORS, finish)
+    return found.by_parts
 
 
 class SharedFinish(Protocol):

@@ -22,12 +22,12 @@ from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND, Budget
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched
-from l2m_gtsam.calibration.cluster_robust import ByParts
 from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
 from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver
+from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.calibration.stated_sizes import leave_noise
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import ROUND_SIGMAS, THERE_SIGMAS, UncertainProblem
@@ -60,7 +60,7 @@ class UncertainSolution:
     stated
         How large errors are whose sigmas were stated.
     by_parts
-        The sensors by the scatter of parts of the drive alone, without the processes.
+        The sensors by the scatter of parts of the drive alone, where that is asked for.
     """
 
     estimate: Estimate
@@ -106,11 +106,7 @@ def solve_uncertain(
     # What a map leaves that does not know its own errors is no process of the drive.
     searched = found.ending is not Ending.SINGULAR and sigmas_hold(errors)
     searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
-    shown, scattered = side_by_side(
-        lambda: found.problem.searched(found.joint) if searched else NOTHING_SEARCHED,
-        lambda: found.problem.scattered(found.joint),
-    )
-    by_parts = found.problem.by_parts(found.joint, found.estimate, scattered)
+    shown = found.problem.searched(found.joint) if searched else NOTHING_SEARCHED
     if shown.found:
         moved = float(np.abs(found.estimate.t - near.t)[view.sensors].max())
         start = start_with(found, shown, field_map, errors, options, again=moved > REOBSERVE_M)
@@ -122,14 +118,38 @@ def solve_uncertain(
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
             start.values,
         )
-        scattered = found.problem.scattered(found.joint)
     problem, joint = found.problem, found.joint
     solved = problem.by_cause(joint, problem.solutions(joint, found.values))
-    solved = problem.wandering(joint, found.values, problem.robust(joint, solved, scattered))
-    solved = problem.halved(joint, solved)
+    scattered, halved = side_by_side(
+        lambda: problem.scattered(joint), lambda: problem.halved(joint, solved)
+    )
+    solved = problem.wandering(joint, found.values, problem.robust(joint, halved, scattered))
     progress(1.0)
     return UncertainSolution(
-        found.estimate, solved, found.ending, found.settled, found.drive.budget, stated, by_parts
+        found.estimate, solved, found.ending, found.settled, found.drive.budget, stated
+    )
+
+
+def check_by_parts(
+    view: View,
+    field_map: QueryableMap,
+    errors: UncertainMap,
+    near: Estimate,
+    tests: Mapping[int, Determinacy],
+    options: OneKeyOptions,
+) -> UncertainSolution:
+    """Return solutions without any process, with what the scatter of parts of the drive says.
+
+    Parameters are those of ``solve_uncertain``.
+    """
+    drive = UncertainDrive.of(view, field_map, errors, near, options)
+    found = settle_by_any(drive, near, tests, options, lambda _: None)
+    return UncertainSolution(
+        found.estimate,
+        found.problem.solutions(found.joint, found.values),
+        found.ending,
+        found.settled,
+        by_parts=found.problem.by_parts(found.joint, found.estimate),
     )
 
 

@@ -17,9 +17,10 @@ from l2m_factors import (
 )
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.budget.found import spread_of_H
-from l2m_gtsam.calibration.budget.processes import ReadingPlaces, processes
+from l2m_gtsam.calibration.budget.looked_for import processes
+from l2m_gtsam.calibration.budget.processes import ReadingPlaces
 from l2m_gtsam.calibration.budget.search import Searched, felt, search
-from l2m_gtsam.calibration.cluster_robust import ByParts, Scatter, scatters, unmodelled
+from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.factor_graph import Estimate, FactorForm, batch_readings, prior_graph
 from l2m_gtsam.calibration.group_noise import group_noise
 from l2m_gtsam.calibration.half_difference import (
@@ -48,6 +49,7 @@ from l2m_gtsam.calibration.optimise import (
     optimise,
     polish,
 )
+from l2m_gtsam.calibration.parts_alone import ByParts, by_parts
 from l2m_gtsam.calibration.priors import contradictions
 from l2m_gtsam.calibration.sensor_columns import SENSOR, columns_of, keys_of
 from l2m_gtsam.calibration.stated_sizes import (
@@ -299,17 +301,21 @@ class UncertainProblem:
             widened.append(each.widened(excess))
         return tuple(widened)
 
-    def by_parts(
-        self,
-        joint: JointInformation,
-        estimate: Estimate,
-        scattered: Mapping[int, tuple[Scatter, ...]],
-    ) -> tuple[ByParts, ...]:
+    def by_parts(self, joint: JointInformation, estimate: Estimate) -> tuple[ByParts, ...]:
         """Return what the scatter of parts of the drive says of each sensor of an estimate."""
-        return tuple(
-            ByParts(s, estimate.vector(s), joint.among((s,))[:-1, :-1], found)
-            for s, found in scattered.items()
-        )
+        groups, found = self._white_groups(joint), []
+        for s in self._view.sensors:
+            own = [each for each in groups if each.rows.sensor == s]
+            at = columns_at(joint.columns, keys_of(s))
+            vector = estimate.vector(s)
+            found.append(by_parts(s, vector, self._view.readings, own, at, joint.every))
+        return tuple(found)
+
+    def _white_groups(self, joint: JointInformation) -> list[WhiteGroup]:
+        """Return the white rows of all readings at the optimum."""
+        rows = [joint.after_step(each) for each in joint.rows if len(each.readings)]
+        pairs = zip(rows, self._noise.whitenings, strict=True)
+        return [WhiteGroup(each, whitening) for each, whitening in pairs]
 
     def _own_rows(self, joint: JointInformation, sensor: int) -> list[Rows]:
         """Return the white rows of a sensor's readings at the optimum."""
@@ -320,9 +326,7 @@ class UncertainProblem:
         self, joint: JointInformation, solved: Sequence[SensorSolution]
     ) -> tuple[SensorSolution, ...]:
         """Return solutions with what the halves of the drive differ by."""
-        rows = [joint.after_step(each) for each in joint.rows if len(each.readings)]
-        pairs = zip(rows, self._noise.whitenings, strict=True)
-        groups = [WhiteGroup(each, whitening) for each, whitening in pairs]
+        groups = self._white_groups(joint)
         later = second_half(self._view.readings)
         halved = {
             s: HalvedSensor(columns_at(joint.columns, keys_of(s))[:JUDGED], self._taken(joint, s))

@@ -30,6 +30,7 @@ BY_SYMBOL = {
     "W": ErrorCause.WANDER,
     "B": ErrorCause.FIELD,
     "F": ErrorCause.WARP,
+    "K": ErrorCause.CLOCK,
 }
 LEAST = 1e-3  # of a variance: less is not listed
 Parts = dict[ErrorCause, FloatArray]

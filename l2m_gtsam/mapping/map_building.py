@@ -10,7 +10,7 @@ from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.mapping.shifts import suite_errors, survey_poses
-from l2m_gtsam.mapping.suite_calibration import suite_doubts
+from l2m_gtsam.mapping.suite_calibration import steady_survey, suite_doubts
 from l2m_gtsam.maps.build import KINDS, build_map
 from l2m_gtsam.maps.compare import MapComparison, compare_maps
 from l2m_gtsam.maps.field_map import FieldMap
@@ -83,8 +83,12 @@ def map_recordings(
     SyncError
         Readings and poses of a recording do not overlap.
     """
+    steady = steady_survey(recordings, suite, options.suite)
+    recordings = steady.recordings
     read = suite_readings(recordings, suite, options.sync, options.pose_noise)
     field_map = build_map(read.points, read.field, options.model, cloud, read.suite, read.poses)
+    if isinstance(field_map, HarmonicMap):
+        field_map = field_map.doubted(steady.doubts)
     # Errors that are stated or found are counted; sensors that count as exact have to look like it.
     if isinstance(field_map, HarmonicMap) and field_map.learnt.suite is None:
         return field_map.doubted(suite_doubts(recordings, suite, options.suite))
@@ -114,7 +118,8 @@ def update_map(
     MapError, SyncError
         As in ``map_recordings``.
     """
-    read = suite_readings(recordings, suite, options.sync, options.pose_noise)
+    steady = steady_survey(recordings, suite, options.suite)
+    read = suite_readings(steady.recordings, suite, options.sync, options.pose_noise)
     if isinstance(field_map, HarmonicMap):
         return field_map.updated(read.points, read.field, read.suite, read.poses)
     return field_map.updated(read.points, read.field)

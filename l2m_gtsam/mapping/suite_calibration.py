@@ -9,6 +9,7 @@ import numpy as np
 from l2m_gtsam.data import Distortion, FloatArray, KnownSensor, Readings, Recording, SyncCounts
 from l2m_gtsam.errors import CalibrationError, L2MError, MapError
 from l2m_gtsam.geometry import polar_rotation
+from l2m_gtsam.mapping.clock_drifts import clock_drifts, steadied
 from l2m_gtsam.mapping.options import SuiteCalibrationOptions
 from l2m_gtsam.mapping.suite_likelihood import SIZE, TAU
 from l2m_gtsam.mapping.suite_poses import with_pose_errors
@@ -38,12 +39,21 @@ NOTICED = 0.1  # share of the residuals' squares; sensors as assumed explain 16 
 UNDETERMINED = 0.5  # share of the prior sigma above which the drive does not determine a parameter
 FURTHEST = 6.0  # prior sigmas of a position; beyond, a rough field was taken for a sensor's
 TOGETHER = 1.5  # variance of a direction in sigmas; errors that are independent have one
+FEW = {"windows": 4, "readings": 600, "modes": 200}  # enough to judge sensors and clocks by
 PARAMETERS = (
     *("t_lidar_mag x", "t_lidar_mag y", "t_lidar_mag z"),
     *(f"C[{i},{j}]" for i in range(3) for j in range(3)),
     *("H x", "H y", "H z"),
     "time offset",
 )
+
+
+@dataclass(frozen=True)
+class SteadySurvey:
+    """Drives of a survey whose stamps do not drift, and a sentence for each clock that did."""
+
+    recordings: Sequence[Recording]
+    doubts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -101,6 +111,11 @@ def calibrate_suite(
     drive = suite_drive(recordings, assumed, options)
     solution = solve_suite(drive.at, drive.assumed, options, progress)
     _check_ending(drive, solution, options)
+    steady = with_steady_clocks(recordings, drive, solution.last.sensors, options)
+    if steady.doubts:
+        drive = suite_drive(steady.recordings, assumed, options)
+        solution = solve_suite(drive.at, drive.assumed, options, progress)
+        _check_ending(drive, solution, options)
     posed = with_pose_errors(
         solution.last,
         drive.recording.trajectory,
@@ -108,9 +123,58 @@ def calibrate_suite(
         prior_information(len(drive.assumed), options),
     )
     found = _result(drive, replace(solution, last=posed.round), options)
+    found = replace(found, doubts=(*found.doubts, *steady.doubts))
     if posed.found is None:
         return found
     return replace(found, doubts=(*found.doubts, posed.found.doubt))
+
+
+@one_blas_thread()
+def steady_survey(
+    recordings: Sequence[Recording],
+    known: Mapping[str, KnownSensor] | None,
+    options: SuiteCalibrationOptions,
+) -> SteadySurvey:
+    """Return drives of calibrated sensors without what their clocks drift by.
+
+    Parameters
+    ----------
+    recordings
+        Drives with poses in one map frame.
+    known, options
+        As in ``suite_doubts``.
+    """
+    few = options.model_copy(update=FEW)
+    try:
+        drive = suite_drive(recordings, known, few)
+        return with_steady_clocks(recordings, drive, drive.assumed, few)
+    except L2MError:  # a survey too small to judge its clocks by
+        return SteadySurvey(recordings)
+
+
+def with_steady_clocks(
+    recordings: Sequence[Recording],
+    drive: SuiteDrive,
+    sensors: FloatArray,
+    options: SuiteCalibrationOptions,
+) -> SteadySurvey:
+    """Return recordings, that a drive joins, without what clocks drift by; sensors are (S, 16)."""
+    parts, readings = drive.recording.parts, drive.at(sensors[:, -1])
+    starts = [
+        part.trajectory.stamp_ns[0] + by - 1
+        for part, by in zip(parts, drive.recording.moved_ns or (0,), strict=True)
+    ]
+    of = np.maximum(np.searchsorted(starts, readings.stamp_ns) - 1, 0)
+    found = clock_drifts(readings, of, sensors, options).found
+    rates = {
+        name: rate for name, rate in zip(readings.sensors, found.tolist(), strict=True) if rate
+    }
+    doubts = tuple(
+        f"the clock of {name} drifts against that of the poses, by {1e5 * rate:.0f} ms in 100 s; "
+        "its stamps were corrected by that. Stamp readings and poses by one clock"
+        for name, rate in rates.items()
+    )
+    return SteadySurvey([steadied(each, rates) for each in recordings], doubts)
 
 
 @one_blas_thread()
@@ -132,7 +196,7 @@ def suite_doubts(
     options
         Of the calibration; fewer windows, readings and modes are enough here.
     """
-    few = options.model_copy(update={"windows": 4, "readings": 600, "modes": 200})
+    few = options.model_copy(update=FEW)
     try:
         drive = suite_drive(recordings, assumed, few)
         step = first_step(drive.at, drive.assumed, few)

@@ -204,6 +204,28 @@ def window_slopes(window: SuiteWindow, sensors: FloatArray, prior: Hyperparamete
     return WindowSlopes(basis, prior.noise, undone, points, found, D, r, gradient, places, J)
 
 
+def late_slopes(
+    window: SuiteWindow, at: WindowSlopes, late: FloatArray, sensors: int
+) -> FloatArray:
+    """Return derivatives of residuals by how fast the clocks of sensors grow late, (N, 3, S).
+
+    Parameters
+    ----------
+    window, at
+        A window of S sensors, and its slopes.
+    late
+        Seconds by which a unit of that makes each reading late, shape (N,).
+    sensors
+        S.
+    """
+    readings = window.readings
+    own = np.where(readings.sensor[:, None] == np.arange(sensors), late[:, None], 0.0)[:, None]
+    places = _place_slopes(readings, at.undone)[:, :, TAU, None] * own
+    places -= places.mean(axis=0)
+    fields = _field_slopes(readings, at.undone)[:, :, TAU, None] * own
+    return np.asarray(fields - at.gradient @ places)
+
+
 def _volume_change(readings: Readings, sensors: FloatArray) -> tuple[FloatArray, float]:
     """Return the sum of all ``log |det C|`` by the sensors' parameters, (16 S,), and itself."""
     slope, count = np.zeros(sensors.shape), np.bincount(readings.sensor, minlength=len(sensors))

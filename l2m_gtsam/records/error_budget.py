@@ -25,6 +25,8 @@ class ErrorCause(StrEnum):
     """A field that is not the map's for a time."""
     WARP = "warp"
     """A frame that is bent against the map's."""
+    CLOCK = "clock"
+    """A clock that drifts against that of the poses."""
     CURRENTS = "currents"
     """What recorded numbers add to the readings."""
     PRIORS = "priors"
@@ -63,6 +65,8 @@ class DisturbanceKind(StrEnum):
     """The field is not the map's for a time, for all sensors alike."""
     WARP = "warp"
     """The drive's frame is bent against the map's."""
+    CLOCK = "clock"
+    """The time offset of a sensor is not constant."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ class Disturbance:
         ``walk_ut`` (from the start to the end of a drive) of H or of a field; of poses in the
         lidar's frame ``tilt_deg`` and ``floor_m`` (along x and y), ``heading_deg`` and
         ``height_m`` (along z); how long an error lasts, ``lasting_s``; ``shift_m``, of the
-        floor's axes.
+        floor's axes; ``drift_s``, of a clock from the start to the end of a drive.
     gain
         Twice the logarithm by which the drive is more likely with it.
     sensor

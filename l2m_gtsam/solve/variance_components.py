@@ -238,6 +238,7 @@ def shared_components(
     spectra: Sequence[FloatArray],
     squares: float | None,
     climb: Climb = SHORT,
+    near: FloatArray | None = None,
 ) -> VarianceComponents:
     """Return the most likely sizes of K processes that several systems have, each with own weights.
 
@@ -252,14 +253,21 @@ def shared_components(
     squares
         As in ``WeightSystem.components_and_noise``; where absent, the noise is known.
     climb
-        How far, in each of ``ROUNDS`` rounds.
+        How far, in the last of ``ROUNDS`` rounds; those before it settle the noise.
+    near
+        Sizes to begin with, shape (K,); those of a process alone, if they are known.
     """
     felt = sum(d @ np.diag(each.information) for each, d in zip(systems, spectra, strict=True))
     count = sum(np.count_nonzero(d, axis=1) for d in spectra)
     unit = np.log(np.maximum(count, 1) / np.where(felt > 0, felt, 1.0))
     bounds = Bounds(unit + np.log(NEGLIGIBLE), unit + np.log(LARGEST))
     start, noise = unit, 1.0
-    for _ in range(ROUNDS):
+    if near is not None:
+        # From zero no climb over logarithms comes back.
+        known = np.log(np.where(near > 0, near, np.exp(unit)))
+        start = np.clip(known, bounds.lb, bounds.ub)
+    for round_ in range(ROUNDS):
+        now = climb if squares is None or round_ == ROUNDS - 1 else SHORT
         white = [each.whiter(noise) for each in systems]
         end = minimize(
             partial(_cost, white, spectra),
@@ -267,7 +275,7 @@ def shared_components(
             jac=True,
             method="L-BFGS-B",
             bounds=bounds,
-            options={"maxiter": climb.steps, "ftol": climb.tolerance},
+            options={"maxiter": now.steps, "ftol": now.tolerance},
         )
         start = end.x
         sizes = np.where(start > unit + np.log(2 * NEGLIGIBLE), np.exp(start), 0.0)

@@ -1,10 +1,13 @@
 """Drives with troubles in one small hall, calibrated once for all tests."""
 
+from dataclasses import replace
 from functools import cache
+
+import numpy as np
 
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.data import KnownSensor
+from l2m_gtsam.data import KnownSensor, Recording
 from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
@@ -26,6 +29,25 @@ def hall(trouble: Trouble) -> TroubledPlace:
 def drive(trouble: Trouble) -> tuple[Calibrated, tuple[KnownSensor, ...], Verdict]:
     place = hall(Trouble.SUITE if trouble.wrong_suite else Trouble.CLEAN)
     recording, truth = troubled_drive(OPTIONS, place, trouble, DRIVE)
+    found, verdict = judged(place, recording)
+    return found, truth, verdict
+
+
+@cache
+def drifting_clock(seconds: float) -> tuple[Calibrated, tuple[KnownSensor, ...], Verdict]:
+    """Return the clean drive where the first sensor's clock drifts by so much, steadily."""
+    place = hall(Trouble.CLEAN)
+    recording, truth = troubled_drive(OPTIONS, place, Trouble.CLEAN, DRIVE)
+    first, *others = recording.series
+    u = (first.stamp_ns - first.stamp_ns[0]) / np.ptp(first.stamp_ns) - 0.5
+    late = first.stamp_ns + np.round(1e9 * seconds * u).astype(np.int64)
+    series = (replace(first, stamp_ns=late), *others)
+    found, verdict = judged(place, replace(recording, series=series))
+    return found, truth, verdict
+
+
+def judged(place: TroubledPlace, recording: Recording) -> tuple[Calibrated, Verdict]:
+    """Return the calibration of a drive, and the verdict on it."""
     found = calibrated(recording, place.field_map, CalibrationOptions())
     metrics = evaluate(recording, found, CalibrationOptions(), QaOptions())
-    return found, truth, judge(found.result, metrics, QaOptions())
+    return found, judge(found.result, metrics, QaOptions())

@@ -1,4 +1,4 @@
-"""The processes of a drive as variables of the last graph: ``W(i)``, ``B()`` and ``F()``.
+"""The processes of a drive as variables of the last graph: ``W(i)``, ``K(i)``, ``B()`` and ``F()``.
 
 Weights have unit variance there. Errors of poses become those of ``pose_errors``, which know how
 they go on between the knots, as if they had been stated.
@@ -11,7 +11,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from l2m_factors import B, F, SharedError, W
+from l2m_factors import B, F, K, SharedError, W
 from l2m_gtsam.calibration.budget.processes import (
     LASTING_S,
     POSE_PARTS,
@@ -111,7 +111,7 @@ def spread_of_H(found: FoundProcess, weights: FloatArray, covariance: FloatArray
 def _key(found: FoundProcess) -> int:
     sensor = found.process.sensor
     if sensor is not None:
-        return W(sensor)
+        return K(sensor) if found.process.kind is DisturbanceKind.CLOCK else W(sensor)
     return B() if found.process.kind is DisturbanceKind.FIELD else F()
 
 

@@ -9,7 +9,6 @@ the spectrum of a field that is smooth over a length (Solin and Sarkka, Statisti
 2020).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -24,10 +23,6 @@ from l2m_gtsam.records.error_budget import DisturbanceKind
 from l2m_gtsam.solve.linear_algebra import right_divided
 
 WANDER_MODES = 24  # slower ones hold all but 2 % of a walk; faster ones of 1/f noise are noise
-# Of each of six errors of poses, and of fields: what lasts a second is half a wave of 1.75 s and
-# more. With fewer modes than that, errors of poses look like fields.
-FINEST_S = 1.75
-FAST_MODES = (48, 96)  # at least and at most: a thousand weights take seconds
 LASTING_S = (1.0, 2.0, 4.0, 8.0)  # how long errors of poses may last
 POSE_PARTS = {  # of rotation and translation along the axes of the lidar
     "tilt": (1, 1, 0, 0, 0, 0),
@@ -350,16 +345,3 @@ class Warp:
     def named(self, form: int, sizes: FloatArray) -> dict[str, float]:
         """Return the shift of both lengths together."""
         return {"shift_m": float(np.sqrt(sizes.sum()))}
-
-
-def processes(places: ReadingPlaces, sensors: Sequence[int]) -> tuple[Process, ...]:
-    """Return all that is looked for; errors of poses only where none are stated."""
-    slow = TimeModes.over(places.readings, WANDER_MODES)
-    found: list[Process] = [Wander(places, sensor, slow) for sensor in sensors]
-    count = int(np.clip(np.ceil(slow.duration.max() / FINEST_S), *FAST_MODES))
-    fast = TimeModes.over(places.readings, count)
-    if len(sensors) > 1:  # of one sensor's wander it cannot be told
-        found.append(FieldProcess(places, fast))
-    if places.readings.pose_root is None:
-        found.append(PoseProcess(places, fast))
-    return (*found, Warp.of(places))

@@ -260,7 +260,8 @@ def _together(known: Felt, taken: dict[int, FoundProcess]) -> Searched:
     at = np.flatnonzero(every.any(axis=0))
     every = every[:, at]
     system = known.system.among(at)
-    fit = shared_components([system], [every], known.squares, TO_THE_TOP)
+    alone = np.concatenate([found.sizes for found in taken.values()])
+    fit = shared_components([system], [every], known.squares, TO_THE_TOP, alone)
     system = system.whiter(fit.noise)
     kept = []
     for k, each in taken.items():

@@ -20,6 +20,7 @@ NAMES = {
     ErrorCause.WANDER: "wander of H",
     ErrorCause.FIELD: "a field that changed",
     ErrorCause.WARP: "a bent frame",
+    ErrorCause.CLOCK: "a clock that drifts",
     ErrorCause.CURRENTS: "recorded numbers",
     ErrorCause.PRIORS: "priors",
     ErrorCause.UNMODELLED: "not modelled",
@@ -32,6 +33,7 @@ REMEDIES = {
     ErrorCause.WANDER: "a sensor that is warm, away from currents",
     ErrorCause.FIELD: "a new survey, or a drive while nothing near by changes",
     ErrorCause.WARP: "poses on the same point cloud for survey and drive",
+    ErrorCause.CLOCK: "one clock for readings and poses",
     ErrorCause.CURRENTS: "a drive on which the recorded numbers change more",
     ErrorCause.PRIORS: "a drive that determines what now comes from priors",
     ErrorCause.UNMODELLED: "stated errors of poses and of the survey's sensors",
@@ -93,6 +95,7 @@ PARTS = {
     "floor_m": (1e3, "{:.1f} mm on the floor"),
     "height_m": (1e3, "{:.1f} mm of height"),
     "shift_m": (1e3, "{:.1f} mm"),
+    "drift_s": (1e3, "{:.0f} ms from the start of the drive to its end"),
     "walk_ut": (1.0, "{:.2g} µT from the start of the drive to its end"),
     "noise_ut": (1.0, "{:.2g} µT for a time"),
 }
@@ -103,6 +106,7 @@ CAUSES = {
     DisturbanceKind.POSES: ErrorCause.POSES,
     DisturbanceKind.FIELD: ErrorCause.FIELD,
     DisturbanceKind.WARP: ErrorCause.WARP,
+    DisturbanceKind.CLOCK: ErrorCause.CLOCK,
 }
 MATTERS = 0.1  # of a variance: what has less of it adds 5 % to a sigma at most
 
@@ -158,6 +162,12 @@ def disturbance_sentence(found: Disturbance) -> str:
             return (
                 f"The frame of the drive is bent against the map's by about {size}. Sigmas hold "
                 "it; use poses on the same point cloud for survey and drive."
+            )
+        case DisturbanceKind.CLOCK:
+            return (
+                f"The clock of {found.sensor} drifts against that of the poses by about {size}. "
+                "Sigmas hold it, and the time offset is that of the middle of the drive; stamp "
+                "readings and poses by one clock."
             )
 
 

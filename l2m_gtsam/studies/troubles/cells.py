@@ -6,8 +6,9 @@ import numpy as np
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
 from l2m_gtsam.calibration.calibrate import calibrated
-from l2m_gtsam.calibration.cluster_robust import ByParts
+from l2m_gtsam.calibration.one_key import solve_by_parts
 from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.errors import L2MError
 from l2m_gtsam.qa.evaluate import evaluate
@@ -20,7 +21,6 @@ from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.surveys import TroubledPlace
 
-CHANCE = 0.05  # of a scatter: with less an offset is said to wander
 BLOCKS = {"t": slice(0, 3), "C": slice(3, 12), "H": slice(12, 15)}
 
 
@@ -35,8 +35,8 @@ class Checked:
     distance
         Squared distance from the truth in the covariance of noise and map.
     ratios
-        Variances found over those expected: of 16 and 8 parts by time, and as many by place; of H
-        with what it is apart in parts, where the scatter is no chance.
+        Variances by the scatter over those of noise and map: of 16 and 8 parts by time, and as many
+        by place.
     directions, freedom
         In how many directions errors differ, by the scatter itself, and how well each ratio is
         known.
@@ -122,7 +122,10 @@ def judged_drive(
         judged_sensor(each, known, verdict.level)
         for each, known in zip(found.result.sensors, truth, strict=True)
     ]
-    for each in found.solution.by_parts:
+    solution = found.solution
+    for each in solve_by_parts(
+        solution.readings, found.solver_map, solution.estimate.t, chosen.solve
+    ):
         judged[each.sensor] = with_check(judged[each.sensor], each, truth[each.sensor])
     return judged
 
@@ -152,17 +155,17 @@ def with_check(judged: JudgedSensor, alone: ByParts, truth: KnownSensor) -> Judg
     e, P = alone.vector - vector_of(truth), alone.covariance
     checked = []
     for name, at in BLOCKS.items():
-        found = [getattr(each, name) for each in alone.scatters]
+        ratios = alone.ratios[name]
         distance = float(e[at] @ np.linalg.solve(P[at, at], e[at]))
-        ratios, directions = tuple(r.value for r in found), tuple(r.directions for r in found)
-        if name == "H":  # the truth is H of one moment
-            apart = tuple(each.spread_of_H for each in alone.scatters)
-            ratios = tuple(
-                r.value + spread * (r.beyond_chance(CHANCE) > 1)
-                for r, spread in zip(found, apart, strict=True)
+        checked.append(
+            Checked(
+                name,
+                distance,
+                tuple(each.value for each in ratios),
+                tuple(each.directions for each in ratios),
+                tuple(each.freedom for each in ratios),
             )
-        freedom = tuple(r.parts * r.directions for r in found)
-        checked.append(Checked(name, distance, ratios, directions, freedom))
+        )
     return replace(judged, alone=tuple(checked))
 
 

@@ -1,26 +1,30 @@
 """Errors that last are found on a drive, sized, and held by the sigmas: one hall, one each."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from l2m_gtsam.calibration.calibrate import Calibrated
+from l2m_gtsam.data import KnownSensor
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.records.error_budget import Disturbance, DisturbanceKind
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.studies.troubles.options import Trouble
-from tests.drives.troubled import OPTIONS, drive, hall
+from tests.drives.troubled import OPTIONS, drifting_clock, drive, hall
 
 # Of 15 parameters of two sensors under one map; 1 of 1,000 each where sigmas are true.
 WITHIN = float(chi2.ppf(0.999, 15))
+DRIFT_S = 0.06  # from the start of a drive to its end
 
 
 def shown(trouble: Trouble, kind: DisturbanceKind) -> list[Disturbance]:
     return [each for each in drive(trouble)[0].result.disturbances if each.kind is kind]
 
 
-def distances(trouble: Trouble) -> list[float]:
+def distances(found: Calibrated, truth: Sequence[KnownSensor]) -> list[float]:
     """Return the squared distance of (t, C, H) of each sensor from the truth."""
-    found, truth, _ = drive(trouble)
     result = []
     for each, known in zip(found.result.sensors, truth, strict=True):
         e = each.t_lidar_mag - known.t_lidar_mag
@@ -44,8 +48,8 @@ def test_nothing_is_found_where_nothing_is() -> None:
     ],
 )
 def test_sigmas_hold_what_lasts_and_the_verdict_says_so(trouble: Trouble, words: str) -> None:
-    assert max(distances(trouble)) < WITHIN
-    verdict = drive(trouble)[2]
+    found, truth, verdict = drive(trouble)
+    assert max(distances(found, truth)) < WITHIN
     assert verdict.level is Level.WARN
     assert any(words in reason.text for reason in verdict.reasons)
     # Both halves have the process: that they differ by it is no second fault.
@@ -84,5 +88,17 @@ def test_a_suite_that_is_off_is_sized_by_its_survey() -> None:
     assert sigma[12] == pytest.approx(OPTIONS.suite_H_ut, rel=0.7)
     assert sigma[3] == pytest.approx(OPTIONS.suite_C, rel=0.5)
     assert any("by the survey itself" in each for each in wrong.learnt.origin.survey)
-    assert max(distances(Trouble.SUITE)) < WITHIN
-    assert drive(Trouble.SUITE)[2].level is Level.WARN
+    found, truth, verdict = drive(Trouble.SUITE)
+    assert max(distances(found, truth)) < WITHIN
+    assert verdict.level is Level.WARN
+
+
+def test_a_clock_that_drifts_is_sized_and_held() -> None:
+    found, truth, verdict = drifting_clock(DRIFT_S)
+    clocks = [each for each in found.result.disturbances if each.kind is DisturbanceKind.CLOCK]
+    assert [each.sensor for each in clocks] == ["mag_00"]
+    # A steady drift is one draw of the walk that is looked for.
+    assert 0.4 < clocks[0].sizes["drift_s"] / DRIFT_S < 2.5
+    assert max(distances(found, truth)) < WITHIN
+    assert found.result["mag_00"].unmodelled.largest == 1
+    assert any("The clock of mag_00 drifts" in reason.text for reason in verdict.reasons)

@@ -12,7 +12,6 @@ from l2m_gtsam.calibration.cluster_robust import (
     BLOCKS,
     WHOLE,
     Excess,
-    Scores,
     directions_of,
     gathered,
     halved,
@@ -88,7 +87,7 @@ def test_expected_scores_are_those_of_many_fits() -> None:
     rng = np.random.default_rng(1)
     one = fitted(rng)
     labels = halved(one.readings.stamp_ns[:, None].astype(np.float64), 4)
-    scores = gathered(one.rows, labels, OWN, one.half).scores(OWN, one.half)
+    scores = gathered(one.rows, labels, OWN, one.half).scores(one.half)
     X = np.vstack([each.jacobian for each in one.rows])
     # e = (I - X P X^T) noise + prior's share; its covariance is I - X P X^T.
     left = np.eye(len(X)) - X @ one.covariance @ X.T
@@ -228,34 +227,3 @@ def test_few_parts_tell_of_few_directions_too() -> None:
     found = [directions_of(rng.standard_normal((8, 3))) for _ in range(400)]
     assert 2.0 < np.mean(found) < 3.0  # of three; a mean of seven squares each
     assert min(found) >= 1
-
-
-def test_an_offset_that_wanders_is_as_far_from_its_mean_as_parts_are() -> None:
-    """Parts with an H each: the spread is theirs, by the covariance of the whole."""
-    rng, parts, each, sigma = np.random.default_rng(7), 8, 50, 0.4
-    found, truth = [], []
-    for _ in range(60):
-        offset = np.repeat(sigma * rng.standard_normal((parts, 3)), each, axis=0)
-        offset -= offset.mean(axis=0)
-        noise = rng.standard_normal((parts * each, 3))
-        P = np.eye(3) / (parts * each)
-        residual = offset + noise - noise.mean(axis=0)
-        scores = residual.reshape(parts, each, 3).sum(axis=1) / (parts * each)
-        expected = np.tile(P * (1 - 1 / parts) / parts, (parts, 1, 1))
-        share = np.tile(np.eye(3) / parts, (parts, 1, 1))
-        found.append(Scores(scores, expected, share).spread(P, slice(0, 3)))
-        truth.append(float((offset**2).mean()) * parts * each)
-    # One draw in sixty of a mean of 24 squares, a root of 2 / (60 * 24): four per cent.
-    assert np.mean(found) == pytest.approx(np.mean(truth), rel=0.12)
-
-
-def test_an_offset_that_stays_has_no_spread_but_by_chance() -> None:
-    rng = np.random.default_rng(8)
-    one = fitted(rng)
-    labels = halved(one.readings.stamp_ns[:, None].astype(np.float64), 4)
-    scores = gathered(one.rows, labels, OWN, one.half).paired().scores(OWN, one.half)
-    P = one.covariance[np.ix_(OWN, OWN)]
-    # Parts know H eight times worse than the whole; chance adds at most that.
-    assert 0 <= scores.spread(P, BLOCKS["H"]) < 8
-    # What a unit of every parameter in each part adds to the whole is one: no prior is on them.
-    np.testing.assert_allclose(scores.share.sum(axis=0), np.eye(SENSOR), atol=1e-9)

@@ -8,7 +8,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
-from l2m_gtsam.mapping.suite_likelihood import SIZE, SuiteWindow, suite_likelihood, undistorted
+from l2m_gtsam.mapping.suite_likelihood import (
+    SIZE,
+    SuiteWindow,
+    late_slopes,
+    suite_likelihood,
+    undistorted,
+    window_slopes,
+)
 from tests.worlds.harmonic import GIVEN, TILTED, basis, places
 
 SENSORS = 2
@@ -53,6 +60,15 @@ def somewhere() -> FloatArray:
 def value(part: SuiteWindow, sensors: FloatArray) -> float:
     moved = at_clocks(part.readings, sensors[:, TIMED])
     return suite_likelihood(replace(part, readings=moved), sensors, GIVEN).value
+
+
+def test_a_clock_that_is_late_all_the_time_is_a_time_offset() -> None:
+    part, sensors = window(), somewhere()
+    at = window_slopes(part, sensors, GIVEN)
+    found = late_slopes(part, at, np.ones(len(part.readings)), SENSORS)
+    np.testing.assert_allclose(found, at.slopes[:, :, TIMED::SIZE], atol=1e-12)
+    grown = late_slopes(part, at, np.linspace(-1, 1, len(part.readings)), SENSORS)
+    assert not np.allclose(grown, 0)
 
 
 def test_the_likelihood_is_that_of_the_dense_process() -> None:

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.solve.variance_components import WeightSystem
+from l2m_gtsam.solve.variance_components import TO_THE_TOP, WeightSystem, shared_components
 
 ROWS, WEIGHTS = 60, 9
 
@@ -65,6 +65,21 @@ def test_sizes_are_where_the_likelihood_is_largest() -> None:
         there = system(Z, y).posterior((found.sizes * factors) @ spectra).likelihood
         # The last update gained less than 0.02.
         assert there < best + 0.02
+
+
+def test_where_a_climb_begins_does_not_matter() -> None:
+    """Near the top, or with one process at nothing, from where it has to come back."""
+    rng = np.random.default_rng(3)
+    spectra = np.repeat(np.eye(2), [4, 5], axis=1)
+    Z, y = drawn(rng, np.array([0.5, 3.0]) @ spectra)
+    given, squares = ([system(Z, y)], [spectra]), float(y @ y)
+    first = shared_components(*given, squares, TO_THE_TOP)
+    for near in (first.sizes, np.array([0.0, 2.0])):
+        again = shared_components(*given, squares, TO_THE_TOP, near)
+        # Three rounds settle the noise to a thousandth, and the gain hangs on it.
+        assert again.gain == pytest.approx(first.gain, rel=1e-4)
+        np.testing.assert_allclose(again.sizes, first.sizes, rtol=0.02)
+        assert again.noise == pytest.approx(first.noise, rel=0.01)
 
 
 def test_what_is_not_there_has_no_size_in_half_of_all_cases_and_is_rarely_shown() -> None:

@@ -5,7 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from l2m_factors import PoseMotion, moved
+from l2m_gtsam.calibration.budget.clock import ClockDrift
 from l2m_gtsam.calibration.budget.found import spread_of_H
+from l2m_gtsam.calibration.budget.looked_for import processes
 from l2m_gtsam.calibration.budget.processes import (
     LASTING_S,
     FieldProcess,
@@ -17,6 +20,8 @@ from l2m_gtsam.calibration.budget.processes import (
     Warp,
 )
 from l2m_gtsam.calibration.budget.search import FoundProcess
+from l2m_gtsam.data import FloatArray, LidarMotion
+from l2m_gtsam.records.error_budget import DisturbanceKind
 from tests.support.scenes import scene
 
 SECONDS = np.linspace(0.0, 200.0, 801)
@@ -103,6 +108,51 @@ def test_other_readings_feel_the_same_weights(kind: type) -> None:
     np.testing.assert_array_equal(
         every.on(few).features(np.arange(len(part))), every.features(part)
     )
+
+
+def test_features_of_a_clock_are_how_the_field_goes_on() -> None:
+    """Along the twist, by central differences, in a field whose gradient is the same all over."""
+    rng, rows = np.random.default_rng(2), np.arange(40)
+    twist = rng.standard_normal((len(ROWS), 6)) * np.repeat([0.5, 1.0], 3)
+    motion = LidarMotion(twist, np.zeros(len(ROWS)))
+    G, B = rng.standard_normal((3, 3)), np.array([20.0, 5.0, -40.0])
+    R, t = READINGS.R_map_lidar, PLACES.t
+
+    def field(R: FloatArray, p: FloatArray, t: FloatArray) -> FloatArray:
+        x = np.einsum("nij,nj->ni", R, t) + p
+        return np.einsum("nji,nj->ni", R, B + x @ G.T)
+
+    places = replace(
+        PLACES,
+        readings=replace(READINGS, motion=motion),
+        b_lidar=field(R, READINGS.p_map_lidar, t),
+        slope=R.transpose(0, 2, 1) @ G,
+    )
+    modes = TimeModes.over(READINGS, 3)
+    found = ClockDrift(places, 0, modes).features(rows)
+    step, ends = 1e-4, []
+    for later in (step, -step):
+        on = PoseMotion(twist[rows], np.zeros(len(rows)))
+        ends.append(
+            field(*moved(R[rows], READINGS.p_map_lidar[rows], on, np.full(40, later)), t[rows])
+        )
+    rate = (ends[0] - ends[1]) / (2 * step)
+    expected = rate[:, :, None] * modes.values(READINGS, rows)[:, None]
+    # Third derivatives times the square of the step.
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_a_clock_is_looked_for_where_the_lidar_moves() -> None:
+    kinds = [each.kind for each in processes(PLACES, (0,))]
+    assert DisturbanceKind.CLOCK not in kinds
+    motion = LidarMotion(np.ones((len(ROWS), 6)), np.zeros(len(ROWS)))
+    moving = replace(PLACES, readings=replace(READINGS, motion=motion))
+    clocks = [each for each in processes(moving, (0,)) if each.kind is DisturbanceKind.CLOCK]
+    assert [each.sensor for each in clocks] == [0]
+    (walk,) = clocks[0].forms[0]
+    # A walk of a second from start to end is a sixth of a square second about its mean.
+    assert walk.sum() == pytest.approx(1 / 6, rel=0.08)
+    assert clocks[0].named(0, np.array([0.04]))["drift_s"] == pytest.approx(0.2)
 
 
 def test_the_spread_of_H_is_its_mean_square_over_the_drive() -> None:

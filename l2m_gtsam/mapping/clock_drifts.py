@@ -1,0 +1,111 @@
+r"""Clocks of a survey's sensors that drift against that of the poses: found by the survey itself.
+
+With a rate r a reading of stamp s is of the pose at s + tau + r u, u the time since the middle of
+its drive. What r does to the readings is u times what the time offset does, and how likely it is
+follows as for all parameters of a suite, with the field integrated out (``suite_likelihood``). A
+sensor has one rate on all drives, as a crystal has.
+
+A drift is taken out of the stamps. A map of stamps that drift is bent along the way: at 0.2 m/s by
+10 mm for 50 ms, and in a turn of 1 rad/s the field is turned by three degrees.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from l2m_gtsam.data import FloatArray, IntArray, Readings, Recording
+from l2m_gtsam.mapping.options import SuiteCalibrationOptions
+from l2m_gtsam.mapping.suite_likelihood import late_slopes, suite_likelihood, window_slopes
+from l2m_gtsam.mapping.suite_solver import likeness, prior_information
+from l2m_gtsam.mapping.suite_windows import windows_over
+from l2m_gtsam.maps.harmonic.structure import NO_SOURCES
+
+# Of a rate: standard deviations below which it is none. Errors of a drive's poses and waves that
+# are left out err alike for longer than neighbouring readings show.
+LEAST_SIGMAS = 6.0
+FASTEST = 0.01  # of a rate, prior: a clock that is off by more than a hundredth is none
+
+
+@dataclass(frozen=True)
+class ClockDrifts:
+    """How fast clocks drift.
+
+    Attributes
+    ----------
+    rates, sigmas
+        Seconds per second of S sensors, shapes (S,).
+    """
+
+    rates: FloatArray
+    sigmas: FloatArray
+
+    @property
+    def found(self) -> FloatArray:
+        """Rates, zero where there is none, shape (S,)."""
+        return np.where(np.abs(self.rates) > LEAST_SIGMAS * self.sigmas, self.rates, 0.0)
+
+
+def clock_drifts(
+    readings: Readings, drive: IntArray, sensors: FloatArray, options: SuiteCalibrationOptions
+) -> ClockDrifts:
+    """Return how fast the clocks of a survey's sensors drift, by one step of scoring.
+
+    Parameters
+    ----------
+    readings
+        Of the survey at the sensors' clocks, N in number.
+    drive
+        Which of K drives each is of, shape (N,).
+    sensors
+        Parameters of S sensors, shape (S, 16).
+    options
+        Windows, and how far sensors may be from these.
+
+    Raises
+    ------
+    MapError
+        There are too few readings.
+    """
+    windows = windows_over(readings, sensors, NO_SOURCES, options)
+    seconds, known = since_middle(readings.stamp_ns, drive), sensors.size
+    count = known + len(sensors)
+    information, slope, residuals = np.zeros((count, count)), np.zeros(count), []
+    for part, rows in zip(windows.parts, windows.rows, strict=True):
+        window = replace(part, readings=readings[rows])
+        at = window_slopes(window, sensors, windows.prior)
+        own = late_slopes(window, at, seconds[rows], len(sensors))
+        information += at.information(np.concatenate([at.slopes, own], axis=2))
+        slope[:known] += suite_likelihood(window, sensors, windows.prior).slope
+        slope[known:] -= np.einsum("ni,nij->j", at.residual, own) / at.noise**2
+        residuals.append(at.residual)
+    alike = likeness(windows, residuals)
+    posterior = information / alike
+    posterior[:known, :known] += prior_information(len(sensors), options)
+    posterior[np.arange(known, count), np.arange(known, count)] += FASTEST**-2
+    factor = cho_factor(posterior)
+    step, covariance = cho_solve(factor, slope / alike), cho_solve(factor, np.eye(count))
+    return ClockDrifts(step[known:], np.sqrt(np.diag(covariance)[known:]))
+
+
+def since_middle(stamp_ns: IntArray, drive: IntArray) -> FloatArray:
+    """Return seconds since the middle of each reading's drive, shape (N,)."""
+    seconds = np.zeros(len(stamp_ns))
+    for each in np.unique(drive):
+        own = np.flatnonzero(drive == each)
+        first, last = stamp_ns[own].min(), stamp_ns[own].max()
+        seconds[own] = 1e-9 * (stamp_ns[own] - first) - 0.5e-9 * (last - first)
+    return seconds
+
+
+def steadied(recording: Recording, rates: dict[str, float]) -> Recording:
+    """Return a recording whose sensors' stamps do not drift, by name; their middle stays."""
+    series = []
+    for each in recording.series:
+        rate = rates.get(each.sensor, 0.0)
+        if rate and len(each.stamp_ns):
+            middle = each.stamp_ns[0] + (each.stamp_ns[-1] - each.stamp_ns[0]) // 2
+            late = np.round(rate * (each.stamp_ns - middle)).astype(np.int64)
+            each = replace(each, stamp_ns=each.stamp_ns + late)
+        series.append(each)
+    return replace(recording, series=tuple(series))
