@@ -45,7 +45,7 @@ def jacobian(rng: np.random.Generator) -> FloatArray:
 
 def fit(X: FloatArray, wrong: FloatArray) -> tuple[FloatArray, ByParts]:
     """Fit to errors in uT, (N, 3); return the errors of all parameters and what is said of them."""
-    covariance = np.linalg.inv(X.T @ X)
+    covariance: FloatArray = np.asarray(np.linalg.inv(X.T @ X), dtype=np.float64)
     white = wrong.ravel() / NOISE
     x = covariance @ (X.T @ white)
     rows = Rows(0, OWN, X, X @ x - white, np.arange(READINGS))
@@ -92,7 +92,7 @@ def test_white_noise_is_left_as_it_is() -> None:
 def test_the_share_that_parts_show_is_that_of_many_walks() -> None:
     rng = np.random.default_rng(3)
     X = jacobian(rng)
-    covariance = np.linalg.inv(X.T @ X)
+    covariance: FloatArray = np.asarray(np.linalg.inv(X.T @ X), dtype=np.float64)
     rows = Rows(0, OWN, X, np.zeros(len(X)), np.arange(READINGS))
     group = WhiteGroup(rows, np.broadcast_to(np.eye(3) / NOISE, (READINGS, 3, 3)))
     modes = Walk.of(readings_of(READINGS), [group], OWN[12:15], HalfCovariance.of(covariance))

@@ -120,7 +120,7 @@ def test_features_of_a_clock_are_how_the_field_goes_on() -> None:
 
     def field(R: FloatArray, p: FloatArray, t: FloatArray) -> FloatArray:
         x = np.einsum("nij,nj->ni", R, t) + p
-        return np.einsum("nji,nj->ni", R, B + x @ G.T)
+        return np.asarray(np.einsum("nji,nj->ni", R, B + x @ G.T))
 
     places = replace(
         PLACES,
