@@ -74,7 +74,9 @@ def row(place: Place) -> list[str]:
     solve = seconds(lambda: in_threads(made[0].tiles.__getitem__, range(len(made[0].tiles))), 1)
     tiles, fast = made[0].tiles, CompiledTiles.of(made[0].learnt, made[0].options, made[0].tiles)
     indices = range(len(tiles))
-    compiling = seconds(lambda: in_threads(lambda i: fast.compiled(i, partial(tiles.__getitem__, i)), indices), 1)
+    compiling = seconds(
+        lambda: in_threads(lambda i: fast.compiled(i, partial(tiles.__getitem__, i)), indices), 1
+    )
     with TemporaryDirectory() as folder:
         kept = made[0].with_store(TileFolder(Path(folder), PLENTY))
         together = seconds(lambda: kept.make_tiles(lambda _done, _total: None), 1)
