@@ -144,12 +144,13 @@ class FieldFilter:
         where = place_readings(readings, {int(readings.key_pose[0]): state.pose}, known)
         predicted = predict(FieldWithWeights(field, state.weights), where, known)
         turned = where.C @ where.readings.R_map_lidar.transpose(0, 2, 1)
+        features = field.features(where.x)
         lever = carried_back(readings.R_key_lidar, readings.p_key_lidar)
         H = np.concatenate(
             [
                 predicted.by_lidar @ lever,
-                turned @ field.features(where.x),
-                by_distortion(where, state.weights, field, len(known.names)),
+                turned @ features,
+                by_distortion(where, features @ state.weights, len(known.names)),
                 np.zeros((len(readings), 3, POSE)),
             ],
             axis=2,
@@ -159,12 +160,12 @@ class FieldFilter:
         return residual, W @ H, float(np.linalg.slogdet(W)[1].sum())
 
 
-def by_distortion(
-    where: PlacedReadings, weights: FloatArray, field: WholeField, count: int
-) -> FloatArray:
-    """Return the derivatives of n residuals by C row by row and H of all sensors, (n, 3, 12 S)."""
+def by_distortion(where: PlacedReadings, B: FloatArray, count: int) -> FloatArray:
+    """Return the derivatives of n residuals by C row by row and H of all sensors, (n, 3, 12 S).
+
+    The field B at the readings is in uT, shape (n, 3).
+    """
     at, n = where.readings, len(where.x)
-    B = field.features(where.x) @ weights
     b = np.einsum("nji,nj->ni", at.R_map_lidar, B)
     found = np.zeros((n, 3, count, DISTORTION))
     for axis in range(3):

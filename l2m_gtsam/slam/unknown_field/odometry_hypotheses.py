@@ -37,7 +37,7 @@ class Hypothesis:
     poses
         All key poses, in the frame of the field.
     recorded
-        Numbers of the key poses to which the step was as recorded, of those with two ways.
+        Numbers of the key poses to which the step was as recorded, of those at a jump.
     """
 
     state: FilterState
@@ -104,21 +104,20 @@ class Hypotheses:
         follows
             The filter.
         was_motion
-            Of its step, where it has two ways: what was decided before, None if nothing.
+            Of its step, where there is a recorded one beside it: what was decided before, None if
+            nothing.
         """
-        ways = [step_of(key_pose)]
-        recorded = [False]
+        steps = []  # with the jumps that are motion by them
+        if key_pose.recorded is None or not was_motion:
+            steps.append((step_of(key_pose), frozenset[int]()))
         if key_pose.recorded is not None and was_motion is not False:
-            ways.append(step_of(key_pose.recorded))
-            recorded.append(True)
-        if was_motion:
-            ways, recorded = ways[1:], recorded[1:]
+            steps.append((step_of(key_pose.recorded), frozenset({key_pose.number})))
         found = []
         for each in self.all:
-            for step, is_recorded in zip(ways, recorded, strict=True):
-                chosen = each.recorded | {key_pose.number} if is_recorded else each.recorded
+            for step, jumps in steps:
                 state = follows.after(each.state, step)
-                found.append(Hypothesis(state, (*each.poses, state.pose), chosen))
+                recorded = each.recorded | jumps
+                found.append(Hypothesis(state, (*each.poses, state.pose), recorded))
         return Hypotheses(tuple(likely(found)))
 
     def decided(self, numbers: Sequence[int]) -> tuple[JumpDecision, ...]:

@@ -23,11 +23,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.field_filter import FieldFilter, dead_reckoned
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     Hypotheses,
@@ -92,19 +91,9 @@ class OneFieldExplorer:
         Prior of the first key pose, and the sensor.
     options
         As of a localisation.
-
-    Raises
-    ------
-    ConfigError
-        Calibrations are to be refined.
     """
 
     def __init__(self, start: StartPose, sensors: KnownSensors, options: SlamOptions) -> None:
-        if options.calibration is CalibrationUse.REFINED:
-            raise ConfigError(
-                "`slam.calibration: refined` works off line where there is no map; on line give "
-                "`fixed`"
-            )
         self.start, self._sensors, self._options = start, sensors, options
         self._origin = as_pose(start.T_map_lidar)
         self._key_poses: list[ArrivedKeyPose] = []
