@@ -12,8 +12,8 @@ import numpy as np
 
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.maps.sources.found_sources import FoundSources, price
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import FoundSources, price
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 from l2m_gtsam.solve.linear_algebra import right_divided
 

@@ -24,12 +24,8 @@ from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
-from l2m_gtsam.maps.sources.search import (
-    FoundSources,
-    SourceSearchOptions,
-    find_sources,
-    price,
-)
+from l2m_gtsam.maps.sources.found_sources import FoundSources, price
+from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.solve.chi_square import quantile

@@ -28,8 +28,8 @@ from l2m_gtsam.calibration.coverage import UncertainMap
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.maps.sources.found_sources import price
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import price
 from l2m_gtsam.records.calibration import Disagreement
 from l2m_gtsam.records.places import Cause, CauseGain
 

@@ -19,7 +19,8 @@ from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed
-from l2m_gtsam.maps.sources.search import find_sources, price
+from l2m_gtsam.maps.sources.found_sources import price
+from l2m_gtsam.maps.sources.search import find_sources
 from l2m_gtsam.maps.training import additional_set
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.recording.sync import synchronise, with_offsets

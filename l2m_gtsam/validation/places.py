@@ -19,8 +19,9 @@ from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.missed_steel import missed_by_map
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
+from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import FoundSources, find_sources, price, refined
+from l2m_gtsam.maps.sources.search import find_sources
 from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width

@@ -7,7 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.maps.field_map import optional_members
-from l2m_gtsam.maps.sources.search import FoundSources
+from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.source import SourceShape
 
 # Of the standard deviations that a search found: it rests on the readings of the graph itself, in

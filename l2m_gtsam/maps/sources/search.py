@@ -7,31 +7,23 @@ all that were found before, and stays if it explains more than its parameters do
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.data import BoolArray, FloatArray, IntArray
+from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
+from l2m_gtsam.maps.sources.found_sources import FoundSources, nothing_found, price, refined
 from l2m_gtsam.maps.sources.marginal import AXES, MarginalRows
-from l2m_gtsam.maps.sources.source import HALF_AXIS, MOMENT, PARAMETERS, UT_M3, SourceShape
+from l2m_gtsam.maps.sources.source import UT_M3, SourceShape
 from l2m_gtsam.maps.sources.wrong_reading import wrong_reading
 from l2m_gtsam.options import Options
 
 BATCH = 128  # candidates that are asked together
 FELT_M = 4.0  # from a candidate: a source that is not felt there is none that matters
-STEPS = 20  # of a refinement
-SMALL_STEP = 0.01  # of a sigma squared: a refinement has ended
-HALF_LENGTH_M = 0.5  # standard deviation of half a bar's length before readings
-# Steel that comes and goes stands on the floor and is no higher than people move it: over the
-# sensors, metres, mean and standard deviation.
-HEIGHT_M = 0.5, 1.0
 # Between candidates a source explains more than at the best of them: not three times as much.
 HOPELESS = 0.4  # of the price
-MOMENT_AM2 = 1000.0  # standard deviation of a moment beforehand: a lorry's
-LONGEST_M = 0.3  # of a step of a refinement
 FIRST_HALF_M = (0.3, 0.8)  # where the length of a bar is started, near a dipole and elsewhere
 # Bars stand upright or lie: components of the axis that are zero stay so.
 STANDING = np.array([[0.0, 0.0, 1.0]])
@@ -53,62 +45,6 @@ class SourceSearchOptions(Options):
     """Steel is no nearer to a sensor than this, metres."""
     heights: tuple[float, ...] = (-0.4, 0.1, 0.6, 1.2, 2.0)
     """Heights over the sensors that are tried first, metres."""
-
-
-@dataclass(frozen=True)
-class FoundSources:
-    """Sources with their covariance.
-
-    Attributes
-    ----------
-    shapes
-        The sources, K of them.
-    root
-        Of the covariance of their position, moment and half axis, source by source; what a dipole
-        does not have is zero, shape (9 K, q).
-    gains
-        How much each explains that the others do not: twice the logarithm of the likelihood ratio,
-        shape (K,).
-    left
-        Squared length of what all of them leave, white.
-    wrong
-        Readings that are wrong by themselves, which no source explains: they did not count.
-    """
-
-    shapes: tuple[SourceShape, ...]
-    root: FloatArray
-    gains: FloatArray
-    left: float
-    wrong: tuple[int, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.shapes)
-
-    @property
-    def parameters(self) -> int:
-        """Number of parameters of all of them."""
-        return sum(int(_free(each).sum()) for each in self.shapes)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Of the parameters of all of them, shape (9 K, 9 K)."""
-        return np.asarray(self.root @ self.root.T)
-
-    def field(self, points: FloatArray) -> FloatArray:
-        """Return the field of all of them in uT, shape (N, 3)."""
-        return sum(
-            (each.field_and_gradient(points)[0] for each in self.shapes), np.zeros_like(points)
-        )
-
-
-def nothing_found(rows: MarginalRows) -> FoundSources:
-    """Return no sources."""
-    return FoundSources((), np.empty((0, 0)), np.empty(0), rows.pull(rows.residual)[1])
-
-
-def price(rows: MarginalRows, parameters: int) -> float:
-    """Return what a model of so many more parameters has to explain (Schwarz 1978)."""
-    return parameters * float(np.log(3 * max(len(rows), 2)))
 
 
 def find_sources(
@@ -282,139 +218,6 @@ def best_of(rows: MarginalRows, found: FoundSources, starts: list[SourceShape]) 
 
 def _left(found: FoundSources) -> float:
     return found.left
-
-
-def refined(rows: MarginalRows, shapes: tuple[SourceShape, ...]) -> FoundSources:
-    """Return the most likely sources near some, by damped Gauss-Newton steps."""
-    if not shapes:
-        return nothing_found(rows)
-    free = np.concatenate([_free(each) for each in shapes])
-    theta = np.concatenate([each.vector for each in shapes])
-    prior = SourcePrior.of(len(shapes), float(np.median(rows.points[:, 2])), free)
-    state = _State.at(rows, theta, free, prior)
-    lengths = np.tile(~_is_moment(), len(shapes))[free]
-    damping = 1e-3
-    for _ in range(STEPS):
-        F = state.information + damping * np.diag(np.diag(state.information))
-        step = np.linalg.solve(F, state.gradient)
-        long = np.abs(step[lengths]).max(initial=0.0)
-        trial = theta.copy()
-        trial[free] += step * min(1.0, LONGEST_M / max(long, LONGEST_M))
-        after = _State.at(rows, trial, free, prior)
-        if after.cost < state.cost:
-            gained, state, theta = state.cost - after.cost, after, trial
-            damping = max(damping / 5, 1e-9)
-            if gained < SMALL_STEP:
-                break
-        else:
-            damping *= 8
-            if damping > 1e8:
-                break
-    root = np.zeros((len(theta), int(free.sum())))
-    root[free] = _inverse_root(state.information)
-    count = len(shapes)
-    return FoundSources(
-        tuple(SourceShape(each) for each in theta.reshape(count, PARAMETERS)),
-        root,
-        np.full(count, np.nan),
-        state.cost,
-    )
-
-
-@dataclass(frozen=True)
-class SourcePrior:
-    """What is known of sources beforehand: mean and information of the free parameters, (P,)."""
-
-    mean: FloatArray
-    information: FloatArray
-
-    @classmethod
-    def of(cls, count: int, height: float, free: BoolArray) -> "SourcePrior":
-        """Return the prior of so many sources, where sensors are at a height in metres."""
-        mean, information = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-        mean[2], information[2] = height + HEIGHT_M[0], HEIGHT_M[1] ** -2
-        information[MOMENT] = MOMENT_AM2**-2
-        information[HALF_AXIS] = HALF_LENGTH_M**-2
-        return cls(np.tile(mean, count)[free], np.tile(information, count)[free])
-
-
-@dataclass(frozen=True)
-class _State:
-    """Cost at some sources; a step that is refused needs no derivatives.
-
-    Attributes
-    ----------
-    rows, shapes, free, prior
-        What the cost is of.
-    off
-        What free parameters differ from their mean by, shape (P,).
-    pulled
-        Precision times residuals, shape (N, 3).
-    cost
-        Squared length of the white residuals, and of ``off``.
-    """
-
-    rows: MarginalRows
-    shapes: list[SourceShape]
-    free: BoolArray
-    prior: "SourcePrior"
-    off: FloatArray
-    pulled: FloatArray
-    cost: float
-
-    @classmethod
-    def at(
-        cls, rows: MarginalRows, theta: FloatArray, free: BoolArray, prior: "SourcePrior"
-    ) -> "_State":
-        shapes = [SourceShape(each) for each in theta.reshape(-1, PARAMETERS)]
-        field = sum(
-            (s.field_and_gradient(rows.points)[0] for s in shapes), np.zeros_like(rows.points)
-        )
-        pulled, squared = rows.pull(rows.residual - field)
-        off = theta[free] - prior.mean
-        cost = squared + float(prior.information @ off**2)
-        return cls(rows, shapes, free, prior, off, pulled, cost)
-
-    @cached_property
-    def _jacobian(self) -> FloatArray:
-        every = [each.derivatives(self.rows.points) for each in self.shapes]
-        return np.asarray(np.concatenate(every, axis=2)[:, :, self.free])
-
-    @cached_property
-    def gradient(self) -> FloatArray:
-        """By the free parameters, downwards, shape (P,)."""
-        pull = np.einsum("nim,ni->m", self._jacobian, self.pulled)
-        return np.asarray(pull - self.prior.information * self.off)
-
-    @cached_property
-    def information(self) -> FloatArray:
-        """Of the free parameters, shape (P, P)."""
-        return self.rows.information(self._jacobian) + np.diag(self.prior.information)
-
-
-def _free(shape: SourceShape) -> BoolArray:
-    """Return which parameters of a source are open: a dipole has no length, a bar a direction."""
-    return np.asarray(~_is_half_axis() | (shape.vector != 0))
-
-
-def _is_half_axis() -> BoolArray:
-    mask = np.zeros(PARAMETERS, dtype=np.bool_)
-    mask[HALF_AXIS] = True
-    return mask
-
-
-def _is_moment() -> BoolArray:
-    mask = np.zeros(PARAMETERS, dtype=np.bool_)
-    mask[MOMENT] = True
-    return mask
-
-
-def _inverse_root(information: FloatArray) -> FloatArray:
-    """Return a root of the inverse of an information matrix that may be nearly singular."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-    scaled = information * scale * scale[:, None]
-    values, axes = np.linalg.eigh(scaled)
-    return np.asarray(scale[:, None] * axes / np.sqrt(np.maximum(values, 1e-12)))
 
 
 def pruned(rows: MarginalRows, found: FoundSources, least: float) -> FoundSources:

@@ -7,8 +7,9 @@ from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.sparse import csr_array
 
 from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import FoundSources, SourceSearchOptions, find_sources
+from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
 from l2m_gtsam.slam.unknown_field.changed_visits import VisitResiduals
 from l2m_gtsam.slam.unknown_field.tile_visits import LIKELY, Change, Judged, JudgedVisits
 from l2m_gtsam.slam.unknown_field.visit_graph import POSE, VisitGraph

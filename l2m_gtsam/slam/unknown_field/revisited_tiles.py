@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.maps.sources.search import FoundSources
+from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import place_readings
 from l2m_gtsam.slam.relative_motion import RelativeMotions

@@ -5,8 +5,9 @@ import pytest
 from scipy.sparse import csr_array
 
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import FoundSources, SourceSearchOptions, find_sources
+from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
 from l2m_gtsam.maps.sources.source import SourceShape
 
 NOISE_UT = 0.1

@@ -8,8 +8,8 @@ from scipy.sparse import csr_array
 
 from l2m_gtsam.calibration.averaged_rows import with_calibration
 from l2m_gtsam.data import FloatArray
+from l2m_gtsam.maps.sources.found_sources import nothing_found
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import nothing_found
 from l2m_gtsam.records.places import CLEAR, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.validation.coordinates import PARAMETERS
