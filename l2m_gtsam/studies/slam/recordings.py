@@ -1,5 +1,7 @@
 """Recordings that others made, as drives with their truth, and odometry made of such poses."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from hashlib import sha256
@@ -52,6 +54,26 @@ class TrueDrive:
         return Recording(odometry, (series,), self.source)
 
 
+@contextmanager
+def readable(path: Path, what: str, name: str) -> Iterator[None]:
+    """Raise a ConfigError where a recording cannot be read inside: what of it, from which file."""
+    try:
+        yield
+    except (OSError, KeyError, ValueError) as error:
+        raise ConfigError(
+            f"{path}: no {what} can be read; set `data` to the folder of {name}"
+        ) from error
+
+
+def drive_at(
+    path: Path, content: bytes, seconds: FloatArray, R: FloatArray, p: FloatArray, field: FloatArray
+) -> TrueDrive:
+    """Return a drive through poses at times, with a reading at each, from a file."""
+    stamps = np.round(SECOND * seconds).astype(np.int64)
+    source = SourceFile(str(path), sha256(content).hexdigest())
+    return TrueDrive(Trajectory(stamps, R, p, "map", "lidar"), field, source)
+
+
 def ship_run(path: Path, run: int) -> TrueDrive:
     """Return a run of the model ship.
 
@@ -60,20 +82,15 @@ def ship_run(path: Path, run: int) -> TrueDrive:
     ConfigError
         There is no such file, or it has no such run.
     """
-    try:
+    with readable(path, f"run {run} of the model ship", SHIP):
         content = path.read_bytes()
         with np.load(path, allow_pickle=False) as arrays:
             p, field = arrays[f"position_{run}"], arrays[f"field_{run}"]
             quaternion, period = arrays[f"quaternion_wxyz_{run}"], float(arrays[f"period_{run}"])
-    except (OSError, KeyError, ValueError) as error:
-        raise ConfigError(
-            f"{path}: no run {run} of the model ship can be read; set `data` to the folder of "
-            f"{SHIP}"
-        ) from error
-    R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    stamps = np.round(SECOND * period * np.arange(len(p))).astype(np.int64)
-    truth = Trajectory(stamps, R, p, "map", "lidar")
-    return TrueDrive(truth, EARTH_UT * field, SourceFile(str(path), sha256(content).hexdigest()))
+        R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    return drive_at(
+        path, content, period * np.arange(len(p), dtype=np.float64), R, p, EARTH_UT * field
+    )
 
 
 def robot_run(path: Path, run: int) -> TrueDrive:
@@ -84,7 +101,7 @@ def robot_run(path: Path, run: int) -> TrueDrive:
     ConfigError
         There is no such file, or it has no such pass.
     """
-    try:
+    with readable(path, f"pass {run} of the robot", ROBOT):
         content = path.read_bytes()
         with np.load(path, allow_pickle=False) as arrays:
             rows = np.flatnonzero((arrays["run"] == run) & arrays["ok"])[::EVERY]
@@ -93,13 +110,7 @@ def robot_run(path: Path, run: int) -> TrueDrive:
             field = arrays["mag_body"][rows, 0].astype(np.float64)
             lever = arrays["sensor_positions_body"][0].astype(np.float64)
         R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    except (OSError, KeyError, ValueError) as error:
-        raise ConfigError(
-            f"{path}: no pass {run} of the robot can be read; set `data` to the folder of {ROBOT}"
-        ) from error
-    stamps = np.round(SECOND * seconds).astype(np.int64)
-    truth = Trajectory(stamps, R, p + R @ lever, "map", "lidar")
-    return TrueDrive(truth, field, SourceFile(str(path), sha256(content).hexdigest()))
+    return drive_at(path, content, seconds, R, p + R @ lever, field)
 
 
 def handheld_run(path: Path, run: int) -> TrueDrive:
@@ -110,7 +121,7 @@ def handheld_run(path: Path, run: int) -> TrueDrive:
     ConfigError
         There is no such file, or it has no such run.
     """
-    try:
+    with readable(path, f"run {run} of the sensor in the hand", HANDHELD):
         content = path.read_bytes()
         with np.load(path, allow_pickle=False) as arrays:
             rows = np.flatnonzero(arrays["run"] == run)[::EVERY_HANDHELD]
@@ -118,14 +129,7 @@ def handheld_run(path: Path, run: int) -> TrueDrive:
             quaternion = arrays["quaternion_wxyz"][rows].astype(np.float64)
             field = arrays["mag_uT"][rows].astype(np.float64)
         R = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-    except (OSError, KeyError, ValueError) as error:
-        raise ConfigError(
-            f"{path}: no run {run} of the sensor in the hand can be read; set `data` to the folder "
-            f"of {HANDHELD}"
-        ) from error
-    stamps = np.round(SECOND * seconds).astype(np.int64)
-    truth = Trajectory(stamps, R, p, "map", "lidar")
-    return TrueDrive(truth, field, SourceFile(str(path), sha256(content).hexdigest()))
+    return drive_at(path, content, seconds, R, p, field)
 
 
 class Form(StrEnum):
