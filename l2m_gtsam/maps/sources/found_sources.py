@@ -35,6 +35,9 @@ class FoundSources:
         shape (K,).
     left
         Squared length of what all of them leave, white.
+    evidence
+        Twice the logarithm of the likelihood with all parameters integrated out, by Laplace's
+        method, less what sources of all shapes have in common (Kass and Raftery 1995, eq. 5).
     wrong
         Readings that are wrong by themselves, which no source explains: they did not count.
     """
@@ -43,6 +46,7 @@ class FoundSources:
     root: FloatArray
     gains: FloatArray
     left: float
+    evidence: float
     wrong: tuple[int, ...] = ()
 
     def __len__(self) -> int:
@@ -67,7 +71,8 @@ class FoundSources:
 
 def nothing_found(rows: MarginalRows) -> FoundSources:
     """Return no sources."""
-    return FoundSources((), np.empty((0, 0)), np.empty(0), rows.pull(rows.residual)[1])
+    left = rows.pull(rows.residual)[1]
+    return FoundSources((), np.empty((0, 0)), np.empty(0), left, -left)
 
 
 def price(rows: MarginalRows, parameters: int) -> float:
@@ -109,6 +114,7 @@ def refined(rows: MarginalRows, shapes: tuple[SourceShape, ...]) -> FoundSources
         root,
         np.full(count, np.nan),
         state.cost,
+        state.evidence,
     )
 
 
@@ -181,6 +187,13 @@ class _State:
     def information(self) -> FloatArray:
         """Of the free parameters, shape (P, P)."""
         return self.rows.information(self._jacobian) + np.diag(self.prior.information)
+
+    @property
+    def evidence(self) -> float:
+        """Of these sources, see `FoundSources`."""
+        known = self.prior.information[self.prior.information > 0]  # of x and y nothing is
+        narrower = float(np.linalg.slogdet(self.information)[1]) - float(np.log(known).sum())
+        return -self.cost - narrower
 
 
 def _free(shape: SourceShape) -> BoolArray:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.dipoles import moment_features
+from l2m_gtsam.maps.sources.dipole_or_bar import best_of, reshaped
 from l2m_gtsam.maps.sources.found_sources import FoundSources, nothing_found, price, refined
 from l2m_gtsam.maps.sources.marginal import AXES, MarginalRows
 from l2m_gtsam.maps.sources.source import UT_M3, SourceShape
@@ -24,10 +25,6 @@ BATCH = 128  # candidates that are asked together
 FELT_M = 4.0  # from a candidate: a source that is not felt there is none that matters
 # Between candidates a source explains more than at the best of them: not three times as much.
 HOPELESS = 0.4  # of the price
-FIRST_HALF_M = (0.3, 0.8)  # where the length of a bar is started, near a dipole and elsewhere
-# Bars stand upright or lie: components of the axis that are zero stay so.
-STANDING = np.array([[0.0, 0.0, 1.0]])
-LYING = np.array([[0.92, 0.39, 0.0], [-0.39, 0.92, 0.0]])
 DIPOLE = 6  # parameters
 MOST_WRONG = 20  # readings; with more of them it is not single ones that are wrong
 
@@ -89,7 +86,7 @@ def find_sources(
         if alone is not None or too_near(better, rows, options):
             break
         found = better
-    found = pruned(rows, found, price(rows, DIPOLE) + trials)
+    found = pruned(rows, reshaped(rows, found), trials)
     return replace(found, wrong=tuple(wrong))
 
 
@@ -197,40 +194,22 @@ def by_block(positions: FloatArray) -> IntArray:
     return np.asarray(np.lexsort((cell[:, 1], cell[:, 0])))
 
 
-def best_of(rows: MarginalRows, found: FoundSources, starts: list[SourceShape]) -> FoundSources:
-    """Return the best refinement of sources and one more, a dipole or a bar."""
-    dipole = min((refined(rows, (*found.shapes, each)) for each in starts), key=_left)
-    best, before = dipole, (*dipole.shapes[:-1],)
-    for axes in (STANDING, LYING):
-        near, elsewhere = FIRST_HALF_M
-        bars = [
-            refined(rows, (*before, dipole.shapes[-1].with_half_axis(near * axis))) for axis in axes
-        ]
-        bars += [
-            refined(rows, (*found.shapes, starts[0].with_half_axis(elsewhere * axis)))
-            for axis in axes
-        ]
-        bar = min(bars, key=_left)
-        if best.left - bar.left > price(rows, bar.parameters - best.parameters):
-            best = bar
-    return best
+def pruned(rows: MarginalRows, found: FoundSources, trials: float) -> FoundSources:
+    """Return the sources that explain enough which the others do not, with how much that is.
 
-
-def _left(found: FoundSources) -> float:
-    return found.left
-
-
-def pruned(rows: MarginalRows, found: FoundSources, least: float) -> FoundSources:
-    """Return the sources that explain enough which the others do not, with how much that is."""
+    The others may take other shapes: a dipole beside a dipole is often the length of a bar.
+    """
     while len(found):
         without = [
             refined(rows, found.shapes[:k] + found.shapes[k + 1 :]) for k in range(len(found))
         ]
         gains = np.array([each.left - found.left for each in without])
-        worst = int(np.argmin(gains))
-        if gains[worst] >= least:
+        least = without[int(np.argmin(gains))]
+        fewer = reshaped(rows, least)
+        earned = price(rows, DIPOLE - fewer.parameters + least.parameters) + trials
+        if fewer.left - found.left >= earned:
             return replace(found, gains=gains)
-        found = without[worst]
+        found = fewer
     return nothing_found(rows)
 
 

@@ -5,40 +5,12 @@ from typing import Any
 import magpylib
 import numpy as np
 import pytest
-from scipy.sparse import csr_array, eye_array
 
 from l2m_gtsam.data import FieldSample, FloatArray
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
-from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
 from l2m_gtsam.maps.sources.source import SourceShape
-
-NOISE_UT = 0.1
-DIPOLE = SourceShape.dipole(np.array([1.0, 0.8, 0.5]), np.array([3.0, -2.0, 9.0]))
-BAR = DIPOLE.with_half_axis(np.array([0.0, 0.0, 0.5]))
-
-
-def path() -> FloatArray:
-    """Return a loop about 3 by 2 m, two sensors 0.2 m apart, metres, shape (240, 3)."""
-    turn = np.linspace(0, 2 * np.pi, 120, endpoint=False)
-    loop = np.column_stack([1 + 1.5 * np.cos(turn), np.sin(turn), np.zeros(120)])
-    return np.concatenate([loop, loop + np.array([0.0, 0.2, 0.1])])
-
-
-def rows_with(field: FloatArray, seed: int) -> MarginalRows:
-    """Return rows with white noise and an unknown uniform field for each sensor."""
-    points = path()
-    noise = NOISE_UT * np.random.default_rng(seed).normal(size=points.shape)
-    offset = np.kron(np.repeat(np.eye(2), 120, axis=0), np.eye(3))
-    white = csr_array(eye_array(3 * len(points)) / NOISE_UT)
-    return MarginalRows(
-        points=points,
-        residual=field + noise + np.repeat([[3.0, -1.0, 2.0], [0.0, 5.0, -4.0]], 120, axis=0),
-        whitening=white,
-        nuisance=csr_array(white @ offset),
-        prior=1e-4 * np.eye(6),
-        slot=np.tile(np.arange(120), 2),
-    )
+from tests.worlds.loop_rows import BAR, DIPOLE, loop_path, rows_with
 
 
 @pytest.mark.parametrize("half", [0.25, 0.5, 1.0])
@@ -50,7 +22,7 @@ def test_a_bar_is_that_of_magpylib(half: float) -> None:
     magnet = library.magnet.Cuboid(
         dimension=(0.01, 0.01, 2 * half), magnetization=bar.moment / volume, position=bar.position
     )
-    points = path()[np.linalg.norm(path() - bar.position, axis=1) > 0.9 * half]
+    points = loop_path()[np.linalg.norm(loop_path() - bar.position, axis=1) > 0.9 * half]
     field, _ = bar.field_and_gradient(points)
     expected = 1e6 * magnet.getB(points)
     assert np.abs(field - expected).max() < 0.02 * np.abs(expected).max()
@@ -58,7 +30,7 @@ def test_a_bar_is_that_of_magpylib(half: float) -> None:
 
 @pytest.mark.parametrize("shape", [DIPOLE, BAR])
 def test_derivatives_are_those_of_the_field(shape: SourceShape) -> None:
-    points, step = path()[::17], 1e-5
+    points, step = loop_path()[::17], 1e-5
     analytic = shape.derivatives(points)
     for k in range(9):
         ends = []
@@ -92,7 +64,7 @@ def test_information_is_that_of_the_whole_covariance() -> None:
 
 @pytest.mark.parametrize("shape", [DIPOLE, BAR])
 def test_a_source_is_found_as_it_is(shape: SourceShape) -> None:
-    field, _ = shape.field_and_gradient(path())
+    field, _ = shape.field_and_gradient(loop_path())
     rows = rows_with(field, 2)
     found = find_sources(rows, rows.points, SourceSearchOptions(), None)
     assert len(found) == 1
@@ -124,11 +96,11 @@ class Uniform:
 
 
 def test_a_changed_map_has_the_field_of_both() -> None:
-    field, _ = DIPOLE.field_and_gradient(path())
-    found = find_sources(rows_with(field, 2), path(), SourceSearchOptions(), None)
+    field, _ = DIPOLE.field_and_gradient(loop_path())
+    found = find_sources(rows_with(field, 2), loop_path(), SourceSearchOptions(), None)
     changed, surveyed = ChangedMap(Uniform(), found), Uniform()
-    sample = changed.query(path())
-    expected = surveyed.query(path()).field + found.field(path())
+    sample = changed.query(loop_path())
+    expected = surveyed.query(loop_path()).field + found.field(loop_path())
     assert np.array_equal(sample.field, expected)
-    assert np.array_equal(sample.inside, path()[:, 0] > 0)
-    assert np.array_equal(changed.field_and_gradient(path())[0], sample.field)
+    assert np.array_equal(sample.inside, loop_path()[:, 0] > 0)
+    assert np.array_equal(changed.field_and_gradient(loop_path())[0], sample.field)
