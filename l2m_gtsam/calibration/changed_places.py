@@ -16,16 +16,16 @@ from l2m_gtsam.calibration.averaged_rows import (
     pose_shares,
 )
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
-from l2m_gtsam.calibration.causes import changed_sources, offset_gain
+from l2m_gtsam.calibration.causes import offset_gain
 from l2m_gtsam.calibration.coverage import UncertainMap, errors_over_stated
-from l2m_gtsam.calibration.missed_steel import missed_by_map
+from l2m_gtsam.calibration.drive_sources import drive_sources
 from l2m_gtsam.calibration.moving_solve import MovingProblem, MovingSolution, solve_moving
 from l2m_gtsam.calibration.one_key import OneKeySolution
 from l2m_gtsam.calibration.view import QueryableMap, RememberedMap, places_of
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.changed_map import ChangedMap
-from l2m_gtsam.maps.sources.found_sources import FoundSources, price
-from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
+from l2m_gtsam.maps.sources.found_sources import FoundSources
+from l2m_gtsam.maps.sources.search import SourceSearchOptions
 from l2m_gtsam.options import Options
 from l2m_gtsam.records.places import ChangedSource
 from l2m_gtsam.solve.chi_square import quantile
@@ -152,18 +152,10 @@ def search(
     # solve that knows sources are what these have to stand beside.
     budget = NOTHING_FOUND if known is None else solution.budget
     rows = drive.marginal(field_map, field_map, budget, options.averaging)
-    found = find_sources(rows, places, options.sources, known)
-    rows = rows.without(found.wrong)
-    gained = rows.pull(rows.residual)[1] - found.left - price(rows, found.parameters)
-    if not len(found) or gained < offset_gain(rows, drive):
+    shown = drive_sources(rows, drive, places, field_map, options.sources, known)
+    if not len(shown.found) or shown.gain < offset_gain(shown.rows, drive):
         return None
-    missed = missed_by_map(found.shapes, field_map)
-    records = changed_sources(rows, drive, found)
-    return ChangedSources(
-        found,
-        tuple(each for each, was in zip(records, missed, strict=True) if not was),
-        np.array([each.position for each in found.shapes])[missed],
-    )
+    return ChangedSources(shown.found, shown.changed(), shown.missed_places)
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ import numpy as np
 
 from l2m_gtsam.calibration.averaged_rows import AveragedDrive, averaged, with_calibration
 from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
-from l2m_gtsam.calibration.causes import changed_sources, vehicle_gain
+from l2m_gtsam.calibration.causes import vehicle_gain
 from l2m_gtsam.calibration.changed_places import ChangesOptions, suspected
 from l2m_gtsam.calibration.coverage import sigmas_hold
+from l2m_gtsam.calibration.drive_sources import drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.missed_steel import missed_by_map
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings, Recording
 from l2m_gtsam.errors import MapError
 from l2m_gtsam.mapping.map_building import SurveyReadings, suite_readings
@@ -19,8 +19,6 @@ from l2m_gtsam.mapping.options import MappingOptions
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
 from l2m_gtsam.maps.harmonic.renewal import DriveReadings, renewed
-from l2m_gtsam.maps.sources.found_sources import price
-from l2m_gtsam.maps.sources.search import find_sources
 from l2m_gtsam.maps.training import additional_set
 from l2m_gtsam.parallel.threads import one_blas_thread
 from l2m_gtsam.recording.sync import synchronise, with_offsets
@@ -89,13 +87,8 @@ def seen_sources(
         return SeenSources((), 0.0, 0.0)
     free = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
     rows = with_calibration(free, covariances(known))
-    found = find_sources(rows, places, options.sources, None)
-    rows = rows.without(found.wrong)
-    gain = rows.pull(rows.residual)[1] - found.left - price(rows, found.parameters)
-    missed = missed_by_map(found.shapes, field_map)
-    seen = zip(changed_sources(rows, drive, found), missed, strict=True)
-    changed = tuple(each for each, was in seen if not was)
-    return SeenSources(changed, gain, vehicle_gain(rows, drive))
+    shown = drive_sources(rows, drive, places, field_map, options.sources)
+    return SeenSources(shown.changed(), shown.gain, vehicle_gain(shown.rows, drive))
 
 
 def covariances(known: Sequence[KnownSensor]) -> FloatArray:

@@ -15,13 +15,12 @@ from l2m_gtsam.calibration.budget.found import NOTHING_FOUND
 from l2m_gtsam.calibration.causes import changed_sources
 from l2m_gtsam.calibration.changed_places import ChangesOptions, is_place_of, suspected
 from l2m_gtsam.calibration.coverage import UncertainMap
+from l2m_gtsam.calibration.drive_sources import drive_sources
 from l2m_gtsam.calibration.factor_graph import Estimate
-from l2m_gtsam.calibration.missed_steel import missed_by_map
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, LidarMotion, Readings
 from l2m_gtsam.maps.sources.found_sources import FoundSources, price, refined
 from l2m_gtsam.maps.sources.marginal import MarginalRows
-from l2m_gtsam.maps.sources.search import find_sources
 from l2m_gtsam.records.places import CLEAR, ChangedSource, WhatChanged
 from l2m_gtsam.records.validation import CalibrationPart
 from l2m_gtsam.validation.coordinates import COLUMNS, PARAMETERS, changes_of, columns_of, width
@@ -176,12 +175,9 @@ def shown_sources(
     if not len(places):
         return None
     rows = drive.marginal(field_map, field_map, NOTHING_FOUND, options.averaging)
-    found = find_sources(rows, places, options.sources, None)
-    rows, missed = rows.without(found.wrong), missed_by_map(found.shapes, field_map)
-    if missed.any():
-        kept = tuple(each for each, was in zip(found.shapes, missed, strict=True) if not was)
-        found = replace(refined(rows, kept), gains=found.gains[~missed])
-    return ShownSources(rows, drive, found) if len(found) else None
+    shown = drive_sources(rows, drive, places, field_map, options.sources)
+    found = shown.of_changes()
+    return ShownSources(shown.rows, drive, found) if len(found) else None
 
 
 def is_searched(field_map: QueryableMap, options: ChangesOptions) -> bool:
