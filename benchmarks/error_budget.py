@@ -84,7 +84,7 @@ def cost(field_map: CompiledMap, readings: Readings) -> Cost:
     began = process_time()
     drive = UncertainDrive.of(*given, OPTIONS)
     found = settle_by_any(drive, joint.estimate, tests, OPTIONS, lambda _: None)
-    found.problem.solutions(found.joint, found.values)
+    found.optimum.solutions()
     between = process_time()
     whole = solve_uncertain(*given, tests, OPTIONS, lambda _: None)
     kinds = sorted({each.process.kind.value for each in whole.budget.found})

@@ -21,6 +21,7 @@ from l2m_gtsam.calibration.joint import joint_problem
 from l2m_gtsam.calibration.optimise import LinearSolver
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
+from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import observe
 from l2m_gtsam.data import FloatArray, KnownSensor, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import CompiledMap, HarmonicMap
@@ -57,8 +58,8 @@ class Case:
     def round(self) -> list[FloatArray]:
         """Return covariances after a descent, degrees of freedom and marginals by GTSAM."""
         values = self.problem.descend(self.values, OPTIONS, LinearSolver.CHOLESKY).values
-        joint = self.problem.linearised(values)
-        return [each.joint_covariance for each in self.problem.solutions(joint, values)]
+        solved = UncertainOptimum.at(self.problem, values).solutions()
+        return [each.joint_covariance for each in solved]
 
     def eliminated(self, values: gtsam.Values) -> Eliminated:
         """Return the old engine's solution of the linear graph."""

@@ -15,6 +15,7 @@ from l2m_gtsam.calibration.joint import SensorSolution, joint_problem, sensor_so
 from l2m_gtsam.calibration.priors import NO_PRIORS, Priors
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
+from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import QueryableMap, View, glimpse, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.records.calibration import Uncertainty
@@ -163,4 +164,4 @@ def _uncertain(
     drive = UncertainDrive.of(view, field_map, errors, estimate, options)
     values = starting_values(estimate, view.sensors, drive.prior.coverage)
     problem = UncertainProblem(drive, estimate, tests, options.factors)
-    return problem.solutions(problem.linearised(values), values)
+    return UncertainOptimum.at(problem, values).solutions()

@@ -25,12 +25,12 @@ from l2m_gtsam.calibration.budget.search import NOTHING_SEARCHED, Searched
 from l2m_gtsam.calibration.coverage import UncertainMap, sigmas_hold
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.joint import SensorSolution
-from l2m_gtsam.calibration.joint_information import JointInformation
 from l2m_gtsam.calibration.optimise import Ending, LinearSolver
 from l2m_gtsam.calibration.parts_alone import ByParts
 from l2m_gtsam.calibration.stated_sizes import leave_noise
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import ROUND_SIGMAS, THERE_SIGMAS, UncertainProblem
+from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import REOBSERVE_M, QueryableMap, View
 from l2m_gtsam.parallel.threads import side_by_side
 from l2m_gtsam.records.error_budget import StatedSize
@@ -102,11 +102,11 @@ def solve_uncertain(
     drive = UncertainDrive.of(view, field_map, errors, near, options)
     found = settle_by_any(drive, near, tests, options, lambda done: progress(SEARCHED * done))
     # Processes would take up what is stated too small: it is judged without them.
-    stated = found.problem.stated(found.joint, found.values, options.sensor_noise_ut)
+    stated = found.optimum.stated(options.sensor_noise_ut)
     # What a map leaves that does not know its own errors is no process of the drive.
     searched = found.ending is not Ending.SINGULAR and sigmas_hold(errors)
     searched = searched and leave_noise(stated, found.estimate.noise[view.sensors])
-    shown = found.problem.searched(found.joint) if searched else NOTHING_SEARCHED
+    shown = found.optimum.searched() if searched else NOTHING_SEARCHED
     if shown.found:
         moved = float(np.abs(found.estimate.t - near.t)[view.sensors].max())
         start = start_with(found, shown, field_map, errors, options, again=moved > REOBSERVE_M)
@@ -118,12 +118,10 @@ def solve_uncertain(
             lambda done: progress(SEARCHED + (1 - SEARCHED) * done),
             start.values,
         )
-    problem, joint = found.problem, found.joint
-    solved = problem.by_cause(joint, problem.solutions(joint, found.values))
-    scattered, halved = side_by_side(
-        lambda: problem.scattered(joint), lambda: problem.halved(joint, solved)
-    )
-    solved = problem.wandering(joint, found.values, problem.robust(joint, halved, scattered))
+    optimum = found.optimum
+    solved = optimum.by_cause(optimum.solutions())
+    scattered, halved = side_by_side(optimum.scattered, lambda: optimum.halved(solved))
+    solved = optimum.wandering(optimum.robust(halved, scattered))
     progress(1.0)
     return UncertainSolution(
         found.estimate, solved, found.ending, found.settled, found.drive.budget, stated
@@ -146,10 +144,10 @@ def check_by_parts(
     found = settle_by_any(drive, near, tests, options, lambda _: None)
     return UncertainSolution(
         found.estimate,
-        found.problem.solutions(found.joint, found.values),
+        found.optimum.solutions(),
         found.ending,
         found.settled,
-        by_parts=found.problem.by_parts(found.joint, found.estimate),
+        by_parts=found.optimum.by_parts(),
     )
 
 
@@ -208,9 +206,9 @@ def start_with(
 def with_processes(found: "Settled", budget: Budget, shown: Searched) -> gtsam.Values:
     """Return where the optimum is with processes that are no errors of poses, to first order."""
     delta = gtsam.VectorValues()
-    for key, at in found.joint.columns.items():
+    for key, at in found.optimum.joint.columns.items():
         delta.insert(key, shown.moved[at])
-    values = found.values.retract(delta)
+    values = found.optimum.values.retract(delta)
     # Each has a variable of its own.
     for key, weights in zip(budget.variables, shown.weights, strict=True):
         values.insert(key, weights)
@@ -260,8 +258,8 @@ def step_uncertain(
         step = problem.polish(values, 1, solver)
         if step.ending is not Ending.SINGULAR:
             break
-    joint, estimate = problem.linearised(step.values), near.updated(step.values, view.sensors)
-    solved = problem.solutions(joint, step.values)
+    estimate = near.updated(step.values, view.sensors)
+    solved = UncertainOptimum.at(problem, step.values).solutions()
     return UncertainSolution(estimate, solved, step.ending, settled=True)
 
 
@@ -289,10 +287,10 @@ class Settled:
     ----------
     drive
         What it is about.
-    problem, joint
-        The graph of the last round, and all its variables together.
-    values, estimate
-        The optimum.
+    optimum
+        That of the graph of the last round.
+    estimate
+        All sensors there, with their noise.
     ending
         How the last optimisation ended.
     settled
@@ -300,9 +298,7 @@ class Settled:
     """
 
     drive: UncertainDrive
-    problem: UncertainProblem
-    joint: JointInformation
-    values: gtsam.Values
+    optimum: UncertainOptimum
     estimate: Estimate
     ending: Ending
     settled: bool
@@ -341,14 +337,15 @@ def settle(
         problem = UncertainProblem(drive, estimate, tests, options.factors)
         arrived = problem.arrive(values, options, solver, near=near)
         values, joint = arrived.values, arrived.joint
+        optimum = UncertainOptimum(problem, values, joint)
         if arrived.ending is Ending.SINGULAR:
-            return Settled(drive, problem, joint, values, estimate, arrived.ending, settled=False)
+            return Settled(drive, optimum, estimate, arrived.ending, settled=False)
         if not near:  # then it was a descent
             ending = arrived.ending
         near = joint.furthest(sensors) < ROUND_SIGMAS
         after = estimate.updated(values, sensors)
         if options.sensor_noise_ut is None:
-            after = replace(after, noise=problem.noise(joint, values, estimate))
+            after = replace(after, noise=optimum.noise())
         # The weights of the first round are those of the optimum with independent errors.
         at_rest = joint.furthest(sensors) < SETTLED_SIGMAS and joint.decrement < THERE_SIGMAS
         settled = at_rest and problem.same_noise(after, estimate) and round_ > 0
@@ -356,4 +353,4 @@ def settle(
         if settled:
             break
         progress((round_ + 2) / (MAX_ROUNDS + 1))
-    return Settled(drive, problem, joint, values, estimate, ending, settled)
+    return Settled(drive, optimum, estimate, ending, settled)

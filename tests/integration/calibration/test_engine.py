@@ -22,6 +22,7 @@ from l2m_gtsam.calibration.optimise import (
 )
 from l2m_gtsam.calibration.uncertain_drive import UncertainDrive, starting_values
 from l2m_gtsam.calibration.uncertain_graph import UncertainProblem
+from l2m_gtsam.calibration.uncertain_optimum import UncertainOptimum
 from l2m_gtsam.calibration.view import View, observe
 from l2m_gtsam.data import FloatArray, Readings
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
@@ -121,8 +122,8 @@ def test_the_old_elimination_says_the_same(last: LastGraph, form: FactorForm) ->
     problem = last.problem(form)
     values = problem.polish(last.values(np.zeros(3)), 1, LinearSolver.CHOLESKY).values
     old = eliminate(problem.graph.linearize(values), last.view.sensors, last.drive.prior.sizes)
-    joint = problem.linearised(values)
-    found = problem.solutions(joint, values)
+    optimum = UncertainOptimum.at(problem, values)
+    joint, found = optimum.joint, optimum.solutions()
     for each in found:
         s = each.sensor
         expected = old.covariance(s)[:15, :15]
@@ -260,7 +261,7 @@ def test_a_forecast_stands_on_the_same_graph(last: LastGraph, field_map: Harmoni
     problem = last.problem(FactorForm.BLOCK)
     values = last.values(np.zeros(3))
     for each, found in zip(
-        stated.solved, problem.solutions(problem.linearised(values), values), strict=True
+        stated.solved, UncertainOptimum.at(problem, values).solutions(), strict=True
     ):
         np.testing.assert_allclose(
             each.joint_covariance, found.joint_covariance, rtol=1e-9, atol=1e-18
