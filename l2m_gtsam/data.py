@@ -261,7 +261,7 @@ class Readings:
         lidar frame, rotation (rad) before translation (m), shape (N, 6, 6); absent for exact poses.
     regressors
         Recorded numbers whose field may be part of the readings, each in its own unit, shape
-        (N, K); zero where a sensor does not feel them, absent where none were recorded.
+        (N, K); zero where they do not act on a sensor, absent where none were recorded.
     drive
         Which drive each is of, ascending for each sensor, shape (N,); absent where there is one.
     """

@@ -96,7 +96,7 @@ def key_pose_factor(
     errors
         What its readings share with others, as of ``uncertain_block_factor``.
     step
-        What they feel of the error of the step to the next key pose; nothing without.
+        What the error of the step to the next key pose adds to them; nothing without.
     """
     rows = batch.rows_of(key_pose)
     terms = [] if step is None else [step]

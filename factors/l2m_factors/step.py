@@ -1,4 +1,4 @@
-r"""Readings between two key poses: what they feel of the error of odometry's step.
+r"""Readings between two key poses: what the error of odometry's step adds to them.
 
 A reading after a share s of the step from ``X(k)`` to ``X(k+1)`` stands at ``X(k) (R, p)`` if the
 step is Z. With ``d = Log(Z^{-1} X(k)^{-1} X(k+1))`` it stands elsewhere by ``s d``, and
@@ -22,7 +22,7 @@ from l2m_factors.whitening import Whitening
 
 @dataclass(frozen=True)
 class StepError:
-    """What n readings between a key pose and the next feel of the error of the step.
+    """What the error of a step adds to n readings on it.
 
     Attributes
     ----------

@@ -252,7 +252,7 @@ def tile_residual(
     whitening
         Of its n readings.
     step
-        What they feel of the error of the step to the next key pose; nothing without.
+        What the error of the step to the next key pose adds to them; nothing without.
     slow
         What they have of a slow error of their sensor; nothing without.
     """

@@ -67,7 +67,7 @@ class OneKeyOptions(Options):
     robust: RobustOptions = RobustOptions()
     """What becomes of readings that the map and one distortion cannot explain."""
     moving_field_ut: float = Field(default=50.0, gt=0)
-    """With `bag.regressors`: what a sensor may feel of a number, before any reading: a standard
+    """With `bag.regressors`: what a number may add to a sensor, before any reading: a standard
     deviation in microtesla while the number is one standard deviation off its mean."""
     rank: RankOptions = RankOptions()
     """When a direction counts as determined."""

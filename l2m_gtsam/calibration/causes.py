@@ -17,8 +17,8 @@ from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.records.places import Cause, CauseGain, ChangedSource
 from l2m_gtsam.solve.linear_algebra import right_divided
 
-FELT_UT = 0.2  # weaker a source is not felt
-FELT_SHARE = 0.2  # of its strongest field: where a passage begins and ends
+DETECTED_UT = 0.2  # weaker a source is not detected
+DETECTED_SHARE = 0.2  # of its strongest field: where a passage begins and ends
 APART = 30  # slots from one passage to the next
 REJECTED = 0.5  # share of the readings of an average, from which it disagrees
 
@@ -40,9 +40,9 @@ def changed_sources(
     for k, shape in enumerate(found.shapes):
         field, _ = shape.field_and_gradient(rows.points)
         strength = np.linalg.norm(field, axis=1)
-        felt = strength > max(FELT_UT, FELT_SHARE * float(strength.max(initial=0.0)))
+        detected = strength > max(DETECTED_UT, DETECTED_SHARE * float(strength.max(initial=0.0)))
         away = np.linalg.norm(rows.points - shape.position, axis=1)
-        passage = passages_of(drive.averages.slot, felt)
+        passage = passages_of(drive.averages.slot, detected)
         others = rows.residual - found.field(rows.points) + field
         records.append(
             ChangedSource(
@@ -61,12 +61,12 @@ def changed_sources(
     return tuple(records)
 
 
-def passages_of(slot: IntArray, felt: BoolArray) -> IntArray:
-    """Return the number of the passage that each reading is of, -1 where nothing is felt, (N,)."""
-    slots = np.unique(slot[felt])
+def passages_of(slot: IntArray, detected: BoolArray) -> IntArray:
+    """Return the passage of each reading, -1 where nothing is detected, shape (N,)."""
+    slots = np.unique(slot[detected])
     number = np.concatenate([[0], np.cumsum(np.diff(slots) > APART)]) if len(slots) else slots
     passage = np.full(len(slot), -1)
-    passage[felt] = number[np.searchsorted(slots, slot[felt])]
+    passage[detected] = number[np.searchsorted(slots, slot[detected])]
     return passage
 
 

@@ -93,7 +93,7 @@ def errors_over_stated(field_map: object) -> float:
 
 
 class NothingShared:
-    """A map whose errors are independent: one tile with one weight that no reading feels."""
+    """A map whose errors are independent: one tile with one weight that changes no reading."""
 
     covariance = np.eye(1)
     spread, shift = np.empty(0), np.empty((3, 0))
@@ -162,7 +162,7 @@ class Coverage:
     seconds
         When each pose was taken, as the knots count, shape (N,).
     moving
-        The sensors that feel recorded numbers.
+        The sensors whose field recorded numbers change.
     budget
         Processes that were found in the readings.
     spread

@@ -8,7 +8,7 @@ map, b the field of a source that a drive shows and sigma the noise of a reading
 
 is twice the logarithm of the likelihood that the source stood there already over that it did not:
 neither has parameters that the other has not. Steel that came or went since leaves -sum |b|^2 /
-sigma^2, and where the survey does not feel a source nothing is said.
+sigma^2, and where a source is beyond reach of the survey nothing is said.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ import numpy as np
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import BoolArray
 from l2m_gtsam.maps.field_map import Surveyed
-from l2m_gtsam.maps.sources.search import FELT_M
+from l2m_gtsam.maps.sources.search import REACH_M
 from l2m_gtsam.maps.sources.source import SourceShape
 from l2m_gtsam.records.places import CLEAR
 
@@ -37,7 +37,7 @@ def missed_by_map(shapes: Sequence[SourceShape], field_map: QueryableMap) -> Boo
     """
     if not shapes or not isinstance(field_map, Surveyed):
         return np.zeros(len(shapes), dtype=np.bool_)
-    near = field_map.readings.tree.query_ball_point([each.position for each in shapes], FELT_M)
+    near = field_map.readings.tree.query_ball_point([each.position for each in shapes], REACH_M)
     read = field_map.readings[np.unique(np.concatenate([np.array(rows, int) for rows in near]))]
     if not len(read):
         return np.zeros(len(shapes), dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Fields that move with recorded numbers: variables ``Q(i)`` of the sensors that feel them.
+"""Fields that move with recorded numbers: variables ``Q(i)`` of the sensors that they act on.
 
 A number q_k, a motor's current, adds q_k g_k to the field at a sensor, in the lidar frame; the
 sensor reads h_k = C g_k of it. That is an error of the map which all readings of a sensor share.
@@ -34,7 +34,7 @@ class Correction:
 
 @dataclass(frozen=True)
 class MovingFields:
-    """The sensors that feel recorded numbers.
+    """The sensors whose field recorded numbers change.
 
     Attributes
     ----------

@@ -127,7 +127,7 @@ class MovingSolution:
     not_compared
         Why there is no comparison for the other solved ones.
     moving
-        Fields of the numbers, for sensors that feel them.
+        Fields of the numbers, for sensors that they act on.
     """
 
     solution: OneKeySolution
@@ -169,7 +169,7 @@ class MovingProblem:
     priors: Priors = NO_PRIORS
 
     def solved(self, t_start: FloatArray, fields: Mapping[int, Correction]) -> "Round":
-        """Solve without the fields of the sensors that feel some, and compare models."""
+        """Solve without the fields of the sensors that some act on, and compare models."""
         given = without(self.readings, fields)
         solution = solve_one_key(
             given,
@@ -225,7 +225,7 @@ class Round:
     Attributes
     ----------
     fields
-        What was taken off of the sensors that feel something.
+        What was taken off of the sensors that some act on.
     given
         The readings without that.
     solution
@@ -298,7 +298,7 @@ def solve_moving(problem: MovingProblem, t_start: FloatArray) -> MovingSolution:
 
 
 def without(readings: Readings, fields: Mapping[int, Correction]) -> Readings:
-    """Return readings without the fields of numbers, and the numbers only where they are felt."""
+    """Return readings without the fields of numbers, and the numbers only where they act."""
     if readings.regressors is None or not fields:
         return replace(readings, regressors=None)
     B, numbers = readings.field.copy(), np.zeros_like(readings.regressors)

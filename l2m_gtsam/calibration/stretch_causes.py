@@ -203,5 +203,5 @@ def _first(found: tuple[float, float]) -> float:
 def _size(field: FloatArray) -> float:
     """Return the root mean square of the length of a field where there is any, uT."""
     squares = np.sum(field**2, axis=1)
-    felt = squares > 0
-    return float(np.sqrt(squares[felt].mean())) if felt.any() else 0.0
+    present = squares > 0
+    return float(np.sqrt(squares[present].mean())) if present.any() else 0.0

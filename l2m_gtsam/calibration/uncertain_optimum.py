@@ -11,7 +11,7 @@ from l2m_factors import D, Q, U, W
 from l2m_gtsam.calibration.budget.found import spread_of_H
 from l2m_gtsam.calibration.budget.looked_for import processes
 from l2m_gtsam.calibration.budget.processes import ReadingPlaces
-from l2m_gtsam.calibration.budget.search import Searched, felt, search
+from l2m_gtsam.calibration.budget.search import Searched, process_information, search
 from l2m_gtsam.calibration.cluster_robust import Scatter, scatters, unmodelled
 from l2m_gtsam.calibration.coverage import Coverage
 from l2m_gtsam.calibration.half_difference import (
@@ -112,7 +112,9 @@ class UncertainOptimum:
         problem = self.problem
         places = ReadingPlaces.of(self._view.readings, problem.drive.field_map, problem.estimate)
         looked_for, rows = processes(places, self._view.sensors), self._rows
-        known = felt(looked_for, self.joint, rows, problem.noise.whitenings, places.C)
+        known = process_information(
+            looked_for, self.joint, rows, problem.noise.whitenings, places.C
+        )
         return search(known)
 
     def scattered(self) -> dict[int, tuple[Scatter, ...]]:
@@ -223,7 +225,7 @@ class UncertainOptimum:
         return self.problem.tests[sensor].free + self.joint.taken(sensor)
 
     def _correction(self, sensor: int) -> Correction | None:
-        """Return what recorded numbers still add to a sensor's readings; none if it feels none."""
+        """Return what recorded numbers still add to a sensor's readings; none if none act on it."""
         moving, key = self._coverage.moving, Q(sensor)
         if sensor not in moving.scales:
             return None

@@ -100,8 +100,8 @@ class PosedSurvey:
             system = WeightSystem(0.5 * (left + left.T), pull)
             squares = float((slopes.residual**2).sum()) / slopes.noise**2
             variance = np.square(E).mean(axis=(0, 1))
-            felt = np.array([variance[part == each].sum() for each in np.unique(PARTS)])
-            found.append(PosesInWindow(PoseView(system, part, squares, felt), E, crossed))
+            by_unit = np.array([variance[part == each].sum() for each in np.unique(PARTS)])
+            found.append(PosesInWindow(PoseView(system, part, squares, by_unit), E, crossed))
         return found
 
 
@@ -156,8 +156,8 @@ def pose_sizes_of(survey: PosedSurvey) -> FoundPoses | None:
         views = [each.view for each in survey.seen(unit, lasting_s)]
         if not found:  # of these parts, those that matter
             sizes = likely(views, parts, known=False).sizes
-            felt = np.mean([each.felt for each in views], axis=0) * sizes
-            parts = np.flatnonzero(felt > LEAST_SHARE * survey.last.windows.prior.noise**2)
+            variance = np.mean([each.by_unit for each in views], axis=0) * sizes
+            parts = np.flatnonzero(variance > LEAST_SHARE * survey.last.windows.prior.noise**2)
             if not len(parts):
                 return None
             views = [each.among(parts) for each in views]

@@ -136,18 +136,18 @@ class SurveyPoses:
         mine = np.flatnonzero(rows[np.minimum(at, len(rows) - 1)] == self.reading)
         at, shift = at[mine], self.shift[mine]
         size = np.ones(POSE) if self.sizes is None else self.sizes
-        felt = np.flatnonzero(size)
-        change = (shift[:, 3:] - gradient[at] @ shift[:, :3])[:, :, felt] * size[felt]
+        parts = np.flatnonzero(size)
+        change = (shift[:, 3:] - gradient[at] @ shift[:, :3])[:, :, parts] * size[parts]
         spacing = self.lasting_s / KNOTS
         knots = ErrorKnots.at(self.drive[mine], self.seconds[mine], spacing, self.lasting_s)
         while len(knots.drive) > MOST_KNOTS:
             spacing *= 2
             knots = ErrorKnots.at(self.drive[mine], self.seconds[mine], spacing, self.lasting_s)
-        effect = np.zeros((len(rows), len(knots.drive), 3, len(felt)))
+        effect = np.zeros((len(rows), len(knots.drive), 3, len(parts)))
         for side in range(2):
             weighted = change * knots.weight[:, side, None, None]
             np.add.at(effect, (at, knots.index[:, side]), weighted)
-        return KnotEffects(knots, felt, effect.transpose(0, 2, 1, 3))
+        return KnotEffects(knots, parts, effect.transpose(0, 2, 1, 3))
 
 
 def rounded(shift: FloatArray) -> FloatArray:
@@ -206,14 +206,14 @@ class KnotEffects:
     ----------
     knots
         When.
-    felt
+    parts
         Which of the six errors, shape (c,).
     effect
         Of a unit of each in uT, map frame, shape (n, 3, Q, c).
     """
 
     knots: ErrorKnots
-    felt: IntArray
+    parts: IntArray
     effect: FloatArray
 
     @property
@@ -228,4 +228,4 @@ class KnotEffects:
     @property
     def part(self) -> IntArray:
         """Which of the six errors each column of ``white`` is of, shape (Q c,)."""
-        return np.tile(self.felt, len(self.knots.drive))
+        return np.tile(self.parts, len(self.knots.drive))

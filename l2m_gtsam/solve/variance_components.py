@@ -192,9 +192,9 @@ class WeightSystem:
     def components(self, spectra: FloatArray) -> VarianceComponents:
         """Return the most likely sizes of K processes of these spectra, shape (K, m)."""
         alone = np.diag(self.information)
-        felt = spectra @ alone
+        expected = spectra @ alone
         count = np.count_nonzero(spectra, axis=1)
-        sizes = np.where(felt > 0, count / np.where(felt > 0, felt, 1.0), 0.0)
+        sizes = np.where(expected > 0, count / np.where(expected > 0, expected, 1.0), 0.0)
         last = -np.inf
         for _ in range(MOST_UPDATES):
             variances = sizes @ spectra
@@ -206,7 +206,7 @@ class WeightSystem:
             informed = spectra @ known
             ratio = (spectra @ found.rest**2) / np.where(informed > 0, informed, 1.0)
             sizes = sizes * np.sqrt(np.where(informed > 0, ratio, 0.0))
-            sizes = np.where(sizes * felt > NEGLIGIBLE, sizes, 0.0)
+            sizes = np.where(sizes * expected > NEGLIGIBLE, sizes, 0.0)
         return VarianceComponents(sizes, 2 * self.fit(sizes @ spectra).likelihood)
 
     def whiter(self, noise: float) -> "WeightSystem":
@@ -257,9 +257,9 @@ def shared_components(
     near
         Sizes to begin with, shape (K,); those of a process alone, if they are known.
     """
-    felt = sum(d @ np.diag(each.information) for each, d in zip(systems, spectra, strict=True))
+    expected = sum(d @ np.diag(each.information) for each, d in zip(systems, spectra, strict=True))
     count = sum(np.count_nonzero(d, axis=1) for d in spectra)
-    unit = np.log(np.maximum(count, 1) / np.where(felt > 0, felt, 1.0))
+    unit = np.log(np.maximum(count, 1) / np.where(expected > 0, expected, 1.0))
     bounds = Bounds(unit + np.log(NEGLIGIBLE), unit + np.log(LARGEST))
     start, noise = unit, 1.0
     if near is not None:

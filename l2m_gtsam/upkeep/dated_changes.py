@@ -30,7 +30,10 @@ def in_utc(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-FELT_UT, FELT_SHARE = 0.2, 0.2  # weaker a source is not felt; and of its strongest field
+DETECTED_UT, DETECTED_SHARE = (
+    0.2,
+    0.2,
+)  # weaker a source is not detected; and of its strongest field
 SAME_M, SAME_SHARE = 0.3, 0.3  # so near, and so alike, two sources are one
 SIGMAS = 3.0
 TAKEN = 0.3  # of its moment: what a map has of steel that went, at least
@@ -72,14 +75,14 @@ def has_cloud(field_map: HarmonicMap, diary: MapDiary) -> bool:
 
 
 def last_felt(field_map: HarmonicMap, source: ChangedSource) -> int:
-    """Return the last drive of a map that came to where a source is felt."""
+    """Return the last drive of a map that came to where a source is detected."""
     history, points = field_map.learnt.history, field_map.readings.points
     if history is None:
         return 0
     shape = SourceShape(np.concatenate([source.position, source.moment, source.half_axis]))
     strength = np.linalg.norm(shape.field_and_gradient(points)[0], axis=1)
-    felt = strength > max(FELT_UT, FELT_SHARE * float(strength.max()))
-    return int(history.drive[felt].max(initial=0))
+    detected = strength > max(DETECTED_UT, DETECTED_SHARE * float(strength.max()))
+    return int(history.drive[detected].max(initial=0))
 
 
 def brought_by(source: ChangedSource, changes: Sequence[DatedChange]) -> int | None:

@@ -79,7 +79,7 @@ NOTHING_SEARCHED = Searched()
 
 
 @dataclass(frozen=True)
-class Felt:
+class ProcessInformation:
     """What white readings say of the weights of several processes.
 
     Attributes
@@ -119,13 +119,13 @@ class Felt:
         return Searched(tuple(found), noise, tuple(np.split(white, ends)), moved)
 
 
-def felt(
+def process_information(
     processes: Sequence[Process],
     joint: JointInformation,
     rows: Sequence[Rows],
     whitened: Sequence[FloatArray],
     C: FloatArray,
-) -> Felt:
+) -> ProcessInformation:
     """Return what readings say of processes that are not in their graph.
 
     Parameters
@@ -168,7 +168,7 @@ def felt(
     information = own - joint.every.around(across) + loose.T @ loose
     system = WeightSystem(0.5 * (information + information.T), pull)
     squares = sum(float(each.residual @ each.residual) for each in rows)
-    return Felt(processes, columns, system, squares, joint, across)
+    return ProcessInformation(processes, columns, system, squares, joint, across)
 
 
 def batches(
@@ -195,7 +195,7 @@ def _times(W: FloatArray, Z: FloatArray) -> FloatArray:
     return np.asarray((W @ Z.reshape(len(W), 3, -1)).reshape(Z.shape))
 
 
-def search(known: Felt) -> Searched:
+def search(known: ProcessInformation) -> Searched:
     """Return the processes without which a drive is much less likely.
 
     The kind that explains most is taken first, for all sensors that show it; the others have to
@@ -245,7 +245,7 @@ def _price(process: Process) -> float:
     return 2 * float(np.log(len(process.forms)))
 
 
-def _together(known: Felt, taken: dict[int, FoundProcess]) -> Searched:
+def _together(known: ProcessInformation, taken: dict[int, FoundProcess]) -> Searched:
     """Return processes with the sizes that are most likely for all of them at once."""
     if not taken:
         return NOTHING_SEARCHED

@@ -40,7 +40,9 @@ from l2m_gtsam.parallel.threads import in_threads
 
 NEGLIGIBLE = 1e-11  # share of the variance at places
 LINEAR = 0.002  # metres over which a field that varies over decimetres is linear
-FELT = 0.01  # of the noise, root mean square over a drive: what matters to ten thousand readings
+NOTICEABLE = (
+    0.01  # of the noise, root mean square over a drive: what matters to ten thousand readings
+)
 
 
 @dataclass(frozen=True)
@@ -199,7 +201,7 @@ def suite_modes(
 ) -> SuiteModes:
     """Return what errors of the survey's sensors do over places, as numbers of unit variance.
 
-    Of their sixteen errors each, the combinations stay that a drive feels.
+    Of their sixteen errors each, the combinations stay that a drive shows.
     """
     if learnt.suite is None or not tiles:
         return SuiteModes({}, np.empty((3, 0)), np.empty(0))
@@ -222,7 +224,7 @@ def suite_modes(
         seen = seen.reshape(-1, len(root))
         gram += seen.T @ seen * (len(rows) / len(some))
     squares, turned = np.linalg.eigh(gram)
-    least = 3 * len(points) * (FELT * learnt.hyperparameters.noise) ** 2
+    least = 3 * len(points) * (NOTICEABLE * learnt.hyperparameters.noise) ** 2
     return every.among(turned[:, squares > least])
 
 

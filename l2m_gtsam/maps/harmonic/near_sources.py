@@ -78,7 +78,7 @@ class PointSources:
 
 @dataclass(frozen=True)
 class NearSources:
-    """The parts of sources that end at a radius, sorted by the cells in which they are felt.
+    """The parts of sources that end at a radius, sorted by the cells that they reach.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class NearSources:
         Where each cell starts in ``table``, shape (nx ny nz + 1,).
     table
         Positions, moments and squared radii (x, y, z, mx, my, mz, edge, 1 / edge) of the sources
-        that are felt in a cell, cell by cell, shape (8, E); some without a moment to fill lists up.
+        that reach a cell, cell by cell, shape (8, E); some without a moment to fill lists up.
     """
 
     corner: FloatArray
@@ -141,7 +141,7 @@ def near_sources(
 def count_near(
     x: FloatArray, y: FloatArray, z: FloatArray, edge: FloatArray, counts: IntArray
 ) -> None:
-    """Add up how many sources are felt in each cell.
+    """Add up how many sources reach each cell.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def fill_near(
     free: IntArray,
     table: FloatArray,
 ) -> None:
-    """Write each source into the lists of the cells that it is felt in; see ``count_near``.
+    """Write each source into the lists of the cells that it reaches; see ``count_near``.
 
     Parameters
     ----------

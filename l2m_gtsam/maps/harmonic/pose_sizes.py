@@ -97,14 +97,14 @@ class PoseView:
         Which of ``PARTS`` each is, shape (q,).
     squares
         Sum of squares of the residuals, white by the map's noise.
-    felt
+    by_unit
         Mean variance of a reading by a unit of each part, uT^2, shape (4,).
     """
 
     system: WeightSystem
     part: IntArray
     squares: float
-    felt: FloatArray
+    by_unit: FloatArray
 
     def among(self, parts: IntArray) -> "PoseView":
         """Return the same for some parts, the others being zero."""
@@ -134,8 +134,8 @@ def pose_sizes(
         seen = in_threads(lasted, some)
         if not found:  # of these parts, those that matter
             sizes = likely(seen, parts, known=noise_known).sizes
-            felt = np.mean([each.felt for each in seen], axis=0) * sizes
-            parts = np.flatnonzero(felt > LEAST_SHARE * learnt.hyperparameters.noise**2)
+            variance = np.mean([each.by_unit for each in seen], axis=0) * sizes
+            parts = np.flatnonzero(variance > LEAST_SHARE * learnt.hyperparameters.noise**2)
             if not len(parts):
                 return None
         fit = likely([each.among(parts) for each in seen], parts, known=noise_known)
@@ -201,8 +201,8 @@ def pose_view(learnt: Learnt, tiles: Tiles, poses: SurveyPoses, index: int) -> P
     beside = np.arange(len(information)) >= count
     if beside.any():
         system = system.beside(beside.astype(float)).among(np.arange(count))
-    felt = np.square(errors[:, :, :count]).mean(axis=(0, 1))
-    by_part = np.array([felt[part == each].sum() for each in np.unique(PARTS)])
+    by_unit = np.square(errors[:, :, :count]).mean(axis=(0, 1))
+    by_part = np.array([by_unit[part == each].sum() for each in np.unique(PARTS)])
     return PoseView(system, part, float(r @ r), by_part)
 
 

@@ -1,7 +1,7 @@
 """A magnetic potential on a regular grid: field and gradient for solvers that ask a lot.
 
 Field and gradient are the exact derivatives of one scalar, a spline without steps, which makes the
-gradient symmetric; see ``spline``. A node is felt no further than 8 cells away.
+gradient symmetric; see ``spline``. A node has an effect no further than 8 cells away.
 
 The error of the field falls with the seventh power of the spacing and that of its gradient with
 the sixth. Where the field varies by 30 uT, 0.005 uT and 0.02 uT/m are met with a spacing of 0.09 of

@@ -5,7 +5,7 @@ second derivatives step from cell to cell. A spline that meets the values at the
 solve over the whole grid, and a strong source beside it would ring everywhere. Here the
 coefficients come from a short symmetric filter of the values instead (a quasi-interpolant, after
 C. de Boor and G. J. Fix, "Spline approximation by quasiinterpolants", 1973): polynomials of degree
-7 are still reproduced, and a node is felt no further than 8 cells away.
+7 are still reproduced, and a node has an effect no further than 8 cells away.
 """
 
 from math import comb, factorial

@@ -22,7 +22,7 @@ from l2m_gtsam.maps.sources.wrong_reading import wrong_reading
 from l2m_gtsam.options import Options
 
 BATCH = 128  # candidates that are asked together
-FELT_M = 4.0  # from a candidate: a source that is not felt there is none that matters
+REACH_M = 4.0  # of a source: what it adds further away changes nothing
 # Between candidates a source explains more than at the best of them: not three times as much.
 HOPELESS = 0.4  # of the price
 DIPOLE = 6  # parameters
@@ -129,11 +129,11 @@ class SourcePlaces:
             if not len(part):
                 continue
             at = positions[part]
-            felt = np.zeros(len(rows), dtype=np.bool_)
-            felt[
-                np.concatenate([np.array(q, dtype=int) for q in tree.query_ball_point(at, FELT_M)])
+            within = np.zeros(len(rows), dtype=np.bool_)
+            within[
+                np.concatenate([np.array(q, dtype=int) for q in tree.query_ball_point(at, REACH_M)])
             ] = True
-            own = rows.near(felt)
+            own = rows.near(within)
             white = own.whitened(UT_M3 * moment_features(own.points, at))
             seen = own.projected(white)
             for each, k in zip(part, range(len(part)), strict=True):

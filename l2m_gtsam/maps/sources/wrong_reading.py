@@ -38,7 +38,7 @@ def wrong_reading(
     F, g = rows.information(features), np.einsum("nim,ni->m", features, pulled)
     source = g[0] ** 2 / F[0, 0]
     reading = float(g[1:] @ np.linalg.solve(F[1:, 1:], g[1:]))
-    # Elsewhere the source may be felt by hardly any reading: then both explain the same.
+    # Elsewhere the source may change hardly any reading: then both explain the same.
     both = float(g @ np.linalg.lstsq(F, g, rcond=1e-10)[0])
     worth = reading - price - 2 * float(np.log(len(rows)))
     return most if worth > source - least and both - reading < least else None

@@ -57,7 +57,7 @@ def moved_steel(judged: JudgedVisits, change: Change) -> MovedSteel:
     between = judged.during(change)
     if not (len(sources) and between):
         return MovedSteel(sources, change)
-    # The later of the visits between may have felt the sources: from which one on is likeliest?
+    # The later of the visits between may show the sources: from which one on is likeliest?
     rows = change_rows(judged, between)
     field, middle = sources.field(rows.points), [judged.visits[k].visit.middle for k in between]
     times = [change.begin, *middle, change.end]

@@ -59,7 +59,7 @@ class RevisitedTiles:
     def renewed(self, anchoring: Anchoring) -> RenewedTiles:
         """Return the same with a tile of its own from each visit on that found another field.
 
-        Steel that was moved is felt in other tiles, too. One that was visited before and after a
+        Steel that was moved changes other tiles, too. One that was visited before and after a
         tile changed clearly needs little evidence to end there; so it does where what the moved
         steel adds is known worse than a reading. Else that is taken off its later readings.
         """
