@@ -30,10 +30,8 @@ def in_utc(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-DETECTED_UT, DETECTED_SHARE = (
-    0.2,
-    0.2,
-)  # weaker a source is not detected; and of its strongest field
+# A source is detected where its field is as strong as this, and as this share of its strongest.
+DETECTED_UT, DETECTED_SHARE = 0.2, 0.2
 SAME_M, SAME_SHARE = 0.3, 0.3  # so near, and so alike, two sources are one
 SIGMAS = 3.0
 TAKEN = 0.3  # of its moment: what a map has of steel that went, at least
@@ -61,7 +59,7 @@ def dated_changes(
         gone = -float(standing_moment(field_map, source) @ source.moment)
         taken = gone > TAKEN * float(source.moment @ source.moment)
         what = Happening.WENT if brought is not None or taken else came
-        before = last_felt(field_map, source)
+        before = last_detected(field_map, source)
         changes.append(DatedChange(what, source, drive, before, brought))
     return tuple(with_moves(changes, first))
 
@@ -74,7 +72,7 @@ def has_cloud(field_map: HarmonicMap, diary: MapDiary) -> bool:
     return len(field_map.learnt.strengths) > len(diary.changes)
 
 
-def last_felt(field_map: HarmonicMap, source: ChangedSource) -> int:
+def last_detected(field_map: HarmonicMap, source: ChangedSource) -> int:
     """Return the last drive of a map that came to where a source is detected."""
     history, points = field_map.learnt.history, field_map.readings.points
     if history is None:
