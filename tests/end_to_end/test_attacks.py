@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from tests.drives.bags import Entry, ros, write
-from tests.fuzz.runner import Ended, import_commands, run_case, start_command
+from tests.fuzz.runner import Ended, run_case, start_command
 from tests.support.bag_records import MAGIC_ROS1, ros1_bag, ros1_records, ros1_repacked, sized
 
 FILES = (Path(__file__).parents[1] / "files").resolve()
@@ -32,11 +32,6 @@ LITTLE = 64 << 20  # bytes at the peak beside the program itself: 11 to 17 MiB w
 SOON = 1.0  # seconds of a core; it takes 0.4
 SHORT = 1000  # letters of a last line
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def imported() -> None:
-    import_commands()
 
 
 def refused(folder: Path, *words: object, most_bytes: int = LITTLE) -> str:
@@ -302,4 +297,5 @@ def test_12_a_map_that_unpacks_to_gigabytes(tmp_path: Path) -> None:
     assert path.stat().st_size < 8 << 20
     found = run(tmp_path, "map", "info", path)
     assert found.how == "refused", found
-    assert found.peak_bytes < LITTLE + 8 * numbers
+    # Once: twice would be 960 MB. 67 MiB more were seen, of modules that the command loads.
+    assert found.peak_bytes < 1.5 * 8 * numbers

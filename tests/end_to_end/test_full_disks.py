@@ -6,7 +6,6 @@ import pytest
 
 from tests.fuzz.corpus import make_demo
 from tests.fuzz.full_disks import fill_all, may_mount
-from tests.fuzz.runner import import_commands
 from tests.fuzz.trials import BAD, commands, table
 
 DISKS = 20
@@ -17,7 +16,6 @@ def test_full_disks(tmp_path: Path) -> None:
     if not may_mount(tmp_path / "disk"):
         pytest.skip("a small file system cannot be mounted here")
     make_demo(tmp_path / "demo")
-    import_commands()
     found = fill_all(commands(tmp_path, tmp_path / "demo"), DISKS, tmp_path, seed=0)
     print(table(found))
     assert not {left for _, left in found} & set(BAD)

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from l2m_gtsam.storage.cloud import read_cloud
 from tests.fuzz.cases import Case, case_of, ended
 from tests.fuzz.corpus import make_demo, quick_corpus, whole_corpus
 from tests.fuzz.run import FILES, run
-from tests.fuzz.runner import BAD, GOOD, import_commands
+from tests.fuzz.runner import BAD, GOOD, run_case
 from tests.fuzz.sound import Sound
 
 EACH = 2  # cases of each file in the short run
@@ -17,7 +18,6 @@ LONG = "L2M_FUZZ_CASES"  # environment variable: how many cases of the long run
 
 @pytest.fixture(scope="module")
 def corpus(tmp_path_factory: pytest.TempPathFactory) -> list[Sound]:
-    import_commands()
     return quick_corpus(tmp_path_factory.mktemp("corpus"), FILES.resolve())
 
 
@@ -28,6 +28,13 @@ def test_sound_files_are_read(corpus: list[Sound]) -> None:
         for words in sound.commands if sound.commands[0][0] == "inspect" else sound.commands[:1]:
             found = ended(Case(number, sound, "none", words, sound.path.read_bytes()))
             assert found.how == GOOD[0], (sound.kind, words, found)
+
+
+def test_threads_of_other_tests_do_no_harm(corpus: list[Sound], tmp_path: Path) -> None:
+    """A compressed cloud that was read here starts threads, which a command has none of."""
+    sound = next(each for each in corpus if each.path.suffix == ".laz")
+    read_cloud(sound.path, 0.1)
+    assert run_case(["read", "cloud", str(sound.path)], tmp_path, tmp_path / "out").how == GOOD[0]
 
 
 def test_a_case_is_the_same_each_time(corpus: list[Sound]) -> None:
@@ -48,7 +55,6 @@ def test_nothing_breaks_it_for_long(tmp_path: Path) -> None:
     make_demo(demo)
     folder = tmp_path / "corpus"
     folder.mkdir()
-    import_commands()
     whole = whole_corpus(folder, FILES.resolve(), demo)
     counts, took = run(range(int(os.environ.get(LONG, "10000"))), whole, tmp_path)
     print(took, (tmp_path / "table.md").read_text(), sep="\n")

@@ -13,7 +13,6 @@ import pytest
 from l2m_gtsam.storage.result_set import SET_FILE
 from tests.fuzz.corpus import make_demo
 from tests.fuzz.kills import kill_all, killed
-from tests.fuzz.runner import import_commands
 from tests.fuzz.trials import BAD, Command, commands, files, prepared, table
 
 FILES = Path(__file__).parents[1] / "files"
@@ -22,7 +21,6 @@ ALL = 200  # in the studies
 
 
 def test_a_killed_comparison_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
-    import_commands()
     names = ("calibration.yaml", "metrics.json")
     other = ("validate", "--calibration", "HERE/calibration.yaml")
     compared = (*other, "--compare", "HERE/calibration.yaml", "--out", "OUT")
@@ -50,7 +48,6 @@ def test_seconds_of_a_run_are_no_results(tmp_path: Path) -> None:
 @pytest.mark.study
 def test_kills_at_random_moments(tmp_path: Path) -> None:
     make_demo(tmp_path / "demo")
-    import_commands()
     found = kill_all(commands(tmp_path, tmp_path / "demo"), ALL, tmp_path, seed=0)
     print(table(found))
     assert not {left for _, left in found} & set(BAD)

@@ -8,7 +8,7 @@ from rosbags.highlevel import AnyReader
 
 from tests.drives.large_bags import write_among_images
 from tests.fuzz.corpus import make_demo
-from tests.fuzz.runner import import_commands, run_case
+from tests.fuzz.runner import run_case
 
 SIZE = 2_000_000_000
 MOST_BYTES = 3 << 28  # beside the program, which takes 250 MB
@@ -19,7 +19,6 @@ COMPUTES_S = 20.0  # of a core: the calibration itself takes 7
 def test_a_bag_with_images_and_clouds(tmp_path: Path) -> None:
     demo = tmp_path / "demo"
     make_demo(demo)
-    import_commands()
     bag = write_among_images(tmp_path / "large", demo / "calibration_mcap", SIZE)
     library = seconds_of_library(bag)
     looked = run_case(["inspect", str(bag)], tmp_path, tmp_path / "out")

@@ -15,7 +15,6 @@ from pathlib import Path
 from random import Random
 
 from tests.fuzz.corpus import make_demo
-from tests.fuzz.runner import import_commands
 from tests.fuzz.trials import (
     BAD,
     NEW,
@@ -125,7 +124,6 @@ def main() -> None:
     make_demo(asked.demo.resolve())
     shutil.rmtree(asked.out, ignore_errors=True)
     asked.out.mkdir(parents=True)
-    import_commands()
     chosen = commands(asked.out.resolve(), asked.demo.resolve())
     wanted = [each for each in chosen if not asked.only or each.name in asked.only]
     found = fill_all(wanted, asked.disks, asked.out.resolve(), asked.seed)

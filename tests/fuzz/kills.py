@@ -16,7 +16,6 @@ from random import Random
 from time import monotonic, sleep
 
 from tests.fuzz.corpus import make_demo
-from tests.fuzz.runner import import_commands
 from tests.fuzz.trials import (
     BAD,
     MOST_S,
@@ -99,7 +98,6 @@ def main() -> None:
     make_demo(asked.demo.resolve())
     shutil.rmtree(asked.out, ignore_errors=True)
     asked.out.mkdir(parents=True)
-    import_commands()
     chosen = commands(asked.out.resolve(), asked.demo.resolve())
     wanted = [each for each in chosen if not asked.only or each.name in asked.only]
     found = kill_all(wanted, asked.kills, asked.out.resolve(), asked.seed)

@@ -10,7 +10,7 @@ from shutil import rmtree
 
 from tests.fuzz.cases import case_of, ended, table
 from tests.fuzz.corpus import make_demo, quick_corpus, whole_corpus
-from tests.fuzz.runner import BAD, import_commands
+from tests.fuzz.runner import BAD
 from tests.fuzz.sound import Sound
 
 FILES = Path(__file__).parents[1] / "files"
@@ -47,7 +47,6 @@ def main() -> None:
         make_demo(asked.demo.resolve())
         whole = whole_corpus(corpus_folder, files, asked.demo.resolve())
         corpus = [each for each in whole if each.computes or not asked.computing]
-    import_commands()
     run(range(asked.first, asked.first + asked.cases), corpus, asked.out)
 
 
