@@ -285,8 +285,6 @@ class Settled:
 
     Attributes
     ----------
-    drive
-        What it is about.
     optimum
         That of the graph of the last round.
     estimate
@@ -297,11 +295,15 @@ class Settled:
         Whether another round would repeat the last.
     """
 
-    drive: UncertainDrive
     optimum: UncertainOptimum
     estimate: Estimate
     ending: Ending
     settled: bool
+
+    @property
+    def drive(self) -> UncertainDrive:
+        """Readings and what they share."""
+        return self.optimum.problem.drive
 
 
 def settle(
@@ -339,7 +341,7 @@ def settle(
         values, joint = arrived.values, arrived.joint
         optimum = UncertainOptimum(problem, values, joint)
         if arrived.ending is Ending.SINGULAR:
-            return Settled(drive, optimum, estimate, arrived.ending, settled=False)
+            return Settled(optimum, estimate, arrived.ending, settled=False)
         if not near:  # then it was a descent
             ending = arrived.ending
         near = joint.furthest(sensors) < ROUND_SIGMAS
@@ -353,4 +355,4 @@ def settle(
         if settled:
             break
         progress((round_ + 2) / (MAX_ROUNDS + 1))
-    return Settled(drive, optimum, estimate, ending, settled)
+    return Settled(optimum, estimate, ending, settled)

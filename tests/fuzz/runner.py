@@ -23,8 +23,8 @@ BAD = ("traceback", "fault", "hang", "memory", "crash", "no line", "left over")
 class Ended:
     """How a case ended: a word of ``GOOD`` or ``BAD``, what it used and what it said.
 
-    ``peak_bytes`` is the memory at its peak beyond the heap that it was forked with: that one is as
-    large as what ran in the same process before.
+    ``peak_bytes`` is the memory at its peak beyond the heap that it was forked with, which
+    holds what commands import.
     """
 
     how: str

@@ -16,6 +16,7 @@ import pkgutil
 import resource
 import subprocess
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -158,8 +159,6 @@ def _child(request: Request) -> None:
     except SystemExit as end:
         _leave(end.code if isinstance(end.code, int) else 0)
     except BaseException:  # what `main` lets through is what is looked for
-        import traceback
-
         traceback.print_exc()
         _leave(99)
     _leave(0)
@@ -169,7 +168,8 @@ def _replace_command(read: Callable[[Path], object], path: Path) -> None:
     def command(_: list[str]) -> None:
         read(path)
 
-    app.app = command  # type: ignore[assignment]
+    # Errors end as those of a command do; the process ends with it.
+    app.app = command  # type: ignore[assignment]  # called as Typer's object is
 
 
 def _leave(code: int) -> None:

@@ -40,9 +40,7 @@ from l2m_gtsam.parallel.threads import in_threads
 
 NEGLIGIBLE = 1e-11  # share of the variance at places
 LINEAR = 0.002  # metres over which a field that varies over decimetres is linear
-NOTICEABLE = (
-    0.01  # of the noise, root mean square over a drive: what matters to ten thousand readings
-)
+NOTICEABLE = 0.01  # of the noise, rms over a drive: what matters to ten thousand readings
 
 
 @dataclass(frozen=True)
