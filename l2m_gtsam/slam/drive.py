@@ -45,6 +45,13 @@ class KnownSensors:
         more = np.concatenate([np.zeros(3), np.full(9, distortion**2), np.full(3, offset**2)])
         return replace(self, covariance=self.covariance + np.diag(more))
 
+    def corrected(self, correction: FloatArray) -> "KnownSensors":
+        """Return one sensor whose field is ``A b + h`` where now it is b, of (A row by row, h)."""
+        A, h = correction[:9].reshape(3, 3), correction[9:]
+        C = np.linalg.solve(A.T, self.distortion[0, :9].reshape(3, 3).T).T
+        H = self.distortion[0, 9:] - C @ h
+        return replace(self, distortion=np.append(C.ravel(), H)[None])
+
     def fixed(self) -> Calibrations:
         """Return them as constants of factors."""
         return Calibrations(self.t, self.distortion, self.offset)

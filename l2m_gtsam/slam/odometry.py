@@ -183,13 +183,12 @@ def odometry_steps(
     stated = _stated(trajectory, rows, R, p) if options.stated is Usage.USED else None
     if stated is not None:  # the repair of jumps has put their covariance into the poses'
         covariance = stated + isotropic_covariance(options.least_deg, options.least_m)
-        share = options.steady or 0.0
     else:
         covariance = drift_covariance(R, p, options)
         for jump in jumps:
             covariance[np.searchsorted(rows, jump.row)] += jump.covariance
-        share = options.position_share if options.steady is None else options.steady
     seconds = 1e-9 * np.diff(trajectory.stamp_ns[rows])
+    share = steady_share(options, is_stated=stated is not None)
     return OdometrySteps(
         R,
         p,
@@ -197,8 +196,20 @@ def odometry_steps(
         stated=stated is not None,
         scale=options.scale,
         fixed_axes=fixed,
-        steady=None if options.scale or not share else steady_weights(seconds, p, share),
+        steady=steady_weights(seconds, p, share) if share else None,
     )
+
+
+def steady_share(options: DriftOptions, *, is_stated: bool) -> float:
+    """Return a steady drift's standard deviation as a share of the distance; 0 for none.
+
+    Covariances that a recording states have what they share already.
+    """
+    if options.scale:
+        return 0.0
+    if options.steady is None:
+        return 0.0 if is_stated else options.position_share
+    return options.steady
 
 
 def steady_weights(seconds: FloatArray, p: FloatArray, share: float) -> FloatArray:

@@ -134,7 +134,7 @@ def logged_trajectory(lines: Sequence[LogLine]) -> Trajectory:
 
 
 KIND = "online-state"
-VERSION = 1
+VERSION = 2
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
 from l2m_gtsam.slam.links import Links
-from l2m_gtsam.slam.odometry import FixedStep, odometry_steps
+from l2m_gtsam.slam.odometry import FixedStep, odometry_steps, steady_share
 from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, ScanAtKeyPose
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep, suspect_step, velocity
@@ -264,7 +264,8 @@ class Intake:
         options = self._options
         taken = self._placed(waiting, trajectory)
         readings = thinned_readings(taken, trajectory, rows, options.key_poses.readings)
-        steps = odometry_steps(trajectory, rows, options.drift).as_walk(options.drift.over_m)
+        steps = odometry_steps(trajectory, rows, options.drift)
+        steps = steps.with_scale_as_drift(options.drift.over_m)
         of_key_pose = key_pose_readings(readings, trajectory, rows)
         return ArrivedKeyPose(
             number,
@@ -276,6 +277,7 @@ class Intake:
             readings.stamp_ns,
             Links.none(),
             fixed=self._fixed(poses[0].T, poses[row].T),
+            steady=steady_share(options.drift, is_stated=steps.stated),
         )
 
     def _fixed(self, before: RigidTransform, after: RigidTransform) -> FixedStep | None:

@@ -49,7 +49,8 @@ class ArrivedKeyPose:
     R, p
         By odometry in the frame of the key pose before, shapes (3, 3) and (3,), metres.
     covariance
-        Of a right perturbation of this step, rotation (rad) before translation (m), shape (6, 6).
+        Of a right perturbation of this step, rotation (rad) before translation (m), shape (6, 6),
+        without a steady drift.
     readings
         n readings between both, relative to the one before.
     reading_ns
@@ -62,6 +63,8 @@ class ArrivedKeyPose:
         That are not registered yet.
     fixed
         The step along fixed axes, where odometry knows it so.
+    steady
+        Standard deviation of odometry's steady drift as a share of the distance; 0 for none.
     recorded
         The same key pose by the step that odometry recorded, where this one goes on with the motion
         before, for the recorded step is far from it.
@@ -78,6 +81,7 @@ class ArrivedKeyPose:
     lost: bool = False
     scans: tuple[ScanAtKeyPose, ...] = ()
     fixed: FixedStep | None = None
+    steady: float = 0.0
     recorded: "ArrivedKeyPose | None" = None
 
     @property
@@ -89,6 +93,13 @@ class ArrivedKeyPose:
     def length_m(self) -> float:
         """Length of the step in metres."""
         return float(np.linalg.norm(self.p))
+
+    def as_walk(self, over_m: float) -> "ArrivedKeyPose":
+        """Return it for estimators without a steady drift; see ``OdometrySteps.as_walk``."""
+        covariance = self.covariance.copy()
+        covariance[3:, 3:] += self.steady**2 * over_m * self.length_m * np.eye(3)
+        recorded = None if self.recorded is None else self.recorded.as_walk(over_m)
+        return replace(self, covariance=covariance, steady=0.0, recorded=recorded)
 
     @classmethod
     def first(cls, stamp_ns: int, links: Links) -> "ArrivedKeyPose":

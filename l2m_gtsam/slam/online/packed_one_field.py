@@ -57,6 +57,7 @@ def _packed_prior(prior: WholePrior) -> Arrays:
     return {
         "potential": np.array([found.prior.sigma, found.prior.length]),
         "noise": np.array([noise.ut, noise.white, noise.slow_s]),
+        "correction": found.correction,
         "log_likelihood": np.array([found.log_likelihood]),
         "at": found.at,
         "box": np.stack([prior.low, prior.high]),
@@ -69,6 +70,7 @@ def _unpacked_prior(arrays: Arrays) -> WholePrior:
     spectrum = FieldSpectrum(
         PotentialHyperparameters(sigma=sigma, length=length),
         SensorNoise(*arrays["noise"].tolist()),
+        arrays["correction"],
         float(arrays["log_likelihood"][0]),
         arrays["at"],
     )

@@ -57,6 +57,7 @@ def packed_key_poses(key_poses: Sequence[ArrivedKeyPose]) -> Arrays:
         "R": np.reshape([each.R for each in key_poses], (-1, 3, 3)),
         "p": np.reshape([each.p for each in key_poses], (-1, 3)),
         "covariance": np.reshape([each.covariance for each in key_poses], (-1, 6, 6)),
+        "steady": np.array([each.steady for each in key_poses], dtype=np.float64),
         "count": np.array([len(each.readings) for each in key_poses], dtype=np.int64),
         "reading_ns": np.concatenate(
             [np.empty(0, dtype=np.int64), *(each.reading_ns for each in key_poses)]
@@ -103,6 +104,7 @@ def unpacked_key_poses(arrays: Arrays) -> list[ArrivedKeyPose]:
                 arrays["reading_ns"][rows],
                 links[own],
                 fixed=step if np.isfinite(step.shift).all() else None,
+                steady=float(arrays["steady"][k]),
             )
         )
     return found

@@ -192,6 +192,8 @@ class OnlineSlam:
         for key_pose in self.intake.key_poses(to_the_end=to_the_end):
             if self.estimator is None and self.search is None:
                 self._begin()
+            if not isinstance(self.estimator, OneFieldExplorer):
+                key_pose = key_pose.as_walk(self.options.drift.over_m)
             yield from self._added(renumbered(key_pose, self.base))
 
     def _begin(self) -> None:

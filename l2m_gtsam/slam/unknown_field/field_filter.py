@@ -174,12 +174,39 @@ def by_distortion(where: PlacedReadings, B: FloatArray, count: int) -> FloatArra
     return found.reshape(n, 3, -1)
 
 
-def dead_reckoned(
-    pose: gtsam.Pose3, covariance: FloatArray, step: FilterStep
-) -> tuple[gtsam.Pose3, FloatArray]:
-    """Return a pose in the frame of the first, and its covariance (6, 6), after a step."""
-    after, F, _ = _moved(step, pose, np.zeros(POSE))
-    return after, F @ covariance @ F.T + step.covariance
+@dataclass(frozen=True)
+class DeadReckoning:
+    """A pose by odometry alone.
+
+    Attributes
+    ----------
+    pose
+        In the frame of the first key pose.
+    walk
+        Covariance of a right perturbation by errors of single steps, shape (6, 6).
+    by_drift
+        Derivative of it by a steady drift in its standard deviations, shape (6, 6).
+    """
+
+    pose: gtsam.Pose3
+    walk: FloatArray
+    by_drift: FloatArray
+
+    @classmethod
+    def at_start(cls) -> "DeadReckoning":
+        """Return the first key pose, which is exact."""
+        return cls(gtsam.Pose3(), np.zeros((POSE, POSE)), np.zeros((POSE, POSE)))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of a right perturbation, shape (6, 6)."""
+        return np.asarray(self.walk + self.by_drift @ self.by_drift.T)
+
+    def after(self, step: FilterStep) -> "DeadReckoning":
+        """Return the pose after a step."""
+        pose, F, by_drift = _moved(step, self.pose, np.zeros(POSE))
+        walk = F @ self.walk @ F.T + step.covariance
+        return DeadReckoning(pose, walk, F @ self.by_drift + by_drift)
 
 
 def _moved(

@@ -15,12 +15,7 @@ from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.relative_motion import from_end
 from l2m_gtsam.slam.slips import SLIPPED
-from l2m_gtsam.slam.unknown_field.field_filter import (
-    NO_DRIFT,
-    FieldFilter,
-    FilterState,
-    FilterStep,
-)
+from l2m_gtsam.slam.unknown_field.field_filter import FieldFilter, FilterState, FilterStep
 
 MOST = 4  # hypotheses: of two jumps that nothing has decided yet
 CERTAIN = 7.0  # nats, a thousand to one
@@ -153,4 +148,6 @@ def step_of(key_pose: ArrivedKeyPose) -> FilterStep:
     readings = key_pose.readings
     if len(readings):
         readings = from_end(readings, key_pose.R, key_pose.p)
-    return FilterStep(key_pose.step, key_pose.covariance, readings, NO_DRIFT, key_pose.fixed)
+    # All of a steady drift comes with distance: with half of it by time the errors are the same.
+    steady = np.array([0.0, key_pose.steady * key_pose.length_m])
+    return FilterStep(key_pose.step, key_pose.covariance, readings, steady, key_pose.fixed)

@@ -65,6 +65,9 @@ class FieldSpectrum:
         Of the potential.
     noise
         Of the readings.
+    correction
+        A row by row and h in uT, with which ``A b + h`` is the field at the sensor where its
+        calibration says b: the likeliest, shape (12,).
     log_likelihood
         Of the readings, but for constants.
     at
@@ -73,6 +76,7 @@ class FieldSpectrum:
 
     prior: PotentialHyperparameters
     noise: SensorNoise
+    correction: FloatArray
     log_likelihood: float
     at: FloatArray
 
@@ -113,7 +117,11 @@ def learnt_spectrum(
         },
     )
     return FieldSpectrum(
-        likelihood.prior(end.x), likelihood.noise(end.x), -float(end.fun), np.asarray(end.x)
+        likelihood.prior(end.x),
+        likelihood.noise(end.x),
+        likelihood.correction(end.x),
+        -float(end.fun),
+        np.asarray(end.x),
     )
 
 
@@ -149,8 +157,18 @@ class SpectrumLikelihood:
             float(self._strength * np.exp(at[2])), float(white), float(np.exp(at[4]))
         )
 
+    def correction(self, at: FloatArray) -> FloatArray:
+        """Return the likeliest A, h there, shape (12,)."""
+        information, _ = self._without_field(at)
+        return self._likeliest(information)
+
     def log_likelihood(self, at: FloatArray) -> float:
         """Return the log likelihood there, but for constants."""
+        information, volume = self._without_field(at)
+        return self._by_distortion(information) - volume
+
+    def _without_field(self, at: FloatArray) -> tuple[FloatArray, float]:
+        """Return the information about A, h with the field integrated out, and its volume."""
         noise = self.noise(at)
         slow = (1 - noise.white) * np.exp(-self._apart / noise.slow_s)
         root = cholesky(noise.ut**2 * (slow + noise.white * np.eye(self._count)), lower=True)
@@ -164,10 +182,17 @@ class SpectrumLikelihood:
         lower = cholesky(np.eye(F.shape[1]) + F.T @ F, lower=True)
         half = solve_triangular(lower, F.T @ G, lower=True)
         volume = np.log(np.diag(lower)).sum() + AXES * np.log(np.diag(root)).sum()
-        return float(self._by_distortion(G.T @ G - half.T @ half) - volume)
+        return G.T @ G - half.T @ half, float(volume)
 
     def _by_distortion(self, information: FloatArray) -> float:
         """Return the log likelihood with A, h integrated out, of readings of this information."""
+        a, own = self._likeliest(information), np.sqrt(self._variance)
+        _, hessian = self._slopes(information, a)
+        volume = float(np.linalg.slogdet(own[:, None] * hessian * own)[1])
+        return -self._cost(information, a) - 0.5 * volume
+
+    def _likeliest(self, information: FloatArray) -> FloatArray:
+        """Return the mode of A, h by Newton's method."""
         a = self._mean.copy()
         cost = self._cost(information, a)
         for _ in range(NEWTON):
@@ -178,9 +203,7 @@ class SpectrumLikelihood:
                 if (lower := self._cost(information, trial)) <= cost:
                     a, cost = trial, lower
                     break
-        own = np.sqrt(self._variance)
-        _, hessian = self._slopes(information, a)
-        return -cost - 0.5 * float(np.linalg.slogdet(own[:, None] * hessian * own)[1])
+        return a
 
     def _cost(self, information: FloatArray, a: FloatArray) -> float:
         sign, volume = np.linalg.slogdet(a[:9].reshape(3, 3))

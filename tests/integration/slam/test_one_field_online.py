@@ -59,11 +59,14 @@ def whole(ship: TrueDrive) -> tuple[OnlineSlam, list[OnlinePose]]:
     return slam, poses
 
 
-def test_half_of_a_ships_drift_goes_as_it_drives(all_of_it: TrueDrive) -> None:
-    """Each pose when it is made, along fixed axes; docs/studies/slam has all drives."""
+def test_three_fifths_of_a_ships_drift_go_as_it_drives(all_of_it: TrueDrive) -> None:
+    """Each pose when it is made, along fixed axes; docs/studies/slam has all drives.
+
+    They are 64 to 67 % with seeds 0 to 2.
+    """
     odometry, options = odometry_of(all_of_it, Form.WORLD)
     row = online_row(all_of_it, odometry, options, STATED_UT)
-    assert row.rms_m < 0.6 * rms(odometry.p, all_of_it.truth.p)
+    assert row.rms_m < 0.4 * rms(odometry.p, all_of_it.truth.p)
     # Poses of one drive err together, and the filter linearises each reading once.
     assert row.nees is not None
     assert row.nees < 24
@@ -157,7 +160,9 @@ def test_a_pose_that_odometry_excludes_is_refused(ship: TrueDrive) -> None:
         if not found or not isinstance(explorer, OneFieldExplorer) or not explorer.is_learnt:
             continue
         if refused is None:
-            explorer._covariance /= 1e4
+            known = explorer._reckoned
+            by_drift = known.by_drift / 1e2
+            explorer._reckoned = replace(known, walk=known.walk / 1e4, by_drift=by_drift)
         refused = found if refused is None else refused
     kinds = [each.kind for each in slam.events()]
     assert kinds.count(EventKind.CORRECTION_REFUSED) == 1

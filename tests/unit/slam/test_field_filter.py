@@ -17,10 +17,10 @@ from l2m_gtsam.slam.odometry import FixedStep
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.unknown_field.field_filter import (
     NO_DRIFT,
+    DeadReckoning,
     FieldFilter,
     FilterState,
     FilterStep,
-    dead_reckoned,
 )
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     CERTAIN,
@@ -97,26 +97,37 @@ def test_at_known_poses_the_field_is_the_ridge_solution(field: WholeField) -> No
     assert state.log_likelihood == pytest.approx(log_likelihood, abs=1e-2)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.05])
 @pytest.mark.parametrize("fixed", [False, True])
-def test_without_readings_it_is_odometry(field: WholeField, fixed: bool) -> None:
+def test_without_readings_it_is_odometry(field: WholeField, fixed: bool, share: float) -> None:
     """Mean and covariance; along fixed axes errors of turns shift nothing."""
     follows, Q = FieldFilter(field, sensors(), LARGEST), np.diag([1, 2, 3, 4, 5, 6]) * 1e-4
-    state, covariance = follows.start(), np.zeros((6, 6))
-    pose = gtsam.Pose3()
-    poses = walked()
+    state, reckoned, poses = follows.start(), DeadReckoning.at_start(), walked()
+    length = sum(np.linalg.norm(each.translation()) for each in motions())
     for before, after, motion in zip(poses[:-1], poses[1:], motions(), strict=True):
         turn = after.rotation().compose(before.rotation().inverse()).matrix()
         axes = FixedStep(turn, after.translation() - before.translation()) if fixed else None
-        step = FilterStep(motion, Q, no_readings(), NO_DRIFT, axes)
-        state = follows.after(state, step)
-        pose, covariance = dead_reckoned(pose, covariance, step)
-    for found in (state.pose, pose):
+        steady = np.array([0.0, share * np.linalg.norm(motion.translation())])
+        step = FilterStep(motion, Q, no_readings(), steady, axes)
+        state, reckoned = follows.after(state, step), reckoned.after(step)
+    for found in (state.pose, reckoned.pose):
         np.testing.assert_allclose(found.matrix(), poses[-1].matrix(), atol=1e-12)
-    np.testing.assert_allclose(state.pose_covariance, covariance, rtol=1e-12)
+    np.testing.assert_allclose(state.pose_covariance, reckoned.covariance, rtol=1e-12)
     if fixed:  # sums of the steps' own, turned to the axes of the last pose
         R = [poses[-1].rotation().matrix().T @ each.rotation().matrix() for each in poses[1:]]
         shifts = sum(each @ Q[3:, 3:] @ each.T for each in R)
-        np.testing.assert_allclose(covariance[3:, 3:], shifts, rtol=1e-9)
+        drift = (share * length) ** 2 * np.eye(3)  # along one line all the way
+        np.testing.assert_allclose(reckoned.covariance[3:, 3:], shifts + drift, rtol=1e-9)
+
+
+def test_a_corrected_sensor_sees_the_field_that_the_correction_says() -> None:
+    rng = np.random.default_rng(2)
+    C, H, A, h = rng.normal(size=(3, 3)), rng.normal(size=3), rng.normal(size=(3, 3)), np.ones(3)
+    known = replace(sensors(), distortion=np.append(C.ravel(), H)[None])
+    found = known.corrected(np.append(A.ravel(), h)).distortion[0]
+    z = rng.normal(size=3)
+    b = A @ np.linalg.solve(C, z - H) + h
+    np.testing.assert_allclose(found[:9].reshape(3, 3) @ b + found[9:], z, atol=1e-9)
 
 
 def test_a_reading_far_off_counts_as_little_as_the_least_that_does(field: WholeField) -> None:

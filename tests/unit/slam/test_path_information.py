@@ -71,7 +71,9 @@ def step(request: pytest.FixtureRequest) -> Step:
     for k, pose in enumerate(poses):
         values.insert(X(k), pose)
     prior = PotentialHyperparameters(sigma=3.0, length=0.6)
-    spectrum = FieldSpectrum(prior, NOISE, 0.0, np.zeros(5))
+    spectrum = FieldSpectrum(
+        prior, NOISE, np.append(np.eye(3).ravel(), np.zeros(3)), 0.0, np.zeros(5)
+    )
     return Step(drive, poses, values, WholePrior(spectrum, np.full(3, -1.0), np.full(3, 1.8), 120))
 
 

@@ -56,6 +56,10 @@ def test_steel_beside_the_sensor_is_no_noise() -> None:
     free, held = (learnt_spectrum(readings, each, 1.0) for each in (0.3, 1e-3))
     assert free.noise.ut == pytest.approx(true.ut, rel=0.5)
     assert free.log_likelihood > held.log_likelihood + 50
+    # The correction undoes it. A factor of all three axes is one of the field's strength, too; a
+    # tenth is what noise of 0.3 uT and a prior of 0.3 leave of the rest.
+    rest = free.correction[:9].reshape(3, 3) @ C
+    np.testing.assert_allclose(rest / np.cbrt(np.linalg.det(rest)), np.eye(3), atol=0.1)
 
 
 def test_scaling_all_readings_down_is_no_gain() -> None:
