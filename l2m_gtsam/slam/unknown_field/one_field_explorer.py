@@ -42,9 +42,10 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
     spectrum_at,
 )
 
-# Of the filter's noise: slow errors count as white there, and of errors that last 3 to 4 s, one
-# reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 2, 3, 4 and
-# 5 give errors of 0.48, 0.47, 0.47 and 0.49 m in the mean of twelve drives, NEES of 13, 8.6, 7.3, 5.7.
+# Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
+# reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 2, 3, 4
+# and 5 give errors of 0.48, 0.47, 0.47 and 0.49 m in the mean of twelve drives, and a NEES of 13.1,
+# 8.6, 7.3 and 5.7.
 NOISE_FACTOR = 4.0
 GROWN = 1.25  # path, after which field and noise are learnt again
 ROOM = 0.1  # of the drive's extent, by which the box is wider than the margin, to be left seldom
