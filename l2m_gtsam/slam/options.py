@@ -85,6 +85,9 @@ class WholeFieldOptions(Options):
     """And of the entries of C: soft iron beside a sensor that was calibrated elsewhere, or not at
     all, comes to that. A drive that turns determines most of them, so that a larger value
     costs little."""
+    solve_after_m: float = Field(default=10.0, gt=0)
+    """On line, path length after which the drive is solved for the first time, and again whenever
+    its path has doubled."""
 
 
 class CalibrationUse(StrEnum):

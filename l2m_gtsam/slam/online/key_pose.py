@@ -94,6 +94,12 @@ class ArrivedKeyPose:
         """Length of the step in metres."""
         return float(np.linalg.norm(self.p))
 
+    def without_readings(self) -> "ArrivedKeyPose":
+        """Return it by odometry alone."""
+        recorded = None if self.recorded is None else self.recorded.without_readings()
+        none = np.empty(0, dtype=np.int64)
+        return replace(self, readings=no_readings(), reading_ns=none, recorded=recorded)
+
     def as_walk(self, over_m: float) -> "ArrivedKeyPose":
         """Return it for estimators without a steady drift; see ``OdometrySteps.as_walk``."""
         covariance = self.covariance.copy()
@@ -139,6 +145,8 @@ def key_poses_of(drive: Drive) -> Iterator[ArrivedKeyPose]:
 def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: KnownSensors) -> Drive:
     """Return key poses, from the first on, as a drive."""
     steps = key_poses[1:]
+    ways = [each.fixed.shift for each in steps if each.fixed is not None]
+    drifts = np.array([each.steady * each.length_m for each in steps])
     return Drive(
         stamp_ns=np.array([each.stamp_ns for each in key_poses], dtype=np.int64),
         steps=OdometrySteps(
@@ -146,6 +154,8 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
             np.reshape([each.p for each in steps], (-1, 3)),
             np.reshape([each.covariance for each in steps], (-1, POSE, POSE)),
             stated=False,
+            fixed_axes=np.stack(ways) if ways and len(ways) == len(steps) else None,
+            steady=np.column_stack([0.0 * drifts, drifts]) if drifts.any() else None,
         ),
         readings=joined_readings([each.readings for each in key_poses]),
         start=start,

@@ -9,14 +9,19 @@ from l2m_gtsam.slam.online.packing import (
     Arrays,
     named,
     packed_key_poses,
+    packed_poses,
     under,
     unpacked_key_poses,
+    unpacked_poses,
 )
+from l2m_gtsam.slam.unknown_field.field_filter import FilterState
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
-from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldState
+from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldState, SolvedBeginning
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
 from l2m_gtsam.slam.unknown_field.spectrum import FieldSpectrum
 from l2m_gtsam.slam.unknown_field.whole_field import WholePrior
+
+STATE = ("weights", "distortion", "steady", "covariance")
 
 
 def packed_one_field(state: OneFieldState) -> Arrays:
@@ -29,9 +34,11 @@ def packed_one_field(state: OneFieldState) -> Arrays:
         "learnt_m": np.array([state.learnt_m]),
         "decisions": np.reshape(np.array(decisions, dtype=np.int64), (-1, 2)),
     }
-    if state.prior is None:
-        return arrays
-    return {**arrays, **named("prior", _packed_prior(state.prior))}
+    if state.prior is not None:
+        arrays |= named("prior", _packed_prior(state.prior))
+    if state.beginning is not None:
+        arrays |= named("beginning", _packed_beginning(state.beginning))
+    return arrays
 
 
 def unpacked_one_field(arrays: Arrays) -> OneFieldState:
@@ -42,13 +49,33 @@ def unpacked_one_field(arrays: Arrays) -> OneFieldState:
         for each in unpacked_key_poses(under("key_poses", arrays))
     )
     decisions = arrays["decisions"].tolist()
-    prior = under("prior", arrays)
+    prior, beginning = under("prior", arrays), under("beginning", arrays)
     return OneFieldState(
         key_poses,
         _unpacked_prior(prior) if prior else None,
+        _unpacked_beginning(beginning) if beginning else None,
         float(arrays["learnt_m"][0]),
         tuple(JumpDecision(number, bool(was_motion)) for number, was_motion in decisions),
     )
+
+
+def _packed_beginning(beginning: SolvedBeginning) -> Arrays:
+    state = beginning.state
+    return {
+        **named("poses", packed_poses(beginning.poses)),
+        **named("pose", packed_poses([state.pose])),
+        **{name: getattr(state, name) for name in STATE},
+        "log_likelihood": np.array([state.log_likelihood]),
+        "recorded": np.array(sorted(beginning.recorded), dtype=np.int64),
+    }
+
+
+def _unpacked_beginning(arrays: Arrays) -> SolvedBeginning:
+    weights, distortion, steady, covariance = (arrays[name] for name in STATE)
+    pose, likely = unpacked_poses(under("pose", arrays))[0], float(arrays["log_likelihood"][0])
+    state = FilterState(pose, weights, distortion, steady, covariance, likely)
+    poses = tuple(unpacked_poses(under("poses", arrays)))
+    return SolvedBeginning(poses, state, frozenset(arrays["recorded"].tolist()))
 
 
 def _packed_prior(prior: WholePrior) -> Arrays:

@@ -1,22 +1,21 @@
 """On-line SLAM of one sensor in an unknown field: one field for all of the drive so far.
 
-A filter follows the drive key pose by key pose. What field and noise are like is learnt again each
-time that the path has grown by a quarter, at the poses found so far, and with it what the
-calibration leaves of C and H. The drive is followed anew with it from its start. The box of the
-field grows with the path. That work is spread over the key poses that come meanwhile. All key poses
-with their readings are kept, about a kilobyte of each. Detail beyond the limit of eigenfunctions
-counts as noise.
+A filter follows the drive key pose by key pose. Each time that the path has doubled, or has grown
+by a quarter and left the box of the field, the drive so far is solved as off line, from its
+odometry on (:mod:`.smoothed_drive`), and the filter goes on from what that says of the last key
+pose, field and sensor (:mod:`.end_state`). The work is spread over the key poses that come
+meanwhile, which are then followed. To begin the solution at the poses found so far was tried: it
+stays near them, and errors on a model ship become half as large or twice as large by chance.
+
+Where the field has more detail than the limit of eigenfunctions holds, the rest counts as noise:
+field and noise are learnt at the poses found so far, and the drive is followed from its start.
 
 Where the field changes within less than the pose is known to, the filter may go astray. A pose that
-odometry excludes is refused, and the drive goes on by odometry until field and noise are learnt
-again.
-
-To smooth the path by Levenberg-Marquardt each time, and to linearise the readings there when it is
-followed anew, was tried: errors on a model ship became half as large or twice as large by chance,
-and sigmas smaller.
+odometry excludes is refused, and the drive goes on by odometry until the drive is solved again. All
+key poses with their readings are kept, about a kilobyte of each.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -28,13 +27,16 @@ from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.unknown_field.field_filter import DeadReckoning, FieldFilter
+from l2m_gtsam.slam.unknown_field.end_state import end_state
+from l2m_gtsam.slam.unknown_field.field_filter import DeadReckoning, FieldFilter, FilterState
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     Hypotheses,
+    Hypothesis,
     JumpDecision,
     step_of,
 )
-from l2m_gtsam.slam.unknown_field.spectrum import MARGIN, FieldSpectrum
+from l2m_gtsam.slam.unknown_field.smoothed_drive import SmoothedDrive, smoothed
+from l2m_gtsam.slam.unknown_field.spectrum import MARGIN
 from l2m_gtsam.slam.unknown_field.whole_field import (
     WholePrior,
     box_prior,
@@ -47,11 +49,32 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
 # and 5 give errors of 0.48, 0.47, 0.47 and 0.49 m in the mean of twelve drives, and a NEES of 13.1,
 # 8.6, 7.3 and 5.7.
 NOISE_FACTOR = 4.0
-GROWN = 1.25  # path, after which field and noise are learnt again
-ROOM = 0.1  # of the drive's extent, by which the box is wider than the margin, to be left seldom
-LEAST_ROOM = 0.5  # lengths of the field: a wider box needs more waves
+GROWN = 2.0  # path, after which the drive is solved again: all of it takes twice the last solution
+LEFT = 1.25  # the same where the vehicle has left the box
+ROUNDS = (1, 1, 2)  # of the solution's stages; with as many as off line poses are no better
+NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
 IMPOSSIBLE = float(chi2.isf(1e-6, POSE))  # squared distance from odometry in its sigmas
+LEAST = 20  # key poses that are solved as a whole
 PIECE = 20  # key poses that are followed anew while one comes
+
+
+@dataclass(frozen=True)
+class SolvedBeginning:
+    """The beginning of a drive, solved as a whole.
+
+    Attributes
+    ----------
+    poses
+        Its key poses, in the frame of the field.
+    state
+        At the last of them.
+    recorded
+        Numbers of the key poses to which the step was as recorded, of those at a jump.
+    """
+
+    poses: tuple[gtsam.Pose3, ...]
+    state: FilterState
+    recorded: frozenset[int]
 
 
 @dataclass(frozen=True)
@@ -64,6 +87,8 @@ class OneFieldState:
         All so far.
     prior
         Of the field; None where it is not learnt yet.
+    beginning
+        What was solved in it; None where the drive is followed from its start.
     learnt_m
         Path at which it was learnt, metres.
     decisions
@@ -72,15 +97,17 @@ class OneFieldState:
 
     key_poses: tuple[ArrivedKeyPose, ...]
     prior: WholePrior | None
+    beginning: SolvedBeginning | None
     learnt_m: float
     decisions: tuple[JumpDecision, ...]
 
 
 @dataclass(frozen=True)
 class FollowedField:
-    """The field, the filter in it, and what the drive may be."""
+    """The field, what was solved in it, the filter, and what the drive may be."""
 
     prior: WholePrior
+    beginning: SolvedBeginning | None
     follows: FieldFilter
     hypotheses: Hypotheses
 
@@ -133,8 +160,6 @@ class OneFieldExplorer:
         if self._work is None:
             self._work = self._due(self._now)
         self._go_on()
-        if self._now is not None and not _is_inside(self._now):
-            self._complete()
         if self._now is not None and not self._is_possible(self._now):
             self._refuse()
         return self._known()
@@ -151,7 +176,7 @@ class OneFieldExplorer:
     def poses(self) -> list[gtsam.Pose3]:
         """Return all key poses, each by the readings until then."""
         if self._now is None:
-            return drive_of(self._key_poses, self.start, self._sensors).dead_reckoning()
+            return self._drive(len(self._key_poses)).dead_reckoning()
         return [self._origin.compose(each) for each in self._now.hypotheses.best.poses]
 
     def field_along_path(self) -> tuple[FloatArray, FloatArray]:
@@ -183,8 +208,9 @@ class OneFieldExplorer:
         """Do all work that has begun, and return what is to be kept."""
         self._complete()
         prior = None if self._now is None else self._now.prior
+        beginning = None if self._now is None else self._now.beginning
         decisions = tuple(self._decisions.values())
-        return OneFieldState(tuple(self._key_poses), prior, self._learnt_m, decisions)
+        return OneFieldState(tuple(self._key_poses), prior, beginning, self._learnt_m, decisions)
 
     @classmethod
     def resumed(
@@ -201,7 +227,7 @@ class OneFieldExplorer:
         own._path_m = sum(each.length_m for each in state.key_poses[1:])
         own._learnt_m = state.learnt_m
         if state.prior is not None:
-            own._work = own._following(state.prior)
+            own._work = own._following(state.prior, state.beginning)
             own._complete()
         own._news = []
         return own
@@ -221,33 +247,62 @@ class OneFieldExplorer:
         covariance = covariance + back @ self.start.covariance @ back.T
         return Belief(self._origin.compose(pose), self._sensors, covariance)
 
-    def _drive(self) -> Drive:
-        """Return the drive so far, jumps as they are likeliest to be."""
-        recorded = frozenset[int]()
-        if self._now is not None:
-            recorded = self._now.hypotheses.best.recorded
+    @property
+    def _recorded(self) -> frozenset[int]:
+        """Key poses at jumps whose steps are likeliest as recorded."""
+        if self._now is None:
+            return frozenset()
+        return self._now.hypotheses.best.recorded
+
+    def _drive(self, count: int) -> Drive:
+        """Return so many key poses, jumps as they are likeliest to be."""
+        recorded = self._recorded
         chosen = [
             each if each.recorded is None or each.number not in recorded else each.recorded
-            for each in self._key_poses
+            for each in self._key_poses[:count]
         ]
         return drive_of(chosen, self.start, self._sensors)
 
     def _due(self, now: FollowedField | None) -> Iterator[FollowedField | None] | None:
         """Return work that is due, to be done in pieces."""
-        if self._path_m >= max(self._options.tiles.learn_over_m, GROWN * self._learnt_m):
+        growth = GROWN if now is None or _is_inside(now) else LEFT
+        if self._path_m >= max(self._options.whole_field.solve_after_m, growth * self._learnt_m):
             return self._learning(now)
-        if now is not None and not _is_inside(now):
-            return self._following(self._boxed(now.prior.spectrum))
         return None
 
     def _learning(self, now: FollowedField | None) -> Iterator[FollowedField | None]:
-        """Learn field and noise at the poses found so far, and follow the drive anew, in pieces."""
+        """Solve the drive so far, and follow the rest, in pieces."""
         self._learnt_m = self._path_m
-        options = self._options.whole_field
+        # A jump that nothing has decided yet is followed both ways.
+        count = min([len(self._key_poses), *self._open])
+        recorded = frozenset(each for each in self._recorded if each < count)
+        drive = self._drive(count)
+        smooth = None if count < LEAST else (yield from self._smoothing(drive))
+        if smooth is not None:
+            poses = smooth.stage.last.poses
+            relative = tuple(poses[0].between(pose) for pose in poses)
+            beginning = SolvedBeginning(relative, end_state(smooth), recorded)
+            yield None
+            yield from self._following(smooth.prior, beginning)
+            return
+        options, everything = self._options.whole_field, self._drive(len(self._key_poses))
         first = None if now is None else now.prior.spectrum
-        spectrum = spectrum_at(self._drive(), self.poses(), options, first)
+        spectrum = spectrum_at(everything, self.poses(), options, first)
         yield None
-        yield from self._following(self._boxed(spectrum))
+        x, margin = placed(everything, self.poses()).x, MARGIN * spectrum.prior.length
+        low, high = x.min(axis=0) - margin, x.max(axis=0) + margin
+        yield from self._following(box_prior(low, high, spectrum, options.waves), None)
+
+    def _smoothing(self, drive: Drive) -> Generator[None, None, SmoothedDrive | None]:
+        """Solve a drive in pieces; return None where the field has too much detail for that."""
+        work = smoothed(drive, drive.dead_reckoning(), self._options, ROUNDS)
+        while True:
+            try:
+                next(work)
+            except StopIteration as end:
+                found: SmoothedDrive | None = end.value
+                return found
+            yield None
 
     def _is_possible(self, now: FollowedField) -> bool:
         """Return whether odometry, with the drift that is stated, can have been so far off."""
@@ -260,23 +315,23 @@ class OneFieldExplorer:
         self._learnt_m = self._path_m
         self._has_refused = True
 
-    def _boxed(self, spectrum: FieldSpectrum) -> WholePrior:
-        """Return a prior with a box about the path so far, and room for what comes."""
-        length, x = spectrum.prior.length, placed(self._drive(), self.poses()).x
-        low, high = x.min(axis=0), x.max(axis=0)
-        room = MARGIN * length + np.maximum(ROOM * (high - low), LEAST_ROOM * length)
-        most = self._options.whole_field.waves
-        return box_prior(low - room, high + room, spectrum, most)
+    def _following(
+        self, prior: WholePrior, beginning: SolvedBeginning | None
+    ) -> Iterator[FollowedField | None]:
+        """Follow all key poses from a beginning, or the start, on, in pieces.
 
-    def _following(self, prior: WholePrior) -> Iterator[FollowedField | None]:
-        """Follow all key poses from the start, in pieces; yield nothing, and at last the result."""
+        Yields nothing, and at last the result.
+        """
         options = self._options
         sensors = self._sensors.corrected(prior.spectrum.correction)
         sensors = sensors.loosened(0.0, options.whole_field.offset)
         noise = np.array([NOISE_FACTOR * prior.spectrum.noise.ut])
         follows = FieldFilter(prior.field, replace(sensors, noise=noise), options.robust.largest)
-        anew = FollowedField(prior, follows, Hypotheses.begun(follows))
-        done = 1
+        hypotheses, done = Hypotheses.begun(follows), 1
+        if beginning is not None:
+            known = Hypothesis(beginning.state, beginning.poses, beginning.recorded)
+            hypotheses, done = Hypotheses((known,)), len(beginning.poses)
+        anew = FollowedField(prior, beginning, follows, hypotheses)
         while done < len(self._key_poses):
             anew = self._after(anew, self._key_poses[done])
             done += 1
@@ -285,6 +340,8 @@ class OneFieldExplorer:
         yield anew
 
     def _after(self, now: FollowedField, key_pose: ArrivedKeyPose) -> FollowedField:
+        if not _is_inside(now):  # the field says nothing there
+            key_pose = key_pose.without_readings()
         decision = self._decisions.get(key_pose.number)
         was_motion = None if decision is None else decision.was_motion
         return replace(now, hypotheses=now.hypotheses.after(key_pose, now.follows, was_motion))
@@ -311,6 +368,6 @@ class OneFieldExplorer:
 
 def _is_inside(now: FollowedField) -> bool:
     """Return whether the vehicle is so far inside of the box that its faces do not matter."""
-    margin = MARGIN * now.prior.spectrum.prior.length
+    margin = NEAR * now.prior.spectrum.prior.length
     place = now.hypotheses.best.state.pose.translation()
     return bool(np.all(place > now.prior.low + margin) and np.all(place < now.prior.high - margin))

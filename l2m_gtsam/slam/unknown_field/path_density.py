@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 from scipy.spatial.transform import Rotation
 
+from l2m_factors import skew
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
@@ -57,6 +58,26 @@ class DensitySlopes:
     """
 
     cost: float
+    by_path: FloatArray
+    by_sensor: FloatArray
+
+
+@dataclass(frozen=True)
+class WeightsOfPath:
+    """What is known of a field's m weights once path and sensor are given.
+
+    Attributes
+    ----------
+    covariance
+        Of the weights on a given path, shape (m, m).
+    by_path
+        Derivative of the likeliest weights by a right perturbation of the lidar at each reading,
+        shape (m, N, 6).
+    by_sensor
+        By (t, C row by row, H), shape (m, 15).
+    """
+
+    covariance: FloatArray
     by_path: FloatArray
     by_sensor: FloatArray
 
@@ -120,4 +141,44 @@ class PathDensity:
             cost=float(fit + np.log(np.diag(lower)).sum()),
             by_path=np.hstack([by_turn, by_shift]),
             by_sensor=np.concatenate([lever.sum(axis=0), by_C.ravel(), by_H]),
+        )
+
+    def weights(self, weights: FloatArray, sensor: FloatArray) -> WeightsOfPath:
+        """Return how the likeliest weights, (m,), follow path and sensor, to first order.
+
+        Residuals count as small beside the field: their product with its slopes is left out, as in
+        a Gauss-Newton step.
+
+        Parameters
+        ----------
+        weights
+            The likeliest at the estimate, shape (m,).
+        sensor
+            t, C row by row, and H, shape (15,).
+        """
+        at, N, m = self._readings, len(self._readings.z), len(self._field)
+        t, C = sensor[:3], sensor[3:12].reshape(3, 3)
+        R_back, x = at.R.transpose(0, 2, 1), at.p + at.R @ t
+        features = C @ R_back @ self._field.features(x)
+        white = self._noise(features.reshape(N, -1))
+        flat = features.reshape(AXES * N, m)
+        lower = cholesky(np.eye(m) + flat.T @ white.reshape(AXES * N, m), lower=True)
+        covariance = cho_solve((lower, True), np.eye(m))
+        # The likeliest are S P^T T^-1 (z - H) with S the covariance: dw = -S P^T T^-1 d(P w + H).
+        back = -covariance @ white.reshape(AXES * N, m).T
+        field, gradient = self._field.field_and_gradient(x, weights)
+        b = np.einsum("nij,nj->ni", R_back, field)
+        by_shift = R_back @ gradient @ at.R
+        by_turn = skew(b) - by_shift @ skew(t[None])
+        by_lidar = C @ np.concatenate([by_turn, by_shift], axis=2)
+        by_sensor = np.zeros((N, AXES, len(sensor)))
+        by_sensor[:, :, :3] = C @ by_shift
+        for axis in range(AXES):
+            by_sensor[:, axis, 3 + 3 * axis : 6 + 3 * axis] = b
+            by_sensor[:, axis, 12 + axis] = 1.0
+        own = back.reshape(m, N, AXES)
+        return WeightsOfPath(
+            covariance,
+            np.einsum("mna,nap->mnp", own, by_lidar),
+            back @ by_sensor.reshape(AXES * N, -1),
         )

@@ -100,14 +100,26 @@ def path_information(
         Robust weight of each reading, positive, shape (N,).
     """
     near = PathNeighbourhood(drive, poses, values, prior, noise, weights)
+    return PathInformation(near.odometry, *near.moved_by(determined(near)))
+
+
+def determined(near: "PathNeighbourhood", count: int = VECTORS) -> FloatArray:
+    """Return a root of what readings take from the covariance I of n errors, shape (n, q).
+
+    Parameters
+    ----------
+    near
+        The density at errors.
+    count
+        Products of Lanczos' iteration. With fewer, less is found, so that sigmas are larger.
+    """
     here = near.slopes(np.zeros(near.size))
     first = np.random.default_rng(SEED).normal(size=near.size)
     found, vectors = eigenpairs(
-        lambda v: (near.slopes(SIDE * v) - here) / SIDE, first, min(VECTORS, near.size)
+        lambda v: (near.slopes(SIDE * v) - here) / SIDE, first, min(count, near.size)
     )
     known = found > LEAST
-    share = vectors[:, known] * np.sqrt(found[known] / (1 + found[known]))
-    return PathInformation(near.odometry, *near.moved_by(share))
+    return np.asarray(vectors[:, known] * np.sqrt(found[known] / (1 + found[known])))
 
 
 class PathNeighbourhood:
@@ -142,25 +154,49 @@ class PathNeighbourhood:
         readings, self._by_pose = path_readings(motions, poses)
         seconds = NS * (drive.reading_ns - drive.stamp_ns[0])
         information = NoiseInformation(noise, seconds, weights)
-        self._density = PathDensity(readings, prior.field, information)
+        self.density = PathDensity(readings, prior.field, information)
         sensors = drive.sensors
-        self._sensor = np.concatenate([sensors.t[0], sensors.distortion[0]])
+        self.sensor = np.concatenate([sensors.t[0], sensors.distortion[0]])
         covariance = sensors.covariance[0]
         self._by_sensor = covariance_root(covariance, np.sqrt(np.diag(covariance)))
 
     @property
     def size(self) -> int:
         """Number n of errors."""
-        return self._steps + len(self._sensor)
+        return self._steps + len(self.sensor)
 
     def slopes(self, errors: FloatArray) -> FloatArray:
         """Return the derivatives of minus the log density where errors are so, both (n,)."""
         poses, sensor = self.moved_by(errors[:, None])
         moved = (self._by_pose @ poses.ravel()).reshape(-1, POSE)
-        found = self._density.slopes(moved, self._sensor + sensor[:, 0])
+        found = self.density.slopes(moved, self.sensor + sensor[:, 0])
         back = np.append(np.zeros(self._others), self._by_pose.T @ found.by_path.ravel())
         by_steps = np.asarray(self._transposed.solve(back))
         return np.append(by_steps, self._by_sensor.T @ found.by_sensor)
+
+    def by_errors(
+        self, by_poses: FloatArray, by_drift: FloatArray, by_sensor: FloatArray
+    ) -> FloatArray:
+        """Return derivatives of r quantities by all errors, shape (r, n).
+
+        Parameters
+        ----------
+        by_poses
+            By right perturbations of K key poses, shape (r, K, 6).
+        by_drift
+            By odometry's steady drift, shape (r, 6); it counts where that is a variable.
+        by_sensor
+            By (t, C row by row, H), shape (r, 15).
+        """
+        flat = by_poses.reshape(len(by_poses), -1)
+        others = by_drift if self._others == POSE else np.zeros((len(flat), self._others))
+        by_steps = self._transposed.solve(np.hstack([others, flat]).T).T
+        return np.hstack([by_steps, by_sensor @ self._by_sensor])
+
+    def by_key_poses(self, by_readings: FloatArray) -> FloatArray:
+        """Return derivatives by K key poses (r, K, 6) from those by N readings' poses (r, N, 6)."""
+        flat = by_readings.reshape(len(by_readings), -1)
+        return np.asarray((self._by_pose.T @ flat.T).T.reshape(len(flat), -1, POSE))
 
     def moved_by(self, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how q errors (n, q) move K poses, (K, 6, q), and the sensor, (15, q)."""

@@ -134,8 +134,7 @@ def test_detail_beyond_the_limit_of_waves_counts_as_noise(shared_data: Path) -> 
     options = SlamOptions.model_validate(
         {
             "key_poses": {"distance_m": 0.3, "angle_deg": 30},
-            "tiles": {"learn_over_m": 8.0},
-            "whole_field": {"waves": 50},
+            "whole_field": {"waves": 50, "solve_after_m": 8.0},
         }
     )
     slam = OnlineSlam(as_recorded(STATED_UT), options)

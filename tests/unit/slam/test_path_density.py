@@ -103,3 +103,41 @@ def test_slopes_by_points_are_those_of_the_features() -> None:
     slopes = field.basis.slopes(readings.p) * field.scale
     expected = np.einsum("nam,nacm->nc", by, slopes)
     np.testing.assert_allclose(field.by_points(readings.p, by), expected, rtol=1e-10)
+
+
+def test_the_likeliest_weights_follow_path_and_sensor() -> None:
+    """Against ridge solutions by definition on paths and sensors beside the estimate."""
+    readings, field = along_a_path()
+    at, rng, quiet = sensor(), np.random.default_rng(6), NOISE.scaled(0.01)
+    noise = np.kron(1e-4 * noise_covariance(), np.eye(3))
+
+    def features(moved: FloatArray, s: FloatArray) -> FloatArray:
+        R = readings.R @ Rotation.from_rotvec(moved[:, :3]).as_matrix()
+        x = readings.p + np.einsum("nij,nj->ni", readings.R, moved[:, 3:]) + R @ s[:3]
+        own = s[3:12].reshape(3, 3) @ R.transpose(0, 2, 1) @ field.features(x)
+        return np.asarray(own.reshape(3 * COUNT, -1))
+
+    still = np.zeros((COUNT, 6))
+    # Readings that the field explains, so that the product of residuals and slopes is small.
+    z = (features(still, at) @ rng.normal(size=len(field))).reshape(-1, 3) + at[12:]
+
+    def likeliest(moved: FloatArray, s: FloatArray) -> FloatArray:
+        F, y = features(moved, s), (z - s[12:]).ravel()
+        white = np.linalg.solve(noise, np.column_stack([F, y]))
+        information = np.eye(len(field)) + F.T @ white[:, :-1]
+        return np.asarray(np.linalg.solve(information, F.T @ white[:, -1]))
+
+    own = PathDensity(
+        PathReadings(readings.R, readings.p, z), field, NoiseInformation(quiet, SECONDS, WEIGHTS)
+    )
+    found = own.weights(likeliest(still, at), at)
+    F = features(still, at)
+    information = np.eye(len(field)) + F.T @ np.linalg.solve(noise, F)
+    np.testing.assert_allclose(found.covariance @ information, np.eye(len(field)), atol=1e-6)
+    for _ in range(4):
+        v, s = rng.normal(size=(COUNT, 6)), rng.normal(size=15)
+        ends = [likeliest(by * STEP * v, at + by * STEP * s) for by in (1.0, -1.0)]
+        slope = np.einsum("mnp,np->m", found.by_path, v) + found.by_sensor @ s
+        # What the prior leaves of the readings, a thousandth, times slopes of its directions.
+        expected = (ends[0] - ends[1]) / (2 * STEP)
+        assert np.linalg.norm(slope - expected) < 0.02 * np.linalg.norm(expected)

@@ -1,0 +1,92 @@
+"""Where a filter goes on from a drive that was solved as a whole."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from l2m_factors import X
+from l2m_gtsam.data import FieldSeries, Recording, SourceFile, Trajectory
+from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
+from l2m_gtsam.progress import silent
+from l2m_gtsam.slam.drive import EXACT_START
+from l2m_gtsam.slam.localisation import prepared
+from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.solution import REJECTED_WEIGHT
+from l2m_gtsam.slam.unknown_field import end_state as module
+from l2m_gtsam.slam.unknown_field.end_state import end_state
+from l2m_gtsam.slam.unknown_field.path_information import path_information
+from l2m_gtsam.slam.unknown_field.smoothed_drive import SmoothedDrive, smoothed, with_noise
+from l2m_gtsam.slam.unknown_field.whole_smoother import reported
+from l2m_gtsam.studies.slam.methods import as_recorded
+
+COUNT, EVERY_S = 40, 0.5
+
+
+@pytest.fixture(scope="module")
+def smooth() -> SmoothedDrive:
+    """Two laps of 3 m, ten key poses."""
+    rng, at = np.random.default_rng(1), np.linspace(0, 4 * np.pi, COUNT)
+    p = np.column_stack([0.5 * np.cos(at), 0.4 * np.sin(at), 0.05 * np.sin(2 * at)])
+    R = Rotation.from_euler("z", at[:, None] + np.pi / 2).as_matrix()
+    prior = PotentialHyperparameters(sigma=6.0, length=0.5)
+    basis = PotentialBasis.over(p.min(axis=0) - 1, p.max(axis=0) + 1, prior, 150)
+    b = basis.features(p) @ (np.sqrt(basis.variance) * rng.normal(size=len(basis)))
+    field = np.einsum("nji,nj->ni", R, b) + 0.3 * rng.normal(size=b.shape)
+    stamps = np.round(1e9 * EVERY_S * np.arange(COUNT)).astype(np.int64)
+    recording = Recording(
+        Trajectory(stamps, R, p, "map", "lidar"),
+        (FieldSeries("mag", "/mag", "lidar", stamps, field),),
+        SourceFile("laps", ""),
+    )
+    options = SlamOptions.model_validate(
+        {"key_poses": {"distance_m": 0.6, "angle_deg": 170, "readings": 8}}
+    )
+    drive, _ = prepared(recording, as_recorded(0.3), options)
+    drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
+    found = reported(smoothed(drive, drive.dead_reckoning(), options, (1, 1, 1)), silent)
+    assert found is not None
+    return found
+
+
+def test_pose_and_sensor_have_the_covariance_of_the_path(
+    smooth: SmoothedDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With as many vectors as errors: the same as of poses that are asked for alone."""
+    monkeypatch.setattr(module, "VECTORS", 1000)
+    state, last = end_state(smooth), smooth.stage.last
+    poses, K = last.poses, len(last.poses)
+    drive = replace(smooth.drive, sensors=with_noise(last.sensors, smooth.noise))
+    weights = np.maximum(last.weights, REJECTED_WEIGHT)
+    path = path_information(drive, poses, last.values, smooth.prior, smooth.noise, weights)
+    ends = path.learnt[[0, -1]].reshape(12, -1)
+    joint = path.odometry.joint([X(0), X(K - 1)]) - ends @ ends.T
+    relative = poses[0].between(poses[-1])
+    by_ends = np.hstack([-relative.inverse().AdjointMap(), np.eye(6)])
+    np.testing.assert_allclose(state.pose.matrix(), relative.matrix(), atol=1e-12)
+    expected = by_ends @ joint @ by_ends.T
+    scale = np.sqrt(np.diag(expected))
+    # Lanczos' iterations of 120 and of all vectors differ by what eigenvalues below 0.01 hold.
+    np.testing.assert_allclose(
+        state.pose_covariance / np.outer(scale, scale),
+        expected / np.outer(scale, scale),
+        atol=0.01,
+    )
+    own = slice(-18, -6)
+    distortion = (smooth.drive.sensors.covariance[0] - path.sensor @ path.sensor.T)[3:, 3:]
+    np.testing.assert_allclose(
+        np.diag(state.covariance)[own], np.diag(distortion), rtol=0.02, atol=1e-12
+    )
+
+
+def test_it_is_a_covariance_that_says_more_than_the_priors(smooth: SmoothedDrive) -> None:
+    state, m = end_state(smooth), len(smooth.prior.field)
+    P = state.covariance
+    assert P.shape == (6 + m + 12 + 6, 6 + m + 12 + 6)
+    np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-9 * np.abs(P).max())
+    assert np.linalg.eigvalsh(P).min() > -1e-9 * np.linalg.eigvalsh(P).max()
+    own = np.diag(P)[6 : 6 + m]
+    # A weight's prior has unit variance, and what is known of it is added up to first order.
+    assert own.max() < 1.1
+    assert own.sum() < 0.8 * m
