@@ -8,7 +8,8 @@ meanwhile, which are then followed. To begin the solution at the poses found so 
 stays near them, and errors on a model ship become half as large or twice as large by chance.
 
 Where the field has more detail than the limit of eigenfunctions holds, the rest counts as noise:
-field and noise are learnt at the poses found so far, and the drive is followed from its start.
+field and noise are learnt at the poses found so far, and the drive is followed from its start. The
+same is done where a longer drive than can be solved in the meantime leaves the box.
 
 Where the field changes within less than the pose is known to, the filter may go astray. A pose that
 odometry excludes is refused, and the drive goes on by odometry until the drive is solved again. All
@@ -50,11 +51,11 @@ from l2m_gtsam.slam.unknown_field.whole_field import (
 # 8.6, 7.3 and 5.7.
 NOISE_FACTOR = 4.0
 GROWN = 2.0  # path, after which the drive is solved again: all of it takes twice the last solution
-LEFT = 1.25  # the same where the vehicle has left the box
+LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
 ROUNDS = (1, 1, 2)  # of the solution's stages; with as many as off line poses are no better
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
 IMPOSSIBLE = float(chi2.isf(1e-6, POSE))  # squared distance from odometry in its sigmas
-LEAST = 20  # key poses that are solved as a whole
+LEAST, MOST = 20, 1500  # key poses that are solved as a whole: a round of so many takes ten seconds
 PIECE = 20  # key poses that are followed anew while one comes
 
 
@@ -265,7 +266,10 @@ class OneFieldExplorer:
 
     def _due(self, now: FollowedField | None) -> Iterator[FollowedField | None] | None:
         """Return work that is due, to be done in pieces."""
-        growth = GROWN if now is None or _is_inside(now) else LEFT
+        inside = now is not None and _is_inside(now)
+        if inside and len(self._key_poses) > MOST:
+            return None
+        growth = GROWN if inside else LEFT
         if self._path_m >= max(self._options.whole_field.solve_after_m, growth * self._learnt_m):
             return self._learning(now)
         return None
@@ -277,7 +281,7 @@ class OneFieldExplorer:
         count = min([len(self._key_poses), *self._open])
         recorded = frozenset(each for each in self._recorded if each < count)
         drive = self._drive(count)
-        smooth = None if count < LEAST else (yield from self._smoothing(drive))
+        smooth = (yield from self._smoothing(drive)) if LEAST <= count <= MOST else None
         if smooth is not None:
             poses = smooth.stage.last.poses
             relative = tuple(poses[0].between(pose) for pose in poses)

@@ -2,18 +2,22 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from l2m_gtsam.data import Trajectory
 from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.replay import give, messages
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.session import OnlinePose, OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.unknown_field import one_field_explorer
 from l2m_gtsam.slam.unknown_field.one_field_explorer import OneFieldExplorer
+from l2m_gtsam.slam.unknown_field.smoothed_drive import smoothed
 from l2m_gtsam.studies.slam.methods import as_recorded, online_row, rms, stated_drift
 from l2m_gtsam.studies.slam.recordings import (
     ROBOT,
@@ -59,6 +63,7 @@ def whole(ship: TrueDrive) -> tuple[OnlineSlam, list[OnlinePose]]:
     return slam, poses
 
 
+@pytest.mark.study
 def test_three_fifths_of_a_ships_drift_go_as_it_drives(all_of_it: TrueDrive) -> None:
     """Each pose when it is made, along fixed axes; docs/studies/slam has all drives.
 
@@ -88,8 +93,8 @@ def test_it_is_one_field_and_jumps_of_the_recording_are_motion(
     truth = ship.truth.p[np.searchsorted(ship.truth.stamp_ns, stamps)]
     odometry, _ = odometry_of(ship, Form.VEHICLE)
     drift = odometry.p[np.searchsorted(odometry.stamp_ns, stamps)]
-    # The sooner the drive ends the less has odometry drifted.
-    assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.8 * rms(drift, truth)
+    # 36 % with this seed. With others, and in all of the drive, up to 45 %.
+    assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.5 * rms(drift, truth)
 
 
 @pytest.mark.parametrize("share", [0.15, 0.7], ids=["before the field is learnt", "after"])
@@ -146,6 +151,28 @@ def test_detail_beyond_the_limit_of_waves_counts_as_noise(shared_data: Path) -> 
     # Odometry is the truth here, so that all errors are the field's. Four sigmas, for poses of one
     # drive err together; a centimetre where the first pose is known exactly.
     assert np.all(np.linalg.norm(found - drive.truth.p[at], axis=1) < 4 * sigma + 0.01)
+
+
+def test_a_drive_too_long_to_be_solved_goes_on_with_the_filter(
+    ship: TrueDrive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if 60 key poses were all that can be solved in the meantime."""
+    solved = list[int]()
+
+    def counted(drive: Drive, *rest: Any) -> Any:
+        solved.append(len(drive))
+        return smoothed(drive, *rest)
+
+    monkeypatch.setattr(one_field_explorer, "MOST", 60)
+    monkeypatch.setattr(one_field_explorer, "smoothed", counted)
+    odometry, options = odometry_of(ship, Form.WORLD)
+    slam = OnlineSlam(as_recorded(STATED_UT), options)
+    poses = [pose for each in messages(ship.recording(odometry)) for pose in give(slam, each)]
+    assert solved
+    assert max(solved) <= 60
+    at = np.searchsorted(ship.truth.stamp_ns, [each.stamp_ns for each in poses])
+    found = np.stack([each.T_map_lidar.t for each in poses])
+    assert rms(found, ship.truth.p[at]) < 0.8 * rms(odometry.p[at], ship.truth.p[at])
 
 
 def test_a_pose_that_odometry_excludes_is_refused(ship: TrueDrive) -> None:
