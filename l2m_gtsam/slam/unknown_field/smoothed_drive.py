@@ -73,8 +73,8 @@ class SmoothedDrive:
         The graph of the last stage, and its solution.
     prior, noise
         Of the field and of the readings in it.
-    first, learnt
-        What was learnt at the poses of odometry, and at those found.
+    first
+        What was learnt at the poses of odometry.
     """
 
     drive: Drive
@@ -83,7 +83,6 @@ class SmoothedDrive:
     prior: WholePrior
     noise: SensorNoise
     first: WholePrior
-    learnt: WholePrior
 
 
 def smoothed(
@@ -117,19 +116,21 @@ def smoothed(
     if first is None or learnt is None:
         return None
     free = replace(drive, sensors=drive.sensors.loosened(whole.distortion, whole.offset))
-    poses, sensors, done = learnt.poses, free.sensors, 2
-    for factor, times in zip(STAGES, rounds, strict=True):
-        noise, prior = learnt.prior.spectrum.noise.floored().scaled(factor), learnt.prior
+    poses, sensors, prior, done = learnt.poses, free.sensors, learnt.prior, 2
+    for number, (factor, times) in enumerate(zip(STAGES, rounds, strict=True)):
+        if number > 0:
+            yield done / count
+            following = learnt_prior(drive, poses, whole, prior.spectrum)
+            if following is None:
+                return None
+            prior = following
+        noise = prior.spectrum.noise.floored().scaled(factor)
         problem, sensors = stage_problem(free, prior, noise, options), with_noise(sensors, noise)
         for _ in range(times):
             yield done / count
             stage, done = solved_stage(problem, poses, sensors), done + 1
             poses, sensors = stage.last.poses, stage.last.sensors
-        following = learnt_prior(drive, poses, whole, prior.spectrum)
-        if following is None:
-            return None
-        learnt = LearntPoses(poses, following)
-    return SmoothedDrive(free, problem, stage, prior, noise, first, learnt.prior)
+    return SmoothedDrive(free, problem, stage, prior, noise, first)
 
 
 def with_noise(sensors: KnownSensors, noise: SensorNoise) -> KnownSensors:

@@ -67,7 +67,10 @@ def map_whole_drive(
     found = reported(smoothed(drive, initial, options), progress)
     if found is None:
         return None
-    solution = where_gained(drive, found, options)
+    learnt = learnt_prior(drive, found.stage.last.poses, options.whole_field, found.prior.spectrum)
+    if learnt is None:
+        return None
+    solution = where_gained(drive, found, learnt, options)
     progress("solving poses and field", 1.0)
     return solution
 
@@ -84,9 +87,21 @@ def reported(
             return found
 
 
-def where_gained(drive: Drive, smooth: SmoothedDrive, options: SlamOptions) -> FieldSolution:
-    """Return a solved drive; where nothing is shown to be gained, at the poses of odometry."""
-    last, learnt = smooth.stage.last, smooth.learnt
+def where_gained(
+    drive: Drive, smooth: SmoothedDrive, learnt: WholePrior, options: SlamOptions
+) -> FieldSolution:
+    """Return a solved drive; where nothing is shown to be gained, at the poses of odometry.
+
+    Parameters
+    ----------
+    drive, smooth
+        The drive, and its solution.
+    learnt
+        Of field and noise at the poses found.
+    options
+        How to solve.
+    """
+    last = smooth.stage.last
     found = with_information(smooth.problem.finished(last), last.values, smooth.prior, smooth.noise)
     bent = 0.5 * found.solution.odometry_chi2 * 6 * len(drive)
     likelier = learnt.spectrum.log_likelihood - smooth.first.spectrum.log_likelihood - bent
