@@ -94,6 +94,15 @@ class ArrivedKeyPose:
         """Length of the step in metres."""
         return float(np.linalg.norm(self.p))
 
+    @property
+    def steady_m(self) -> FloatArray:
+        """What one standard deviation of the drift adds to the step, with time and distance, (2,).
+
+        All of it comes with distance: with half of it by time the errors on a model ship are the
+        same, and the mean speed is not known yet.
+        """
+        return np.array([0.0, self.steady * self.length_m])
+
     def without_readings(self) -> "ArrivedKeyPose":
         """Return it by odometry alone."""
         recorded = None if self.recorded is None else self.recorded.without_readings()
@@ -145,8 +154,8 @@ def key_poses_of(drive: Drive) -> Iterator[ArrivedKeyPose]:
 def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: KnownSensors) -> Drive:
     """Return key poses, from the first on, as a drive."""
     steps = key_poses[1:]
-    ways = [each.fixed.shift for each in steps if each.fixed is not None]
-    drifts = np.array([each.steady * each.length_m for each in steps])
+    shifts = [each.fixed.shift for each in steps if each.fixed is not None]
+    steady = np.reshape([each.steady_m for each in steps], (-1, 2))
     return Drive(
         stamp_ns=np.array([each.stamp_ns for each in key_poses], dtype=np.int64),
         steps=OdometrySteps(
@@ -154,8 +163,8 @@ def drive_of(key_poses: Sequence[ArrivedKeyPose], start: StartPose, sensors: Kno
             np.reshape([each.p for each in steps], (-1, 3)),
             np.reshape([each.covariance for each in steps], (-1, POSE, POSE)),
             stated=False,
-            fixed_axes=np.stack(ways) if ways and len(ways) == len(steps) else None,
-            steady=np.column_stack([0.0 * drifts, drifts]) if drifts.any() else None,
+            fixed_axes=np.stack(shifts) if shifts and len(shifts) == len(steps) else None,
+            steady=steady if steady.any() else None,
         ),
         readings=joined_readings([each.readings for each in key_poses]),
         start=start,

@@ -63,18 +63,16 @@ def _packed_beginning(beginning: SolvedBeginning) -> Arrays:
     state = beginning.state
     return {
         **named("poses", packed_poses(beginning.poses)),
-        **named("pose", packed_poses([state.pose])),
         **{name: getattr(state, name) for name in STATE},
-        "log_likelihood": np.array([state.log_likelihood]),
         "recorded": np.array(sorted(beginning.recorded), dtype=np.int64),
     }
 
 
 def _unpacked_beginning(arrays: Arrays) -> SolvedBeginning:
     weights, distortion, steady, covariance = (arrays[name] for name in STATE)
-    pose, likely = unpacked_poses(under("pose", arrays))[0], float(arrays["log_likelihood"][0])
-    state = FilterState(pose, weights, distortion, steady, covariance, likely)
     poses = tuple(unpacked_poses(under("poses", arrays)))
+    # The last pose is the state's, and the likelihood counts readings from there on.
+    state = FilterState(poses[-1], weights, distortion, steady, covariance, 0.0)
     return SolvedBeginning(poses, state, frozenset(arrays["recorded"].tolist()))
 
 

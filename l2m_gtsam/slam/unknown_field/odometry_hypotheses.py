@@ -148,6 +148,6 @@ def step_of(key_pose: ArrivedKeyPose) -> FilterStep:
     readings = key_pose.readings
     if len(readings):
         readings = from_end(readings, key_pose.R, key_pose.p)
-    # All of a steady drift comes with distance: with half of it by time the errors are the same.
-    steady = np.array([0.0, key_pose.steady * key_pose.length_m])
-    return FilterStep(key_pose.step, key_pose.covariance, readings, steady, key_pose.fixed)
+    return FilterStep(
+        key_pose.step, key_pose.covariance, readings, key_pose.steady_m, key_pose.fixed
+    )

@@ -37,25 +37,19 @@ from l2m_gtsam.slam.unknown_field.odometry_hypotheses import (
     step_of,
 )
 from l2m_gtsam.slam.unknown_field.smoothed_drive import SmoothedDrive, smoothed
-from l2m_gtsam.slam.unknown_field.spectrum import MARGIN
-from l2m_gtsam.slam.unknown_field.whole_field import (
-    WholePrior,
-    box_prior,
-    placed,
-    spectrum_at,
-)
+from l2m_gtsam.slam.unknown_field.whole_field import WholePrior, capped_prior, spectrum_at
 
 # Of the filter's noise. Slow errors count as white there: of errors that last 3 to 4 s, with a
 # reading each 0.43 s, white ones 3.7 to 4.5 times as large say as much. On the model ship 2, 3, 4
-# and 5 give errors of 0.48, 0.47, 0.47 and 0.49 m in the mean of twelve drives, and a NEES of 13.1,
-# 8.6, 7.3 and 5.7.
+# and 5 give errors of 0.48, 0.47, 0.47 and 0.49 m in the mean of twelve drives that the filter
+# follows from their start, and a NEES of 13.1, 8.6, 7.3 and 5.7.
 NOISE_FACTOR = 4.0
 GROWN = 2.0  # path, after which the drive is solved again: all of it takes twice the last solution
 LEFT = 1.25  # the same where the vehicle has left the box, or a correction was refused
 ROUNDS = (1, 1, 2)  # of the solution's stages; with as many as off line poses are no better
 NEAR = 1.0  # lengths of the field, to the faces of the box: nearer, these matter
 IMPOSSIBLE = float(chi2.isf(1e-6, POSE))  # squared distance from odometry in its sigmas
-LEAST, MOST = 20, 1500  # key poses that are solved as a whole: a round of so many takes ten seconds
+LEAST, MOST = 20, 1500  # key poses that are solved as a whole; a round of 350 takes two seconds
 PIECE = 20  # key poses that are followed anew while one comes
 
 
@@ -290,12 +284,10 @@ class OneFieldExplorer:
             yield from self._following(smooth.prior, beginning)
             return
         options, everything = self._options.whole_field, self._drive(len(self._key_poses))
-        first = None if now is None else now.prior.spectrum
-        spectrum = spectrum_at(everything, self.poses(), options, first)
+        first, poses = None if now is None else now.prior.spectrum, self.poses()
+        spectrum = spectrum_at(everything, poses, options, first)
         yield None
-        x, margin = placed(everything, self.poses()).x, MARGIN * spectrum.prior.length
-        low, high = x.min(axis=0) - margin, x.max(axis=0) + margin
-        yield from self._following(box_prior(low, high, spectrum, options.waves), None)
+        yield from self._following(capped_prior(everything, poses, options, spectrum), None)
 
     def _smoothing(self, drive: Drive) -> Generator[None, None, SmoothedDrive | None]:
         """Solve a drive in pieces; return None where the field has too much detail for that."""

@@ -18,9 +18,10 @@ import numpy as np
 from scipy.linalg import cho_solve, cholesky
 from scipy.spatial.transform import Rotation
 
-from l2m_factors import skew
+from l2m_factors import MagneticReadings, reading_residuals, skew
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.unknown_field.sensor_noise import NoiseInformation
+from l2m_gtsam.slam.unknown_field.tiled_drive import FieldWithWeights
 from l2m_gtsam.slam.unknown_field.whole_field import WholeField
 
 AXES = 3
@@ -166,16 +167,12 @@ class PathDensity:
         covariance = cho_solve((lower, True), np.eye(m))
         # The likeliest are S P^T T^-1 (z - H) with S the covariance: dw = -S P^T T^-1 d(P w + H).
         back = -covariance @ white.reshape(AXES * N, m).T
-        field, gradient = self._field.field_and_gradient(x, weights)
-        b = np.einsum("nij,nj->ni", R_back, field)
-        by_shift = R_back @ gradient @ at.R
-        by_turn = skew(b) - by_shift @ skew(t[None])
-        by_lidar = C @ np.concatenate([by_turn, by_shift], axis=2)
-        by_sensor = np.zeros((N, AXES, len(sensor)))
-        by_sensor[:, :, :3] = C @ by_shift
-        for axis in range(AXES):
-            by_sensor[:, axis, 3 + 3 * axis : 6 + 3 * axis] = b
-            by_sensor[:, axis, 12 + axis] = 1.0
+        readings = MagneticReadings(np.zeros(N, dtype=np.int64), at.R, at.p, at.z)
+        known = FieldWithWeights(self._field, weights)
+        here = reading_residuals(readings, known, t[None], sensor[None, 3:])
+        by_turn = C @ skew(here.b_lidar) - here.de_dt @ skew(t[None])
+        by_lidar = np.concatenate([by_turn, here.de_dt], axis=2)
+        by_sensor = np.concatenate([here.de_dt, here.de_dD], axis=2)
         own = back.reshape(m, N, AXES)
         return WeightsOfPath(
             covariance,

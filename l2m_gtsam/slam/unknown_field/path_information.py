@@ -170,9 +170,8 @@ class PathNeighbourhood:
         poses, sensor = self.moved_by(errors[:, None])
         moved = (self._by_pose @ poses.ravel()).reshape(-1, POSE)
         found = self.density.slopes(moved, self.sensor + sensor[:, 0])
-        back = np.append(np.zeros(self._others), self._by_pose.T @ found.by_path.ravel())
-        by_steps = np.asarray(self._transposed.solve(back))
-        return np.append(by_steps, self._by_sensor.T @ found.by_sensor)
+        by_poses, none = self.by_key_poses(found.by_path[None]), np.zeros((1, POSE))
+        return np.asarray(self.by_errors(by_poses, none, found.by_sensor[None])[0])
 
     def by_errors(
         self, by_poses: FloatArray, by_drift: FloatArray, by_sensor: FloatArray

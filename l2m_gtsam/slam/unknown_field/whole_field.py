@@ -6,7 +6,7 @@ and a return is seen by the readings of one tile alone. Here all readings determ
 weights. The box is fixed to the first key pose.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -159,28 +159,23 @@ def prior_about(
 
     Parameters and result as of ``learnt_prior``.
     """
-    x = placed(drive, poses).x
-    low, high, margin = x.min(axis=0), x.max(axis=0), MARGIN * spectrum.prior.length
-    waves = waves_for(high - low + 2 * margin, spectrum.prior.length)
-    if waves > options.waves:
-        return None
-    return WholePrior(spectrum, low - margin, high + margin, waves)
+    prior = full_prior(drive, poses, spectrum)
+    return prior if prior.waves <= options.waves else None
 
 
-def box_prior(low: FloatArray, high: FloatArray, spectrum: FieldSpectrum, most: int) -> WholePrior:
-    """Return the prior of a field in a given box, of what was learnt.
+def capped_prior(
+    drive: Drive, poses: list[gtsam.Pose3], options: WholeFieldOptions, spectrum: FieldSpectrum
+) -> WholePrior:
+    """Return the same of a field with any detail: what shorter waves hold counts as noise."""
+    prior = full_prior(drive, poses, spectrum)
+    return replace(prior, waves=min(prior.waves, options.waves))
 
-    Parameters
-    ----------
-    low, high
-        Corners in the frame of the first key pose in metres, shape (3,).
-    spectrum
-        What was learnt.
-    most
-        Limit of eigenfunctions; what shorter waves hold counts as noise.
-    """
-    waves = min(waves_for(high - low, spectrum.prior.length), most)
-    return WholePrior(spectrum, low, high, waves)
+
+def full_prior(drive: Drive, poses: list[gtsam.Pose3], spectrum: FieldSpectrum) -> WholePrior:
+    """Return the prior in a box about the poses with all waves that the field needs."""
+    x, margin = placed(drive, poses).x, MARGIN * spectrum.prior.length
+    low, high = x.min(axis=0) - margin, x.max(axis=0) + margin
+    return WholePrior(spectrum, low, high, waves_for(high - low, spectrum.prior.length))
 
 
 def placed(drive: Drive, poses: list[gtsam.Pose3]) -> PlacedReadings:

@@ -64,14 +64,14 @@ def whole(ship: TrueDrive) -> tuple[OnlineSlam, list[OnlinePose]]:
 
 
 @pytest.mark.study
-def test_three_fifths_of_a_ships_drift_go_as_it_drives(all_of_it: TrueDrive) -> None:
+def test_most_of_a_ships_drift_goes_as_it_drives(all_of_it: TrueDrive) -> None:
     """Each pose when it is made, along fixed axes; docs/studies/slam has all drives.
 
-    They are 64 to 67 % with seeds 0 to 2.
+    It is 61 % here, 70 % in the mean of seeds 3 to 9 (docs/slam-measurements.md).
     """
     odometry, options = odometry_of(all_of_it, Form.WORLD)
     row = online_row(all_of_it, odometry, options, STATED_UT)
-    assert row.rms_m < 0.4 * rms(odometry.p, all_of_it.truth.p)
+    assert row.rms_m < 0.5 * rms(odometry.p, all_of_it.truth.p)
     # Poses of one drive err together, and the filter linearises each reading once.
     assert row.nees is not None
     assert row.nees < 24
@@ -93,7 +93,7 @@ def test_it_is_one_field_and_jumps_of_the_recording_are_motion(
     truth = ship.truth.p[np.searchsorted(ship.truth.stamp_ns, stamps)]
     odometry, _ = odometry_of(ship, Form.VEHICLE)
     drift = odometry.p[np.searchsorted(odometry.stamp_ns, stamps)]
-    # 36 % with this seed. With others, and in all of the drive, up to 45 %.
+    # 36 % with this seed; in all of the drive up to 41 % with seeds 0 to 9.
     assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.5 * rms(drift, truth)
 
 
