@@ -25,7 +25,9 @@ from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation_file import TruthRecord
 from l2m_gtsam.records.scans import Scan
+from l2m_gtsam.slam.online.belief import POSE
 from l2m_gtsam.slam.online.events import OnlineEvent
+from l2m_gtsam.slam.online.loop_matcher import LoopMatcher
 from l2m_gtsam.slam.online.replay import give, messages, with_scans
 from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
@@ -117,7 +119,7 @@ def slam_online(
     if truth is not None:
         check_truth(truth, recording.trajectory, config.slam.max_pose_gap_s, str(given.truth))
     field_map = None if saved is None else _opened(saved, recording, config, progress)
-    matcher = None if saved is None else _matcher(given.bag, saved, config)
+    matcher = _matcher(given.bag, saved, config)
     begun = _begun(calibration, config, field_map, matcher, out, resume=resume)
     ensure_folder(out)
     with OnlineLog(out / LOG_FILE, begun.lines) as log:
@@ -152,7 +154,7 @@ def _begun(
     calibration: CalibrationResult,
     config: Config,
     field_map: FieldMap | None,
-    matcher: ScanMatcher | None,
+    matcher: ScanMatcher | LoopMatcher | None,
     out: Path,
     *,
     resume: bool,
@@ -172,13 +174,21 @@ def _opened(saved: SavedMap, recording: Recording, config: Config, progress: Pro
     return saved.open(progress, [] if start.anywhere or is_given else [recording])
 
 
-def _matcher(bag: Path, saved: SavedMap, config: Config) -> ScanMatcher | None:
-    """Return what registers the scans of a bag on the cloud of a map; None without one of both."""
-    mapped, options = saved.state.lidar, config.lidar.localisation
-    if mapped is None or config.slam.scans is Usage.IGNORED or not has_clouds(bag):
+def _matcher(bag: Path, saved: SavedMap | None, config: Config) -> ScanMatcher | LoopMatcher | None:
+    """Return what registers the scans of a bag: on the cloud of the map, without a map on others.
+
+    There is none for a bag without clouds, or a map without one.
+    """
+    slam = config.slam
+    if slam.scans is Usage.IGNORED or not has_clouds(bag):
         return None
-    edge = options.registration.edge
-    return ScanMatcher(Surface(mapped.points), options, edge, config.slam.drift)
+    if saved is None:
+        loops, largest = config.lidar.loops, slam.robust.largest_of(POSE)
+        return LoopMatcher(loops, loops.registration.edge, slam.drift, largest)
+    mapped, options = saved.state.lidar, config.lidar.localisation
+    if mapped is None:
+        return None
+    return ScanMatcher(Surface(mapped.points), options, options.registration.edge, slam.drift)
 
 
 class _Run:

@@ -1,7 +1,7 @@
 """Loop closures: scans of revisited places, registered on those of earlier visits."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,15 +52,33 @@ class LoopClosureSearch:
 
 
 @dataclass(frozen=True)
-class _KeyScan:
-    """A scan as it is kept: its thinned points, in half the memory, and where odometry has it."""
+class KeyScan:
+    """A scan as it is kept.
+
+    Attributes
+    ----------
+    stamp_ns
+        Its time in nanoseconds.
+    points
+        Thinned, in metres in the lidar frame, shape (N, 3), in half the memory.
+    T
+        Pose of the lidar, by odometry or as it is known by now.
+    path_m
+        Path to it in metres.
+    """
 
     stamp_ns: int
     points: "np.ndarray[tuple[int, ...], np.dtype[np.float32]]"
     T: RigidTransform
     path_m: float
 
+    @classmethod
+    def of(cls, stamp_ns: int, scan: Surface, T: RigidTransform, path_m: float) -> "KeyScan":
+        """Return a scan to be kept."""
+        return cls(stamp_ns, scan.points.astype(np.float32), T, path_m)
+
     def surface(self) -> Surface:
+        """Return it to be registered."""
         return Surface(self.points.astype(np.float64))
 
 
@@ -76,17 +94,16 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
     options
         Where to search, and what to believe.
     """
-    kept, loops, refused = list[_KeyScan](), list[LoopClosure](), Counter[Refusal]()
+    kept, loops, refused = list[KeyScan](), list[LoopClosure](), Counter[Refusal]()
     path, last = 0.0, None
     for step in steps:
         path += float(np.linalg.norm(step.step.t))
         if last is not None and path - last < options.key_distance_m:
             continue
         last = path
-        points = step.surface.points.astype(np.float32)
-        here = _KeyScan(step.stamp_ns, points, step.T_odom_lidar, path)
-        for earlier in _candidates(kept, here, options):
-            closed = _closed(earlier, here, step.surface, options.registration)
+        here = KeyScan.of(step.stamp_ns, step.surface, step.T_odom_lidar, path)
+        for k in candidates(kept, here, options):
+            closed = closed_loop(kept[k], here, step.surface, options.registration)
             if isinstance(closed, LoopClosure):
                 loops.append(closed)
             else:
@@ -95,18 +112,28 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
     return LoopClosureSearch(tuple(loops), dict(refused))
 
 
-def _candidates(kept: list[_KeyScan], here: _KeyScan, options: LoopOptions) -> list[_KeyScan]:
-    """Return the earlier scans that may be of the same place, the nearest first."""
-    old = [each for each in kept if here.path_m - each.path_m >= options.least_way_m]
-    away = [float(np.linalg.norm(each.T.t - here.T.t)) for each in old]
-    near = [k for k in np.argsort(away)[: options.most] if away[k] <= options.search_m]
-    return [old[k] for k in near]
+def candidates(kept: Sequence[KeyScan], here: KeyScan, options: LoopOptions) -> list[int]:
+    """Return the rows of earlier scans that may be of the same place, the nearest first."""
+    old = [k for k, each in enumerate(kept) if here.path_m - each.path_m >= options.least_way_m]
+    away = [float(np.linalg.norm(kept[k].T.t - here.T.t)) for k in old]
+    near = np.argsort(away)[: options.most].tolist()
+    return [old[k] for k in near if away[k] <= options.search_m]
 
 
-def _closed(
-    earlier: _KeyScan, here: _KeyScan, scan: Surface, options: RegistrationOptions
+def closed_loop(
+    earlier: KeyScan, here: KeyScan, scan: Surface, options: RegistrationOptions
 ) -> LoopClosure | Refusal:
-    """Return the loop closure between two scans, or why there is none."""
+    """Return the loop closure between two scans, or why there is none.
+
+    Parameters
+    ----------
+    earlier, here
+        Both scans; their poses together tell where the second is looked for in the first.
+    scan
+        The second.
+    options
+        How they are registered.
+    """
     first, guess = earlier.surface(), between(earlier.T, here.T)
     found = register(scan, first, guess, options)
     back = register(first, scan, found.T.inverse(), options)

@@ -219,3 +219,8 @@ def odometry_jumps(
 def as_pose(transform: RigidTransform) -> gtsam.Pose3:
     """Return a transform as GTSAM's pose."""
     return gtsam.Pose3(gtsam.Rot3(transform.R), transform.t)
+
+
+def as_transform(pose: gtsam.Pose3) -> RigidTransform:
+    """Return GTSAM's pose as a transform."""
+    return RigidTransform(pose.rotation().matrix(), pose.translation())

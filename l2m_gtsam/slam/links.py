@@ -7,6 +7,7 @@ import numpy as np
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between, compose, moved
+from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.recording.sync import interpolated
 from l2m_gtsam.records.scans import LoopClosure, PoseFix, ScanEvidence
 from l2m_gtsam.slam.odometry import drift_covariance
@@ -66,10 +67,56 @@ class Links:
             np.concatenate([each.covariance for each in parts]),
         )
 
+    @classmethod
+    def single(cls, origin: int, key_pose: int, found: PoseEstimate) -> "Links":
+        """Return one link: a key pose in the frame of an earlier one, or of the map."""
+        at, T = (np.array([origin]), np.array([key_pose])), found.T
+        return cls(*at, T.R[None], T.t[None], found.covariance[None])
+
+    def estimate(self, row: int) -> PoseEstimate:
+        """Return the measured pose of a link."""
+        return PoseEstimate(RigidTransform(self.R[row], self.p[row]), self.covariance[row])
+
     @property
     def in_map(self) -> BoolArray:
         """Which fix a key pose in the map, shape (L,); the others are loop closures."""
         return np.asarray(self.origin == MAP)
+
+
+def carried_on(found: PoseEstimate, step: RigidTransform, drift: DriftOptions) -> PoseEstimate:
+    """Return a measured pose carried on by a step of odometry.
+
+    Parameters
+    ----------
+    found
+        The pose.
+    step
+        From there, by odometry.
+    drift
+        Of odometry.
+    """
+    covariance = moved(found.covariance[None], step)[0] + _drift_of(step, drift)
+    return PoseEstimate(compose(found.T, step), covariance)
+
+
+def seen_from_before(
+    found: PoseEstimate, step: RigidTransform, drift: DriftOptions
+) -> PoseEstimate:
+    """Return a measured pose in a frame from which a step of odometry leads to its own.
+
+    Parameters
+    ----------
+    found
+        The pose, in the frame after the step.
+    step, drift
+        As of ``carried_on``.
+    """
+    covariance = found.covariance + moved(_drift_of(step, drift)[None], found.T)[0]
+    return PoseEstimate(compose(step, found.T), covariance)
+
+
+def _drift_of(step: RigidTransform, drift: DriftOptions) -> FloatArray:
+    return np.asarray(drift_covariance(step.R[None], step.t[None], drift)[0])
 
 
 def link_stamps(evidence: ScanEvidence) -> IntArray:
@@ -105,9 +152,9 @@ def key_pose_links(
     return Links(
         origin=np.array([each.origin for each in links], dtype=np.int64),
         key_pose=np.array([each.key_pose for each in links], dtype=np.int64),
-        R=np.reshape([each.T.R for each in links], (-1, 3, 3)),
-        p=np.reshape([each.T.t for each in links], (-1, 3)),
-        covariance=np.reshape([each.covariance for each in links], (-1, 6, 6)),
+        R=np.reshape([each.found.T.R for each in links], (-1, 3, 3)),
+        p=np.reshape([each.found.T.t for each in links], (-1, 3)),
+        covariance=np.reshape([each.found.covariance for each in links], (-1, 6, 6)),
     )
 
 
@@ -115,8 +162,7 @@ def key_pose_links(
 class _Link:
     origin: int
     key_pose: int
-    T: RigidTransform
-    covariance: FloatArray
+    found: PoseEstimate
 
 
 class _Carrier:
@@ -137,21 +183,17 @@ class _Carrier:
     def fix(self, fix: PoseFix) -> _Link:
         """Return a key pose in the map."""
         k, T_scan_key = self._nearest[fix.stamp_ns]
-        covariance = moved(fix.covariance[None], T_scan_key)[0] + self._drift(T_scan_key)
-        return _Link(MAP, k, compose(fix.T_map_lidar, T_scan_key), covariance)
+        found = PoseEstimate(fix.T_map_lidar, fix.covariance)
+        return _Link(MAP, k, carried_on(found, T_scan_key, self._options))
 
     def loop(self, loop: LoopClosure) -> _Link:
         """Return a key pose in the frame of an earlier one."""
         origin, T_first_origin = self._nearest[loop.from_ns]
         k, T_second_key = self._nearest[loop.to_ns]
-        T_origin_first = T_first_origin.inverse()
-        T_first_key = compose(loop.T_from_to, T_second_key)
-        covariance = moved(loop.covariance[None], T_second_key)[0] + self._drift(T_second_key)
-        covariance += moved(self._drift(T_origin_first)[None], T_first_key)[0]
-        return _Link(origin, k, compose(T_origin_first, T_first_key), covariance)
-
-    def _drift(self, T: RigidTransform) -> FloatArray:
-        return np.asarray(drift_covariance(T.R[None], T.t[None], self._options)[0])
+        found = PoseEstimate(loop.T_from_to, loop.covariance)
+        of_key_pose = carried_on(found, T_second_key, self._options)
+        there = seen_from_before(of_key_pose, T_first_origin.inverse(), self._options)
+        return _Link(origin, k, there)
 
 
 def _between(one: Trajectory, i: int, other: Trajectory, k: int) -> RigidTransform:

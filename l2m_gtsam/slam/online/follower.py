@@ -20,9 +20,8 @@ from scipy.linalg import block_diag
 
 from l2m_factors import D, KeyPoseReadings, MapBatch, StepError, T, Whitening, X, key_pose_factor
 from l2m_gtsam.calibration.view import QueryableMap
-from l2m_gtsam.data import RigidTransform
 from l2m_gtsam.progress import Progress
-from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.drive import Drive, KnownSensors, StartPose, as_pose, as_transform
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.links import Links
@@ -153,7 +152,7 @@ class Follower:
         """Return a follower that goes on from what was known of a key pose."""
         belief, number = last.belief, last.number
         pose = belief.pose
-        T_map_lidar = RigidTransform(pose.rotation().matrix(), pose.translation())
+        T_map_lidar = as_transform(pose)
         start = StartPose(T_map_lidar, belief.pose_covariance)
         own = cls(start, belief.sensors, field_map, robust, free=free, section=section)
         values, sizes = gtsam.Values(), {X(number): POSE}

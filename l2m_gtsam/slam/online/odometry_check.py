@@ -14,7 +14,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, RigidTransform
 from l2m_gtsam.geometry import isotropic_covariance
-from l2m_gtsam.slam.drive import as_pose
+from l2m_gtsam.slam.drive import as_pose, as_transform
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.slips import FAR_DEG, FAR_M
@@ -133,7 +133,7 @@ def suspect_step(
             "step is as uncertain"
         )
         end = as_pose(before.T).compose(expected)
-        T = RigidTransform(end.rotation().matrix(), end.translation())
+        T = as_transform(end)
         covariance = isotropic_covariance(most_deg, most_m) + np.outer(d, d)
         return SuspectStep(EventKind.ODOMETRY_JUMP, text, T, covariance, replaced=True)
     text = (

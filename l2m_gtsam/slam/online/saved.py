@@ -17,7 +17,9 @@ from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.events import EventKind
 from l2m_gtsam.slam.online.follower import Follower, LastBelief
 from l2m_gtsam.slam.online.intake import Intake, IntakeState
+from l2m_gtsam.slam.online.loop_matcher import LoopMatcher
 from l2m_gtsam.slam.online.odometry_check import OdometryPose, SuspectStep
+from l2m_gtsam.slam.online.packed_loops import packed_loops, resume_loops
 from l2m_gtsam.slam.online.packed_one_field import packed_one_field, unpacked_one_field
 from l2m_gtsam.slam.online.packing import (
     Arrays,
@@ -60,6 +62,8 @@ def saved_state(slam: OnlineSlam) -> SavedState:
         str(stamp): [each.kind.value, each.text]
         for stamp, each in slam.intake.state.suspect.items()
     }
+    if isinstance(slam.matcher, LoopMatcher):
+        arrays |= named("loops", packed_loops(slam.matcher))
     estimator, search = slam.estimator, slam.search
     if isinstance(estimator, Follower):
         facts["stage"] = FOLLOWING
@@ -88,7 +92,7 @@ def resumed_slam(
     calibration: CalibrationResult,
     options: SlamOptions,
     field_map: QueryableMap | None = None,
-    matcher: ScanMatcher | None = None,
+    matcher: ScanMatcher | LoopMatcher | None = None,
 ) -> OnlineSlam:
     """Return a localisation that goes on from a state.
 
@@ -122,6 +126,8 @@ def _resume(slam: OnlineSlam, state: SavedState) -> None:
     arrays, facts = state.arrays, state.facts
     slam.intake.resume(_unpacked_intake(under("intake", arrays), facts["suspect"], slam.intake))
     slam.base, slam.stamp_ns = (int(each) for each in arrays["base"])
+    if isinstance(slam.matcher, LoopMatcher):
+        resume_loops(slam.matcher, under("loops", arrays))
     stages: dict[str, Callable[[], None]] = {
         FOLLOWING: lambda: _resume_following(slam, under("belief", arrays)),
         EXPLORING: lambda: _resume_exploring(slam, under("explorer", arrays), facts),

@@ -5,13 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from l2m_gtsam.geometry import compose, moved
+from l2m_gtsam.geometry import compose
 from l2m_gtsam.lidar.odometry import LEAST_POINTS
 from l2m_gtsam.lidar.registration import PoseEstimate, by_scan, register
 from l2m_gtsam.lidar.scan_localisation import ScanLocalisationOptions
 from l2m_gtsam.lidar.surface import Surface
-from l2m_gtsam.slam.links import MAP, Links
-from l2m_gtsam.slam.odometry import drift_covariance
+from l2m_gtsam.slam.links import MAP, Links, carried_on
 from l2m_gtsam.slam.online.key_pose import ScanAtKeyPose
 from l2m_gtsam.slam.options import DriftOptions
 
@@ -20,8 +19,8 @@ UNSEEN = {"unseen_m": 100.0, "unseen_deg": 100.0}
 
 
 @dataclass(frozen=True)
-class ScanFixes:
-    """Fixes of a key pose, and why other scans gave none."""
+class ScanLinks:
+    """What scans say of a key pose, and why some say nothing."""
 
     links: Links
     refused: tuple[str, ...]
@@ -52,7 +51,7 @@ class ScanMatcher:
 
     def fixes(
         self, scans: Sequence[ScanAtKeyPose], number: int, expected: PoseEstimate, step_m: float
-    ) -> ScanFixes:
+    ) -> ScanLinks:
         """Return what scans say of a key pose.
 
         Parameters
@@ -81,16 +80,12 @@ class ScanMatcher:
                 continue
             found.append(self._link(by_scan(seen, guess, registration), each, number))
             self._path_m = 0.0
-        return ScanFixes(Links.joined(found), tuple(refused))
+        return ScanLinks(Links.joined(found), tuple(refused))
 
     def _link(self, fix: PoseEstimate, at: ScanAtKeyPose, number: int) -> Links:
         """Return a fix of a scan as one of its key pose, less what neighbouring ones share."""
-        T_scan_key = at.T_key_scan.inverse()
         # n fixes that share an error of the cloud get n times its covariance.
         over = self._options.cloud_over_m
         shared = over / np.clip(self._path_m, 0.02 * over, over)
-        own = fix.covariance + shared * self._options.of_cloud()
-        drift = drift_covariance(T_scan_key.R[None], T_scan_key.t[None], self._drift)[0]
-        covariance = moved(own[None], T_scan_key)[0] + drift
-        T = compose(fix.T, T_scan_key)
-        return Links(np.array([MAP]), np.array([number]), T.R[None], T.t[None], covariance[None])
+        own = PoseEstimate(fix.T, fix.covariance + shared * self._options.of_cloud())
+        return Links.single(MAP, number, carried_on(own, at.T_key_scan.inverse(), self._drift))

@@ -19,7 +19,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.localisation import StartVerdict
 from l2m_gtsam.records.scans import Scan
-from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose
+from l2m_gtsam.slam.drive import EXACT_START, KnownSensors, StartPose, as_transform
 from l2m_gtsam.slam.links import Links
 from l2m_gtsam.slam.localisation import is_determined, known_sensors, start_pose
 from l2m_gtsam.slam.online.belief import Belief
@@ -27,8 +27,9 @@ from l2m_gtsam.slam.online.events import EventKind, OnlineEvent
 from l2m_gtsam.slam.online.follower import Follower
 from l2m_gtsam.slam.online.intake import Intake, trajectory_of
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
+from l2m_gtsam.slam.online.loop_matcher import LoopMatcher
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
-from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
+from l2m_gtsam.slam.online.scan_matcher import ScanLinks, ScanMatcher
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
@@ -73,8 +74,7 @@ class OnlinePose:
     @classmethod
     def of(cls, stamp_ns: int, belief: Belief) -> "OnlinePose":
         """Return a belief as it is handed out."""
-        pose = belief.pose
-        T = RigidTransform(pose.rotation().matrix(), pose.translation())
+        T = as_transform(belief.pose)
         return cls(stamp_ns, T, belief.pose_covariance, belief.sensors)
 
 
@@ -109,7 +109,8 @@ class OnlineSlam:
     field_map
         Map; without one the field is found with the poses.
     matcher
-        Registers scans on the cloud of the map; without it scans take no part.
+        Registers scans on the cloud of the map or, where there is none, on those of earlier visits;
+        without it scans take no part.
 
     Raises
     ------
@@ -124,16 +125,17 @@ class OnlineSlam:
         calibration: CalibrationResult,
         options: SlamOptions,
         field_map: QueryableMap | None = None,
-        matcher: ScanMatcher | None = None,
+        matcher: ScanMatcher | LoopMatcher | None = None,
     ) -> None:
         usable = tuple(each for each in calibration.sensors if is_determined(each))
         usable = tuple(each for each in usable if not each.moving)
         if not usable:
             raise CalibrationError("no sensor has a calibration that can be used")
-        check_options(options, has_map=field_map is not None, sensors=len(usable))
+        self._one_field = field_map is None and matcher is None and len(usable) == 1
+        check_options(options, has_map=field_map is not None, one_field=self._one_field)
         self.options, self.sensors = options, known_sensors(usable)
         self._map = field_map.compile() if isinstance(field_map, Compilable) else field_map
-        self._matcher = matcher
+        self.matcher = matcher
         self.intake = Intake(self.sensors, options)
         self.estimator: Follower | Explorer | OneFieldExplorer | None = None
         self.search: StartSearchState | None = None
@@ -161,8 +163,8 @@ class OnlineSlam:
         self.intake.add_reading(stamp_ns, sensor, field_ut)
 
     def add_scan(self, scan: Scan) -> None:
-        """Take a scan; it takes part where there is the cloud of a map."""
-        if self._matcher is not None:
+        """Take a scan; it takes part where there is something that registers it."""
+        if self.matcher is not None:
             self.intake.add_scan(scan)
 
     @one_blas_thread()
@@ -206,7 +208,7 @@ class OnlineSlam:
         if self._map is None:
             if start_options.position is None and start_options.quaternion_xyzw is None:
                 start = replace(start, covariance=EXACT_START)
-            if len(self.sensors.names) == 1:
+            if self._one_field:
                 self.estimator = OneFieldExplorer(start, self.sensors, self.options)
                 self._report(EventKind.ONE_SENSOR, WEAKLY_HELD)
             else:
@@ -285,6 +287,8 @@ class OnlineSlam:
     def _explored(self, explorer: Explorer | OneFieldExplorer, key_pose: ArrivedKeyPose) -> Belief:
         """Return what is known of a key pose without a map."""
         learnt = explorer.is_learnt
+        if isinstance(explorer, Explorer):
+            key_pose = self._with_loops(explorer, key_pose)
         belief = explorer.add(key_pose)
         if isinstance(explorer, OneFieldExplorer):
             for each in explorer.decisions():
@@ -298,13 +302,20 @@ class OnlineSlam:
 
     def _with_fixes(self, before: Belief, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
         """Return a key pose with what its scans say of its place in the map."""
-        if self._matcher is None or not key_pose.scans:
+        if not isinstance(self.matcher, ScanMatcher) or not key_pose.scans:
             return key_pose
-        predicted = before.predicted(key_pose.step, key_pose.covariance).marginalize_previous()
-        pose = predicted.pose
-        T = RigidTransform(pose.rotation().matrix(), pose.translation())
-        expected = PoseEstimate(T, predicted.pose_covariance)
-        found = self._matcher.fixes(key_pose.scans, key_pose.number, expected, key_pose.length_m)
+        expected = expected_place(before, key_pose)
+        found = self.matcher.fixes(key_pose.scans, key_pose.number, expected, key_pose.length_m)
+        return self._linked(key_pose, found)
+
+    def _with_loops(self, explorer: Explorer, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
+        """Return a key pose with what its scans say of its place, by those of earlier visits."""
+        if not isinstance(self.matcher, LoopMatcher):
+            return key_pose
+        expected = expected_place(explorer.belief, key_pose)
+        return self._linked(key_pose, self.matcher.loops(key_pose, expected, explorer.estimate))
+
+    def _linked(self, key_pose: ArrivedKeyPose, found: ScanLinks) -> ArrivedKeyPose:
         for text in found.refused:
             self._report(EventKind.SCAN_REFUSED, text)
         return replace(key_pose, links=Links.joined([key_pose.links, found.links]), scans=())
@@ -356,6 +367,12 @@ class OnlineSlam:
         self._events.append(OnlineEvent(self.stamp_ns, kind, text))
 
 
+def expected_place(before: Belief, key_pose: ArrivedKeyPose) -> PoseEstimate:
+    """Return where the key pose after a belief is by odometry."""
+    predicted = before.predicted(key_pose.step, key_pose.covariance).marginalize_previous()
+    return PoseEstimate(as_transform(predicted.pose), predicted.pose_covariance)
+
+
 def decision_text(decision: JumpDecision, key_poses: Sequence[ArrivedKeyPose]) -> str:
     """Return what the readings say of a jump of odometry."""
     seconds = 1e-9 * key_poses[decision.number].stamp_ns
@@ -363,16 +380,25 @@ def decision_text(decision: JumpDecision, key_poses: Sequence[ArrivedKeyPose]) -
     return f"the jump of odometry at {seconds:.3f} s was {was}, by the readings"
 
 
-def check_options(options: SlamOptions, *, has_map: bool, sensors: int) -> None:
+def check_options(options: SlamOptions, *, has_map: bool, one_field: bool) -> None:
     """Refuse what works off line only.
+
+    Parameters
+    ----------
+    options
+        As of ``OnlineSlam``.
+    has_map
+        Whether there is a map.
+    one_field
+        Whether there is a single sensor and nothing else that knows its places.
 
     Raises
     ------
     ConfigError
         Odometry knows its steps along fixed axes, in a map or with several sensors; or, without a
-        map, the start is to be searched for or calibrations are to be refined.
+        map, the start is to be searched for, or the calibration of a single sensor to be refined.
     """
-    if options.drift.axes is StepAxes.FIXED and (has_map or sensors > 1):
+    if options.drift.axes is StepAxes.FIXED and not one_field:
         raise ConfigError(
             "`slam.drift.axes: fixed` works off line, and on line with one sensor and no map; give "
             "`vehicle`"
@@ -381,7 +407,8 @@ def check_options(options: SlamOptions, *, has_map: bool, sensors: int) -> None:
         return
     if options.start.anywhere:
         raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
-    if options.calibration is CalibrationUse.REFINED:
+    if options.calibration is CalibrationUse.REFINED and one_field:
         raise ConfigError(
-            "`slam.calibration: refined` works off line where there is no map; on line give `fixed`"
+            "`slam.calibration: refined` of one sensor without a map works off line; on line give "
+            "`fixed`"
         )

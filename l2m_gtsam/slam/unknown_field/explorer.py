@@ -11,7 +11,7 @@ drift as odometry does, and the sigmas do not show it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -20,8 +20,10 @@ from pydantic import Field
 from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import ConfigError
+from l2m_gtsam.lidar.registration import PoseEstimate
 from l2m_gtsam.options import Options
-from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_pose
+from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_transform
+from l2m_gtsam.slam.links import Links, carried_on, seen_from_before
 from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
@@ -82,8 +84,8 @@ class ExplorerState:
 class Explorer:
     """Estimates poses and field on line: its state after the key poses added so far.
 
-    Calibrations are fixed, and scans are not used. All readings of a tile determine the sensors'
-    heights together; those of marginalised poses cannot be linearised again.
+    All readings of a tile determine the sensors' heights together; those of marginalised poses
+    cannot be linearised again, at other calibrations neither.
 
     Parameters
     ----------
@@ -99,7 +101,7 @@ class Explorer:
     Raises
     ------
     ConfigError
-        Calibrations are to be refined, or odometry knows its steps along fixed axes.
+        Odometry knows its steps along fixed axes.
     """
 
     def __init__(
@@ -110,17 +112,14 @@ class Explorer:
         prior: FieldPrior | None = None,
         pace: ExploringOptions | None = None,
     ) -> None:
-        if options.calibration is CalibrationUse.REFINED:
-            raise ConfigError(
-                "`slam.calibration: refined` works off line where there is no map; on line give "
-                "`fixed`"
-            )
         if options.drift.axes is StepAxes.FIXED:
             raise ConfigError("`slam.drift.axes: fixed` works off line; on line give `vehicle`")
         self.start, self._sensors, self._options = start, sensors, options
         self._pace = ExploringOptions() if pace is None else pace
-        self._memory = FieldMemory.at_start(start)
+        refined = options.calibration is CalibrationUse.REFINED
+        self._memory = FieldMemory.at_start(start, sensors if refined else None)
         self._waiting: list[ArrivedKeyPose] = []  # until they are solved
+        self._reckoned = dict[int, gtsam.Pose3]()  # where odometry has these
         self._work: Iterator[None] | None = None  # on the section, which is not finished
         self._path_m = self._solved_m = self._opened_m = 0.0
         self._first, self._solved = 0, -1
@@ -193,8 +192,7 @@ class Explorer:
         own._memory, own._past = state.memory, list(state.past)
         own._first = own._solved = state.last
         own._section = OpenSection(sensors, state.prior, options, state.memory, state.last)
-        known = state.memory.known.marginal([X(state.last)])
-        own._belief = Belief(known.values.atPose3(X(state.last)), sensors, known.covariance)
+        own._belief = state.memory.belief(state.last, sensors)
         return own
 
     def state(self) -> "ExplorerState":
@@ -206,6 +204,20 @@ class Explorer:
             self._work = self._handing_over(self._section)
             self._complete()
         return ExplorerState(self._section.prior, self._memory, tuple(self._past), (), self._solved)
+
+    def estimate(self, number: int) -> PoseEstimate:
+        """Return a key pose as it is known now; that of a marginalised one is its anchor's."""
+        if self._section is None or number > self._solved:
+            pose = self._reckoned[number]
+            return PoseEstimate(as_transform(pose), self._belief.pose_covariance)
+        if number >= len(self._past):
+            T = as_transform(self._section.pose(number))
+            return PoseEstimate(T, self._belief.pose_covariance)
+        past = self._past[number]
+        T_map_anchor = as_transform(self._section.pose(past.anchor))
+        known = self._memory.known.marginal([X(past.anchor)]).covariance
+        step = as_transform(past.T_anchor_key)
+        return carried_on(PoseEstimate(T_map_anchor, known), step, self._options.drift)
 
     def poses(self) -> list[gtsam.Pose3]:
         """Return all solved key poses, past ones relative to their anchors' current estimates."""
@@ -240,8 +252,7 @@ class Explorer:
         return points, field
 
     def _prior(self) -> Belief:
-        start = as_pose(self.start.T_map_lidar)
-        return Belief(start, self._sensors, self.start.covariance)
+        return self._memory.belief(0, self._sensors)
 
     def _opened(self, prior: FieldPrior) -> OpenSection:
         return OpenSection(self._sensors, prior, self._options, self._memory, 0)
@@ -270,6 +281,7 @@ class Explorer:
             predicted = self._belief.predicted(key_pose.step, key_pose.covariance)
             self._belief = predicted.marginalize_previous()
             self._path_m += key_pose.length_m
+        self._reckoned[key_pose.number] = self._belief.pose
 
     def _go_on(self) -> None:
         """Do a piece of the work on the section, if there is any."""
@@ -286,26 +298,41 @@ class Explorer:
 
     def _solving(self, section: OpenSection) -> Iterator[None]:
         """Solve the last stretch with what is waiting, and begin another if it is long."""
-        group, path_m = self._waiting, self._path_m
+        group, path_m = [self._tied(each) for each in self._waiting], self._path_m
         self._waiting = []
         belief = yield from section.extended(group)
         self._solved, self._solved_m = group[-1].number, path_m
         for each in self._waiting:
             belief = belief.predicted(each.step, each.covariance).marginalize_previous()
         self._belief = belief
+        self._reckoned = {k: each for k, each in self._reckoned.items() if k > self._solved}
         long = path_m - self._opened_m >= self._pace.section_m
         if long or self._solved - self._first >= SECTION:
             yield
             yield from self._handing_over(section)
 
+    def _tied(self, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
+        """Return a key pose whose links to marginalised key poses begin at these poses' anchors."""
+        links, drift = key_pose.links, self._options.drift
+        parts = [Links.none()]
+        for row in np.flatnonzero(~links.in_map).tolist():
+            origin, found = int(links.origin[row]), links.estimate(row)
+            if origin < len(self._past):
+                past = self._past[origin]
+                step = as_transform(past.T_anchor_key)
+                origin, found = past.anchor, seen_from_before(found, step, drift)
+            parts.append(Links.single(origin, key_pose.number, found))
+        return replace(key_pose, links=Links.joined(parts))
+
     def _handing_over(self, section: OpenSection) -> Iterator[None]:
         """Marginalise the solved key poses but anchors, and begin another section."""
         last = self._solved
+        memory = yield from section.closed()
         for k in range(len(self._past), last + 1):
             anchor = section.tile(k).anchor
             self._past.append(
                 MarginalizedPose(anchor, section.pose(anchor).between(section.pose(k)))
             )
-        self._memory = yield from section.closed()
+        self._memory = memory
         self._first, self._opened_m = last, self._solved_m
         self._section = section.next(self._memory, last)

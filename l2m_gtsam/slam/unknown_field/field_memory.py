@@ -8,13 +8,19 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from scipy.linalg import block_diag
 
-from l2m_factors import X
+from l2m_factors import D, T, X
 from l2m_gtsam.data import FloatArray
-from l2m_gtsam.slam.drive import StartPose, as_pose
+from l2m_gtsam.slam.drive import KnownSensors, StartPose, as_pose
 from l2m_gtsam.slam.joint_gaussian import JointGaussian
-from l2m_gtsam.slam.online.belief import POSE
+from l2m_gtsam.slam.map_prediction import sensors_in
+from l2m_gtsam.slam.online.belief import POSE, Belief
+from l2m_gtsam.slam.pose_graph import EXACT, calibration_values
 from l2m_gtsam.slam.unknown_field.tiles import WaveTile, level_axes, tile_about
+
+POSITION, DISTORTION = 3, 12  # components of a sensor's variables
+CALIBRATION = (ord("T"), ord("D"))
 
 
 @dataclass(frozen=True)
@@ -49,7 +55,8 @@ class FieldMemory:
     Attributes
     ----------
     known
-        Joint Gaussian of the last key pose, the tiles' anchors and weights.
+        Joint Gaussian of the last key pose, the calibrations that are variables, and the tiles'
+        anchors and weights.
     tiles
         B tiles by number.
     """
@@ -58,11 +65,30 @@ class FieldMemory:
     tiles: tuple[RememberedTile, ...] = field(default=())
 
     @classmethod
-    def at_start(cls, start: StartPose) -> "FieldMemory":
-        """Return the memory before a drive."""
-        values = gtsam.Values()
+    def at_start(cls, start: StartPose, free: KnownSensors | None = None) -> "FieldMemory":
+        """Return the memory before a drive; ``free`` has the calibrations that are variables."""
+        values, sizes = gtsam.Values(), {X(0): POSE}
         values.insert(X(0), as_pose(start.T_map_lidar))
-        return cls(JointGaussian(values, {X(0): POSE}, start.covariance))
+        if free is None:
+            return cls(JointGaussian(values, sizes, start.covariance))
+        values.insert(calibration_values(free))
+        for i in range(len(free.names)):
+            sizes |= {T(i): POSITION, D(i): DISTORTION}
+        known = block_diag(start.covariance, *free.covariance)
+        # A calibration may state a parameter as exact.
+        known += np.diag(np.maximum(EXACT**2 - np.diag(known), 0.0))
+        return cls(JointGaussian(values, sizes, known))
+
+    @property
+    def calibrations(self) -> list[int]:
+        """Keys of the calibrations that are variables, position and distortion by turns."""
+        return [key for key in self.known.sizes if gtsam.symbolChr(key) in CALIBRATION]
+
+    def belief(self, number: int, sensors: KnownSensors) -> Belief:
+        """Return what is known of a key pose, and of sensors as far as they are variables."""
+        known = self.known.marginal([X(number), *self.calibrations])
+        own = sensors_in(known.values, sensors)
+        return Belief(known.values.atPose3(X(number)), own, known.covariance)
 
 
 def tile_of(pose: gtsam.Pose3, anchors: list[gtsam.Pose3], core: float) -> int:

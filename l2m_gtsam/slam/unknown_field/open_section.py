@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 
 from l2m_factors import (
+    Calibrations,
     KeyPoseReadings,
     M,
     TileBatch,
@@ -17,13 +18,18 @@ from l2m_factors import (
 )
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
-from l2m_gtsam.slam.joint_gaussian import JointGaussian, part_of, prior_factors
+from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose, part_of, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
-from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, place_readings
+from l2m_gtsam.slam.map_prediction import (
+    MapPrediction,
+    PlacedReadings,
+    place_readings,
+    sensors_in,
+)
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.pose_graph import between_factor
+from l2m_gtsam.slam.pose_graph import between_factor, link_graph
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.solver import (
     colamd_ordering,
@@ -45,10 +51,10 @@ SOFT = 1.0  # convexity of the loss for new readings, mu of ``solve.robust``
 
 @dataclass(frozen=True)
 class SectionReadings:
-    """Readings of a section so far, and the calibrations of their sensors."""
+    """Readings of a section so far, and their sensors' calibrations; None where these are free."""
 
     readings: KeyPoseReadings
-    sensors: KnownSensors
+    fixed: Calibrations | None
 
 
 @dataclass(frozen=True)
@@ -130,7 +136,7 @@ class TileReadings:
 
     def _batch(self, of_section: SectionReadings) -> TileBatch:
         laid, readings = self.laid, of_section.readings[self.laid.rows[self.chosen]]
-        return TileBatch(laid.number, laid.anchor, laid.field, readings, of_section.sensors.fixed())
+        return TileBatch(laid.number, laid.anchor, laid.field, readings, of_section.fixed)
 
 
 class OpenSection:
@@ -141,7 +147,7 @@ class OpenSection:
     sensors, prior, options
         Calibrations, the prior of the field, how to solve.
     memory
-        Joint Gaussian of ``X(first)`` and the tiles.
+        Joint Gaussian of ``X(first)``, the tiles and the calibrations that are variables.
     first
         Its first key pose; readings before it have counted in the section before.
     """
@@ -154,13 +160,16 @@ class OpenSection:
         memory: FieldMemory,
         first: int,
     ) -> None:
-        self._sensors, self._field_prior, self._options = sensors, prior, options
+        self._sensors = sensors_in(memory.known.values, sensors)
+        self._field_prior, self._options = prior, options
         self._memory, self._tiles = memory, list(memory.tiles)
+        self._calibrations = memory.calibrations
         self._first = self._last = first
         self._key_poses: list[ArrivedKeyPose] = []
-        self._of_section = SectionReadings(joined_readings([]), sensors)
-        self._shared = [X(first)]  # with the memory
-        self._values = part_of(memory.known.values, [X(first)])
+        self._fixed = None if self._calibrations else sensors.fixed()
+        self._of_section = SectionReadings(joined_readings([]), self._fixed)
+        self._shared = [X(first), *self._calibrations]  # with the memory
+        self._values = part_of(memory.known.values, self._shared)
         self._tile_of: dict[int, int] = {}
         self._counted: list[TileReadings] = []
         self._prior: gtsam.NonlinearFactorGraph | None = None
@@ -179,8 +188,10 @@ class OpenSection:
         """
         self._key_poses += [each for each in new if each.number > self._first]
         parts = [each.readings for each in self._key_poses]
-        self._of_section = SectionReadings(joined_readings(parts), self._sensors)
+        self._of_section = SectionReadings(joined_readings(parts), self._fixed)
         self._predict(new)
+        if any(len(each.links) for each in new):
+            yield from self._moved_by_loops(new)
         numbers = [each.number for each in new]
         if self._first not in self._tile_of:
             numbers = [self._first, *(k for k in numbers if k > self._first)]
@@ -240,6 +251,22 @@ class OpenSection:
                 self._values.insert(X(each.number), there)
                 self._last = each.number
 
+    def _moved_by_loops(self, new: Sequence[ArrivedKeyPose]) -> Generator[None, None, None]:
+        """Move the section's poses to where new loops of scans put them.
+
+        That is before readings are assigned to tiles: scans know a place from further off.
+        """
+        self._share([X(origin) for each in new for origin in each.links.origin.tolist()])
+        graph, shared = self._motions(), [key for key in self._shared if is_pose(key)]
+        for factor in prior_factors(self._memory.known.marginal(shared)):
+            graph.add(factor)
+        poses = [*shared, *(X(each.number) for each in self._key_poses)]
+        values, most = part_of(self._values, poses), self._options.max_iterations
+        order = colamd_ordering(graph)
+        found = yield from stepwise_levenberg_marquardt(graph, values, order, most, CLOSE)
+        self._values.update(found)
+        yield
+
     def _enter(self, k: int) -> bool:
         """Assign a key pose to its tile; return whether the section enters a tile of the memory."""
         anchors = [self.pose(tile.anchor) for tile in self._tiles]
@@ -252,12 +279,18 @@ class OpenSection:
             return False
         if self._values.exists(M(number)):
             return False
-        for key in (X(self._tiles[number].anchor), M(number)):
+        self._share([X(self._tiles[number].anchor), M(number)])
+        return True
+
+    def _share(self, keys: Sequence[int]) -> None:
+        """Take variables of the memory into the section; those of its own stay."""
+        for key in keys:
+            if key not in self._memory.known.sizes:
+                continue
             if not self._values.exists(key):
                 self._values.insert(part_of(self._memory.known.values, [key]))
             self._shared.append(key)
         self._shared, self._prior = list(dict.fromkeys(self._shared)), None
-        return True
 
     def _waves(self, anchor: int) -> WaveTile:
         """Return the waves of a new tile at a key pose; sensors and readings bound its height."""
@@ -275,10 +308,8 @@ class OpenSection:
         return place_readings(readings, own, self._sensors)
 
     def _factors(self, new: int, scale: float) -> gtsam.NonlinearFactorGraph:
-        """Return odometry, the prior of new tiles, and readings, those since ``new`` scaled."""
-        graph, old = gtsam.NonlinearFactorGraph(), len(self._memory.tiles)
-        for each in self._key_poses:
-            graph.add(between_factor(each.number - 1, each.step, each.covariance))
+        """Return all but the memory; readings since ``new`` are scaled."""
+        graph, old = self._motions(), len(self._memory.tiles)
         for tile in self._tiles[old:]:
             unit = gtsam.noiseModel.Unit.Create(len(tile.field))
             graph.add(gtsam.PriorFactorVector(M(tile.number), np.zeros(len(tile.field)), unit))
@@ -291,6 +322,14 @@ class OpenSection:
         for tile_readings in self._counted:
             for factor in tile_readings.factors(self._of_section):
                 graph.add(factor)
+        return graph
+
+    def _motions(self) -> gtsam.NonlinearFactorGraph:
+        """Return odometry and loops of scans."""
+        graph = gtsam.NonlinearFactorGraph()
+        for each in self._key_poses:
+            graph.add(between_factor(each.number - 1, each.step, each.covariance))
+            graph.push_back(link_graph(each.links))
         return graph
 
     def _weighed(
@@ -322,19 +361,21 @@ class OpenSection:
         self._values = yield from stepwise_levenberg_marquardt(
             graph, self._values, order, most, CLOSE
         )
+        self._sensors = sensors_in(self._values, self._sensors)
 
     def _kept(self) -> list[int]:
         """Return the variables that the memory keeps or shares, the last pose at the end."""
         tiles = [self._tiles[number] for number in sorted(set(self._tile_of.values()))]
         last = X(self._last)
-        own = dict.fromkeys([X(self._first), *(X(tile.anchor) for tile in tiles)])
+        shared = [key for key in self._shared if is_pose(key)]
+        own = dict.fromkeys([*shared, *(X(tile.anchor) for tile in tiles)])
         own.pop(last, None)
-        return [*own, *(M(tile.number) for tile in tiles), last]
+        return [*own, *(M(tile.number) for tile in tiles), *self._calibrations, last]
 
     def _size(self, key: int) -> int:
         if gtsam.symbolChr(key) == ord("M"):
             return len(self._tiles[gtsam.symbolIndex(key)].field)
-        return POSE
+        return self._memory.known.sizes[key] if key in self._calibrations else POSE
 
     def _known(self, keys: list[int]) -> JointGaussian:
         """Return the joint posterior of some variables."""
@@ -343,5 +384,5 @@ class OpenSection:
         return JointGaussian(part_of(self._values, keys), sizes, covariance)
 
     def _belief(self) -> Belief:
-        known = self._known([X(self._last)])
+        known = self._known([X(self._last), *self._calibrations])
         return Belief(self.pose(self._last), self._sensors, known.covariance)

@@ -373,13 +373,14 @@ def explored_field(slam: OnlineSlam) -> tuple[FloatArray, FloatArray]:
 def test_options_that_work_off_line_only_are_refused(
     hall: tuple[tuple[KnownSensor, ...], SlamDrive],
 ) -> None:
-    for chosen, text in (
-        ({"start": {"anywhere": True}}, "give one with --map"),
-        ({"calibration": "refined"}, "works off line"),
-        ({"drift": {"axes": "fixed"}}, "works off line"),
+    several, one = calibrated(hall[0]), calibrated(hall[0][:1])
+    for chosen, text, known in (
+        ({"start": {"anywhere": True}}, "give one with --map", several),
+        ({"calibration": "refined"}, "works off line", one),
+        ({"drift": {"axes": "fixed"}}, "works off line", several),
     ):
         with pytest.raises(ConfigError, match=text):
-            OnlineSlam(calibrated(hall[0]), SlamOptions.model_validate(chosen))
+            OnlineSlam(known, SlamOptions.model_validate(chosen))
 
 
 def test_what_is_kept_does_not_grow_with_the_drive(
