@@ -1,6 +1,6 @@
 """Drives whose odometry drifts, through fields that are known."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from l2m_gtsam.data import (
 )
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.slam.options import KeyPoseOptions
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.calibrations import calibration, sensor
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -72,26 +73,6 @@ def laps(seconds: float, radii: tuple[float, float] = (4.0, 2.5)) -> Trajectory:
     return Trajectory(stamps, R, p, "map", "lidar")
 
 
-def drifted(truth: Trajectory, rng: np.random.Generator, share: float = 0.01) -> Trajectory:
-    """Return what odometry makes of a drive: it slips one way, and the heading wanders a little.
-
-    ``share`` is what the position is wrong by, of the way: a slip along one line of the map, which
-    does not cancel when the vehicle comes back as a wrong scale does.
-    """
-    R_back = truth.R[:-1].transpose(0, 2, 1)
-    turn = Rotation.from_matrix(R_back @ truth.R[1:]).as_rotvec()
-    step = np.einsum("nij,nj->ni", R_back, np.diff(truth.p, axis=0))
-    way = np.linalg.norm(step, axis=1, keepdims=True)
-    heading = rng.uniform(-np.pi, np.pi)
-    slip = share * way * np.array([np.cos(heading), np.sin(heading), 0.1])
-    turn = turn + np.deg2rad(0.05) * np.sqrt(way) * rng.normal(size=turn.shape)
-    R, p = [truth.R[0]], [truth.p[0]]
-    for w, v, off in zip(turn, step, slip, strict=True):
-        p.append(p[-1] + R[-1] @ v + off)
-        R.append(R[-1] @ Rotation.from_rotvec(w).as_matrix())
-    return replace(truth, R=np.stack(R), p=np.stack(p))
-
-
 def slam_drive(
     world: Field,
     sensors: tuple[KnownSensor, ...],
@@ -113,7 +94,7 @@ def slam_drive(
         read = read + noise * rng.normal(size=read.shape)
         series.append(FieldSeries(each.sensor, f"/{each.sensor}", each.sensor, stamps, read))
     source = SourceFile("simulated", "00")
-    return SlamDrive(Recording(drifted(truth, rng), tuple(series), source), truth)
+    return SlamDrive(Recording(slipping(truth, rng), tuple(series), source), truth)
 
 
 def calibrated(

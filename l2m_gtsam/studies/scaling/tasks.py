@@ -1,9 +1,7 @@
 """The measurements of the scaling study within one process."""
 
-import gc
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from time import process_time
 
 import numpy as np
@@ -21,6 +19,7 @@ from l2m_gtsam.simulate.drive import drive
 from l2m_gtsam.simulate.recorder import Vehicle, record
 from l2m_gtsam.simulate.route import calibration_route
 from l2m_gtsam.simulate.sensors import random_array
+from l2m_gtsam.studies.measured import measured
 from l2m_gtsam.studies.methods import numeric_least_squares
 from l2m_gtsam.studies.scaling.measurements import Measurement, Quantity, ScalingOptions, TimedTask
 from l2m_gtsam.studies.site import SurveyedSite, around
@@ -146,11 +145,6 @@ def middle(survey: TrainingSet, most: int) -> TrainingSet:
     return survey[np.sort(np.argsort(away, kind="stable")[:most])]
 
 
-STATUS, REFERENCES = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-FORGET_PEAK = "5"  # see proc(5)
-KIB_PER_MIB = 1024
-
-
 @dataclass(frozen=True)
 class Taken:
     """What a piece of work took.
@@ -177,16 +171,13 @@ def taken(work: Callable[[], object], rounds: int, long: float) -> Taken:
     long
         Work that takes so many seconds is not repeated.
     """
-    gc.collect()  # what earlier work left would be freed meanwhile, and hide what this takes
-    before = _memory("VmRSS") if _forget_peak() else None
-    seconds = timed(work)
-    after = _memory("VmHWM")
-    peak = None if before is None or after is None else max(after - before, 0.0)
+    first = measured(work)
+    seconds = first.seconds
     for _ in range(rounds - 1):
         if seconds >= long:
             break
         seconds = min(seconds, timed(work))
-    return Taken(seconds, peak)
+    return Taken(seconds, first.peak_mib)
 
 
 def timed(work: Callable[[], object]) -> float:
@@ -194,22 +185,3 @@ def timed(work: Callable[[], object]) -> float:
     start = process_time()
     work()
     return process_time() - start
-
-
-def _forget_peak() -> bool:
-    """Start counting the peak of this process' memory anew; return whether that is possible."""
-    try:
-        REFERENCES.write_text(FORGET_PEAK, encoding="ascii")
-    except OSError:
-        return False
-    return True
-
-
-def _memory(name: str) -> float | None:
-    """Return an entry of this process' status in MiB, if the system has it."""
-    try:
-        lines = STATUS.read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    found = [line for line in lines if line.startswith(f"{name}:")]
-    return float(found[0].split()[1]) / KIB_PER_MIB if found else None

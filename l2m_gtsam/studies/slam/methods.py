@@ -1,16 +1,17 @@
 """SLAM without a map, method by method: cells of the study, and what each makes of one drive."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
-from l2m_gtsam.data import Distortion, FloatArray, IntArray, SyncCounts, Trajectory
+from l2m_gtsam.data import FloatArray, IntArray, KnownSensor, Recording, SyncCounts, Trajectory
+from l2m_gtsam.geometry import polar_rotation
 from l2m_gtsam.options import Options
 from l2m_gtsam.progress import silent
 from l2m_gtsam.records.calibration import (
@@ -23,9 +24,11 @@ from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.online.replay import give, messages
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.studies.measured import Measured, measured
 from l2m_gtsam.studies.peers.fixed_lag import FixedLagOptions, fixed_lag_slam
 from l2m_gtsam.studies.peers.particle_slam import ParticleSlamOptions, particle_slam
 from l2m_gtsam.studies.peers.reduced_rank_ekf import (
+    POSE,
     FilteredPath,
     ReducedRankEkfOptions,
     reduced_rank_ekf,
@@ -42,11 +45,12 @@ from l2m_gtsam.studies.slam.recordings import (
     robot_run,
     ship_run,
 )
-from l2m_gtsam.studies.statistics import nees
+from l2m_gtsam.studies.statistics import LEVEL, nees
 
 EXACT = 1e-10  # variance of a calibration that is taken as given
 OVER_M = 10.0  # over which the drift is stated
 PARAMETERS = 15
+INSIDE = float(chi2.ppf(LEVEL, POSE))  # squared error in sigmas of the innermost 95 %
 
 
 @dataclass(frozen=True)
@@ -64,17 +68,45 @@ class MethodRow:
         Processor milliseconds per key pose.
     unchanged
         Whether the method returned odometry, as nothing was gained.
+    inside
+        Share of the poses that are within their own 95 %; None where it states none.
+    peak_mib
+        By how much memory grew at most, MiB; None where the system does not report it.
     """
 
     rms_m: float
     nees: float | None
     ms_per_pose: float
     unchanged: bool = False
+    inside: float | None = None
+    peak_mib: float | None = None
+
+    @classmethod
+    def of(
+        cls, took: Measured[Trajectory], truth: Trajectory, *, unchanged: bool = False
+    ) -> "MethodRow":
+        """Return the figures of an estimate and true poses, in whose file its times are."""
+        found = took.result
+        truth = truth[np.searchsorted(truth.stamp_ns, found.stamp_ns)]
+        squared = squared_errors(found, truth)
+        return cls(
+            rms_m=rms(found.p, truth.p),
+            nees=None if squared is None else float(squared.mean()),
+            inside=None if squared is None else float(np.mean(squared < INSIDE)),
+            ms_per_pose=1e3 * took.seconds / max(len(found), 1),
+            peak_mib=took.peak_mib,
+            unchanged=unchanged,
+        )
+
+    @classmethod
+    def of_odometry(cls, odometry: Trajectory, truth: Trajectory) -> "MethodRow":
+        """Return the errors of odometry alone, of which nothing is stated; rows are the same."""
+        return cls(rms(odometry.p, truth.p), None, 0.0)
 
 
 def odometry_row(drive: TrueDrive, odometry: Trajectory, rows: IntArray) -> MethodRow:
     """Return the errors of odometry alone at rows of a drive."""
-    return MethodRow(rms(odometry.p[rows], drive.truth.p[rows]), None, 0.0)
+    return MethodRow.of_odometry(odometry[rows], drive.truth[rows])
 
 
 def peer_row(
@@ -82,30 +114,28 @@ def peer_row(
 ) -> MethodRow:
     """Return those of a peer, whose box is about the true path."""
     box = np.stack([drive.truth.p.min(axis=0), drive.truth.p.max(axis=0)])
-    begun = process_time()
-    found = method(box)
-    taken = process_time() - begun
-    estimate = Trajectory(
-        drive.truth.stamp_ns, found.R, found.p, "map", "lidar", covariance=found.covariance
-    )
-    return MethodRow(
-        rms(found.p[rows], drive.truth.p[rows]),
-        mean_nees(estimate[rows], drive.truth[rows]),
-        1e3 * taken / len(rows),
-    )
+    took = measured(lambda: method(box))
+    found, stamps = took.result, drive.truth.stamp_ns
+    estimate = Trajectory(stamps, found.R, found.p, "map", "lidar", covariance=found.covariance)
+    return MethodRow.of(took.of(estimate[rows]), drive.truth)
 
 
 def online_row(
     drive: TrueDrive, odometry: Trajectory, options: SlamOptions, noise_ut: float
 ) -> MethodRow:
     """Return those of ``l2m slam --online`` without a map: each pose when it is made."""
-    begun = process_time()
-    slam = OnlineSlam(as_recorded(noise_ut), options)
-    poses = [pose for each in messages(drive.recording(odometry)) for pose in give(slam, each)]
+    recording, sensor = drive.recording(odometry), as_recorded(noise_ut)
+    return MethodRow.of(
+        measured(lambda: followed(recording, OnlineSlam(sensor, options))), drive.truth
+    )
+
+
+def followed(recording: Recording, slam: OnlineSlam) -> Trajectory:
+    """Return the key poses of a recording on line, each as it was known when it was made."""
+    poses = [pose for each in messages(recording) for pose in give(slam, each)]
     last = slam.finish()
-    taken = process_time() - begun
     poses = [*(each for each in poses if each.stamp_ns < last[0].stamp_ns), *last]
-    found = Trajectory(
+    return Trajectory(
         np.array([each.stamp_ns for each in poses]),
         np.stack([each.T_map_lidar.R for each in poses]),
         np.stack([each.T_map_lidar.t for each in poses]),
@@ -113,30 +143,20 @@ def online_row(
         "lidar",
         covariance=np.stack([each.covariance for each in poses]),
     )
-    truth = drive.truth[np.searchsorted(drive.truth.stamp_ns, found.stamp_ns)]
-    return MethodRow(
-        rms(found.p, truth.p), mean_nees(found, truth), 1e3 * taken / max(len(poses), 1)
-    )
 
 
 def our_row(
     drive: TrueDrive, odometry: Trajectory, options: SlamOptions, noise_ut: float
 ) -> tuple[MethodRow, IntArray]:
     """Return those of ``l2m slam`` without a map, and the rows of its key poses."""
-    begun = process_time()
-    result = explore(drive.recording(odometry), as_recorded(noise_ut), options, silent).result
-    taken, found = process_time() - begun, result.trajectory
-    rows = np.searchsorted(drive.truth.stamp_ns, found.stamp_ns)
-    truth = drive.truth[rows]
-    return (
-        MethodRow(
-            rms(found.p, truth.p),
-            mean_nees(found, truth),
-            1e3 * taken / len(rows),
-            result.gain is not None and not result.gain.shown,
-        ),
-        rows,
+    recording, sensor = drive.recording(odometry), as_recorded(noise_ut)
+    took = measured(lambda: explore(recording, sensor, options, silent).result)
+    row = MethodRow.of(
+        took.of(took.result.trajectory),
+        drive.truth,
+        unchanged=took.result.gain is not None and not took.result.gain.shown,
     )
+    return row, np.searchsorted(drive.truth.stamp_ns, took.result.trajectory.stamp_ns)
 
 
 def stated_drift(truth: Trajectory, recipe: DriftRecipe, form: Form) -> SlamOptions:
@@ -155,23 +175,31 @@ def stated_drift(truth: Trajectory, recipe: DriftRecipe, form: Form) -> SlamOpti
 
 def as_recorded(noise_ut: float) -> CalibrationResult:
     """Return a calibration that undoes nothing, for recordings that come without one."""
-    sensor = SensorCalibration(
-        sensor="mag",
-        status=SensorStatus.SOLVED,
-        message="as recorded",
-        t_lidar_mag=np.zeros(3),
-        distortion=Distortion.identity(),
-        R_lidar_mag=np.eye(3),
-        covariance=EXACT * np.eye(PARAMETERS),
-        rotation_covariance=EXACT * np.eye(3),
-        noise=noise_ut,
-        residuals=None,
-        undetermined=(),
-        sync=SyncCounts(0, 0, 0, 0, 0, 0, 0),
-        outside_map=0,
-        time_offset=None,
+    return given_sensors([KnownSensor.ideal("mag")], noise_ut)
+
+
+def given_sensors(sensors: Sequence[KnownSensor], noise_ut: float) -> CalibrationResult:
+    """Return the calibration of sensors that are known exactly."""
+    entries = tuple(
+        SensorCalibration(
+            sensor=each.sensor,
+            status=SensorStatus.SOLVED,
+            message="given",
+            t_lidar_mag=each.t_lidar_mag,
+            distortion=each.distortion,
+            R_lidar_mag=polar_rotation(each.distortion.C, EXACT * np.eye(9)).R_mag_lidar.T,
+            covariance=EXACT * np.eye(PARAMETERS),
+            rotation_covariance=EXACT * np.eye(3),
+            noise=noise_ut,
+            residuals=None,
+            undetermined=(),
+            sync=SyncCounts(0, 0, 0, 0, 0, 0, 0),
+            outside_map=0,
+            time_offset=None,
+        )
+        for each in sensors
     )
-    return CalibrationResult((sensor,), 0, Uncertainty.FULL, (), (), None, None, {}, {})
+    return CalibrationResult(entries, 0, Uncertainty.FULL, (), (), None, None, {}, {})
 
 
 def rms(p: FloatArray, truth: FloatArray) -> float:
@@ -179,13 +207,16 @@ def rms(p: FloatArray, truth: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.sum((p - truth) ** 2, axis=1))))
 
 
-def mean_nees(estimate: Trajectory, truth: Trajectory) -> float | None:
-    """Return the mean over all poses but the first, which is given; None without covariances."""
+def squared_errors(estimate: Trajectory, truth: Trajectory) -> FloatArray | None:
+    """Return the squared errors of all poses but the first, which is given, in their own sigmas.
+
+    None where the estimate has no covariances.
+    """
     if estimate.covariance is None:
         return None
     turn = Rotation.from_matrix(estimate.R.transpose(0, 2, 1) @ truth.R).as_rotvec()
     shift = np.einsum("nji,nj->ni", estimate.R, truth.p - estimate.p)
-    return float(nees(np.hstack([turn, shift])[1:], estimate.covariance[1:]).mean())
+    return nees(np.hstack([turn, shift])[1:], estimate.covariance[1:])
 
 
 RECORDINGS = ("ship-1", "ship-2", "hand-0", "hand-1")

@@ -56,6 +56,12 @@ class MethodFigures:
         Whether no seed is worse than its odometry.
     nees, ms_per_pose
         Means; NEES is None where the method states no sigmas.
+    unchanged
+        In how many seeds odometry was returned.
+    inside
+        Mean share of poses within their own 95 %; None where the method states no sigmas.
+    peak_mib
+        Largest, MiB; None where the system does not report it.
     """
 
     rms_m: float
@@ -65,6 +71,8 @@ class MethodFigures:
     nees: float | None
     ms_per_pose: float
     unchanged: int
+    inside: float | None = None
+    peak_mib: float | None = None
 
 
 @dataclass(frozen=True)
@@ -204,16 +212,23 @@ def figures_of(rows: list[MethodRow], before: list[MethodRow]) -> MethodFigures:
     """Return one method's figures, beside odometry's rows of the same seeds."""
     error = np.array([each.rms_m for each in rows])
     alone = np.array([each.rms_m for each in before])
-    stated = [each.nees for each in rows if each.nees is not None]
     return MethodFigures(
         rms_m=float(error.mean()),
         worst_m=float(error.max()),
         removed=float(1 - error.mean() / alone.mean()),
         never_worse=bool((error <= alone).all()),
-        nees=float(np.mean(stated)) if stated else None,
+        nees=mean_of([each.nees for each in rows]),
+        inside=mean_of([each.inside for each in rows]),
         ms_per_pose=float(np.mean([each.ms_per_pose for each in rows])),
+        peak_mib=max((each.peak_mib for each in rows if each.peak_mib is not None), default=None),
         unchanged=sum(each.unchanged for each in rows),
     )
+
+
+def mean_of(values: list[float | None]) -> float | None:
+    """Return the mean of what is stated; None of nothing."""
+    stated = [each for each in values if each is not None]
+    return float(np.mean(stated)) if stated else None
 
 
 SLAM = SlamStudy()

@@ -16,7 +16,8 @@ from l2m_gtsam.data import FloatArray, Recording
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.places import Cause, ChangedSource
-from tests.drives.robot import SENSORS, assumed_sensors, map_by, robot_pass
+from l2m_gtsam.studies.slam_array.robot import SENSORS, assumed_sensors, robot_pass
+from tests.drives.robot import map_by
 from tests.drives.shelves import Shelf, with_shelves
 
 FIRST = SENSORS[0]

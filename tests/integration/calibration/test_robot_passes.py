@@ -14,7 +14,8 @@ import pytest
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import FloatArray
-from tests.drives.robot import SENSORS, assumed_sensors, map_by, robot_pass
+from l2m_gtsam.studies.slam_array.robot import SENSORS, assumed_sensors, robot_pass
+from tests.drives.robot import map_by
 
 RUNS = (1, 2, 3, 4)
 INSIDE = 5.991  # of chi-square with two degrees of freedom, 95 %

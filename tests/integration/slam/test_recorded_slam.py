@@ -23,9 +23,9 @@ from l2m_gtsam.slam.online.replay import messages
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.start.search import find_start
+from l2m_gtsam.studies.slam_array.odometry import slipping
 from tests.drives.motion_capture import QUICK, mapped, read
 from tests.drives.online import driven
-from tests.drives.slam import drifted
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.surveyed import in_odometry
 
@@ -63,7 +63,7 @@ def with_drift(
     truth = Trajectory(
         poses.stamp_ns[rows], poses.R[rows], poses.p[rows], poses.frame, poses.child_frame
     )
-    odometry = drifted(truth, np.random.default_rng(seed))
+    odometry = slipping(truth, np.random.default_rng(seed))
     return replace(recording, trajectory=odometry), truth
 
 
@@ -98,7 +98,7 @@ def part(recording: Recording, start_s: float, seconds: float, seed: int) -> Rec
     own = Trajectory(
         poses.stamp_ns[rows], poses.R[rows], poses.p[rows], poses.frame, poses.child_frame
     )
-    return in_odometry(replace(recording, trajectory=drifted(own, rng)), rng)
+    return in_odometry(replace(recording, trajectory=slipping(own, rng)), rng)
 
 
 @pytest.mark.parametrize("start_s", [5.0, 35.0, 60.0])

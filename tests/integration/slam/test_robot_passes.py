@@ -13,8 +13,8 @@ from l2m_gtsam.records.localisation import LocalisationResult
 from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.localisation import localise
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.robot import RUNS, other_passes, robot_pass, walked
-from tests.drives.slam import drifted
+from l2m_gtsam.studies.slam_array.odometry import slipping, walked
+from l2m_gtsam.studies.slam_array.robot import RUNS, other_passes, robot_pass
 from tests.support.pose_errors import pose_nees, position_error
 
 OPTIONS = SlamOptions.model_validate(
@@ -33,10 +33,10 @@ def missed(reason: str) -> pytest.MarkDecorator:
 @pytest.mark.parametrize(
     ("run", "drift"),
     [
-        (1, drifted),
-        pytest.param(2, drifted, marks=missed("79 % removed, NEES 12.4")),
-        (3, drifted),
-        (4, drifted),
+        (1, slipping),
+        pytest.param(2, slipping, marks=missed("79 % removed, NEES 12.4")),
+        (3, slipping),
+        (4, slipping),
         (1, walked),
         pytest.param(2, walked, marks=missed("83 % removed, NEES 12.2")),
         pytest.param(3, walked, marks=missed("75 % of 116 mm removed")),
@@ -67,7 +67,7 @@ class WithoutMap:
 
 
 @pytest.fixture(
-    scope="module", params=[(run, drift) for drift in (drifted, walked) for run in RUNS]
+    scope="module", params=[(run, drift) for drift in (slipping, walked) for run in RUNS]
 )
 def without_map(request: pytest.FixtureRequest, shared_data: Path) -> WithoutMap:
     run, drift = request.param

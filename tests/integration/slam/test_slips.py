@@ -14,9 +14,10 @@ from l2m_gtsam.slam.localisation import localise, prepared
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.slips import judged
 from l2m_gtsam.slam.smoother import localise_drive
+from l2m_gtsam.studies.slam_array.odometry import slipping
+from l2m_gtsam.studies.slam_array.robot import other_passes, robot_pass
 from tests.drives.faults import jumped, shift
-from tests.drives.robot import other_passes, robot_pass
-from tests.drives.slam import COARSE, calibrated, drifted, rounds, slam_drive
+from tests.drives.slam import COARSE, calibrated, rounds, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 
@@ -72,7 +73,7 @@ def test_slips_of_a_real_robot(shared_data: Path, held_out: int) -> None:
     run = robot_pass(shared_data, held_out)
     truth = run.trajectory[np.arange(0, len(run.trajectory), 5)]
     rng = np.random.default_rng(held_out)
-    odometry = drifted(truth, rng)
+    odometry = slipping(truth, rng)
     rows = np.sort(rng.choice(np.arange(10, len(odometry) - 10, 10), 10, replace=False))
     shifts = [shift(int(row), 0.1, 5 * rng.choice([-1, 1]), rng.uniform(-3, 3)) for row in rows]
 

@@ -18,7 +18,8 @@ from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions, TfChain
 from l2m_gtsam.storage.inspect import inspect_bag
 from l2m_gtsam.storage.trajectory_files import TOPIC, LocalisedMotion, write_trajectory_bag
-from tests.drives.slam import drifted, rounds
+from l2m_gtsam.studies.slam_array.odometry import slipping
+from tests.drives.slam import rounds
 
 EVERY = 7  # a key pose
 
@@ -39,7 +40,7 @@ def motion() -> LocalisedMotion:
         root @ root.transpose(0, 2, 1),
     )
     turn = Rotation.from_euler("z", 50, degrees=True).as_matrix()
-    odometry = drifted(truth, rng)
+    odometry = slipping(truth, rng)
     odometry = replace(odometry, R=turn @ odometry.R, p=odometry.p @ turn.T + 5, frame="/wheels")
     return LocalisedMotion(localised, twists(odometry, localised.stamp_ns), odometry)
 

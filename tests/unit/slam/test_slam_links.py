@@ -18,7 +18,8 @@ from l2m_gtsam.slam.links import MAP, key_pose_links, link_stamps
 from l2m_gtsam.slam.odometry import drift_covariance, key_pose_rows, odometry_steps, with_rows_at
 from l2m_gtsam.slam.options import DriftOptions, KeyPoseOptions
 from l2m_gtsam.slam.pose_graph import PoseGraph, solve_pose_graph
-from tests.drives.slam import drifted, rounds
+from l2m_gtsam.studies.slam_array.odometry import slipping
+from tests.drives.slam import rounds
 
 SIGMA = np.repeat([0.002, 0.01], 3)  # of a registration, rad and m
 SURE = 0.9999
@@ -124,7 +125,7 @@ def test_key_poses_stand_where_scans_were_taken() -> None:
 def test_wrong_loops_and_fixes_are_left_out() -> None:
     """Every third registration is of another place, by metres: the others hold the drive."""
     rng, truth = np.random.default_rng(2), rounds(60)
-    odometry = drifted(truth, rng, share=0.02)
+    odometry = slipping(truth, rng, share=0.02)
     stamps = truth.stamp_ns[100::110]
     fixes = [a_fix(truth, int(stamp), rng) for stamp in stamps]
     pairs = [(truth.stamp_ns[k], truth.stamp_ns[k + 600]) for k in range(0, 590, 60)]
@@ -146,7 +147,7 @@ def test_wrong_loops_and_fixes_are_left_out() -> None:
 
 def test_loops_alone_take_drift_out() -> None:
     rng, truth = np.random.default_rng(3), rounds(60)
-    odometry = drifted(truth, rng, share=0.02)
+    odometry = slipping(truth, rng, share=0.02)
     pairs = [(truth.stamp_ns[k], truth.stamp_ns[k + 520]) for k in range(0, 650, 30)]
     loops = tuple(a_loop(truth, int(start), int(end), rng) for start, end in pairs)
     drive, rows = scanned(truth, odometry, ScanEvidence(loops=loops))

@@ -9,7 +9,10 @@ def test_what_is_lost_is_on_the_page() -> None:
     keys = SLAM.keys(options)
     assert len(keys) == len(set(keys)) == 8
     alone = MethodRow(2.0, None, 0.0)
-    good, bad = MethodRow(0.5, 6.0, 50.0), MethodRow(2.5, 40.0, 50.0, unchanged=True)
+    good, bad = (
+        MethodRow(0.5, 6.0, 50.0),
+        MethodRow(2.5, 40.0, 50.0, unchanged=True),
+    )
     peer, lost = MethodRow(1.0, 9.0, 0.5), MethodRow(3.0, 40.0, 20.0)
     cells = {
         key: SlamCell(

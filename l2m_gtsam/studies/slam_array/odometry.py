@@ -1,0 +1,54 @@
+"""Odometry of vehicles, made of their true poses: one that slips, one that walks at random."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from l2m_gtsam.data import FloatArray, Trajectory
+from l2m_gtsam.slam.odometry import drift_covariance
+from l2m_gtsam.slam.options import DriftOptions
+
+TURN_RAD = np.deg2rad(0.05)  # of a heading after a metre
+
+
+def slipping(truth: Trajectory, rng: np.random.Generator, share: float = 0.01) -> Trajectory:
+    """Return odometry that slips one way, and whose heading wanders a little.
+
+    ``share`` is what the position is wrong by, of the path: a slip along one line of the map, which
+    does not cancel when the vehicle comes back as a wrong scale does.
+    """
+    turns, steps = _steps(truth)
+    length = np.linalg.norm(steps, axis=1, keepdims=True)
+    heading = rng.uniform(-np.pi, np.pi)
+    slip = share * length * np.array([np.cos(heading), np.sin(heading), 0.1])
+    turn = Rotation.from_matrix(turns).as_rotvec()
+    turn = turn + TURN_RAD * np.sqrt(length) * rng.normal(size=turn.shape)
+    R, p = [truth.R[0]], [truth.p[0]]
+    for own, step, off in zip(Rotation.from_rotvec(turn).as_matrix(), steps, slip, strict=True):
+        p.append(p[-1] + R[-1] @ step + off)
+        R.append(R[-1] @ own)
+    return replace(truth, R=np.stack(R), p=np.stack(p))
+
+
+def walked(truth: Trajectory, rng: np.random.Generator) -> Trajectory:
+    """Return wheel odometry that drifts as default options say: x, y and heading, step by step."""
+    level = np.array([0.0, 0.0, 1.0, 1.0, 1.0, 0.0])
+    turns, steps = _steps(truth)
+    # What no step is known better than is not drift: at ten poses a second it would be most of it.
+    drift = DriftOptions(least_m=1e-6, least_deg=1e-5)
+    root = np.linalg.cholesky(drift_covariance(turns, steps, drift))
+    off = level * np.einsum("nij,nj->ni", root, rng.normal(size=(len(steps), 6)))
+    steps = steps + np.einsum("nij,nj->ni", turns, off[:, 3:])
+    turns = turns @ Rotation.from_rotvec(off[:, :3]).as_matrix()
+    R, p = [truth.R[0]], [truth.p[0]]
+    for turn, step in zip(turns, steps, strict=True):
+        p.append(p[-1] + R[-1] @ step)
+        R.append(R[-1] @ turn)
+    return replace(truth, R=np.stack(R), p=np.stack(p))
+
+
+def _steps(truth: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Return each pose in the frame of the one before: rotations and positions."""
+    back = truth.R[:-1].transpose(0, 2, 1)
+    return back @ truth.R[1:], np.einsum("nij,nj->ni", back, np.diff(truth.p, axis=0))

@@ -1,0 +1,166 @@
+"""The study of SLAM with several sensors: ``l2m study slam-array``."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from l2m_gtsam.studies.slam.study import MethodFigures, figures_of
+from l2m_gtsam.studies.slam_array.methods import (
+    SlamArrayCell,
+    SlamArrayOptions,
+    cell_keys,
+    computed,
+    read_place,
+    site_of,
+)
+from l2m_gtsam.studies.slam_array.places import MappedDrive
+from l2m_gtsam.studies.study import Study
+
+METHODS = {
+    "odometry": "odometry",
+    "particles": "map: particle filter",
+    "map_online": "map: l2m slam --online",
+    "map_ours": "map: l2m slam",
+    "online": "no map: l2m slam --online",
+    "ours": "no map: l2m slam",
+}
+COLOURS = {
+    "odometry": "#999999",
+    "particles": "#e69f00",
+    "map_online": "#56b4e9",
+    "map_ours": "#0072b2",
+    "online": "#66c2a5",
+    "ours": "#1b7837",
+}
+WIDTH = 0.14  # of a bar, where drives are one apart
+LOWEST_M = 0.005  # of the axis
+
+
+@dataclass(frozen=True)
+class SlamArrayRow:
+    """A recording with one kind of drift."""
+
+    site: str
+    kind: str
+    path_m: float
+    sensors: int
+    odometry: MethodFigures
+    particles: MethodFigures
+    map_online: MethodFigures
+    map_ours: MethodFigures
+    online: MethodFigures
+    ours: MethodFigures
+
+
+@dataclass(frozen=True)
+class SlamArraySummary:
+    """All rows, and the options."""
+
+    options: SlamArrayOptions
+    rows: tuple[SlamArrayRow, ...]
+
+
+class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
+    """Methods side by side; a cell is one drive with one odometry."""
+
+    name = "slam-array"
+    title = "SLAM with several sensors, in a map and without one"
+    size = frozenset({"seeds", "recordings"})
+    options = SlamArrayOptions
+    cell = SlamArrayCell
+    summary = SlamArraySummary
+
+    def keys(self, options: SlamArrayOptions) -> tuple[str, ...]:
+        """Return one cell for each recording, drift and seed."""
+        return cell_keys(options)
+
+    def site(self, options: SlamArrayOptions, key: str) -> str:
+        """Return the recording."""
+        return site_of(key)
+
+    def prepare(self, options: SlamArrayOptions, site: str) -> MappedDrive:
+        """Return the drive and its map."""
+        return read_place(options, site)
+
+    def compute(self, options: SlamArrayOptions, key: str, shared: MappedDrive) -> SlamArrayCell:
+        """Run all methods on one odometry."""
+        return computed(options, key, shared)
+
+    def summarise(
+        self, options: SlamArrayOptions, cells: Mapping[str, SlamArrayCell]
+    ) -> SlamArraySummary:
+        """Return the figures over all seeds."""
+        groups: dict[str, list[SlamArrayCell]] = {}
+        for key, cell in cells.items():
+            groups.setdefault(key.rpartition("-")[0], []).append(cell)
+        return SlamArraySummary(options, tuple(row_of(key, own) for key, own in groups.items()))
+
+    def page_context(self, summary: SlamArraySummary) -> dict[str, Any]:
+        """Return what is lost: rows that odometry wins, and those whose odometry was kept."""
+        named = {f"{row.site}, {row.kind}": row for row in summary.rows}
+        return {
+            "methods": METHODS,
+            "worse": [
+                f"{name} ({', '.join(own)})"
+                for name, row in named.items()
+                if (own := worse_than_odometry(row))
+            ],
+            "unchanged": [
+                f"{name} ({row.ours.unchanged})"
+                for name, row in named.items()
+                if row.ours.unchanged
+            ],
+        }
+
+    def figures(self, summary: SlamArraySummary) -> dict[str, Figure]:
+        """Draw the errors of the methods, drive by drive, on a logarithmic axis."""
+        rows = summary.rows
+        figure = Figure(figsize=(9.0, 4.2), layout="constrained", dpi=150)
+        axes = figure.subplots()
+        for place, name in enumerate(METHODS):
+            _draw_method(axes, rows, name, (place - 0.5 * (len(METHODS) - 1)) * WIDTH)
+        names = [f"{row.site}\n{row.kind}" for row in rows]
+        axes.set_xticks(np.arange(len(rows)), names, fontsize=7)
+        axes.set(ylabel="error (m)", yscale="log", ylim=(LOWEST_M, None))
+        axes.grid(axis="y", alpha=0.3)
+        figure.legend(ncols=3, fontsize=7, loc="outside upper center")
+        return {"slam-array": figure}
+
+
+def _draw_method(axes: Axes, rows: tuple[SlamArrayRow, ...], name: str, beside: float) -> None:
+    """Draw a method's bars, and lines to its worst seed."""
+    for place, row in enumerate(rows):
+        found: MethodFigures = getattr(row, name)
+        label = METHODS[name] if place == 0 else None
+        axes.bar(place + beside, found.rms_m, WIDTH, color=COLOURS[name], label=label)
+        axes.vlines(place + beside, found.rms_m, found.worst_m, color="black", linewidth=0.8)
+
+
+def worse_than_odometry(row: SlamArrayRow) -> list[str]:
+    """Return the methods of which a seed is worse than its odometry."""
+    return [METHODS[name] for name in METHODS if not getattr(row, name).never_worse]
+
+
+def row_of(key: str, cells: list[SlamArrayCell]) -> SlamArrayRow:
+    """Return the figures of one group of seeds."""
+    place, number, kind = key.split("-")
+    before = [each.odometry for each in cells]
+    return SlamArrayRow(
+        site=f"{place} {number}",
+        kind=kind,
+        path_m=cells[0].path_m,
+        sensors=cells[0].sensors,
+        odometry=figures_of(before, before),
+        particles=figures_of([each.particles for each in cells], before),
+        map_online=figures_of([each.map_online for each in cells], before),
+        map_ours=figures_of([each.map_ours for each in cells], before),
+        online=figures_of([each.online for each in cells], before),
+        ours=figures_of([each.ours for each in cells], before),
+    )
+
+
+SLAM_ARRAY = SlamArrayStudy()
