@@ -18,6 +18,7 @@ from l2m_gtsam.slam.unknown_field.visit_graph import VisitGraph, ways_between
 
 KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged
 GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
+MOST_CHANGED = 0.6  # share of the visits to known tiles, beyond which none is believed to have
 TIMES = 8  # the most times at which something is moved on a drive, and that visits are cut
 
 
@@ -62,6 +63,9 @@ class RevisitedTiles:
         Steel that was moved changes other tiles, too. One that was visited before and after a
         tile changed clearly needs little evidence to end there; so it does where what the moved
         steel adds is known worse than a reading. Else that is taken off its later readings.
+
+        Where most visits find another field, none is believed to: that is how it looks from poses
+        that are further off than a field is linear over, and where tiles do not hold the field.
         """
         brought = np.zeros_like(self.motions.readings.field)
         # Sensors at places that are not known find other fields from visit to visit, too.
@@ -72,7 +76,7 @@ class RevisitedTiles:
         for _ in range(TIMES):
             judged = JudgedVisits.of(visits, self._graph(visits), new)
             change = judged.first_change()
-            if change is None:
+            if change is None or (not new and judged.changed > MOST_CHANGED):
                 break
             cut = judged.cut(change)
             if cut is not None:

@@ -203,6 +203,11 @@ class JudgedVisits:
         end = min(last for _, last in sure)
         return Change(max(first for first, _ in sure if first < end), end)
 
+    @property
+    def changed(self) -> float:
+        """Share of the visits that clearly show a change."""
+        return float(np.mean([each.gain > CLEAR for each in self.visits.values()]))
+
     def cut(self, change: "Change") -> int | None:
         """Return the key pose at which something was moved while a tile was visited, if it was."""
         return next(e.cut() for e in self.visits.values() if e.visit.middle == change.end)

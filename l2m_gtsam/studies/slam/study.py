@@ -1,6 +1,6 @@
 """The study of SLAM in an unknown field: ``l2m study slam``."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,7 +53,7 @@ class MethodFigures:
     removed
         Share of the drift that is removed, of the means.
     never_worse
-        Whether no seed is worse than its odometry.
+        Whether no seed is worse than its odometry, at whatever key poses that was returned.
     nees, ms_per_pose
         Means; NEES is None where the method states no sigmas.
     unchanged
@@ -159,7 +159,9 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
         for axes, site in zip(panels, sites, strict=True):
             own = [row for row in summary.rows if row.site == site]
             for place, name in enumerate(METHODS):
-                _draw_method(axes, own, name, (place - 0.5 * (len(METHODS) - 1)) * WIDTH)
+                beside = (place - 0.5 * (len(METHODS) - 1)) * WIDTH
+                found = [getattr(row, name) for row in own]
+                draw_bars(axes, found, METHODS[name], COLOURS[name], beside)
             names = [f"{row.kind}, {row.form}" for row in own]
             axes.set_xticks(np.arange(len(own)), names)
             most = max(row.odometry.worst_m for row in own)
@@ -170,12 +172,25 @@ class SlamStudy(Study[SlamStudyOptions, SlamCell, SlamSummary]):
         return {"slam": figure}
 
 
-def _draw_method(axes: Axes, rows: list[SlamRow], name: str, beside: float) -> None:
-    """Draw a method's bars, and lines to its worst seed."""
-    for place, row in enumerate(rows):
-        found: MethodFigures = getattr(row, name)
-        label = METHODS[name] if place == len(rows) - 1 else None
-        axes.bar(place + beside, found.rms_m, WIDTH, color=COLOURS[name], label=label)
+def draw_bars(
+    axes: Axes, rows: Sequence[MethodFigures], label: str, colour: str, beside: float
+) -> None:
+    """Draw a method's errors, drive by drive, and lines to its worst seeds.
+
+    Parameters
+    ----------
+    axes
+        Drives are one apart.
+    rows
+        The method's figures on each drive.
+    label, colour
+        Of the method.
+    beside
+        How far its bars are beside the middle of a drive.
+    """
+    for place, found in enumerate(rows):
+        own = label if place == len(rows) - 1 else None
+        axes.bar(place + beside, found.rms_m, WIDTH, color=colour, label=own)
         axes.vlines(place + beside, found.rms_m, found.worst_m, color="black", linewidth=0.8)
 
 
@@ -216,7 +231,10 @@ def figures_of(rows: list[MethodRow], before: list[MethodRow]) -> MethodFigures:
         rms_m=float(error.mean()),
         worst_m=float(error.max()),
         removed=float(1 - error.mean() / alone.mean()),
-        never_worse=bool((error <= alone).all()),
+        never_worse=all(
+            each.unchanged or each.rms_m <= own.rms_m
+            for each, own in zip(rows, before, strict=True)
+        ),
         nees=mean_of([each.nees for each in rows]),
         inside=mean_of([each.inside for each in rows]),
         ms_per_pose=float(np.mean([each.ms_per_pose for each in rows])),

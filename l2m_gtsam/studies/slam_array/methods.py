@@ -79,11 +79,6 @@ def cell_keys(options: SlamArrayOptions) -> tuple[str, ...]:
     )
 
 
-def site_of(key: str) -> str:
-    """Return the recording of a cell."""
-    return "-".join(key.split("-")[:2])
-
-
 def read_place(options: SlamArrayOptions, site: str) -> MappedDrive:
     """Return a drive with its map."""
     place, number = site.split("-")

@@ -5,17 +5,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from l2m_gtsam.studies.slam.study import MethodFigures, figures_of
+from l2m_gtsam.studies.slam.methods import site_of
+from l2m_gtsam.studies.slam.study import WIDTH, MethodFigures, draw_bars, figures_of
 from l2m_gtsam.studies.slam_array.methods import (
     SlamArrayCell,
     SlamArrayOptions,
     cell_keys,
     computed,
     read_place,
-    site_of,
 )
 from l2m_gtsam.studies.slam_array.places import MappedDrive
 from l2m_gtsam.studies.study import Study
@@ -36,7 +35,6 @@ COLOURS = {
     "online": "#66c2a5",
     "ours": "#1b7837",
 }
-WIDTH = 0.14  # of a bar, where drives are one apart
 LOWEST_M = 0.005  # of the axis
 
 
@@ -122,22 +120,16 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
         figure = Figure(figsize=(9.0, 4.2), layout="constrained", dpi=150)
         axes = figure.subplots()
         for place, name in enumerate(METHODS):
-            _draw_method(axes, rows, name, (place - 0.5 * (len(METHODS) - 1)) * WIDTH)
+            beside = (place - 0.5 * (len(METHODS) - 1)) * WIDTH
+            draw_bars(
+                axes, [getattr(row, name) for row in rows], METHODS[name], COLOURS[name], beside
+            )
         names = [f"{row.site}\n{row.kind}" for row in rows]
         axes.set_xticks(np.arange(len(rows)), names, fontsize=7)
         axes.set(ylabel="error (m)", yscale="log", ylim=(LOWEST_M, None))
         axes.grid(axis="y", alpha=0.3)
         figure.legend(ncols=3, fontsize=7, loc="outside upper center")
         return {"slam-array": figure}
-
-
-def _draw_method(axes: Axes, rows: tuple[SlamArrayRow, ...], name: str, beside: float) -> None:
-    """Draw a method's bars, and lines to its worst seed."""
-    for place, row in enumerate(rows):
-        found: MethodFigures = getattr(row, name)
-        label = METHODS[name] if place == 0 else None
-        axes.bar(place + beside, found.rms_m, WIDTH, color=COLOURS[name], label=label)
-        axes.vlines(place + beside, found.rms_m, found.worst_m, color="black", linewidth=0.8)
 
 
 def worse_than_odometry(row: SlamArrayRow) -> list[str]:
