@@ -14,9 +14,9 @@ from l2m_gtsam.batch.scan_poses import bag_scans, read_drive_or_follow
 from l2m_gtsam.batch.slam import MAP_FILE, TRAJECTORY_FILE, SlamInput
 from l2m_gtsam.config import Config
 from l2m_gtsam.data import FloatArray, Recording, RigidTransform, Trajectory
-from l2m_gtsam.errors import SyncError
+from l2m_gtsam.errors import LidarError, SyncError
 from l2m_gtsam.geometry import compose
-from l2m_gtsam.lidar.surface import Surface
+from l2m_gtsam.lidar.surface import Surface, library
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.maps.field_map import FieldMap
 from l2m_gtsam.progress import Progress, silent
@@ -119,8 +119,10 @@ def slam_online(
     if truth is not None:
         check_truth(truth, recording.trajectory, config.slam.max_pose_gap_s, str(given.truth))
     field_map = None if saved is None else _opened(saved, recording, config, progress)
-    matcher = _matcher(given.bag, saved, config)
+    matcher, ignored = _matcher_or_why_not(given.bag, saved, config)
     begun = _begun(calibration, config, field_map, matcher, out, resume=resume)
+    if ignored is not None:
+        begun.slam.report_scans_ignored(ignored)
     ensure_folder(out)
     with OnlineLog(out / LOG_FILE, begun.lines) as log:
         run = _Run(begun, log, out / STATE_FILE, config.slam.online.save_every_s)
@@ -174,6 +176,18 @@ def _opened(saved: SavedMap, recording: Recording, config: Config, progress: Pro
     return saved.open(progress, [] if start.anywhere or is_given else [recording])
 
 
+def _matcher_or_why_not(
+    bag: Path, saved: SavedMap | None, config: Config
+) -> tuple[ScanMatcher | LoopMatcher | None, str | None]:
+    """Return what registers scans; without a map a drive goes on without them, as off line."""
+    try:
+        return _matcher(bag, saved, config), None
+    except LidarError as error:
+        if saved is not None:
+            raise
+        return None, f"point clouds take no part: {error}"
+
+
 def _matcher(bag: Path, saved: SavedMap | None, config: Config) -> ScanMatcher | LoopMatcher | None:
     """Return what registers the scans of a bag: on the cloud of the map, without a map on others.
 
@@ -183,6 +197,7 @@ def _matcher(bag: Path, saved: SavedMap | None, config: Config) -> ScanMatcher |
     if slam.scans is Usage.IGNORED or not has_clouds(bag):
         return None
     if saved is None:
+        library("small_gicp")  # or it is missed where the first scan is registered
         loops, largest = config.lidar.loops, slam.robust.largest_of(POSE)
         return LoopMatcher(loops, loops.registration.edge, slam.drift, largest)
     mapped, options = saved.state.lidar, config.lidar.localisation

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from l2m_gtsam.batch import online_slam
+from l2m_gtsam.errors import LidarError
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
 from l2m_gtsam.storage.pose_files import read_tum
@@ -91,3 +93,22 @@ def test_what_cannot_be_resumed_is_one_line(command: list[str], tmp_path: Path) 
     assert "give both" in complaint_here(*without, "--out", tmp_path, "--resume")
     (tmp_path / "state.npz").write_bytes(b"PK\x05\x06" + bytes(18))
     assert "begin without --resume" in complaint_here(*command, "--out", tmp_path, "--resume")
+
+
+def test_without_the_extra_clouds_take_no_part_and_it_is_said(
+    yard: CalibratedYard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a map a drive goes on by magnetometers alone, as off line."""
+
+    def missing(_: str) -> None:
+        raise LidarError("poses from point clouds need small_gicp: pip install it")
+
+    monkeypatch.setattr(online_slam, "has_clouds", lambda _: True)
+    monkeypatch.setattr(online_slam, "library", missing)
+    content = json.loads(yard.yard.config.read_text())
+    content["slam"] = {"key_poses": {"distance_m": 0.5, "angle_deg": 30}}
+    config, out = tmp_path / "slam.yaml", tmp_path / "out"
+    config.write_text(json.dumps(content))
+    arguments = ("--calibration", yard.calibration, "--config", config, "--out", out)
+    l2m("slam", yard.drive, "--online", *arguments)
+    assert "point clouds take no part: poses from" in (out / "online.jsonl").read_text()

@@ -363,6 +363,10 @@ class OnlineSlam:
         """Report that the drive was resumed."""
         self._report(EventKind.RESUMED, "goes on from a saved state")
 
+    def report_scans_ignored(self, text: str) -> None:
+        """Report why scans take no part."""
+        self._report(EventKind.SCAN_REFUSED, text)
+
     def _report(self, kind: EventKind, text: str) -> None:
         self._events.append(OnlineEvent(self.stamp_ns, kind, text))
 
