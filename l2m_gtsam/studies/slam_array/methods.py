@@ -17,7 +17,7 @@ from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.studies.measured import measured
 from l2m_gtsam.studies.peers.map_particles import MapParticlesOptions, map_particles
 from l2m_gtsam.studies.slam.methods import MethodRow, followed
-from l2m_gtsam.studies.slam_array.places import PLACES, Drift, MappedDrive, strengths
+from l2m_gtsam.studies.slam_array.places import PLACES, Drift, DriveInMap, strengths
 
 RECORDINGS = (
     *(f"robot-{run}" for run in (1, 2, 3, 4)),
@@ -79,13 +79,13 @@ def cell_keys(options: SlamArrayOptions) -> tuple[str, ...]:
     )
 
 
-def read_place(options: SlamArrayOptions, site: str) -> MappedDrive:
+def read_place(options: SlamArrayOptions, site: str) -> DriveInMap:
     """Return a drive with its map."""
     place, number = site.split("-")
     return PLACES[place](Path(options.data), int(number))
 
 
-def computed(options: SlamArrayOptions, key: str, drive: MappedDrive) -> SlamArrayCell:
+def computed(options: SlamArrayOptions, key: str, drive: DriveInMap) -> SlamArrayCell:
     """Return a cell."""
     *_, kind, number = key.split("-")
     drift, seed, truth = Drift(kind), int(number), drive.truth
@@ -123,7 +123,7 @@ def is_gained(result: LocalisationResult) -> bool:
 
 
 def particles(
-    options: SlamArrayOptions, drive: MappedDrive, odometry: Trajectory, drift: Drift, seed: int
+    options: SlamArrayOptions, drive: DriveInMap, odometry: Trajectory, drift: Drift, seed: int
 ) -> Trajectory:
     """Return the poses of the particle filter, a step each ``APART_M`` of path."""
     rows = apart(odometry.p)

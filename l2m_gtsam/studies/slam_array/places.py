@@ -53,7 +53,7 @@ class Drift(StrEnum):
 
 
 @dataclass(frozen=True)
-class MappedDrive:
+class DriveInMap:
     """A drive through a mapped place.
 
     Attributes
@@ -86,7 +86,7 @@ class MappedDrive:
         return replace(self.recording, trajectory=odometry)
 
 
-def robot(folder: Path, run: int) -> MappedDrive:
+def robot(folder: Path, run: int) -> DriveInMap:
     """Return a pass of a wheeled robot with three magnetometers, in the map of the other passes.
 
     Raises
@@ -98,12 +98,12 @@ def robot(folder: Path, run: int) -> MappedDrive:
         others, drive = other_passes(folder, run), robot_pass(folder, run, EVERY)
     options = {"key_poses": {"distance_m": 0.1, "readings": 1}, "calibration": "refined"}
     chosen = SlamOptions.model_validate(options)
-    return MappedDrive(
+    return DriveInMap(
         drive, others.suite, compiled(others.field_map), wheels, dict.fromkeys(Drift, chosen)
     )
 
 
-def array(folder: Path, run: int) -> MappedDrive:
+def array(folder: Path, run: int) -> DriveInMap:
     """Return a run of an array of thirty magnetometers, in the map of the first five runs.
 
     Raises
@@ -139,7 +139,7 @@ def array(folder: Path, run: int) -> MappedDrive:
         KnownSensor(name, at, Distortion.identity()) for name, at in zip(names, t, strict=True)
     ]
     options = SlamOptions.model_validate({"key_poses": {"distance_m": 0.1, "readings": 1}})
-    return MappedDrive(
+    return DriveInMap(
         recording,
         given_sensors(known, ARRAY_UT),
         compiled(field_map),
@@ -148,7 +148,7 @@ def array(folder: Path, run: int) -> MappedDrive:
     )
 
 
-def simulated(world: ScenarioOptions) -> MappedDrive:
+def simulated(world: ScenarioOptions) -> DriveInMap:
     """Return a simulated drive with twelve sensors, in the map of its survey."""
     made = simulate(world)
     suite = {each.sensor: each for each in made.suite}
@@ -161,7 +161,7 @@ def simulated(world: ScenarioOptions) -> MappedDrive:
         return drifting(truth, walk if drift is Drift.WALK else scale, world.noise, rng)
 
     of_all = {"key_poses": {"readings": 2}}
-    return MappedDrive(
+    return DriveInMap(
         recording,
         given_sensors(made.truth, SIMULATED_UT),
         compiled(field_map),
@@ -173,12 +173,12 @@ def simulated(world: ScenarioOptions) -> MappedDrive:
     )
 
 
-def warehouse(_: Path, seed: int) -> MappedDrive:
+def warehouse(_: Path, seed: int) -> DriveInMap:
     """Return three laps round the racks of a simulated warehouse."""
     return simulated(scenario(seed, {"calibration_route": {"laps": 3, "turns": 0}}))
 
 
-def corridor(_: Path, seed: int) -> MappedDrive:
+def corridor(_: Path, seed: int) -> DriveInMap:
     """Return a simulated corridor without a feature, driven twice to its end and back."""
     return simulated(scenario(seed, {"calibration_route": {"laps": 2}, "corridor": {"length": 40}}))
 

@@ -16,7 +16,7 @@ from l2m_gtsam.studies.slam_array.methods import (
     computed,
     read_place,
 )
-from l2m_gtsam.studies.slam_array.places import MappedDrive
+from l2m_gtsam.studies.slam_array.places import DriveInMap
 from l2m_gtsam.studies.study import Study
 
 METHODS = {
@@ -80,11 +80,11 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
         """Return the recording."""
         return site_of(key)
 
-    def prepare(self, options: SlamArrayOptions, site: str) -> MappedDrive:
+    def prepare(self, options: SlamArrayOptions, site: str) -> DriveInMap:
         """Return the drive and its map."""
         return read_place(options, site)
 
-    def compute(self, options: SlamArrayOptions, key: str, shared: MappedDrive) -> SlamArrayCell:
+    def compute(self, options: SlamArrayOptions, key: str, shared: DriveInMap) -> SlamArrayCell:
         """Run all methods on one odometry."""
         return computed(options, key, shared)
 
