@@ -16,7 +16,7 @@ Other = TypeVar("Other")
 
 
 @dataclass(frozen=True)
-class Measured(Generic[Result]):
+class MeasuredWork(Generic[Result]):
     """A piece of work that was done.
 
     Attributes
@@ -33,12 +33,12 @@ class Measured(Generic[Result]):
     seconds: float
     peak_mib: float | None
 
-    def of(self, part: Other) -> "Measured[Other]":
+    def of(self, part: Other) -> "MeasuredWork[Other]":
         """Return the same work with another result, such as a part of its own."""
-        return Measured(part, self.seconds, self.peak_mib)
+        return MeasuredWork(part, self.seconds, self.peak_mib)
 
 
-def measured(work: Callable[[], Result]) -> Measured[Result]:
+def measured(work: Callable[[], Result]) -> MeasuredWork[Result]:
     """Do a piece of work, and return what it took."""
     _forget_earlier()
     before = _memory("VmRSS") if _forget_peak() else None
@@ -47,7 +47,7 @@ def measured(work: Callable[[], Result]) -> Measured[Result]:
     seconds = process_time() - start
     after = _memory("VmHWM")
     peak = None if before is None or after is None else max(after - before, 0.0)
-    return Measured(result, seconds, peak)
+    return MeasuredWork(result, seconds, peak)
 
 
 def _forget_earlier() -> None:

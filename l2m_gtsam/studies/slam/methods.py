@@ -24,7 +24,7 @@ from l2m_gtsam.slam.exploration import explore
 from l2m_gtsam.slam.online.replay import give, messages
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.studies.measured import Measured, measured
+from l2m_gtsam.studies.measured import MeasuredWork, measured
 from l2m_gtsam.studies.peers.fixed_lag import FixedLagOptions, fixed_lag_slam
 from l2m_gtsam.studies.peers.particle_slam import ParticleSlamOptions, particle_slam
 from l2m_gtsam.studies.peers.reduced_rank_ekf import (
@@ -83,7 +83,7 @@ class MethodRow:
 
     @classmethod
     def of(
-        cls, took: Measured[Trajectory], truth: Trajectory, *, unchanged: bool = False
+        cls, took: MeasuredWork[Trajectory], truth: Trajectory, *, unchanged: bool = False
     ) -> "MethodRow":
         """Return the figures of an estimate and true poses, in whose file its times are."""
         found = took.result

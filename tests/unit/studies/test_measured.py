@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from l2m_gtsam.studies.measured import Measured, measured
+from l2m_gtsam.studies.measured import MeasuredWork, measured
 
 MIB = 2**20
 
@@ -22,4 +22,4 @@ def test_memory_counts_at_its_peak_and_each_work_alone() -> None:
 
 def test_a_part_of_a_result_took_as_long() -> None:
     whole = measured(lambda: (1, "text"))
-    assert whole.of(whole.result[1]) == Measured("text", whole.seconds, whole.peak_mib)
+    assert whole.of(whole.result[1]) == MeasuredWork("text", whole.seconds, whole.peak_mib)
