@@ -1,4 +1,4 @@
-"""Localisation in a known map by a particle filter, after A. Solin et al. (IPIN 2016).
+"""Localisation in a known map by a particle filter, after A. Solin et al. (ENC 2016).
 
 Particles follow odometry with its drift. Each weighs as much as it predicts the strength of the
 field at the sensors: strength does not depend on the attitude, so that calibrated sensors of any

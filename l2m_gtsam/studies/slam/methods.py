@@ -42,6 +42,7 @@ from l2m_gtsam.studies.slam.recordings import (
     TrueDrive,
     drifted,
     handheld_run,
+    parts_of,
     robot_run,
     ship_run,
 )
@@ -306,9 +307,9 @@ READERS = {
 
 def read_drive(options: SlamStudyOptions, site: str) -> TrueDrive:
     """Return a recording with its true poses."""
-    carrier, run = site.split("-")
+    carrier, run = parts_of(site, READERS)
     read, name = READERS[carrier]
-    return read(Path(options.data) / name, int(run))
+    return read(Path(options.data) / name, run)
 
 
 def computed(options: SlamStudyOptions, key: str, drive: TrueDrive) -> SlamCell:

@@ -1,6 +1,6 @@
 """Recordings that others made, as drives with their truth, and odometry made of such poses."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -52,6 +52,21 @@ class TrueDrive:
         """Return the drive as it would be recorded with an odometry."""
         series = FieldSeries("mag", "/mag", "lidar", self.truth.stamp_ns, self.field)
         return Recording(odometry, (series,), self.source)
+
+
+def parts_of(site: str, known: Iterable[str]) -> tuple[str, int]:
+    """Return the name and the number of a recording, such as ``ship-1``.
+
+    Raises
+    ------
+    ConfigError
+        It has no number, or another name than those that are known.
+    """
+    name, _, number = site.partition("-")
+    if name not in known or not number.isdecimal():
+        named = ", ".join(f"{each}-1" for each in known)
+        raise ConfigError(f"`recordings`: {site!r} is none; they are named like {named}")
+    return name, int(number)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.studies.measured import measured
 from l2m_gtsam.studies.peers.map_particles import MapParticlesOptions, map_particles
 from l2m_gtsam.studies.slam.methods import MethodRow, followed
+from l2m_gtsam.studies.slam.recordings import parts_of
 from l2m_gtsam.studies.slam_array.places import PLACES, Drift, DriveInMap, strengths
 
 RECORDINGS = (
@@ -81,8 +82,8 @@ def cell_keys(options: SlamArrayOptions) -> tuple[str, ...]:
 
 def read_place(options: SlamArrayOptions, site: str) -> DriveInMap:
     """Return a drive with its map."""
-    place, number = site.split("-")
-    return PLACES[place](Path(options.data), int(number))
+    place, number = parts_of(site, PLACES)
+    return PLACES[place](Path(options.data), number)
 
 
 def computed(options: SlamArrayOptions, key: str, drive: DriveInMap) -> SlamArrayCell:
@@ -130,7 +131,7 @@ def particles(
     steps = odometry[rows]
     found = map_particles(
         steps,
-        strengths(drive.recording, drive.calibration, steps.stamp_ns.tolist()),
+        strengths(drive.recording, drive.calibration, steps.stamp_ns),
         np.stack([each.t_lidar_mag for each in drive.calibration.sensors]),
         drive.field_map,
         drive.options[drift].drift,

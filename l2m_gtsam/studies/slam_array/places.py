@@ -4,7 +4,7 @@ Each place has the map of other drives, the calibration of its sensors, and one 
 poses are known. Odometry is made of these.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from hashlib import sha256
@@ -18,6 +18,7 @@ from l2m_gtsam.data import (
     Distortion,
     FieldSeries,
     FloatArray,
+    IntArray,
     KnownSensor,
     Recording,
     SourceFile,
@@ -32,9 +33,9 @@ from l2m_gtsam.simulate.odometry import OdometryDriftOptions, drifting
 from l2m_gtsam.simulate.scenario import ScenarioOptions, simulate
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.studies.slam.methods import given_sensors
-from l2m_gtsam.studies.slam.recordings import readable
+from l2m_gtsam.studies.slam.recordings import ROBOT, readable
 from l2m_gtsam.studies.slam_array.odometry import slipping, walked
-from l2m_gtsam.studies.slam_array.robot import other_passes, robot_pass
+from l2m_gtsam.studies.slam_array.robot import RUNS, other_passes, robot_pass
 
 ARRAY = "array30_simulated_10runs.npz"
 ARRAY_UT, SIMULATED_UT = 0.1, 0.1  # noise of a reading
@@ -94,8 +95,12 @@ def robot(folder: Path, run: int) -> DriveInMap:
     ConfigError
         There is no such file, or it has no such pass.
     """
-    with readable(folder, f"pass {run} of the robot", "the robot's file"):
-        others, drive = other_passes(folder, run), robot_pass(folder, run, EVERY)
+    path = folder / ROBOT
+    with readable(path, f"pass {run} of the robot", ROBOT):
+        drive = robot_pass(folder, run, EVERY)
+    if run not in RUNS:
+        raise ConfigError(f"{path}: pass {run} is not one of {RUNS[0]} to {RUNS[-1]}")
+    others = other_passes(folder, run)
     options = {"key_poses": {"distance_m": 0.1, "readings": 1}, "calibration": "refined"}
     chosen = SlamOptions.model_validate(options)
     return DriveInMap(
@@ -200,18 +205,18 @@ def compiled(field_map: QueryableMap) -> QueryableMap:
 
 
 def strengths(
-    recording: Recording, calibration: CalibrationResult, stamp_ns: Sequence[int]
+    recording: Recording, calibration: CalibrationResult, stamp_ns: IntArray
 ) -> FloatArray:
-    """Return the field's strength at each calibrated sensor at N times in uT, shape (N, S).
+    """Return the field's strength at N times at the S sensors of a calibration, uT, shape (N, S).
 
     Readings are interpolated; NaN where a sensor has none around.
     """
-    known = {each.sensor: each for each in calibration.sensors}
+    recorded = {each.sensor: each for each in recording.series}
     columns = []
-    for series in recording.series:
-        sensor = known[series.sensor]
+    for sensor in calibration.sensors:
+        series = recorded[sensor.sensor]
         offset = 0.0 if sensor.time_offset is None else sensor.time_offset.seconds
-        at = np.asarray(stamp_ns) - round(1e9 * offset)
+        at = stamp_ns - round(1e9 * offset)
         axes = [
             np.interp(at, series.stamp_ns, axis, left=np.nan, right=np.nan)
             for axis in series.field.T

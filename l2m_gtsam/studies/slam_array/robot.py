@@ -18,7 +18,6 @@ from l2m_gtsam.studies.slam.recordings import ROBOT
 SENSORS = ("invensense", "trivisio", "nexus")
 TRIVISIO_UT = 46.0  # its readings are in units of about so many microtesla
 RUNS = (1, 2, 3, 4)
-CLOCK_S = 0.15  # one sensor is late by 0.12 to 0.16 s
 
 
 def robot_pass(folder: Path, run: int, every: int = 1) -> Recording:
@@ -42,7 +41,7 @@ def assumed_sensors(folder: Path) -> dict[str, KnownSensor]:
     """Return the sensors at their measured places, otherwise ideal."""
     with np.load(folder / ROBOT, allow_pickle=False) as arrays:
         places = arrays["sensor_positions_body"]
-    ideal = Distortion.from_vector(np.append(np.eye(3).ravel(), np.zeros(3)))
+    ideal = Distortion.identity()
     return {name: KnownSensor(name, at, ideal) for name, at in zip(SENSORS, places, strict=True)}
 
 

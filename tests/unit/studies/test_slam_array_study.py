@@ -1,6 +1,7 @@
 """The study of SLAM with several sensors: its page, from made-up cells, and what its cells use."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +9,11 @@ import pytest
 from l2m_gtsam.data import Distortion, FieldSeries, KnownSensor, Recording, SourceFile, Trajectory
 from l2m_gtsam.errors import ConfigError
 from l2m_gtsam.studies.slam.methods import MethodRow, given_sensors
+from l2m_gtsam.studies.slam.study import SLAM
 from l2m_gtsam.studies.slam_array.methods import SlamArrayCell, SlamArrayOptions, apart
-from l2m_gtsam.studies.slam_array.places import array, strengths
+from l2m_gtsam.studies.slam_array.places import array, robot, strengths
 from l2m_gtsam.studies.slam_array.study import SLAM_ARRAY
+from l2m_gtsam.studies.study import Study
 
 
 def test_what_is_lost_is_on_the_page() -> None:
@@ -66,7 +69,8 @@ def test_strengths_are_those_of_the_field_whatever_a_sensor_does_to_it() -> None
     )
     poses = Trajectory(stamps, np.tile(np.eye(3), (11, 1, 1)), np.zeros((11, 3)), "map", "lidar")
     recording = Recording(poses, series, SourceFile("drive", ""))
-    found = strengths(recording, given_sensors(known, 0.1), [0, 5 * 10**7, 2 * 10**9])
+    at = np.array([0, 5 * 10**7, 2 * 10**9])
+    found = strengths(recording, given_sensors(known[::-1], 0.1), at)  # in the calibration's order
     np.testing.assert_allclose(found[:2], [[30.0, 30.0], [31.0, 31.0]], rtol=1e-12)
     assert np.isnan(found[2]).all()
 
@@ -76,3 +80,15 @@ def test_a_run_of_the_map_is_no_drive_through_it(tmp_path: Path, shared_data: Pa
         array(shared_data, 3)
     with pytest.raises(ConfigError, match="no run 6 of the array can be read"):
         array(tmp_path, 6)
+
+
+@pytest.mark.parametrize("study", [SLAM, SLAM_ARRAY])
+@pytest.mark.parametrize("site", ["submarine-1", "robot", "robot-one"])
+def test_a_recording_that_is_none_is_named(study: Study[Any, Any, Any], site: str) -> None:
+    with pytest.raises(ConfigError, match=f"'{site}' is none; they are named like"):
+        study.prepare(study.options(recordings=(site,)), site)
+
+
+def test_a_pass_that_there_is_not_is_named(shared_data: Path) -> None:
+    with pytest.raises(ConfigError, match="pass 9 is not one of 1 to 4"):
+        robot(shared_data, 9)
