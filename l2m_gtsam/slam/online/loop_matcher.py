@@ -1,7 +1,7 @@
 """Scans on those of earlier visits, as they come: loops of key poses where there is no map."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -30,13 +30,20 @@ class KeptScan:
         Number of its key pose.
     T_key_scan
         The lidar at the scan, by odometry in the frame of the key pose.
-    scan
-        Its points, and where it was when it was taken.
+    stamp_ns, points, path_m
+        As of ``KeyScan``.
     """
 
     key_pose: int
     T_key_scan: RigidTransform
-    scan: KeyScan
+    stamp_ns: int
+    points: "np.ndarray[tuple[int, ...], np.dtype[np.float32]]"
+    path_m: float
+
+    def seen_from(self, T_map_key: RigidTransform) -> KeyScan:
+        """Return it as it is placed by its key pose."""
+        T = compose(T_map_key, self.T_key_scan)
+        return KeyScan(self.stamp_ns, self.points, T, self.path_m)
 
 
 class LoopMatcher:
@@ -112,10 +119,7 @@ class LoopMatcher:
         T = compose(expected.T, at.T_key_scan)
         here = KeyScan.of(key_pose.stamp_ns, surface, T, self.path_m)
         before = [known(each.key_pose) for each in self.kept]
-        scans = [
-            replace(each.scan, T=compose(there.T, each.T_key_scan))
-            for each, there in zip(self.kept, before, strict=True)
-        ]
+        scans = [each.seen_from(there.T) for each, there in zip(self.kept, before, strict=True)]
         found = list[Links | str]()
         for row in candidates(scans, here, options):
             closed = closed_loop(scans[row], here, surface, options.registration)
@@ -129,8 +133,10 @@ class LoopMatcher:
                 found.append(Links.single(earlier.key_pose, key_pose.number, seen))
             else:
                 found.append(CONTRADICTS)
-        if all(np.linalg.norm(each.T.t - T.t) >= options.key_distance_m for each in scans):
-            self.kept.append(KeptScan(key_pose.number, at.T_key_scan, here))
+        is_new = all(np.linalg.norm(each.T.t - T.t) >= options.key_distance_m for each in scans)
+        if is_new and CONTRADICTS not in found:  # true scans would contradict one that lies
+            own = here.stamp_ns, here.points, here.path_m
+            self.kept.append(KeptScan(key_pose.number, at.T_key_scan, *own))
         return found
 
     def _fits(self, seen: PoseEstimate, before: PoseEstimate, expected: PoseEstimate) -> bool:

@@ -26,6 +26,7 @@ from l2m_gtsam.slam.online.saved import resumed_slam, saved_state
 from l2m_gtsam.slam.online.scan_matcher import ScanMatcher
 from l2m_gtsam.slam.online.session import OnlineSlam
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, TileOptions
+from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.drives.exploring import rms
 from tests.drives.online import OnlineRun, driven
@@ -254,9 +255,10 @@ def test_loops_of_scans_take_the_drift_out_on_line_without_a_map(
 
 def test_scans_are_kept_per_place(whole_run: tuple[OnlineSlam, OnlineRun]) -> None:
     """None was taken nearer than a metre to one before it, as they were placed then."""
-    matcher = whole_run[0].matcher
+    matcher, explorer = whole_run[0].matcher, whole_run[0].estimator
     assert isinstance(matcher, LoopMatcher)
-    p = np.stack([each.scan.T.t for each in matcher.kept])
+    assert isinstance(explorer, Explorer)
+    p = np.stack([explorer.estimate(each.key_pose).T.t for each in matcher.kept])
     apart = np.linalg.norm(p[:, None] - p, axis=2) + 10 * np.eye(len(p))
     assert apart.min() > 0.7  # poses were corrected since the first of two was kept
     assert len(p) < 22  # of 49 m
