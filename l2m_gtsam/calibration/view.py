@@ -40,6 +40,11 @@ class Compilable(Protocol):
         """Return that form."""
 
 
+def for_solvers(field_map: QueryableMap) -> QueryableMap:
+    """Return a map in its faster form, if it has one."""
+    return field_map.compile() if isinstance(field_map, Compilable) else field_map
+
+
 @dataclass(frozen=True)
 class View:
     """Usable readings at an estimate.

@@ -12,7 +12,7 @@ from l2m_gtsam.calibration.prepare import prepare
 from l2m_gtsam.calibration.prior_options import priors_of
 from l2m_gtsam.calibration.priors import Priors
 from l2m_gtsam.calibration.start.rigid_groups import placed
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
     FieldSeries,
     FloatArray,
@@ -120,7 +120,7 @@ def plan(
     """
     synchronised = prepare(recording, options)
     readings = synchronised.readings
-    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    solver_map = for_solvers(field_map)
     noise = _noise(field_map, options, planning)
     priors = priors_of(options.priors, readings.sensors)
     task = Task(solver_map, _places(readings.sensors, options, priors), noise, options, priors)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, Readings, Recording, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, ConfigError, SyncError
 from l2m_gtsam.geometry import isotropic_covariance
@@ -93,7 +93,7 @@ def localise(
             "`slam.drift.axes: fixed` works without a map: leave out --map, or give `vehicle`"
         )
     drive, notes = prepared(recording, calibration, options, evidence)
-    solver_map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+    solver_map = for_solvers(field_map)
     search = None
     if options.start.anywhere:
         search = find_start(drive, solver_map, options, progress)

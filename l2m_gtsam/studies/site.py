@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial import cKDTree
 
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray, KnownSensor, Readings
 from l2m_gtsam.mapping.map_building import suite_readings
 from l2m_gtsam.mapping.options import MappingOptions
@@ -72,7 +72,7 @@ class SurveyedSite:
         """Return a map of the survey, in its form for solvers."""
         cloud = self.cloud if KINDS[options.kind].uses_structure else None
         learnt = build_map(self.survey.points, self.survey.field, options, cloud)
-        return learnt.compile() if isinstance(learnt, Compilable) else learnt
+        return for_solvers(learnt)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 from l2m_gtsam.calibration.factor_graph import Estimate
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.calibration.prepare import prepare
-from l2m_gtsam.calibration.view import Compilable, QueryableMap, places_of
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers, places_of
 from l2m_gtsam.data import (
     FloatArray,
     Readings,
@@ -164,7 +164,7 @@ def _test_of(
     return _Test(
         recording=recording,
         readings=readings,
-        field_map=field_map.compile() if isinstance(field_map, Compilable) else field_map,
+        field_map=for_solvers(field_map),
         stuck=frozenset(readings.sensors[k] for k in stuck_sensors(readings)),
         options=options,
         chance=chance,

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import CalibrationError, ConfigError
 from l2m_gtsam.lidar.registration import PoseEstimate
@@ -30,7 +30,8 @@ from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose, drive_of, renumbered
 from l2m_gtsam.slam.online.loop_matcher import LoopMatcher
 from l2m_gtsam.slam.online.odometry_check import OdometryPose
 from l2m_gtsam.slam.online.scan_matcher import ScanLinks, ScanMatcher
-from l2m_gtsam.slam.options import CalibrationUse, SlamOptions, StepAxes
+from l2m_gtsam.slam.online.supported_options import check_options
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.start.search import GROWTH, find_start, start_found
 from l2m_gtsam.slam.unknown_field.explorer import Explorer
 from l2m_gtsam.slam.unknown_field.odometry_hypotheses import JumpDecision
@@ -134,7 +135,7 @@ class OnlineSlam:
         self._one_field = field_map is None and matcher is None and len(usable) == 1
         check_options(options, has_map=field_map is not None, one_field=self._one_field)
         self.options, self.sensors = options, known_sensors(usable)
-        self._map = field_map.compile() if isinstance(field_map, Compilable) else field_map
+        self._map = None if field_map is None else for_solvers(field_map)
         self.matcher = matcher
         self.intake = Intake(self.sensors, options)
         self.estimator: Follower | Explorer | OneFieldExplorer | None = None
@@ -382,37 +383,3 @@ def decision_text(decision: JumpDecision, key_poses: Sequence[ArrivedKeyPose]) -
     seconds = 1e-9 * key_poses[decision.number].stamp_ns
     was = "motion, as recorded" if decision.was_motion else "a slip: the motion before went on"
     return f"the jump of odometry at {seconds:.3f} s was {was}, by the readings"
-
-
-def check_options(options: SlamOptions, *, has_map: bool, one_field: bool) -> None:
-    """Refuse what works off line only.
-
-    Parameters
-    ----------
-    options
-        As of ``OnlineSlam``.
-    has_map
-        Whether there is a map.
-    one_field
-        Whether there is a single sensor and nothing else that knows its places.
-
-    Raises
-    ------
-    ConfigError
-        Odometry knows its steps along fixed axes, in a map or with several sensors; or, without a
-        map, the start is to be searched for, or the calibration of a single sensor to be refined.
-    """
-    if options.drift.axes is StepAxes.FIXED and not one_field:
-        raise ConfigError(
-            "`slam.drift.axes: fixed` works off line, and on line with one sensor and no map; give "
-            "`vehicle`"
-        )
-    if has_map:
-        return
-    if options.start.anywhere:
-        raise ConfigError("`slam.start.anywhere` searches a map for the start: give one with --map")
-    if options.calibration is CalibrationUse.REFINED and one_field:
-        raise ConfigError(
-            "`slam.calibration: refined` of one sensor without a map works off line; on line give "
-            "`fixed`"
-        )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import Field
 
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.maps.build import build_map
 from l2m_gtsam.simulate.brought_steel import brought_steel
@@ -112,7 +112,7 @@ def loaded_hall(options: ChangesStudyOptions, number: int) -> LoadedHall:
     return LoadedHall(
         hall,
         seed,
-        learnt.compile() if isinstance(learnt, Compilable) else learnt,
+        for_solvers(learnt),
         calibration_drive(hall, seed, span, options.noise, options.sensors, 30).sensors,
         tuple(five_changes(options, inside, *STEPS[path], rng) for path in range(options.paths)),
     )

@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.alternation import OneKeyOptions
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import FloatArray, Readings, Trajectory
 from l2m_gtsam.maps.build import MapOptions, build_map
 from l2m_gtsam.options import Options
@@ -106,7 +106,7 @@ def mapped_hall(options: HonestyOptions, noise: float, number: int) -> MappedHal
     read = survey(hall, seed, options.heights, noise, options.survey_readings)
     cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
     learnt = build_map(read.points, read.field, options.map, cloud)
-    compiled = learnt.compile() if isinstance(learnt, Compilable) else learnt
+    compiled = for_solvers(learnt)
     return MappedHall(hall, seed, noise, compiled)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
     Distortion,
     FieldSeries,
@@ -104,7 +104,7 @@ def robot(folder: Path, run: int) -> DriveInMap:
     options = {"key_poses": {"distance_m": 0.1, "readings": 1}, "calibration": "refined"}
     chosen = SlamOptions.model_validate(options)
     return DriveInMap(
-        drive, others.suite, compiled(others.field_map), wheels, dict.fromkeys(Drift, chosen)
+        drive, others.suite, for_solvers(others.field_map), wheels, dict.fromkeys(Drift, chosen)
     )
 
 
@@ -147,7 +147,7 @@ def array(folder: Path, run: int) -> DriveInMap:
     return DriveInMap(
         recording,
         given_sensors(known, ARRAY_UT),
-        compiled(field_map),
+        for_solvers(field_map),
         wheels,
         dict.fromkeys(Drift, options),
     )
@@ -169,7 +169,7 @@ def simulated(world: ScenarioOptions) -> DriveInMap:
     return DriveInMap(
         recording,
         given_sensors(made.truth, SIMULATED_UT),
-        compiled(field_map),
+        for_solvers(field_map),
         drifted,
         {
             Drift.WALK: SlamOptions.model_validate(of_all),
@@ -197,11 +197,6 @@ def scenario(seed: int, place: dict[str, object]) -> ScenarioOptions:
 def wheels(truth: Trajectory, drift: Drift, rng: np.random.Generator) -> Trajectory:
     """Return odometry of wheels."""
     return slipping(truth, rng) if drift is Drift.SLIP else walked(truth, rng)
-
-
-def compiled(field_map: QueryableMap) -> QueryableMap:
-    """Return a map in its form for solvers."""
-    return field_map.compile() if isinstance(field_map, Compilable) else field_map
 
 
 def strengths(

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
     Distortion,
     FieldSeries,
@@ -146,7 +146,7 @@ def troubled_place(
         suite = {name: replace(each, covariance=None) for name, each in suite.items()}
     chosen = MappingOptions(model=options.map)
     learnt = map_recordings([recording], suite, chosen, truth.cloud())
-    compiled = learnt.compile() if isinstance(learnt, Compilable) else learnt
+    compiled = for_solvers(learnt)
     return TroubledPlace(truth, compiled)
 
 

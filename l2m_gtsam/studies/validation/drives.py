@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.calibration.calibrate import calibrate
 from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.calibration.view import Compilable, QueryableMap
+from l2m_gtsam.calibration.view import QueryableMap, for_solvers
 from l2m_gtsam.data import (
     Distortion,
     FieldSeries,
@@ -118,7 +118,7 @@ def calibrated_hall(options: ValidationStudyOptions, number: int) -> CalibratedH
     read = survey(hall, seed, options.heights, options.noise, options.survey_readings)
     cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
     learnt = build_map(read.points, read.field, options.map, cloud)
-    field_map = learnt.compile() if isinstance(learnt, Compilable) else learnt
+    field_map = for_solvers(learnt)
     span = min(options.heights), max(options.heights)
     sensors = calibration_drive(hall, seed, span, options.noise, options.sensors, 30).sensors
     path = path_of(options, hall, drive_seed(seed, 0))

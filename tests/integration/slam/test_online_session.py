@@ -370,19 +370,6 @@ def explored_field(slam: OnlineSlam) -> tuple[FloatArray, FloatArray]:
     return slam.estimator.field_along_path()
 
 
-def test_options_that_work_off_line_only_are_refused(
-    hall: tuple[tuple[KnownSensor, ...], SlamDrive],
-) -> None:
-    several, one = calibrated(hall[0]), calibrated(hall[0][:1])
-    for chosen, text, known in (
-        ({"start": {"anywhere": True}}, "give one with --map", several),
-        ({"calibration": "refined"}, "works off line", one),
-        ({"drift": {"axes": "fixed"}}, "works off line", several),
-    ):
-        with pytest.raises(ConfigError, match=text):
-            OnlineSlam(known, SlamOptions.model_validate(chosen))
-
-
 def test_what_is_kept_does_not_grow_with_the_drive(
     hall: tuple[tuple[KnownSensor, ...], SlamDrive],
 ) -> None:
