@@ -13,11 +13,16 @@ from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.unknown_field.changed_visits import Seen, trusted
 from l2m_gtsam.slam.unknown_field.moved_sources import moved_steel
 from l2m_gtsam.slam.unknown_field.tile_visits import LIKELY, JudgedVisits, Visit, middle_of
-from l2m_gtsam.slam.unknown_field.tiles import Anchoring, FieldPrior, WaveTile, relative_place
+from l2m_gtsam.slam.unknown_field.tiles import (
+    Anchoring,
+    FieldPrior,
+    WaveTile,
+    relative_place,
+    visits_among,
+)
 from l2m_gtsam.slam.unknown_field.visit_graph import VisitGraph, ways_between
 
 KNOWN_M = 0.02  # standard deviation of a sensor's place, up to which tiles are judged
-GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
 MOST_CHANGED = 0.6  # share of the visits to known tiles, beyond which none is believed to have
 TIMES = 8  # the most times at which something is moved on a drive, and that visits are cut
 
@@ -143,7 +148,7 @@ class RevisitedTiles:
         visits = list[Visit]()
         for number, anchor in enumerate(anchoring.anchor.tolist()):
             own = np.flatnonzero(anchoring.tile == number)
-            parts = np.split(own, np.flatnonzero(np.diff(own) > GONE) + 1)
+            parts = [own[visit] for visit in visits_among(own)]
             rows = [np.flatnonzero(np.isin(self._key_pose, each)) for each in parts]
             found = [(part, each) for part, each in zip(parts, rows, strict=True) if len(each)]
             if found:

@@ -1,5 +1,6 @@
 """A drive's readings partitioned into tiles of an unknown field, at an estimate of its poses."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 
@@ -92,6 +93,31 @@ class FieldWithWeights:
         return FieldSample(field, gradient, self._tile.unresolved(points), inside)
 
 
+def anchored(poses: list[gtsam.Pose3], prior: FieldPrior) -> tuple[Anchoring, FloatArray]:
+    """Return the tiles of K key poses, and their level axes in the map, shape (K, 3, 3)."""
+    R = np.stack([pose.rotation().matrix() for pose in poses])
+    p = np.stack([pose.translation() for pose in poses])
+    return anchor_tiles(R, p, prior.options.core), level_axes(R)
+
+
+def occupied_tiles(
+    anchoring: Anchoring,
+    motions: RelativeMotions,
+    poses: list[gtsam.Pose3],
+    sensors: KnownSensors,
+    prior: FieldPrior,
+) -> Iterator[OccupiedTile]:
+    """Yield the tiles that have readings; arguments as of ``TiledDrive.partition``."""
+    owner = anchoring.tile[motions.readings.key_pose]
+    for number, anchor in enumerate(anchoring.anchor.tolist()):
+        rows = np.flatnonzero(owner == number)
+        if len(rows):
+            where = relative_place(motions.readings[rows], poses, anchor, sensors)
+            axes = level_axes(poses[anchor].rotation().matrix()[None])[0]
+            up = poses[anchor].rotation().matrix().T @ axes
+            yield OccupiedTile(number, anchor, rows, WaveTile.about(prior, up, where.x), where)
+
+
 @dataclass(frozen=True)
 class TiledDrive:
     """All tiles of a drive.
@@ -120,21 +146,11 @@ class TiledDrive:
         prior: FieldPrior,
     ) -> "TiledDrive":
         """Return the tiles of a drive at an estimate of its motions, key poses and sensors."""
-        R = np.stack([pose.rotation().matrix() for pose in poses])
-        p = np.stack([pose.translation() for pose in poses])
-        axes = level_axes(R)
-        anchoring = anchor_tiles(R, p, prior.options.core)
+        anchoring, axes = anchored(poses, prior)
         renewed = RevisitedTiles(motions, poses, sensors, prior, axes).renewed(anchoring)
-        anchoring, motions = renewed.anchoring, motions.without(renewed.brought)
-        owner = anchoring.tile[motions.readings.key_pose]
-        tiles = []
-        for number, anchor in enumerate(anchoring.anchor.tolist()):
-            rows = np.flatnonzero(owner == number)
-            if len(rows):
-                where = relative_place(motions.readings[rows], poses, anchor, sensors)
-                field = WaveTile.about(prior, R[anchor].T @ axes[anchor], where.x)
-                tiles.append(OccupiedTile(number, anchor, rows, field, where))
-        return cls(anchoring, tuple(tiles), renewed.brought)
+        own = motions.without(renewed.brought)
+        tiles = occupied_tiles(renewed.anchoring, own, poses, sensors, prior)
+        return cls(renewed.anchoring, tuple(tiles), renewed.brought)
 
     def moved(
         self, motions: RelativeMotions, poses: list[gtsam.Pose3], sensors: KnownSensors

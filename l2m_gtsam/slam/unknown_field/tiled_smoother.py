@@ -46,6 +46,7 @@ from l2m_gtsam.slam.solver import (
     sensor_covariances,
     weights_first,
 )
+from l2m_gtsam.slam.unknown_field.return_search import ReturnSearch
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
@@ -138,16 +139,19 @@ def incremental_poses(
 ) -> list[gtsam.Pose3]:
     """Return the poses of a drive solved piece by piece, the last piece by odometry."""
     path = drive.steps.path
-    poses = initial
+    divided, noise = partial(TiledDrive.partition, prior=prior), STAGES[0][0] * drive.sensors.noise
+    poses, known, begun = initial, 0, 0
     for end in np.arange(PIECE_M, path[-1], PIECE_M):
         progress("following the drive", float(end / path[-1]))
         count = int(np.searchsorted(path, end))
-        divided = partial(TiledDrive.partition, prior=prior)
-        part = TiledProblem(drive.until(count), divided, options)
-        solved = part.solved(poses[:count], drive.sensors, *STAGES[0])
+        part = drive.until(count)
+        start = ReturnSearch(part, prior, noise, known, begun).likeliest(poses[:count])
+        solved = TiledProblem(part, divided, options).solved(start, drive.sensors, *STAGES[0])
         shift = solved.poses[-1].compose(poses[count - 1].inverse())
         poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
-    return poses
+        returns = solved.tiled.anchoring.returns(path, AWAY_M)
+        known, begun = (int(returns[-1]) if len(returns) else 0), count
+    return ReturnSearch(drive, prior, noise, known, begun).likeliest(poses)
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ from l2m_gtsam.slam.unknown_field.linear_field import LinearField
 # square of this factor; the loss is small, for readings are dense along the path.
 WIDER = 10.0
 
+GONE = 15  # key poses elsewhere, after which one in a tile is of another visit
+
 
 @dataclass(frozen=True)
 class FieldPrior:
@@ -197,6 +199,11 @@ class Anchoring:
             if returned:
                 found.append(k)
         return np.array(found, dtype=np.int64)
+
+
+def visits_among(key_poses: IntArray) -> list[IntArray]:
+    """Return the rows of each visit to a tile, of the key poses that are in it, ascending."""
+    return np.split(np.arange(len(key_poses)), np.flatnonzero(np.diff(key_poses) > GONE) + 1)
 
 
 def anchor_tiles(R: FloatArray, p: FloatArray, core: float) -> Anchoring:
