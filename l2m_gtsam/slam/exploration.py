@@ -20,7 +20,8 @@ from l2m_gtsam.slam.slips import judged, with_open_jumps, with_recorded_jumps
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.unknown_field.kept_odometry import with_gain
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
-from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution, map_drive
+from l2m_gtsam.slam.unknown_field.tiled_smoother import FieldSolution
+from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from l2m_gtsam.slam.unknown_field.whole_smoother import DriveLikelihood, map_whole_drive
 
@@ -106,7 +107,7 @@ def explore(
     refined = options.calibration is CalibrationUse.REFINED and mapped.is_corrected
     kept = calibration if refined else None
     result = localisation_result(drive, mapped.solution, by_scans, kept)
-    explored = Explored(mapped.tiles, len(mapped.returns) / len(drive))
+    explored = Explored(len(mapped.tiled.tiles), len(mapped.returns) / len(drive))
     result = replace(
         explored_result(result, explored),
         notes=(

@@ -38,7 +38,7 @@ class DriveSolution:
         Robust weight of each reading, 0 to 1, shape (N,); zero outside of the map.
     near_changes
         Which readings are left out because others near them do not fit, shape (N,).
-    bent
+    odometry_chi2
         Mean square of the whitened components by which the steps between the poses differ from
         odometry's; 1 is consistent.
     scale
@@ -74,6 +74,11 @@ class DriveSolution:
     def scale_error(self) -> float:
         """Relative error of odometry's lengths: true ones are ``1 + scale_error`` times as long."""
         return 0.0 if self.scale is None else self.scale.longer
+
+    @property
+    def bent(self) -> float:
+        """What the poses cost against odometry, in nats."""
+        return 0.5 * self.odometry_chi2 * 6 * len(self.drive)
 
     @property
     def used(self) -> BoolArray:

@@ -11,7 +11,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.slam.online.key_pose import key_poses_of
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import Explorer, ExploringOptions
-from l2m_gtsam.slam.unknown_field.tiled_smoother import map_drive
+from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from tests.drives.exploring import OnLine, prepared_drive, rms
 from tests.drives.slam import calibrated, laps

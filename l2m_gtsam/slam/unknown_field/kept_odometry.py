@@ -48,13 +48,14 @@ def with_gain(
     """
     solution = mapped.solution
     sensors, used = solution.drive.sensors, solution.used
-    likely = []
-    for poses in (solution.poses, odometry):
-        motions = RelativeMotions.along(recorded, poses)
-        tiled = TiledDrive.partition(motions, poses, sensors, prior)
-        likely.append(readings_log_likelihood(tiled, sensors, used))
-    bent = 0.5 * solution.odometry_chi2 * 6 * len(recorded)
-    gain = gain_of(solution.poses, odometry, mapped.marginals, likely[0] - likely[1] - bent)
+    motions = RelativeMotions.along(recorded, odometry)
+    drifted = TiledDrive.lasting(motions, odometry, sensors, prior)
+    likelier = (
+        readings_log_likelihood(mapped.tiled, sensors, used)
+        - readings_log_likelihood(drifted, sensors, used)
+        - solution.bent
+    )
+    gain = gain_of(solution.poses, odometry, mapped.marginals, likelier)
     if gain.shown:
         return replace(mapped, gain=gain)
     return replace(along_odometry(recorded, odometry, prior, options), gain=gain)
@@ -82,7 +83,7 @@ def along_odometry(
     marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
     sensors, robust = drive.sensors, options.robust
     motions = RelativeMotions.along(drive, poses)
-    tiled = TiledDrive.partition(motions, poses, sensors, prior)
+    tiled = TiledDrive.lasting(motions, poses, sensors, prior)
     weights = tiled.weights(sensors, sensors.noise)
     predicted = DrivePrediction(motions, tiled.prediction(weights, sensors))
     squared = predicted.squared(sensors.noise)
@@ -104,4 +105,4 @@ def along_odometry(
         step_covariance=jump_covariances(marginals, drive),
     )
     returns = tiled.anchoring.returns(drive.steps.path, AWAY_M)
-    return FieldSolution(solution, len(tiled.tiles), returns, marginals)
+    return FieldSolution(solution, tiled, returns, marginals)

@@ -27,6 +27,7 @@ from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, visits_among
 
 SIGMAS = 3.0  # of odometry, within which a place is looked for: 99 % in a plane
 MOST_NODES = 400  # of the lattice; those that odometry likes best
+STEP_M = (0.4, 1.0)  # least and greatest step of the lattice: depths are learnt from a few metres
 CLEAR = 10.0  # nats by which another place must be likelier than that by odometry
 HELD = 1e-3  # rad, m: sigma of poses that do not take part in the search
 AT_NODE_M = 1e-3  # sigma of the last pose about a node
@@ -143,7 +144,8 @@ class ReturnSearch:
         """Depth of the stronger sources in metres: from so far off a place is found back to."""
         known = self.prior.hyperparameters
         on_floor = known.floor_scale >= known.ceiling_scale
-        return known.floor_depth if on_floor else known.ceiling_depth
+        depth = known.floor_depth if on_floor else known.ceiling_depth
+        return float(np.clip(depth, *STEP_M))
 
 
 def nodes(covariance: FloatArray, step: float) -> FloatArray:

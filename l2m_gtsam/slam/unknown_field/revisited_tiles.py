@@ -51,7 +51,7 @@ class RevisitedTiles:
     Attributes
     ----------
     motions, poses, sensors, prior
-        As for ``TiledDrive.partition``.
+        As for ``TiledDrive.renewed``.
     axes
         Level axes of the key poses in the map, shape (K, 3, 3).
     """

@@ -107,7 +107,7 @@ def occupied_tiles(
     sensors: KnownSensors,
     prior: FieldPrior,
 ) -> Iterator[OccupiedTile]:
-    """Yield the tiles that have readings; arguments as of ``TiledDrive.partition``."""
+    """Yield the tiles that have readings; arguments as of ``TiledDrive.lasting``."""
     owner = anchoring.tile[motions.readings.key_pose]
     for number, anchor in enumerate(anchoring.anchor.tolist()):
         rows = np.flatnonzero(owner == number)
@@ -138,14 +138,27 @@ class TiledDrive:
     brought: FloatArray
 
     @classmethod
-    def partition(
+    def lasting(
         cls,
         motions: RelativeMotions,
         poses: list[gtsam.Pose3],
         sensors: KnownSensors,
         prior: FieldPrior,
     ) -> "TiledDrive":
-        """Return the tiles of a drive at an estimate of its motions, key poses and sensors."""
+        """Return tiles whose fields last, at an estimate of a drive's motions and key poses."""
+        anchoring, _ = anchored(poses, prior)
+        tiles = occupied_tiles(anchoring, motions, poses, sensors, prior)
+        return cls(anchoring, tuple(tiles), np.zeros_like(motions.readings.field))
+
+    @classmethod
+    def renewed(
+        cls,
+        motions: RelativeMotions,
+        poses: list[gtsam.Pose3],
+        sensors: KnownSensors,
+        prior: FieldPrior,
+    ) -> "TiledDrive":
+        """Return tiles that end where visits find another field; arguments as of ``lasting``."""
         anchoring, axes = anchored(poses, prior)
         renewed = RevisitedTiles(motions, poses, sensors, prior, axes).renewed(anchoring)
         own = motions.without(renewed.brought)

@@ -1,18 +1,11 @@
-"""Batch SLAM in an unknown field: all poses and the field of a drive, estimated together.
+"""All poses of a drive and its unknown field as one factor graph, estimated together.
 
-The field is described by tiles that are anchored to key poses. All poses and the tiles' weights are
-solved together by Levenberg-Marquardt, in stages: first the noise of readings is scaled up, so that
-only the field's long waves matter, and a revisited place is recognised from as far off as odometry
-has drifted; then it is reduced. At each stage tiles are laid out anew at the current poses, and
-readings that no tile explains lose their weight.
-
-Odometry drifts out of the reach of the longest waves, too. So the drive is first solved coarsely,
-piece by piece: each is initialised by the one before.
+The field is described by tiles that are anchored to key poses. Poses and the tiles' weights are
+solved together by Levenberg-Marquardt.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import gtsam
 import numpy as np
@@ -20,7 +13,6 @@ import numpy as np
 from l2m_factors import X
 from l2m_gtsam.calibration.optimise import TOLERANCE, Ending
 from l2m_gtsam.data import FloatArray, IntArray
-from l2m_gtsam.progress import Progress
 from l2m_gtsam.records.localisation import Gain
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, place_readings, poses_in, sensors_in
@@ -46,15 +38,10 @@ from l2m_gtsam.slam.solver import (
     sensor_covariances,
     weights_first,
 )
-from l2m_gtsam.slam.unknown_field.return_search import ReturnSearch
 from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
 from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
-from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from l2m_gtsam.solve.robust import WEIGHTS
 
-# Factor of the readings' noise and convexity of the loss (mu of ``solve.robust``), stage by stage.
-STAGES = ((16.0, 1.0), (4.0, 1.0), (1.0, 1.0), (1.0, np.inf), (1.0, np.inf))
-PIECE_M = 30.0  # path length over which odometry drifts less than the longest waves
 AWAY_M = 5.0  # path length after which entering a tile again closes a loop
 
 
@@ -70,8 +57,8 @@ class FieldSolution:
     ----------
     solution
         Poses, sensors, and the tiles' predictions of the readings.
-    tiles
-        Number of tiles with readings.
+    tiled
+        Its tiles.
     returns
         Numbers of the key poses that revisit a tile.
     marginals
@@ -84,7 +71,7 @@ class FieldSolution:
     """
 
     solution: DriveSolution
-    tiles: int
+    tiled: TiledDrive
     returns: IntArray
     marginals: PoseCovariance
     gain: Gain | None = None
@@ -94,64 +81,6 @@ class FieldSolution:
     def is_corrected(self) -> bool:
         """Whether the poses are those that the readings correct."""
         return self.gain is None or self.gain.shown
-
-
-def map_drive(
-    drive: Drive,
-    initial: list[gtsam.Pose3],
-    prior: FieldPrior,
-    options: SlamOptions,
-    progress: Progress,
-) -> FieldSolution:
-    """Estimate the poses of a drive and the field along it.
-
-    Parameters
-    ----------
-    drive
-        The drive.
-    initial
-        K key poses by odometry and scans.
-    prior
-        Of the field.
-    options
-        How to solve.
-    progress
-        Called with a stage and the fraction of it that is done.
-    """
-    poses, sensors = incremental_poses(drive, initial, prior, options, progress), drive.sensors
-    problem = TiledProblem(drive, partial(TiledDrive.partition, prior=prior), options)
-    for stage, (scale, mu) in enumerate(STAGES[:-1]):
-        progress("solving poses and field", stage / len(STAGES))
-        solved = problem.solved(poses, sensors, scale, mu)
-        poses, sensors = solved.poses, solved.sensors
-    scale, mu = STAGES[-1]
-    found = problem.finished(problem.solved(poses, sensors, scale, mu))
-    progress("solving poses and field", 1.0)
-    return found
-
-
-def incremental_poses(
-    drive: Drive,
-    initial: list[gtsam.Pose3],
-    prior: FieldPrior,
-    options: SlamOptions,
-    progress: Progress,
-) -> list[gtsam.Pose3]:
-    """Return the poses of a drive solved piece by piece, the last piece by odometry."""
-    path = drive.steps.path
-    divided, noise = partial(TiledDrive.partition, prior=prior), STAGES[0][0] * drive.sensors.noise
-    poses, known, begun = initial, 0, 0
-    for end in np.arange(PIECE_M, path[-1], PIECE_M):
-        progress("following the drive", float(end / path[-1]))
-        count = int(np.searchsorted(path, end))
-        part = drive.until(count)
-        start = ReturnSearch(part, prior, noise, known, begun).likeliest(poses[:count])
-        solved = TiledProblem(part, divided, options).solved(start, drive.sensors, *STAGES[0])
-        shift = solved.poses[-1].compose(poses[count - 1].inverse())
-        poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
-        returns = solved.tiled.anchoring.returns(path, AWAY_M)
-        known, begun = (int(returns[-1]) if len(returns) else 0), count
-    return ReturnSearch(drive, prior, noise, known, begun).likeliest(poses)
 
 
 @dataclass(frozen=True)
@@ -273,7 +202,7 @@ class TiledProblem:
         )
         path = drive.steps.path
         returns = tiled.anchoring.returns(path, AWAY_M)
-        return FieldSolution(solution, len(tiled.tiles), returns, marginals)
+        return FieldSolution(solution, tiled, returns, marginals)
 
 
 def in_map(

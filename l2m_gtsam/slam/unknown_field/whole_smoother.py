@@ -103,8 +103,8 @@ def where_gained(
     """
     last = smooth.stage.last
     found = with_information(smooth.problem.finished(last), last.values, smooth.prior, smooth.noise)
-    bent = 0.5 * found.solution.odometry_chi2 * 6 * len(drive)
-    likelier = learnt.spectrum.log_likelihood - smooth.first.spectrum.log_likelihood - bent
+    likelier = learnt.spectrum.log_likelihood - smooth.first.spectrum.log_likelihood
+    likelier -= found.solution.bent
     gain = gain_of(found.solution.poses, drive.dead_reckoning(), found.marginals, likelier)
     if gain.shown:
         settled = is_settled(smooth.stage, found.solution)

@@ -39,7 +39,7 @@ def test_from_far_off_no_visit_is_believed_to_find_another_field(
     p = np.stack([pose.translation() for pose in poses])
 
     def tiles() -> int:
-        return len(TiledDrive.partition(motions, poses, drive.sensors, prior).anchoring)
+        return len(TiledDrive.renewed(motions, poses, drive.sensors, prior).anchoring)
 
     assert tiles() == len(anchor_tiles(R, p, OPTIONS.tiles.core))
     monkeypatch.setattr(revisited_tiles, "MOST_CHANGED", 1.0)

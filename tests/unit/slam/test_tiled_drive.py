@@ -42,7 +42,7 @@ def counted(drawn: DrawnDrive, stated: float, spoilt: FloatArray, weights: Float
     """
     drive = drawn.drive
     poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
-    tiled = TiledDrive.partition(RelativeMotions.along(drive, poses), poses, drive.sensors, PRIOR)
+    tiled = TiledDrive.lasting(RelativeMotions.along(drive, poses), poses, drive.sensors, PRIOR)
     noise = np.full(len(drive.sensors.names), stated)
     prediction = tiled.prediction(tiled.weights(drive.sensors, noise), drive.sensors)
     squared = spoilt + prediction.squared(prediction.whitening(noise))
@@ -80,12 +80,12 @@ def test_a_tile_without_readings_is_not_laid(drawn: DrawnDrive) -> None:
     drive = drawn.drive
     poses = [gtsam.Pose3(gtsam.Rot3(R), p) for R, p in zip(drawn.R, drawn.p, strict=True)]
     motions = RelativeMotions.along(drive, poses)
-    whole = TiledDrive.partition(motions, poses, drive.sensors, PRIOR)
+    whole = TiledDrive.lasting(motions, poses, drive.sensors, PRIOR)
     assert len(whole.tiles) > 1
     gone = whole.tiles[0]
     kept = np.setdiff1d(np.arange(len(drive.readings)), gone.rows)
     left = replace(motions, readings=motions.readings[kept])
-    fewer = TiledDrive.partition(left, poses, drive.sensors, PRIOR)
+    fewer = TiledDrive.lasting(left, poses, drive.sensors, PRIOR)
     assert [each.number for each in fewer.tiles] == [each.number for each in whole.tiles[1:]]
     for after, before in zip(fewer.tiles, whole.tiles[1:], strict=True):
         np.testing.assert_array_equal(kept[after.rows], before.rows)
