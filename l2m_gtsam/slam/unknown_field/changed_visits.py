@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.linalg import cho_factor, cho_solve, cholesky, eigh, solve_triangular
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.slam.unknown_field.linear_field import LinearField
@@ -51,6 +51,11 @@ class Seen:
     def __getitem__(self, rows: IntArray | BoolArray) -> "Seen":
         return Seen(self.points[rows], self.field[rows], self.variance[rows], self.key_pose[rows])
 
+    def thinned(self, most: int) -> "Seen":
+        """Return so many of them at most, evenly spread."""
+        rows = np.linspace(0, len(self) - 1, min(len(self), most)).astype(np.int64)
+        return self[np.unique(rows)]
+
 
 @dataclass(frozen=True)
 class Remembered:
@@ -75,6 +80,13 @@ class Remembered:
     def __add__(self, other: "Remembered") -> "Remembered":
         """Return what both say."""
         return Remembered(self.information + other.information, self.pulled + other.pulled)
+
+    @property
+    def evidence(self) -> float:
+        """How likely the readings are, weights integrated out, less what they are without field."""
+        lower = cholesky(self.information + np.eye(len(self.pulled)), lower=True)
+        c = solve_triangular(lower, self.pulled, lower=True)
+        return float(0.5 * (c @ c) - np.log(np.diag(lower)).sum())
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.sparse import csr_array
 
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.sources.found_sources import FoundSources
 from l2m_gtsam.maps.sources.marginal import MarginalRows
 from l2m_gtsam.maps.sources.search import SourceSearchOptions, find_sources
@@ -94,25 +94,19 @@ def _rows_of(
     judged: Judged, graph: VisitGraph, mean: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return places and residuals of a visit in the map, their whitening and white derivatives."""
-    visit, rows = judged.visit, thinned(len(judged.visit.seen))
-    seen = visit.seen[rows]
+    visit, seen = judged.visit, judged.visit.seen.thinned(READINGS)
     own = VisitResiduals.of(visit.field, judged.earlier, seen, visit.T_anchor_node)
     # A tile moves with the first visit of it.
     T_map_anchor = graph.nodes[judged.first].compose(judged.T_anchor_first.inverse())
     R, p = T_map_anchor.rotation().matrix(), T_map_anchor.translation()
-    F = own.features.reshape(3 * len(rows), -1) @ judged.earlier.axes
+    F = own.features.reshape(3 * len(seen), -1) @ judged.earlier.axes
     spread = (F * judged.earlier.variance) @ F.T + np.diag(seen.variance.ravel())
     lower = cholesky(spread, lower=True)
     D = own.by_motion.reshape(-1, POSE)
-    turned = np.kron(np.eye(len(rows)), R.T)
+    turned = np.kron(np.eye(len(seen)), R.T)
     return (
         seen.points @ R.T + p,
         (own.left - own.by_motion @ mean) @ R.T,
         solve_triangular(lower, turned, lower=True),
         solve_triangular(lower, D, lower=True),
     )
-
-
-def thinned(count: int) -> IntArray:
-    """Return so many rows at most, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, READINGS)).astype(np.int64))

@@ -7,30 +7,53 @@ each as odometry's errors would bend it, and the node is taken where visits to t
 best.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import product
+from functools import cached_property
 
 import gtsam
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
 
-from l2m_factors import X
+from l2m_factors import KeyPoseReadings, X
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import poses_in
 from l2m_gtsam.slam.pose_graph import link_graph, odometry_graph, shared_values
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solver import Marginals, colamd_ordering
+from l2m_gtsam.slam.unknown_field.changed_visits import Remembered, Seen
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile, anchored, occupied_tiles
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, visits_among
 
-SIGMAS = 3.0  # of odometry, within which a place is looked for: 99 % in a plane
-MOST_NODES = 400  # of the lattice; those that odometry likes best
-STEP_M = (0.4, 1.0)  # least and greatest step of the lattice: depths are learnt from a few metres
+SIGMAS = 3.5  # of odometry, within which a place is looked for: 99.3 % of a Gaussian in space
+MOST_NODES = 300  # of the lattice; those that odometry likes best
+MOST_STEPS = 20  # of the lattice along an axis, either way: a sphere of so many has 33,000 nodes
+DEPTH_M = (0.4, 1.0)  # within which the sources' depth counts: it is learnt from a few metres
+STEPS = (0.5, 0.63, 0.8, 1.0)  # of the lattice, in depths: the finest that has few enough nodes
+REFINED = 3  # nodes about which the lattice is halved
+READINGS = 6  # for each key pose, which stand for all of them with less noise
 CLEAR = 10.0  # nats by which another place must be likelier than that by odometry
 HELD = 1e-3  # rad, m: sigma of poses that do not take part in the search
 AT_NODE_M = 1e-3  # sigma of the last pose about a node
+
+
+@dataclass(frozen=True)
+class Path:
+    """K key poses that end at a node of the lattice.
+
+    Attributes
+    ----------
+    poses
+        The poses.
+    node
+        Where the last one is, less where odometry has it, in the map, metres, shape (3,).
+    likelihood
+        How much likelier than apart their visits to common tiles are, less what the path costs
+        against odometry, in nats.
+    """
+
+    poses: list[gtsam.Pose3]
+    node: FloatArray
+    likelihood: float
 
 
 @dataclass(frozen=True)
@@ -70,20 +93,47 @@ class ReturnSearch:
         -------
         The same poses where no other path is clearly likelier.
         """
-        best, most = poses, -np.inf
-        for number, (path, cost) in enumerate(self._paths(poses)):
-            likelihood = self.agreement(path) - cost
-            if number == 0:
-                most = likelihood + CLEAR
-            elif likelihood > most:
-                best, most = path, likelihood
-        return best
+        bending = Bending(self.drive, poses, self.known)
+        around, step = nodes(bending.covariance, self._depth)
+        if not len(around):
+            return poses
+        # A path bends by millimetres in a step: where a reading is on its key pose stays.
+        readings = few_of(RelativeMotions.along(self.drive, poses).readings, len(poses))
 
-    def agreement(self, poses: list[gtsam.Pose3]) -> float:
+        def path(node: FloatArray) -> Path:
+            bent, cost = bending.to(node)
+            return Path(bent, node, self.agreement(readings, bent) - cost)
+
+        paths = sorted((path(node) for node in around), key=lambda each: -each.likelihood)
+        finer = np.unique([each.node + 0.5 * step * BESIDE for each in paths[:REFINED]], axis=0)
+        finer = finer.reshape(-1, 3)
+        best = max([paths[0], *map(path, finer)], key=lambda each: each.likelihood)
+        # Visits that are likelier apart than together are no return.
+        now = max(self.agreement(readings, poses), 0.0)
+        return best.poses if best.likelihood > now + CLEAR else poses
+
+    def density(self, poses: list[gtsam.Pose3], values: gtsam.Values) -> float:
+        """Return how likely a solution is, in nats but for a constant.
+
+        Parameters
+        ----------
+        poses
+            K key poses.
+        values
+            The same, with what else odometry's factors are on.
+        """
+        readings = few_of(RelativeMotions.along(self.drive, poses).readings, len(poses))
+        links = link_graph(self.drive.links)
+        cost = odometry_graph(self.drive).error(values) + links.error(values)
+        return self.agreement(readings, poses) - float(cost)
+
+    def agreement(self, readings: KeyPoseReadings, poses: list[gtsam.Pose3]) -> float:
         """Return by how much readings are likelier in common tiles than with a tile for each visit.
 
         Parameters
         ----------
+        readings
+            Of the drive, all or some, which stand for all with less noise.
         poses
             K key poses.
 
@@ -91,98 +141,114 @@ class ReturnSearch:
         -------
         In nats, of the tiles that the vehicle was in since ``begun`` and before.
         """
-        motions = RelativeMotions.along(self.drive, poses)
         anchoring, _ = anchored(poses, self.prior)
         again = set(anchoring.tile[self.begun :].tolist())
-        tiles = occupied_tiles(anchoring, motions, poses, self.drive.sensors, self.prior)
-        key_pose = motions.readings.key_pose
+        tiles = occupied_tiles(anchoring, readings, poses, self.drive.sensors, self.prior)
+        share = len(readings) / len(self.drive.readings)
         return sum(
-            self._agreement(tile, visits_among(key_pose[tile.rows]))
+            self._agreement(tile, visits_among(readings.key_pose[tile.rows]), share)
             for tile in tiles
             if tile.number in again
         )
 
-    def _agreement(self, tile: OccupiedTile, visits: list[IntArray]) -> float:
+    def _agreement(self, tile: OccupiedTile, visits: list[IntArray], share: float) -> float:
         """Return by how much visits to one tile, rows of its readings, are likelier together."""
         if len(visits) < 2:
             return 0.0
-        x, noise = tile.placed.x, self.noise[tile.placed.readings.sensor, None]
-        root = 1 / np.sqrt(noise**2 + tile.field.unresolved(x))
-        features = tile.field.features(x) * root[:, :, None]
-        whitened = tile.placed.field(self.drive.sensors) * root
-        alone = sum(evidence(features[rows], whitened[rows]) for rows in visits)
-        return evidence(features, whitened) - alone
-
-    def _paths(self, poses: list[gtsam.Pose3]) -> Iterator[tuple[list[gtsam.Pose3], float]]:
-        """Yield paths, the first as it is, with what they cost against odometry, in nats."""
-        values = shared_values(self.drive)
-        for k, pose in enumerate(poses):
-            values.insert(X(k), pose)
-        graph = odometry_graph(self.drive)
-        graph.push_back(link_graph(self.drive.links))
-        held = gtsam.noiseModel.Isotropic.Sigma(6, HELD)
-        for k in range(self.known + 1):
-            graph.add(gtsam.PriorFactorPose3(X(k), poses[k], held))
-        linear, ordering = graph.linearize(values), colamd_ordering(graph)
-        last = len(poses) - 1
-        level = poses[last].rotation().matrix()[:2]  # of the map along the vehicle's axes
-        by_pose = np.hstack([np.zeros((2, 3)), level])
-        covariance = by_pose @ Marginals(linear, ordering).of(X(last)) @ by_pose.T
-        least = linear.error(linear.optimize(ordering))
-        exact = gtsam.noiseModel.Isotropic.Sigma(2, AT_NODE_M)
-        yield poses, 0.0
-        for node in nodes(covariance, self._reach):
-            bent = gtsam.GaussianFactorGraph()
-            bent.push_back(linear)
-            bent.add(gtsam.JacobianFactor(X(last), by_pose, node, exact))
-            delta = bent.optimize(ordering)
-            path = list(poses_in(values.retract(delta), len(poses)).values())
-            yield path, linear.error(delta) - least
+        x, sensor = tile.placed.x, tile.placed.readings.sensor
+        variance = share * (self.noise[sensor, None] ** 2 + tile.field.unresolved(x))
+        b, together, alone = tile.placed.field(self.drive.sensors), None, 0.0
+        for rows in visits:
+            own = Remembered.of(tile.field, Seen(x[rows], b[rows], variance[rows], rows))
+            alone += own.evidence
+            together = own if together is None else together + own
+        return 0.0 if together is None else together.evidence - alone
 
     @property
-    def _reach(self) -> float:
-        """Depth of the stronger sources in metres: from so far off a place is found back to."""
+    def _depth(self) -> float:
+        """Depth of the stronger sources in metres: a field is linear over about as much."""
         known = self.prior.hyperparameters
         on_floor = known.floor_scale >= known.ceiling_scale
-        depth = known.floor_depth if on_floor else known.ceiling_depth
-        return float(np.clip(depth, *STEP_M))
+        return float(np.clip(known.floor_depth if on_floor else known.ceiling_depth, *DEPTH_M))
 
 
-def nodes(covariance: FloatArray, step: float) -> FloatArray:
-    """Return the nodes of a lattice over a Gaussian in a plane but its middle, likeliest first.
+class Bending:
+    """A path whose end is moved as odometry and scans allow.
+
+    Parameters
+    ----------
+    drive
+        K key poses.
+    poses
+        Where they are.
+    known
+        Number of the last one that stays there.
+    """
+
+    def __init__(self, drive: Drive, poses: list[gtsam.Pose3], known: int) -> None:
+        self._values, self._last = shared_values(drive), len(poses) - 1
+        for k, pose in enumerate(poses):
+            self._values.insert(X(k), pose)
+        graph = odometry_graph(drive)
+        graph.push_back(link_graph(drive.links))
+        held = gtsam.noiseModel.Isotropic.Sigma(6, HELD)
+        for k in range(known + 1):
+            graph.add(gtsam.PriorFactorPose3(X(k), poses[k], held))
+        self._linear, self._ordering = graph.linearize(self._values), colamd_ordering(graph)
+        self._by_pose = np.hstack([np.zeros((3, 3)), poses[-1].rotation().matrix()])
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the last pose's place in the map, square metres, shape (3, 3)."""
+        of_pose = Marginals(self._linear, self._ordering).of(X(self._last))
+        return np.asarray(self._by_pose @ of_pose @ self._by_pose.T)
+
+    def to(self, node: FloatArray) -> tuple[list[gtsam.Pose3], float]:
+        """Return the likeliest path whose end is moved so in the map, and its cost in nats."""
+        exact = gtsam.noiseModel.Isotropic.Sigma(3, AT_NODE_M)
+        bent = gtsam.GaussianFactorGraph()
+        bent.push_back(self._linear)
+        bent.add(gtsam.JacobianFactor(X(self._last), self._by_pose, node, exact))
+        delta = bent.optimize(self._ordering)
+        poses = poses_in(self._values.retract(delta), self._last + 1)
+        return list(poses.values()), self._linear.error(delta) - self._least
+
+    @cached_property
+    def _least(self) -> float:
+        return float(self._linear.error(self._linear.optimize(self._ordering)))
+
+
+BESIDE = np.delete(np.indices((3, 3, 3)).reshape(3, -1).T - 1.0, 13, axis=0)  # of a node, in steps
+
+
+def few_of(readings: KeyPoseReadings, key_poses: int) -> KeyPoseReadings:
+    """Return ``READINGS`` for each key pose, evenly spread; all where there are no more."""
+    count = min(len(readings), READINGS * key_poses)
+    return readings[np.linspace(0, len(readings) - 1, count).astype(np.int64)]
+
+
+def nodes(covariance: FloatArray, depth: float) -> tuple[FloatArray, float]:
+    """Return the nodes of a lattice over a Gaussian in space but its middle, likeliest first.
 
     Parameters
     ----------
     covariance
-        Of the Gaussian, square metres, shape (2, 2).
-    step
-        Of the lattice along its axes in metres.
+        Of the Gaussian, square metres, shape (3, 3).
+    depth
+        That ``STEPS`` are in, metres.
 
     Returns
     -------
-    Shape (n, 2), metres.
+    Nodes in metres, shape (n, 3), and the step of the lattice.
     """
     variance, axes = np.linalg.eigh(covariance)
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    count = np.minimum(SIGMAS * sigma / step, MOST_NODES).astype(int)
-    along = np.array(list(product(*(np.arange(-n, n + 1) for n in count)))) * step
-    squared = np.sum((along / np.maximum(sigma, step / SIGMAS)) ** 2, axis=1)
-    order = np.argsort(squared, kind="stable")
-    chosen = order[(squared[order] > 0) & (squared[order] <= SIGMAS**2)][:MOST_NODES]
-    return np.asarray(along[chosen] @ axes.T)
-
-
-def evidence(features: FloatArray, field: FloatArray) -> float:
-    """Return the log likelihood of whitened readings, weights integrated out, but for constants.
-
-    Parameters
-    ----------
-    features
-        Of m weights of unit prior variance, shape (n, 3, m).
-    field
-        Whitened readings, shape (n, 3).
-    """
-    F, y = features.reshape(-1, features.shape[-1]), field.ravel()
-    lower = cholesky(F.T @ F + np.eye(F.shape[1]), lower=True)
-    c = solve_triangular(lower, F.T @ y, lower=True)
-    return float(0.5 * (c @ c) - np.log(np.diag(lower)).sum())
+    for step in depth * np.array(STEPS):
+        count = np.minimum(SIGMAS * sigma / step, MOST_STEPS).astype(int)
+        along = step * (np.indices(2 * count + 1).reshape(3, -1).T - count)
+        squared = np.sum((along / np.maximum(sigma, step / SIGMAS)) ** 2, axis=1)
+        order = np.argsort(squared, kind="stable")
+        chosen = order[(squared[order] > 0) & (squared[order] <= SIGMAS**2)]
+        if len(chosen) <= MOST_NODES:
+            break
+    return along[chosen[:MOST_NODES]] @ axes.T, float(step)

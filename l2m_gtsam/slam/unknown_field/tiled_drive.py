@@ -10,6 +10,7 @@ import numpy as np
 from l2m_factors import (
     Calibrations,
     ComplexityPenalty,
+    KeyPoseReadings,
     M,
     TileBatch,
     effective_parameters,
@@ -102,17 +103,17 @@ def anchored(poses: list[gtsam.Pose3], prior: FieldPrior) -> tuple[Anchoring, Fl
 
 def occupied_tiles(
     anchoring: Anchoring,
-    motions: RelativeMotions,
+    readings: KeyPoseReadings,
     poses: list[gtsam.Pose3],
     sensors: KnownSensors,
     prior: FieldPrior,
 ) -> Iterator[OccupiedTile]:
-    """Yield the tiles that have readings; arguments as of ``TiledDrive.lasting``."""
-    owner = anchoring.tile[motions.readings.key_pose]
+    """Yield the tiles that have readings, at an estimate of a drive's key poses."""
+    owner = anchoring.tile[readings.key_pose]
     for number, anchor in enumerate(anchoring.anchor.tolist()):
         rows = np.flatnonzero(owner == number)
         if len(rows):
-            where = relative_place(motions.readings[rows], poses, anchor, sensors)
+            where = relative_place(readings[rows], poses, anchor, sensors)
             axes = level_axes(poses[anchor].rotation().matrix()[None])[0]
             up = poses[anchor].rotation().matrix().T @ axes
             yield OccupiedTile(number, anchor, rows, WaveTile.about(prior, up, where.x), where)
@@ -147,7 +148,7 @@ class TiledDrive:
     ) -> "TiledDrive":
         """Return tiles whose fields last, at an estimate of a drive's motions and key poses."""
         anchoring, _ = anchored(poses, prior)
-        tiles = occupied_tiles(anchoring, motions, poses, sensors, prior)
+        tiles = occupied_tiles(anchoring, motions.readings, poses, sensors, prior)
         return cls(anchoring, tuple(tiles), np.zeros_like(motions.readings.field))
 
     @classmethod
@@ -161,7 +162,7 @@ class TiledDrive:
         """Return tiles that end where visits find another field; arguments as of ``lasting``."""
         anchoring, axes = anchored(poses, prior)
         renewed = RevisitedTiles(motions, poses, sensors, prior, axes).renewed(anchoring)
-        own = motions.without(renewed.brought)
+        own = motions.without(renewed.brought).readings
         tiles = occupied_tiles(renewed.anchoring, own, poses, sensors, prior)
         return cls(renewed.anchoring, tuple(tiles), renewed.brought)
 

@@ -31,13 +31,15 @@ from l2m_gtsam.slam.unknown_field.tiled_smoother import (
     Divided,
     FieldSolution,
     TiledProblem,
+    TiledRound,
 )
-from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
+from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, coarser
 
 # Factor of the readings' noise and convexity of the loss (mu of ``solve.robust``), stage by stage.
 COARSE = ((16.0, 1.0), (4.0, 1.0))
 FINE = ((1.0, 1.0), (1.0, np.inf), (1.0, np.inf))
 CLOSE = 0.5  # decrease of the error in coarse stages that moves poses by less than their sigmas
+SEARCH_MODES = 60  # of a tile, for the search: with so much noise 200 tell no more
 PIECE_M = 30.0  # path length over which a drive is followed at once
 
 
@@ -112,10 +114,10 @@ def solved_in_stages(
 ) -> FieldSolution:
     """Solve a drive; arguments as of ``map_drive``, and how it is divided into tiles."""
     poses = followed(drive, initial, divided, prior, options, progress)
-    sensors, count = drive.sensors, len(COARSE) + len(FINE)
+    sensors, count = drive.sensors, len(COARSE) - 1 + len(FINE)
     coarse = TiledProblem(drive, divided, options, close=CLOSE)
     fine = TiledProblem(drive, divided, options)
-    stages = [*((coarse, *stage) for stage in COARSE), *((fine, *stage) for stage in FINE)]
+    stages = [*((coarse, *stage) for stage in COARSE[1:]), *((fine, *stage) for stage in FINE)]
     for number, (problem, scale, mu) in enumerate(stages):
         progress("solving poses and field", number / count)
         solved = problem.solved(poses, sensors, scale, mu)
@@ -133,18 +135,34 @@ def followed(
     options: SlamOptions,
     progress: Progress,
 ) -> list[gtsam.Pose3]:
-    """Return the poses of a drive solved piece by piece, the last piece by odometry."""
+    """Return the poses of a drive solved piece by piece, coarsely."""
     path, noise = drive.steps.path, COARSE[0][0] * drive.sensors.noise
+    long_waves = coarser(prior, SEARCH_MODES)
     poses, known, begun = initial, 0, 0
     for end in np.arange(PIECE_M, path[-1], PIECE_M):
         progress("following the drive", float(end / path[-1]))
         count = int(np.searchsorted(path, end))
         part = drive.until(count)
-        start = ReturnSearch(part, prior, noise, known, begun).likeliest(poses[:count])
-        problem = TiledProblem(part, divided, options, close=CLOSE)
-        solved = problem.solved(start, drive.sensors, *COARSE[0])
+        search = ReturnSearch(part, long_waves, noise, known, begun)
+        solved = likelier_round(
+            search, TiledProblem(part, divided, options, close=CLOSE), poses[:count]
+        )
         shift = solved.poses[-1].compose(poses[count - 1].inverse())
         poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
         returns = solved.tiled.anchoring.returns(path, AWAY_M)
         known, begun = (int(returns[-1]) if len(returns) else 0), count
-    return ReturnSearch(drive, prior, noise, known, begun).likeliest(poses)
+    search = ReturnSearch(drive, long_waves, noise, known, begun)
+    return likelier_round(search, TiledProblem(drive, divided, options, close=CLOSE), poses).poses
+
+
+def likelier_round(
+    search: ReturnSearch, problem: TiledProblem, poses: list[gtsam.Pose3]
+) -> TiledRound:
+    """Return the coarse solution from poses by odometry, or from those that are searched for.
+
+    A place that only looks like the right one is told by what is left of it once all poses have
+    moved: the likelier solution is returned.
+    """
+    starts = [poses] if (other := search.likeliest(poses)) is poses else [poses, other]
+    rounds = [problem.solved(start, search.drive.sensors, *COARSE[0]) for start in starts]
+    return max(rounds, key=lambda each: search.density(each.poses, each.values))

@@ -1,6 +1,6 @@
 """Tiles of an unknown field, each fixed to a key pose, and the prior of their waves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -48,6 +48,12 @@ class FieldPrior:
     hyperparameters: Hyperparameters
     resolution: Resolution
     options: TileOptions
+
+
+def coarser(prior: FieldPrior, modes: int) -> FieldPrior:
+    """Return a prior whose tiles have so many waves at most."""
+    fewer = prior.options.model_copy(update={"modes": modes})
+    return replace(prior, resolution=within_budget(prior.resolution, fewer))
 
 
 def field_prior(points: FloatArray, field: FloatArray, options: TileOptions) -> FieldPrior:

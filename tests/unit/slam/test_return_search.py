@@ -7,17 +7,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
+from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.drive import EXACT_START, Drive
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
+from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.unknown_field.changed_visits import Remembered
 from l2m_gtsam.slam.unknown_field.return_search import (
+    DEPTH_M,
     MOST_NODES,
     SIGMAS,
     ReturnSearch,
-    evidence,
     nodes,
 )
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
@@ -37,6 +41,10 @@ class Lap:
     search: ReturnSearch
     truth: list[gtsam.Pose3]
 
+    def agreement(self, poses: list[gtsam.Pose3]) -> float:
+        readings = RelativeMotions.along(self.drive, poses).readings
+        return self.search.agreement(readings, poses)
+
     def last_off(self, poses: list[gtsam.Pose3]) -> float:
         return float(np.linalg.norm(poses[-1].translation() - self.truth[-1].translation()))
 
@@ -46,7 +54,7 @@ def lap(seed: int, share: float) -> Lap:
     options = SlamOptions.model_validate(
         {
             "key_poses": {"distance_m": 0.3, "readings": 2},
-            "tiles": {"modes": 100, "learn_over_m": 9.0},
+            "tiles": {"modes": 60, "learn_over_m": 9.0},
             "drift": {"position_share": 1.3 * share, "over_m": 10.0},
         }
     )
@@ -64,14 +72,14 @@ def lap(seed: int, share: float) -> Lap:
 
 
 @pytest.mark.parametrize("seed", [3, 5, 8])
-def test_from_two_metres_off_a_drive_is_brought_back_to_where_a_solver_finds_it(seed: int) -> None:
-    """To a step of the lattice, 0.4 to 0.7 m here; and the path bends, it does not break."""
+def test_from_two_metres_off_a_drive_is_brought_within_the_field_s_reach(seed: int) -> None:
+    """Within a metre, the greatest depth that counts; and the path bends, it does not break."""
     made = lap(seed, share=0.15)
     poses = made.drive.dead_reckoning()
     found = made.search.likeliest(poses)
     assert made.last_off(poses) > 2.0
-    assert made.last_off(found) < 0.7
-    assert made.search.agreement(found) > made.search.agreement(poses) + 20
+    assert made.last_off(found) < DEPTH_M[1]
+    assert made.agreement(found) > made.agreement(poses) + 20
     steps = [
         a.between(b).localCoordinates(c.between(d))
         for a, b, c, d in zip(poses, poses[1:], found, found[1:], strict=False)
@@ -85,18 +93,18 @@ def test_poses_that_are_right_are_left_as_they_are() -> None:
 
 
 def test_odometry_within_the_field_s_reach_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it may be 0.1 m off the lattice has its middle alone, and nothing else is asked."""
-    made, asked = lap(3, share=0.005), list[int]()
+    """Where it may be a few centimetres off the lattice has its middle alone: nothing is asked."""
+    made, asked = lap(3, share=0.003), list[int]()
     whole = ReturnSearch.agreement
 
-    def counted(self: ReturnSearch, poses: list[gtsam.Pose3]) -> float:
+    def counted(self: ReturnSearch, readings: KeyPoseReadings, poses: list[gtsam.Pose3]) -> float:
         asked.append(1)
-        return whole(self, poses)
+        return whole(self, readings, poses)
 
     monkeypatch.setattr(ReturnSearch, "agreement", counted)
     poses = made.drive.dead_reckoning()
     assert made.search.likeliest(poses) is poses
-    assert len(asked) == 1
+    assert not asked
 
 
 def test_known_poses_stay() -> None:
@@ -111,23 +119,25 @@ def test_known_poses_stay() -> None:
 
 
 @given(
-    st.tuples(st.floats(1e-3, 20.0), st.floats(1e-3, 20.0), st.floats(0, np.pi)),
-    st.floats(0.2, 2.0),
+    st.tuples(*3 * [st.floats(1e-3, 20.0)]),
+    st.integers(0, 2**32 - 1),
+    st.floats(0.4, 1.0),
 )
-def test_nodes_are_those_of_a_lattice_within_three_sigmas(
-    gaussian: tuple[float, float, float], step: float
+def test_nodes_are_those_of_a_lattice_within_some_sigmas(
+    sigmas: tuple[float, float, float], turned: int, depth: float
 ) -> None:
-    long, short, angle = gaussian
-    axes = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    covariance = axes @ np.diag([long**2, short**2]) @ axes.T
-    found = nodes(covariance, step)
+    axes = Rotation.random(rng=np.random.default_rng(turned)).as_matrix()
+    covariance = axes @ np.diag(np.square(sigmas)) @ axes.T
+    found, step = nodes(covariance, depth)
+    assert depth / 2 <= step <= depth
     assert len(found) <= MOST_NODES
-    if SIGMAS * max(long, short) < step:
+    if SIGMAS * max(sigmas) < depth / 2:
         assert not len(found)
         return
+    # A covariance of a millimetre beside one of 20 m is known to 1e-16 of the larger.
     squared = np.einsum("ni,ni->n", found, np.linalg.solve(covariance, found.T).T)
-    assert squared.max(initial=0.0) <= SIGMAS**2 + 1e-6
-    assert np.all(np.diff(squared) >= -1e-6)
+    assert squared.max(initial=0.0) <= SIGMAS**2 * (1 + 1e-4)
+    assert np.all(np.diff(squared) >= -1e-4 * SIGMAS**2)
     apart = np.linalg.norm(found[:, None] - found, axis=2)
     assert apart[np.triu_indices(len(found), 1)].min(initial=step) >= step * (1 - 1e-9)
 
@@ -135,13 +145,13 @@ def test_nodes_are_those_of_a_lattice_within_three_sigmas(
 def test_the_evidence_is_that_of_the_normal_distribution() -> None:
     """Of readings ``y = F w + v`` with unit weights and noise: differences of its logarithm."""
     rng = np.random.default_rng(0)
-    features, values = rng.normal(size=(7, 3, 4)), rng.normal(size=(2, 7, 3))
-    F = features.reshape(21, 4)
+    F, values = rng.normal(size=(21, 4)), rng.normal(size=(2, 21))
     normal = multivariate_normal(np.zeros(21), np.eye(21) + F @ F.T)
 
     def expected(y: FloatArray) -> float:
         white = multivariate_normal(np.zeros(21), np.eye(21))
-        return float(normal.logpdf(y.ravel()) - white.logpdf(y.ravel()))
+        return float(normal.logpdf(y) - white.logpdf(y))
 
     for y in values:
-        assert evidence(features, y) == pytest.approx(expected(y), abs=1e-9)
+        seen = Remembered(F.T @ F, F.T @ y)
+        assert seen.evidence == pytest.approx(expected(y), abs=1e-9)
