@@ -37,7 +37,7 @@ AT_NODE_M = 1e-3  # sigma of the last pose about a node
 
 
 @dataclass(frozen=True)
-class Path:
+class BentPath:
     """K key poses that end at a node of the lattice.
 
     Attributes
@@ -100,9 +100,9 @@ class ReturnSearch:
         # A path bends by millimetres in a step: where a reading is on its key pose stays.
         readings = few_of(RelativeMotions.along(self.drive, poses).readings, len(poses))
 
-        def path(node: FloatArray) -> Path:
+        def path(node: FloatArray) -> BentPath:
             bent, cost = bending.to(node)
-            return Path(bent, node, self.agreement(readings, bent) - cost)
+            return BentPath(bent, node, self.agreement(readings, bent) - cost)
 
         paths = sorted((path(node) for node in around), key=lambda each: -each.likelihood)
         finer = np.unique([each.node + 0.5 * step * BESIDE for each in paths[:REFINED]], axis=0)
