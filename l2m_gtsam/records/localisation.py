@@ -210,7 +210,7 @@ class Gain(Record):
     ----------
     likelier
         Logarithm of how much likelier the readings are at the corrected poses, less what these
-        cost against odometry.
+        cost against odometry; with tiles over all poses, about the corrected ones.
     moved_m
         Root mean square distance of the corrected positions from odometry's, metres.
     doubt

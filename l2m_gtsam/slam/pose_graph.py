@@ -168,6 +168,21 @@ def shared_values(drive: Drive) -> gtsam.Values:
     return values
 
 
+def drive_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:
+    """Return the factors of start, odometry and scans."""
+    graph = odometry_graph(drive)
+    graph.push_back(link_graph(drive.links))
+    return graph
+
+
+def drive_values(drive: Drive, poses: list[gtsam.Pose3]) -> gtsam.Values:
+    """Return what these factors are on, at K key poses."""
+    values = shared_values(drive)
+    for k, pose in enumerate(poses):
+        values.insert(X(k), pose)
+    return values
+
+
 def steady_drift(values: gtsam.Values) -> FloatArray | None:
     """Return odometry's steady drift in its standard deviations, shape (6,); None if it is none."""
     return np.asarray(values.atVector(V())) if values.exists(V()) else None

@@ -232,6 +232,22 @@ class Marginals:
         before = tree.optimize()
         return float(sum(own @ (after.at(key) - before.at(key)) for key, own in directions.items()))
 
+    def log_determinant(self, without: Sequence[int] = ()) -> float:
+        """Return half of the logarithm of the determinant of the information.
+
+        Parameters
+        ----------
+        without
+            Variables that are integrated out; each has a prior.
+        """
+        tree = self._qr if self._cholesky is None else self._cholesky
+        whole = float(tree.logDeterminant())
+        if not without:
+            return whole
+        # The conditionals of what is eliminated first are its information where the rest is known.
+        first, _ = self._linear.eliminatePartialMultifrontal(ordered(without))
+        return whole - float(first.logDeterminant())
+
     @cached_property
     def _cholesky(self) -> gtsam.GaussianBayesTree | None:
         return unless_indeterminate(lambda: self._linear.eliminateMultifrontal(self._ordering))

@@ -4,7 +4,8 @@ Two figures, for poses X of K key poses that readings z have corrected from thos
 
 1. **The evidence.** By how much the readings are likelier at X than at O, with the field integrated
    out and their noise the likeliest at each, less what X costs against odometry:
-   ``log p(z | X) - log p(z | O) - c(X)``.
+   ``log p(z | X) - log p(z | O) - c(X)``. With tiles the poses are integrated out, too
+   (:func:`.kept_odometry.narrowing`).
 2. **The doubt.** Readings fit poses that they have moved themselves better than others, by
    hundreds of nats even where these are further off: a path that is right in itself may be turned
    as a whole. How far is in the sigmas. With positions ``x = x_X + e``, e of covariance P

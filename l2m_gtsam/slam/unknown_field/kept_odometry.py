@@ -5,11 +5,17 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from l2m_factors import X
+from l2m_factors import M
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.slam.drive import Drive
-from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.pose_graph import link_graph, link_squared, odometry_graph, shared_values
+from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
+from l2m_gtsam.slam.pose_graph import (
+    calibration_graph,
+    calibration_values,
+    drive_graph,
+    drive_values,
+    link_squared,
+)
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
 from l2m_gtsam.slam.solution import DriveSolution
 from l2m_gtsam.slam.solver import Marginals, colamd_ordering, jump_covariances, pose_covariances
@@ -18,10 +24,6 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
 from l2m_gtsam.slam.unknown_field.tiled_smoother import AWAY_M, FieldSolution, in_map
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior
 from l2m_gtsam.solve.robust import WEIGHTS
-
-# Poses fit the noise of the readings that moved them. On a robot's passes, corrections that were
-# right were likelier by 188 to 717 nats; one that had folded the path onto itself by 7 and 25.
-LEAST_NATS = 50.0
 
 
 def with_gain(
@@ -58,11 +60,27 @@ def with_gain(
         for divided in (TiledDrive.lasting, TiledDrive.renewed)
     )
     likelier = readings_log_likelihood(mapped.tiled, sensors, used) - drifted - solution.bent
+    likelier -= narrowing(mapped, options)
     gain = gain_of(solution.poses, odometry, mapped.marginals, likelier)
-    gain = replace(gain, shown=gain.shown and likelier > LEAST_NATS)
     if gain.shown:
         return replace(mapped, gain=gain)
     return replace(along_odometry(recorded, odometry, prior, options), gain=gain)
+
+
+def narrowing(mapped: FieldSolution, options: SlamOptions) -> float:
+    """Return by how much readings narrow the volume of poses that odometry and scans allow.
+
+    Half of the logarithm of ``det(Q) / det(P)``, with the covariances Q and P of poses, and of
+    calibrations that are variables, without readings and with them. Poses that fit their readings
+    by chance are narrowed as much as others: integrated out, the fit has to pay for it.
+    """
+    drive, tiles = mapped.solution.drive, mapped.tiled.tiles
+    priors, values = drive_graph(drive), drive_values(drive, mapped.solution.poses)
+    if options.calibration is CalibrationUse.REFINED:
+        priors.push_back(calibration_graph(drive.sensors))
+        values.insert(calibration_values(drive.sensors))
+    before = Marginals(priors.linearize(values), colamd_ordering(priors)).log_determinant()
+    return mapped.of_graph.log_determinant([M(tile.number) for tile in tiles]) - before
 
 
 def along_odometry(
@@ -79,11 +97,7 @@ def along_odometry(
     prior, options
         As of ``with_gain``.
     """
-    values = shared_values(drive)
-    for k, pose in enumerate(poses):
-        values.insert(X(k), pose)
-    graph = odometry_graph(drive)
-    graph.push_back(link_graph(drive.links))
+    graph, values = drive_graph(drive), drive_values(drive, poses)
     marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
     sensors, robust = drive.sensors, options.robust
     motions = RelativeMotions.along(drive, poses)
@@ -109,4 +123,4 @@ def along_odometry(
         step_covariance=jump_covariances(marginals, drive),
     )
     returns = tiled.anchoring.returns(drive.steps.path, AWAY_M)
-    return FieldSolution(solution, tiled, returns, marginals)
+    return FieldSolution(solution, tiled, returns, marginals, marginals)

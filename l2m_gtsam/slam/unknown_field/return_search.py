@@ -8,7 +8,8 @@ best.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
+from operator import add
 
 import gtsam
 import numpy as np
@@ -17,7 +18,7 @@ from l2m_factors import KeyPoseReadings, X
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import Drive
 from l2m_gtsam.slam.map_prediction import poses_in
-from l2m_gtsam.slam.pose_graph import link_graph, odometry_graph, shared_values
+from l2m_gtsam.slam.pose_graph import drive_graph, drive_values
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solver import Marginals, colamd_ordering
 from l2m_gtsam.slam.unknown_field.changed_visits import Remembered, Seen
@@ -32,6 +33,7 @@ STEPS = (0.5, 0.63, 0.8, 1.0)  # of the lattice, in depths: the finest that has 
 REFINED = 3  # nodes about which the lattice is halved
 READINGS = 6  # for each key pose, which stand for all of them with less noise
 CLEAR = 10.0  # nats by which another place must be likelier than that by odometry
+BESIDE = np.delete(np.indices((3, 3, 3)).reshape(3, -1).T - 1.0, 13, axis=0)  # of a node, in steps
 HELD = 1e-3  # rad, m: sigma of poses that do not take part in the search
 AT_NODE_M = 1e-3  # sigma of the last pose about a node
 
@@ -105,8 +107,7 @@ class ReturnSearch:
             return BentPath(bent, node, self.agreement(readings, bent) - cost)
 
         paths = sorted((path(node) for node in around), key=lambda each: -each.likelihood)
-        finer = np.unique([each.node + 0.5 * step * BESIDE for each in paths[:REFINED]], axis=0)
-        finer = finer.reshape(-1, 3)
+        finer = np.concatenate([each.node + 0.5 * step * BESIDE for each in paths[:REFINED]])
         best = max([paths[0], *map(path, finer)], key=lambda each: each.likelihood)
         # Visits that are likelier apart than together are no return.
         now = max(self.agreement(readings, poses), 0.0)
@@ -123,9 +124,7 @@ class ReturnSearch:
             The same, with what else odometry's factors are on.
         """
         readings = few_of(RelativeMotions.along(self.drive, poses).readings, len(poses))
-        links = link_graph(self.drive.links)
-        cost = odometry_graph(self.drive).error(values) + links.error(values)
-        return self.agreement(readings, poses) - float(cost)
+        return self.agreement(readings, poses) - float(drive_graph(self.drive).error(values))
 
     def agreement(self, readings: KeyPoseReadings, poses: list[gtsam.Pose3]) -> float:
         """Return by how much readings are likelier in common tiles than with a tile for each visit.
@@ -146,23 +145,21 @@ class ReturnSearch:
         tiles = occupied_tiles(anchoring, readings, poses, self.drive.sensors, self.prior)
         share = len(readings) / len(self.drive.readings)
         return sum(
-            self._agreement(tile, visits_among(readings.key_pose[tile.rows]), share)
+            self._agreement(tile, readings.key_pose[tile.rows], share)
             for tile in tiles
             if tile.number in again
         )
 
-    def _agreement(self, tile: OccupiedTile, visits: list[IntArray], share: float) -> float:
-        """Return by how much visits to one tile, rows of its readings, are likelier together."""
+    def _agreement(self, tile: OccupiedTile, key_pose: IntArray, share: float) -> float:
+        """Return by how much visits to one tile are likelier together."""
+        visits = visits_among(key_pose)
         if len(visits) < 2:
             return 0.0
         x, sensor = tile.placed.x, tile.placed.readings.sensor
         variance = share * (self.noise[sensor, None] ** 2 + tile.field.unresolved(x))
-        b, together, alone = tile.placed.field(self.drive.sensors), None, 0.0
-        for rows in visits:
-            own = Remembered.of(tile.field, Seen(x[rows], b[rows], variance[rows], rows))
-            alone += own.evidence
-            together = own if together is None else together + own
-        return 0.0 if together is None else together.evidence - alone
+        seen = Seen(x, tile.placed.field(self.drive.sensors), variance, key_pose)
+        alone = [Remembered.of(tile.field, seen[rows]) for rows in visits]
+        return reduce(add, alone).evidence - sum(each.evidence for each in alone)
 
     @property
     def _depth(self) -> float:
@@ -186,11 +183,8 @@ class Bending:
     """
 
     def __init__(self, drive: Drive, poses: list[gtsam.Pose3], known: int) -> None:
-        self._values, self._last = shared_values(drive), len(poses) - 1
-        for k, pose in enumerate(poses):
-            self._values.insert(X(k), pose)
-        graph = odometry_graph(drive)
-        graph.push_back(link_graph(drive.links))
+        self._values, self._last = drive_values(drive, poses), len(poses) - 1
+        graph = drive_graph(drive)
         held = gtsam.noiseModel.Isotropic.Sigma(6, HELD)
         for k in range(known + 1):
             graph.add(gtsam.PriorFactorPose3(X(k), poses[k], held))
@@ -218,9 +212,6 @@ class Bending:
         return float(self._linear.error(self._linear.optimize(self._ordering)))
 
 
-BESIDE = np.delete(np.indices((3, 3, 3)).reshape(3, -1).T - 1.0, 13, axis=0)  # of a node, in steps
-
-
 def few_of(readings: KeyPoseReadings, key_poses: int) -> KeyPoseReadings:
     """Return ``READINGS`` for each key pose, evenly spread; all where there are no more."""
     count = min(len(readings), READINGS * key_poses)
@@ -239,10 +230,13 @@ def nodes(covariance: FloatArray, depth: float) -> tuple[FloatArray, float]:
 
     Returns
     -------
-    Nodes in metres, shape (n, 3), and the step of the lattice.
+    Nodes in metres, shape (n, 3), and the step of the lattice; none where the Gaussian is within a
+    depth of its middle.
     """
     variance, axes = np.linalg.eigh(covariance)
     sigma = np.sqrt(np.maximum(variance, 0.0))
+    if SIGMAS * sigma.max() < depth:
+        return np.empty((0, 3)), depth
     for step in depth * np.array(STEPS):
         count = np.minimum(SIGMAS * sigma / step, MOST_STEPS).astype(int)
         along = step * (np.indices(2 * count + 1).reshape(3, -1).T - count)

@@ -61,6 +61,8 @@ class FieldSolution:
         Its tiles.
     returns
         Numbers of the key poses that revisit a tile.
+    of_graph
+        Covariance of all variables of the graph.
     marginals
         Covariance of the poses.
     gain
@@ -73,6 +75,7 @@ class FieldSolution:
     solution: DriveSolution
     tiled: TiledDrive
     returns: IntArray
+    of_graph: Marginals
     marginals: PoseCovariance
     gain: Gain | None = None
     noise: SensorNoise | None = None
@@ -202,7 +205,7 @@ class TiledProblem:
         )
         path = drive.steps.path
         returns = tiled.anchoring.returns(path, AWAY_M)
-        return FieldSolution(solution, tiled, returns, marginals)
+        return FieldSolution(solution, tiled, returns, marginals, marginals)
 
 
 def in_map(

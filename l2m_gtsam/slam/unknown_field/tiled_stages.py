@@ -12,11 +12,13 @@ Fields are taken to last. Only where a visit then finds another field (:mod:`.re
 the drive solved again with tiles that end there, and the likelier of both solutions is kept.
 """
 
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
 import numpy as np
 
+from l2m_gtsam.calibration.optimise import TOLERANCE
 from l2m_gtsam.data import BoolArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive
@@ -35,10 +37,15 @@ from l2m_gtsam.slam.unknown_field.tiled_smoother import (
 )
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, coarser
 
-# Factor of the readings' noise and convexity of the loss (mu of ``solve.robust``), stage by stage.
-COARSE = ((16.0, 1.0), (4.0, 1.0))
-FINE = ((1.0, 1.0), (1.0, np.inf), (1.0, np.inf))
-CLOSE = 0.5  # decrease of the error in coarse stages that moves poses by less than their sigmas
+FOLLOWED = (16.0, 1.0)  # factor of the readings' noise, convexity of the loss (``solve.robust``)
+CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
+# The same stage by stage, and the decrease of the error below which each has converged.
+STAGES = (
+    (4.0, 1.0, CLOSE),
+    (1.0, 1.0, TOLERANCE),
+    (1.0, np.inf, TOLERANCE),
+    (1.0, np.inf, TOLERANCE),
+)
 SEARCH_MODES = 60  # of a tile, for the search: with so much noise 200 tell no more
 PIECE_M = 30.0  # path length over which a drive is followed at once
 
@@ -65,16 +72,16 @@ def map_drive(
     progress
         Called with a stage and the fraction of it that is done.
     """
-    lasting = partial(TiledDrive.lasting, prior=prior)
-    found = solved_in_stages(drive, initial, lasting, prior, options, progress)
+    lasting = StagedDrive(drive, prior, options, partial(TiledDrive.lasting, prior=prior))
+    found = lasting.solved(initial, progress)
     if not finds_changes(found.solution.drive, found.solution.poses, prior):
         return found
 
     def again(stage: str, done: float) -> None:
         progress(f"{stage}, with moved steel", done)
 
-    renewed = partial(TiledDrive.renewed, prior=prior)
-    changed = solved_in_stages(drive, initial, renewed, prior, options, again)
+    renewed = replace(lasting, divided=partial(TiledDrive.renewed, prior=prior))
+    changed = renewed.solved(initial, again)
     used = found.solution.used | changed.solution.used
     return found if log_density(found, used) > log_density(changed, used) + CLEAR else changed
 
@@ -104,65 +111,60 @@ def log_density(found: FieldSolution, used: BoolArray) -> float:
     return readings - solution.bent - 0.5 * float(solution.link_squared.sum())
 
 
-def solved_in_stages(
-    drive: Drive,
-    initial: list[gtsam.Pose3],
-    divided: Divided,
-    prior: FieldPrior,
-    options: SlamOptions,
-    progress: Progress,
-) -> FieldSolution:
-    """Solve a drive; arguments as of ``map_drive``, and how it is divided into tiles."""
-    poses = followed(drive, initial, divided, prior, options, progress)
-    sensors, count = drive.sensors, len(COARSE) - 1 + len(FINE)
-    coarse = TiledProblem(drive, divided, options, close=CLOSE)
-    fine = TiledProblem(drive, divided, options)
-    stages = [*((coarse, *stage) for stage in COARSE[1:]), *((fine, *stage) for stage in FINE)]
-    for number, (problem, scale, mu) in enumerate(stages):
-        progress("solving poses and field", number / count)
-        solved = problem.solved(poses, sensors, scale, mu)
-        poses, sensors = solved.poses, solved.sensors
-    found = fine.finished(solved)
-    progress("solving poses and field", 1.0)
-    return found
+@dataclass(frozen=True)
+class StagedDrive:
+    """A drive to be solved in one kind of tiles.
 
-
-def followed(
-    drive: Drive,
-    initial: list[gtsam.Pose3],
-    divided: Divided,
-    prior: FieldPrior,
-    options: SlamOptions,
-    progress: Progress,
-) -> list[gtsam.Pose3]:
-    """Return the poses of a drive solved piece by piece, coarsely."""
-    path, noise = drive.steps.path, COARSE[0][0] * drive.sensors.noise
-    long_waves = coarser(prior, SEARCH_MODES)
-    poses, known, begun = initial, 0, 0
-    for end in np.arange(PIECE_M, path[-1], PIECE_M):
-        progress("following the drive", float(end / path[-1]))
-        count = int(np.searchsorted(path, end))
-        part = drive.until(count)
-        search = ReturnSearch(part, long_waves, noise, known, begun)
-        solved = likelier_round(
-            search, TiledProblem(part, divided, options, close=CLOSE), poses[:count]
-        )
-        shift = solved.poses[-1].compose(poses[count - 1].inverse())
-        poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
-        returns = solved.tiled.anchoring.returns(path, AWAY_M)
-        known, begun = (int(returns[-1]) if len(returns) else 0), count
-    search = ReturnSearch(drive, long_waves, noise, known, begun)
-    return likelier_round(search, TiledProblem(drive, divided, options, close=CLOSE), poses).poses
-
-
-def likelier_round(
-    search: ReturnSearch, problem: TiledProblem, poses: list[gtsam.Pose3]
-) -> TiledRound:
-    """Return the coarse solution from poses by odometry, or from those that are searched for.
-
-    A place that only looks like the right one is told by what is left of it once all poses have
-    moved: the likelier solution is returned.
+    Attributes
+    ----------
+    drive, prior, options
+        As of ``map_drive``.
+    divided
+        Divides the drive into tiles.
     """
-    starts = [poses] if (other := search.likeliest(poses)) is poses else [poses, other]
-    rounds = [problem.solved(start, search.drive.sensors, *COARSE[0]) for start in starts]
-    return max(rounds, key=lambda each: search.density(each.poses, each.values))
+
+    drive: Drive
+    prior: FieldPrior
+    options: SlamOptions
+    divided: Divided
+
+    def solved(self, initial: list[gtsam.Pose3], progress: Progress) -> FieldSolution:
+        """Return the solution from key poses by odometry and scans."""
+        poses, sensors = self.followed(initial, progress), self.drive.sensors
+        for number, (scale, mu, close) in enumerate(STAGES):
+            progress("solving poses and field", number / len(STAGES))
+            problem = TiledProblem(self.drive, self.divided, self.options, close=close)
+            last = problem.solved(poses, sensors, scale, mu)
+            poses, sensors = last.poses, last.sensors
+        found = problem.finished(last)
+        progress("solving poses and field", 1.0)
+        return found
+
+    def followed(self, initial: list[gtsam.Pose3], progress: Progress) -> list[gtsam.Pose3]:
+        """Return the poses solved piece by piece, coarsely."""
+        path, noise = self.drive.steps.path, FOLLOWED[0] * self.drive.sensors.noise
+        long_waves = coarser(self.prior, SEARCH_MODES)
+        poses, known, begun = initial, 0, 0
+        for end in [*np.arange(PIECE_M, path[-1], PIECE_M), path[-1]]:
+            progress("following the drive", float(begun / len(self.drive)))
+            count = len(self.drive) if end == path[-1] else int(np.searchsorted(path, end))
+            search = ReturnSearch(self.drive.until(count), long_waves, noise, known, begun)
+            solved = self._piece(search, poses[:count])
+            shift = solved.poses[-1].compose(poses[count - 1].inverse())
+            poses = [*solved.poses, *(shift.compose(pose) for pose in poses[count:])]
+            returns = solved.tiled.anchoring.returns(path, AWAY_M)
+            known, begun = (int(returns[-1]) if len(returns) else 0), count
+        return poses
+
+    def _piece(self, search: ReturnSearch, poses: list[gtsam.Pose3]) -> TiledRound:
+        """Return the solution from poses by odometry, or from those that are searched for.
+
+        A place that only looks like the right one is told by what is left of it once all poses
+        have moved: the likelier solution is returned.
+        """
+        problem = TiledProblem(search.drive, self.divided, self.options, close=CLOSE)
+        found = problem.solved(poses, search.drive.sensors, *FOLLOWED)
+        if (start := search.likeliest(poses)) is poses:
+            return found
+        other = problem.solved(start, search.drive.sensors, *FOLLOWED)
+        return max(found, other, key=lambda each: search.density(each.poses, each.values))

@@ -11,14 +11,13 @@ from functools import cached_property
 import gtsam
 import numpy as np
 
-from l2m_factors import X
 from l2m_gtsam.calibration.optimise import Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.progress import Progress
 from l2m_gtsam.slam.drive import Drive, KnownSensors
 from l2m_gtsam.slam.map_prediction import PlacedReadings, poses_in
 from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
-from l2m_gtsam.slam.pose_graph import odometry_graph, shared_values
+from l2m_gtsam.slam.pose_graph import drive_graph, drive_values
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT, DriveSolution
 from l2m_gtsam.slam.solver import Marginals, colamd_ordering, pose_covariances
 from l2m_gtsam.slam.unknown_field.gain import gain_of
@@ -222,10 +221,7 @@ def at_odometry(drive: Drive, prior: WholePrior, options: SlamOptions) -> FieldS
     problem = stage_problem(replace(drive, steps=steps, sensors=sensors), prior, noise, options)
     stage = solved_stage(problem, drive.dead_reckoning(), sensors, ROUNDS[-1])
     found = problem.finished(stage.last)
-    values = shared_values(drive)
-    for k, pose in enumerate(drive.dead_reckoning()):
-        values.insert(X(k), pose)
-    graph = odometry_graph(drive)
+    graph, values = drive_graph(drive), drive_values(drive, drive.dead_reckoning())
     marginals = Marginals(graph.linearize(values), colamd_ordering(graph))
     solution = replace(
         found.solution,

@@ -12,6 +12,7 @@ from l2m_gtsam.slam.solver import (
     colamd_ordering,
     joint_covariance,
     levenberg_marquardt,
+    ordered,
     pose_covariances,
     pose_covariances_together,
     reported_ill_conditioning,
@@ -43,6 +44,21 @@ def test_poses_together_are_as_sure_as_one_by_one() -> None:
     alone = pose_covariances(marginals, COUNT)
     together = pose_covariances_together(marginals, COUNT)
     np.testing.assert_allclose(together, alone, rtol=1e-7, atol=1e-9 * alone.max())
+
+
+def test_determinants_are_those_of_the_dense_information() -> None:
+    """Of all nine poses, and of seven of them with the others integrated out."""
+    graph, values, _ = chain([0.01] * 3 + [0.1] * 3, [0.02] * 3 + [0.05] * 3)
+    linear = graph.linearize(values)
+    marginals = Marginals(linear, colamd_ordering(graph))
+    keys = [X(k) for k in range(9)]
+    H = linear.hessian(ordered(keys))[0]
+    assert marginals.log_determinant() == pytest.approx(0.5 * np.linalg.slogdet(H)[1], rel=1e-12)
+    rows = np.r_[0:12, 18:24, 30:54]  # without the third and the fifth
+    rest = np.linalg.inv(np.linalg.inv(H)[np.ix_(rows, rows)])
+    half = 0.5 * np.linalg.slogdet(rest)[1]
+    # Two inverses: to the condition of the information, 1e6, times rounding.
+    assert marginals.log_determinant([keys[2], keys[4]]) == pytest.approx(half, rel=1e-9)
 
 
 @pytest.mark.parametrize(("start", "step"), FAR_APART)

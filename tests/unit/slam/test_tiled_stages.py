@@ -50,7 +50,7 @@ def test_a_drive_whose_field_lasts_is_solved_once() -> None:
         stages.append(stage)
 
     found = map_drive(drive, poses, prior, QUICK, noted)
-    assert set(stages) == {"solving poses and field"}  # no piece of 30 m, and no moved steel
+    assert set(stages) == {"following the drive", "solving poses and field"}  # no moved steel
     wrong = replace(drive.readings, field=drive.readings.field[::-1])
     other = map_drive(replace(drive, readings=wrong), poses, prior, QUICK, silent)
     used = found.solution.used | other.solution.used
