@@ -49,7 +49,9 @@ def levenberg_marquardt(
     """Minimise a graph's error by Levenberg-Marquardt.
 
     Where Cholesky fails on a linear system GTSAM's optimiser silently increases the damping, as if
-    the step had increased the error. So where the damping has grown in the end, QR continues.
+    the step had increased the error, and small steps then end the descent. So where the damping has
+    grown in the end the descent goes on with that of the start: by Cholesky if that solves the
+    system without damping, and by QR, at ten times the cost, if not.
 
     Parameters
     ----------
@@ -66,7 +68,7 @@ def levenberg_marquardt(
     before, values = first.lambda_(), first.optimize()
     left = max_iterations - first.iterations()
     if first.lambda_() > before and left > 0:
-        second = _optimizer(graph, values, ordering, left, close, LinearSolver.QR)
+        second = _optimizer(graph, values, ordering, left, close, _solver(graph, values, ordering))
         values = second.optimize()
         left -= second.iterations()
     return Optimised(values, Ending.TOLERANCE if left > 0 else Ending.ITERATION_LIMIT)
@@ -81,23 +83,38 @@ def stepwise_levenberg_marquardt(
 ) -> Generator[None, None, gtsam.Values]:
     """Minimise a graph's error by Levenberg-Marquardt, one iteration after the other.
 
-    Yields before the first and after each but the last, and returns the values. Parameters as of
-    ``levenberg_marquardt``, whose result it has.
+    Yields before each iteration, and returns the values. Parameters as of ``levenberg_marquardt``,
+    whose result it has.
     """
     first = _optimizer(graph, start, ordering, max_iterations, close, LinearSolver.CHOLESKY)
-    before, error = first.lambda_(), first.error()
-    yield
-    while True:
-        first.iterate()
-        decrease, error = error - first.error(), first.error()
-        converged = decrease <= max(close, TOLERANCE * (error + decrease))
-        if converged or first.iterations() >= max_iterations:
-            break
+    before = first.lambda_()
+    yield from _iterations(first, max_iterations, close)
+    values, left = first.values(), max_iterations - first.iterations()
+    if first.lambda_() > before and left > 0:  # as there
+        second = _optimizer(graph, values, ordering, left, close, _solver(graph, values, ordering))
+        yield from _iterations(second, left, close)
+        values = second.values()
+    return values
+
+
+def _iterations(
+    engine: gtsam.LevenbergMarquardtOptimizer, max_iterations: int, close: float
+) -> Iterator[None]:
+    """Iterate to convergence as GTSAM's own loop does; yield before each iteration."""
+    error, converged = engine.error(), False
+    while not converged and engine.iterations() < max_iterations:
         yield
-    left = max_iterations - first.iterations()
-    if first.lambda_() > before and left > 0:  # as there: Cholesky has failed
-        return _optimizer(graph, first.values(), ordering, left, close, LinearSolver.QR).optimize()
-    return first.values()
+        engine.iterate()
+        decrease, error = error - engine.error(), engine.error()
+        converged = decrease <= max(close, TOLERANCE * (error + decrease))
+
+
+def _solver(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering
+) -> LinearSolver:
+    """Return Cholesky where it solves a graph's linear system, QR where it does not."""
+    step = unless_indeterminate(lambda: graph.linearize(values).optimize(ordering))
+    return LinearSolver.QR if step is None else LinearSolver.CHOLESKY
 
 
 def colamd_ordering(graph: gtsam.NonlinearFactorGraph) -> gtsam.Ordering:

@@ -1,10 +1,14 @@
 """Covariances of many poses, one by one and together, and where Cholesky is refused."""
 
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 
 from l2m_factors import T, X
+from l2m_gtsam.calibration.optimise import TOLERANCE
+from l2m_gtsam.data import FloatArray
 from l2m_gtsam.errors import CalibrationError
 from l2m_gtsam.slam.solver import (
     TOGETHER,
@@ -96,11 +100,56 @@ def test_where_cholesky_is_refused_descents_go_on_by_qr(
     assert graph.error(found) < 1e-3
 
 
+@pytest.mark.parametrize("in_pieces", [False, True])
+@pytest.mark.parametrize(
+    ("solved", "then"), [(True, "MULTIFRONTAL_CHOLESKY"), (False, "MULTIFRONTAL_QR")]
+)
+def test_where_damping_has_grown_the_descent_goes_on_by_what_solves_it(
+    in_pieces: bool, solved: bool, then: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From 3 on, steps along the tangent of an arc tangent only overshoot; one damped step is made.
+
+    A second variable that no factor holds is what Cholesky refuses.
+    """
+    x, y = gtsam.symbol("x", 0), gtsam.symbol("y", 0)
+
+    def residual(
+        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        at = values.atVector(x)
+        if jacobians is not None:
+            jacobians[0] = np.array([1 / (1 + at**2)])
+            jacobians[1] = np.zeros((1, 1))
+        return np.asarray(np.arctan(at))
+
+    graph, begin = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    unit = gtsam.noiseModel.Unit.Create(1)
+    graph.add(gtsam.CustomFactor(unit, [x, y], residual))
+    if solved:
+        graph.add(gtsam.PriorFactorVector(y, np.zeros(1), unit))
+    begin.insert(x, np.array([3.0]))
+    begin.insert(y, np.zeros(1))
+    solvers: list[str] = []
+
+    def recorded(*args: Any) -> gtsam.LevenbergMarquardtOptimizer:
+        solvers.append(args[2].getLinearSolverType())
+        return optimizer(*args)
+
+    optimizer = gtsam.LevenbergMarquardtOptimizer
+    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", recorded)
+    if in_pieces:
+        in_steps(graph, begin, 50, close=1.0)
+    else:
+        levenberg_marquardt(graph, begin, colamd_ordering(graph), 50, close=1.0)
+    assert solvers == ["MULTIFRONTAL_CHOLESKY", then]
+
+
 def in_steps(
-    graph: gtsam.NonlinearFactorGraph, begin: gtsam.Values, most: int
+    graph: gtsam.NonlinearFactorGraph, begin: gtsam.Values, most: int, close: float = TOLERANCE
 ) -> tuple[gtsam.Values, int]:
     """Return values that are solved for step by step, and how often the work was interrupted."""
-    work, pauses = stepwise_levenberg_marquardt(graph, begin, colamd_ordering(graph), most), 0
+    work = stepwise_levenberg_marquardt(graph, begin, colamd_ordering(graph), most, close)
+    pauses = 0
     while True:
         try:
             next(work)
