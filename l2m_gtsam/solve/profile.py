@@ -191,13 +191,16 @@ def write_trimmed(
         Root mean square of what is left, shape (G, S).
     """
     K = z.shape[2]
-    regressors, used, left, pool = np.ones((REGRESSORS, K)), np.empty(K), np.empty(K), np.empty(K)
+    regressors, used, left, pool = np.empty((REGRESSORS, K)), np.empty(K), np.empty(K), np.empty(K)
     gram, X = np.empty((REGRESSORS, REGRESSORS)), np.empty((REGRESSORS, 3))
+    # Sums and products of whole arrays would take five times as long to compile.
     for g in range(len(b)):
-        write_centred(b[g], inside[g], regressors[1:])
+        write_regressors(b[g], inside[g], regressors)
         for s in range(len(z)):
-            used[:] = inside[g] * has[s]
-            count = int(has[s].sum())
+            count = 0.0
+            for k in range(K):
+                used[k] = inside[g, k] * has[s, k]
+                count += has[s, k]
             kept, total = int(np.ceil(good * count)), 0.0
             for _ in range(CONCENTRATIONS if kept < count else 1):
                 write_fit(regressors, z[s], used, gram, X)
@@ -212,11 +215,19 @@ def write_trimmed(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def write_centred(b: FloatArray, inside: FloatArray, centred: FloatArray) -> None:
-    """Write the field, shape (3, K), about its mean inside the map."""
-    count = max(inside.sum(), 1.0)
+def write_regressors(b: FloatArray, inside: FloatArray, regressors: FloatArray) -> None:
+    """Write ones and the field, shape (3, K), about its mean inside the map, shape (4, K)."""
+    count = 0.0
+    for k in range(len(inside)):
+        regressors[0, k] = 1.0
+        count += inside[k]
     for i in range(3):
-        centred[i] = b[i] - (b[i] * inside).sum() / count
+        total = 0.0
+        for k in range(len(inside)):
+            total += b[i, k] * inside[k]
+        mean = total / max(count, 1.0)
+        for k in range(len(inside)):
+            regressors[1 + i, k] = b[i, k] - mean
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)

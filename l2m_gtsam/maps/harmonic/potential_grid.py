@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.errors import MapError
@@ -161,33 +160,13 @@ def check_size(counts: FloatArray, spacing: float) -> tuple[int, int, int]:
 
 def spread(first: IntArray, last: IntArray, shape: tuple[int, int, int]) -> BoolArray:
     """Return the nodes of the boxes whose first and last nodes, shape (K, 3), are given."""
-    steps = np.zeros((shape[0] + 1, shape[1] + 1, shape[2] + 1), dtype=np.int64)
-    count_boxes(first, last, steps)
-    return np.asarray(steps[:-1, :-1, :-1] > 0)
-
-
-@njit(cache=True, nogil=True)
-def count_boxes(first: IntArray, last: IntArray, counts: IntArray) -> None:
-    """Add up how many boxes each node is in; ``counts`` has one node more along each axis."""
-    for n in range(len(first)):
-        i, j, k = first[n]
-        u, v, w = last[n] + 1
-        # Signs at the corners by inclusion and exclusion: running sums along the axes, below, then
-        # count one inside of the box and none outside (summed-area tables, Crow 1984).
-        counts[i, j, k] += 1
-        counts[u, v, k] += 1
-        counts[u, j, w] += 1
-        counts[i, v, w] += 1
-        counts[u, j, k] -= 1
-        counts[i, v, k] -= 1
-        counts[i, j, w] -= 1
-        counts[u, v, w] -= 1
-    nx, ny, nz = counts.shape
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(1, nz):
-                counts[i, j, k] += counts[i, j, k - 1]
-        for j in range(1, ny):
-            counts[i, j] += counts[i, j - 1]
-        if i > 0:
-            counts[i] += counts[i - 1]
+    counts = np.zeros([nodes + 1 for nodes in shape], dtype=np.int32)
+    # Signs at the corners by inclusion and exclusion: running sums along the axes then count one
+    # inside of a box and none outside (summed-area tables, Crow 1984).
+    ends = np.stack([first, last + 1])
+    for corner in np.ndindex(2, 2, 2):
+        i, j, k = (ends[side, :, axis] for axis, side in enumerate(corner))
+        np.add.at(counts, (i, j, k), (-1) ** sum(corner))
+    for axis in range(3):
+        np.cumsum(counts, axis=axis, dtype=np.int32, out=counts)
+    return np.asarray(counts[:-1, :-1, :-1] > 0)

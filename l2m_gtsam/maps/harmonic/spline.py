@@ -187,11 +187,16 @@ def spline_derivatives(
     for n in range(len(points)):
         i, j, k = stencil_start(points[n], lower, spacing, coefficients.shape)
         if i < 0:
-            field[n], gradient[n] = np.nan, np.nan
+            for a in range(3):
+                field[n, a] = np.nan
+                for c in range(3):
+                    gradient[n, a, c] = np.nan
             continue
-        fraction[:WIDTH] = (points[n, 0] - lower[0]) * per_metre - i - BELOW
-        fraction[WIDTH : 2 * WIDTH] = (points[n, 1] - lower[1]) * per_metre - j - BELOW
-        fraction[2 * WIDTH :] = (points[n, 2] - lower[2]) * per_metre - k - BELOW
+        x = (points[n, 0] - lower[0]) * per_metre - i - BELOW
+        y = (points[n, 1] - lower[1]) * per_metre - j - BELOW
+        z = (points[n, 2] - lower[2]) * per_metre - k - BELOW
+        for a in range(WIDTH):
+            fraction[a], fraction[WIDTH + a], fraction[2 * WIDTH + a] = x, y, z
         spline_weights(fraction, weights)
         start = UNSIGNED(i) * step_x + UNSIGNED(j) * step_y + UNSIGNED(k)
         stencil_derivatives(flat, start, steps, weights, per_metre, per_area, field[n], gradient[n])

@@ -48,7 +48,10 @@ def shares_of(
     """
     rows, tiles = np.empty((2, MOST * len(points)), dtype=np.int64)
     share = np.empty(MOST * len(points))
-    count = write_shares(points, grid.origin, grid.size, grid.cells, blend, rows, tiles, share)
+    bounds = np.stack([grid.cells.min(axis=0), grid.cells.max(axis=0)])
+    count = write_shares(
+        points, grid.origin, grid.size, grid.cells, bounds, blend, rows, tiles, share
+    )
     return rows[:count], tiles[:count], share[:count]
 
 
@@ -58,16 +61,16 @@ def write_shares(
     origin: FloatArray,
     size: float,
     cells: IntArray,
+    bounds: IntArray,
     blend: float,
     rows: IntArray,
     tiles: IntArray,
     share: FloatArray,
 ) -> int:
-    """Write rows, tiles and shares of ``shares_of`` and return how many there are."""
-    low, high = cells[0].copy(), cells[0].copy()
-    for cell in cells:
-        for axis in range(2):
-            low[axis], high[axis] = min(low[axis], cell[axis]), max(high[axis], cell[axis])
+    """Write rows, tiles and shares of ``shares_of`` and return how many there are.
+
+    ``bounds`` has the lowest and the highest cell along each axis, shape (2, 2).
+    """
     own, along = np.empty((2, 2), dtype=np.int64), np.empty((2, 2))
     last = np.zeros((2, 2), dtype=np.int64)  # places that follow each other are in the same cells
     per_size, per_width = 1 / size, 0.5 / blend
@@ -76,7 +79,7 @@ def write_shares(
         for axis in range(2):
             place = (points[n, axis] - origin[axis]) * per_size
             # Far away there is no tile: clipping keeps the cell's number an integer.
-            place = min(max(place, low[axis] - 2.0), high[axis] + 3.0)
+            place = min(max(place, bounds[0, axis] - 2.0), bounds[1, axis] + 3.0)
             own[axis, 0] = int(np.floor(place))
             own[axis, 1] = own[axis, 0] + (1 if place - own[axis, 0] >= 0.5 else -1)
             for side in range(2):
