@@ -38,6 +38,7 @@ from l2m_gtsam.slam.unknown_field.tiled_smoother import (
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, coarser
 
 FOLLOWED = (16.0, 1.0)  # factor of the readings' noise, convexity of the loss (``solve.robust``)
+JUDGED = (4.0, 1.0)  # the same, with which two solutions of a piece are compared
 CLOSE = 0.5  # decrease of the error that moves poses by less than their sigmas
 # The same stage by stage, and the decrease of the error below which each has converged.
 STAGES = (
@@ -159,12 +160,18 @@ class StagedDrive:
     def _piece(self, search: ReturnSearch, poses: list[gtsam.Pose3]) -> TiledRound:
         """Return the solution from poses by odometry, or from those that are searched for.
 
-        A place that only looks like the right one is told by what is left of it once all poses
-        have moved: the likelier solution is returned.
+        With so much noise two places may look alike, as two corners of a room do: the piece is
+        solved from both with less of it, and that one is returned whose solution is likelier then.
         """
         problem = TiledProblem(search.drive, self.divided, self.options, close=CLOSE)
         found = problem.solved(poses, search.drive.sensors, *FOLLOWED)
         if (start := search.likeliest(poses)) is poses:
             return found
         other = problem.solved(start, search.drive.sensors, *FOLLOWED)
-        return max(found, other, key=lambda each: search.density(each.poses, each.values))
+        finer = replace(search, noise=JUDGED[0] * search.drive.sensors.noise)
+
+        def density(each: TiledRound) -> float:
+            judged = problem.solved(each.poses, each.sensors, *JUDGED)
+            return finer.density(judged.poses, judged.values)
+
+        return max(found, other, key=density)
