@@ -1,15 +1,29 @@
-"""A drive in tiles: whether fields last."""
+"""A drive in tiles: whether fields last, and which of two places it comes back to."""
 
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
+import pytest
 
 from l2m_gtsam.progress import silent
-from l2m_gtsam.slam.drive import EXACT_START
+from l2m_gtsam.slam.drive import EXACT_START, KnownSensors
 from l2m_gtsam.slam.localisation import prepared
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.unknown_field.tiled_stages import finds_changes, log_density, map_drive
+from l2m_gtsam.slam.pose_graph import drive_values
+from l2m_gtsam.slam.relative_motion import RelativeMotions
+from l2m_gtsam.slam.unknown_field.return_search import Bending, ReturnSearch
+from l2m_gtsam.slam.unknown_field.tiled_drive import TiledDrive
+from l2m_gtsam.slam.unknown_field.tiled_smoother import TiledProblem
+from l2m_gtsam.slam.unknown_field.tiled_stages import (
+    FOLLOWED,
+    StagedDrive,
+    finds_changes,
+    log_density,
+    map_drive,
+)
 from l2m_gtsam.slam.unknown_field.tiles import drive_prior
 from tests.drives.moved_steel import moved_steel
 from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
@@ -55,3 +69,37 @@ def test_a_drive_whose_field_lasts_is_solved_once() -> None:
     other = map_drive(replace(drive, readings=wrong), poses, prior, QUICK, silent)
     used = found.solution.used | other.solution.used
     assert log_density(found, used) > log_density(other, used)
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_of_two_places_that_is_kept_which_is_likelier_with_less_noise(
+    right: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One path ends where it should, the other beside it, which with much noise looks likelier."""
+    own = random_sensors(2, 4)
+    recorded = slam_drive(dipole_world(2), own, laps(20, (1.9, 1.4)), np.random.default_rng(2))
+    drive, _ = prepared(recorded.recording, calibrated(own), QUICK)
+    drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
+    poses = drive.dead_reckoning()
+    off, _ = Bending(drive, poses, 0).to(np.array([1.2, 0.0, 0.0]))
+    begin, other = (poses, off) if right else (off, poses)
+    prior, likely = drive_prior(drive, poses, QUICK.tiles), ReturnSearch.density
+
+    def as_they_are(
+        _: TiledProblem, at: list[gtsam.Pose3], sensors: KnownSensors, *__: float
+    ) -> SimpleNamespace:
+        tiled = TiledDrive.lasting(RelativeMotions.along(drive, at), at, sensors, prior)
+        return SimpleNamespace(
+            poses=at, sensors=sensors, values=drive_values(drive, at), tiled=tiled
+        )
+
+    def density(search: ReturnSearch, at: list[gtsam.Pose3], values: gtsam.Values) -> float:
+        much = np.array_equal(search.noise, FOLLOWED[0] * drive.sensors.noise)
+        return likely(search, at, values) * (-1 if much else 1)
+
+    monkeypatch.setattr(TiledProblem, "solved", as_they_are)
+    monkeypatch.setattr(ReturnSearch, "likeliest", lambda *_: other)
+    monkeypatch.setattr(ReturnSearch, "density", density)
+    staged = StagedDrive(drive, prior, QUICK, partial(TiledDrive.lasting, prior=prior))
+    found = staged.followed(begin, silent)
+    assert all(one.equals(two, 1e-9) for one, two in zip(found, poses, strict=True))
