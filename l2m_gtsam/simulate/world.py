@@ -72,21 +72,20 @@ class SteelWorld:
         return [points[low : low + size] for low in range(0, len(points), size)]
 
     def _inside_any(self, points: FloatArray) -> BoolArray:
-        within = np.abs(self._in_bodies(points)) <= self.dimensions / 2
-        return np.asarray(np.any(np.all(within, axis=2), axis=1))
+        within = np.abs(self._in_bodies(points)) <= self.dimensions[:, None] / 2
+        return np.asarray(np.any(np.all(within, axis=2), axis=0))
 
     def _in_bodies(self, points: FloatArray) -> FloatArray:
-        """Return every point in every body's frame in metres, shape (P, N, 3)."""
-        offsets = points[:, None] - self.centres
-        return np.asarray(np.einsum("pni,nij->pnj", offsets, self.R_map_body))
+        """Return every point in every body's frame in metres, shape (N, P, 3)."""
+        return np.asarray((points - self.centres[:, None]) @ self.R_map_body)
 
     def _steel_field(self, points: FloatArray) -> FloatArray:
         """Return the field of all bodies in the map frame in microtesla, shape (P, 3)."""
-        shape = (len(points), len(self), 3)
+        shape = (len(self), len(points), 3)
         field = magnet_cuboid_Bfield(
             observers=self._in_bodies(points).reshape(-1, 3),
-            dimensions=np.broadcast_to(self.dimensions, shape).reshape(-1, 3),
-            polarizations=np.broadcast_to(self.polarisations, shape).reshape(-1, 3),
+            dimensions=np.broadcast_to(self.dimensions[:, None], shape).reshape(-1, 3),
+            polarizations=np.broadcast_to(self.polarisations[:, None], shape).reshape(-1, 3),
         ).reshape(shape)
-        in_map = np.einsum("nij,pnj->pi", self.R_map_body, field)
+        in_map = (field @ self.R_map_body.transpose(0, 2, 1)).sum(axis=0)
         return np.asarray(in_map * MICROTESLA_PER_TESLA)
