@@ -113,6 +113,11 @@ class ReturnSearch:
         now = max(self.agreement(readings, poses), 0.0)
         return best.poses if best.likelihood > now + CLEAR else poses
 
+    def apart(self, one: list[gtsam.Pose3], other: list[gtsam.Pose3]) -> bool:
+        """Return whether two paths of K key poses end in places that the lattice tells apart."""
+        away = one[-1].translation() - other[-1].translation()
+        return float(np.linalg.norm(away)) >= STEPS[0] * self._depth
+
     def density(self, poses: list[gtsam.Pose3], values: gtsam.Values) -> float:
         """Return how likely a solution is, in nats but for a constant.
 

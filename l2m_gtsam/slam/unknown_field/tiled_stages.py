@@ -162,12 +162,15 @@ class StagedDrive:
 
         With so much noise two places may look alike, as two corners of a room do: the piece is
         solved from both with less of it, and that one is returned whose solution is likelier then.
+        If both solutions are in one place there is nothing to choose.
         """
         problem = TiledProblem(search.drive, self.divided, self.options, close=CLOSE)
         found = problem.solved(poses, search.drive.sensors, *FOLLOWED)
         if (start := search.likeliest(poses)) is poses:
             return found
         other = problem.solved(start, search.drive.sensors, *FOLLOWED)
+        if not search.apart(found.poses, other.poses):
+            return found
         finer = replace(search, noise=JUDGED[0] * search.drive.sensors.noise)
 
         def density(each: TiledRound) -> float:
