@@ -1,6 +1,6 @@
 """A drive in tiles: whether fields last, and which of two places it comes back to."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -71,19 +71,30 @@ def test_a_drive_whose_field_lasts_is_solved_once() -> None:
     assert log_density(found, used) > log_density(other, used)
 
 
-@pytest.mark.parametrize("right", [True, False])
-def test_of_two_places_that_is_kept_which_is_likelier_with_less_noise(
-    right: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One path ends where it should, the other beside it, which with much noise looks likelier."""
+@dataclass(frozen=True)
+class TwoPlaces:
+    staged: StagedDrive
+    monkeypatch: pytest.MonkeyPatch
+
+    def beside(self, away: float) -> list[gtsam.Pose3]:
+        """Return the path bent so that it ends so many metres beside where it should."""
+        drive = self.staged.drive
+        return Bending(drive, drive.dead_reckoning(), 0).to(np.array([away, 0.0, 0.0]))[0]
+
+    def keeps(self, begin: list[gtsam.Pose3], searched: list[gtsam.Pose3]) -> list[gtsam.Pose3]:
+        self.monkeypatch.setattr(ReturnSearch, "likeliest", lambda *_: searched)
+        return self.staged.followed(begin, silent)
+
+
+@pytest.fixture
+def two_places(monkeypatch: pytest.MonkeyPatch) -> TwoPlaces:
+    """Laps whose pieces stay as given; with much noise the less likely one looks likelier."""
     own = random_sensors(2, 4)
     recorded = slam_drive(dipole_world(2), own, laps(20, (1.9, 1.4)), np.random.default_rng(2))
     drive, _ = prepared(recorded.recording, calibrated(own), QUICK)
     drive = replace(drive, start=replace(drive.start, covariance=EXACT_START))
-    poses = drive.dead_reckoning()
-    off, _ = Bending(drive, poses, 0).to(np.array([1.2, 0.0, 0.0]))
-    begin, other = (poses, off) if right else (off, poses)
-    prior, likely = drive_prior(drive, poses, QUICK.tiles), ReturnSearch.density
+    prior = drive_prior(drive, drive.dead_reckoning(), QUICK.tiles)
+    likely = ReturnSearch.density
 
     def as_they_are(
         _: TiledProblem, at: list[gtsam.Pose3], sensors: KnownSensors, *__: float
@@ -98,8 +109,24 @@ def test_of_two_places_that_is_kept_which_is_likelier_with_less_noise(
         return likely(search, at, values) * (-1 if much else 1)
 
     monkeypatch.setattr(TiledProblem, "solved", as_they_are)
-    monkeypatch.setattr(ReturnSearch, "likeliest", lambda *_: other)
     monkeypatch.setattr(ReturnSearch, "density", density)
     staged = StagedDrive(drive, prior, QUICK, partial(TiledDrive.lasting, prior=prior))
-    found = staged.followed(begin, silent)
-    assert all(one.equals(two, 1e-9) for one, two in zip(found, poses, strict=True))
+    return TwoPlaces(staged, monkeypatch)
+
+
+def test_of_two_places_that_is_kept_which_is_likelier_with_less_noise(
+    two_places: TwoPlaces,
+) -> None:
+    """Whether it is where odometry ends or where the search does."""
+    there, elsewhere = two_places.beside(0.0), two_places.beside(1.2)
+    assert same(two_places.keeps(there, elsewhere), there)
+    assert same(two_places.keeps(elsewhere, there), there)
+
+
+def test_of_two_solutions_in_one_place_the_first_is_kept(two_places: TwoPlaces) -> None:
+    there, near = two_places.beside(0.0), two_places.beside(0.1)
+    assert same(two_places.keeps(near, there), near)
+
+
+def same(found: list[gtsam.Pose3], poses: list[gtsam.Pose3]) -> bool:
+    return all(one.equals(two, 1e-9) for one, two in zip(found, poses, strict=True))
