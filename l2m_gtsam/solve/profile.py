@@ -250,7 +250,8 @@ def write_fit(
     solve_in_place(gram, X)
 
 
-@njit(cache=True, nogil=True)
+# Said, not left out: what a fast kernel calls takes its mode, unless read from the cache.
+@njit(cache=True, nogil=True, fastmath=False)
 def solve_in_place(gram: FloatArray, X: FloatArray) -> None:
     """Replace X, shape (n, 3), by the solution; of ``gram`` the lower half, by Cholesky."""
     n = len(gram)

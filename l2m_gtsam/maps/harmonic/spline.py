@@ -79,7 +79,8 @@ PIECES = np.tile(spline_pieces(), 3)  # once for each axis
 UNSIGNED = np.uint64
 
 
-@njit(cache=True, nogil=True)
+# Said, not left out: what a fast kernel calls takes its mode, unless read from the cache.
+@njit(cache=True, nogil=True, fastmath=False)
 def stencil_start(
     point: FloatArray, lower: FloatArray, spacing: float, shape: tuple[int, int, int]
 ) -> tuple[int, int, int]:
