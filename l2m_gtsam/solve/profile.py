@@ -250,7 +250,7 @@ def write_fit(
     solve_in_place(gram, X)
 
 
-# Said, not left out: what a fast kernel calls takes its mode, unless read from the cache.
+# Not the mode of a fast kernel that calls it, which it has where it is compiled for that one.
 @njit(cache=True, nogil=True, fastmath=False)
 def solve_in_place(gram: FloatArray, X: FloatArray) -> None:
     """Replace X, shape (n, 3), by the solution; of ``gram`` the lower half, by Cholesky."""

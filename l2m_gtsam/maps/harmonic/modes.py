@@ -275,8 +275,8 @@ def add_waves(
         add_symmetric(n, bx, by, bz, xx, yy, zz, xy, xz, yz, field, gradient)
 
 
-# Said, not left out: what a fast kernel calls takes its mode, unless read from the cache.
-@njit(cache=True, nogil=True, fastmath=False)
+# In line: a function that a fast kernel calls is compiled in that one's mode, unless it was before.
+@njit(cache=True, nogil=True, inline="always")
 def write_phases(phase: float, cosines: FloatArray, sines: FloatArray) -> None:
     """Write the cosine and sine of all multiples of a phase."""
     cosines[0], sines[0] = 1.0, 0.0

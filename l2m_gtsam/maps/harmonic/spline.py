@@ -79,7 +79,7 @@ PIECES = np.tile(spline_pieces(), 3)  # once for each axis
 UNSIGNED = np.uint64
 
 
-# Said, not left out: what a fast kernel calls takes its mode, unless read from the cache.
+# Not the mode of a fast kernel that calls it, which it has where it is compiled for that one.
 @njit(cache=True, nogil=True, fastmath=False)
 def stencil_start(
     point: FloatArray, lower: FloatArray, spacing: float, shape: tuple[int, int, int]
