@@ -14,10 +14,9 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.frame import TileFrame, clip_rows, write_local
 from l2m_gtsam.maps.harmonic.modes import Modes
-from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, add_near, near_sources
+from l2m_gtsam.maps.harmonic.near_sources import NearSources, PointSources, near_sources
 from l2m_gtsam.maps.harmonic.places import Places
 from l2m_gtsam.maps.harmonic.potential_grid import PotentialGrid, PotentialLattice, potential_grid
-from l2m_gtsam.maps.harmonic.spline import spline_derivatives
 from l2m_gtsam.maps.harmonic.term_sum import TermSum
 from l2m_gtsam.maps.harmonic.tile import Tile
 from l2m_gtsam.maps.harmonic.tile_shares import Blend
@@ -97,25 +96,18 @@ class CompiledTile:
         rows, share
             Indices of the tile's points and its share in each, shape (K,).
         """
-        frame, grid, near = self.frame, self.grid, self.near
+        # No kernel over all of it: a fast one that another calls may round otherwise when just
+        # compiled than when read from the cache.
+        frame, local = self.frame, np.empty((len(rows), 3))
+        write_inside(points, rows, frame.corner, frame.R_map_tile, *self.walls, local)
+        field, gradient = self.grid.field_and_gradient(local)
+        self.near.add_to(local, field, gradient)
         missing = np.empty(len(rows), dtype=np.int64)
-        count = add_compiled(
-            points,
-            rows,
-            share,
-            (frame.corner, frame.R_map_tile),
-            self.walls,
-            (grid.lower, grid.spacing, grid.coefficients),
-            (near.corner, near.shape, near.starts, near.table),
-            blend.field,
-            blend.gradient,
-            missing,
-        )
+        R = frame.R_map_tile
+        count = add_turned(rows, share, R, field, gradient, blend.field, blend.gradient, missing)
         if count:
             left = missing[:count]
-            local = frame.localise(points[rows[left]])
-            clip_rows(local, *self.walls, local)
-            values = in_map(frame, *self.terms.field_and_gradient(local))
+            values = in_map(frame, *self.terms.field_and_gradient(local[left]))
             blend.add(rows[left], share[left], values)
 
 
@@ -240,58 +232,68 @@ def with_grid(tile: Tile, terms: TermSum, places: Places, fineness: Fineness) ->
 
 
 @njit(cache=True, nogil=True)
-def add_compiled(
+def write_inside(
     points: FloatArray,
     rows: IntArray,
+    corner: FloatArray,
+    R_map_tile: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    local: FloatArray,
+) -> None:
+    """Write some points of the map frame in a tile's frame, moved within its walls.
+
+    Parameters
+    ----------
+    points, rows
+        In metres, shape (N, 3), and which of them, shape (K,).
+    corner, R_map_tile
+        See ``TileFrame``.
+    low, high
+        The walls in the tile's frame in metres, shape (3,).
+    local
+        What is written, metres, shape (K, 3).
+    """
+    for k in range(len(rows)):
+        for i in range(3):
+            local[k, i] = points[rows[k], i]
+    write_local(local, corner, R_map_tile, local)
+    clip_rows(local, low, high, local)
+
+
+@njit(cache=True, nogil=True)
+def add_turned(
+    rows: IntArray,
     share: FloatArray,
-    frame: tuple[FloatArray, FloatArray],
-    walls: tuple[FloatArray, FloatArray],
-    grid: tuple[FloatArray, float, FloatArray],
-    near: tuple[FloatArray, tuple[int, int, int], IntArray, FloatArray],
+    R_map_tile: FloatArray,
+    part_field: FloatArray,
+    part_gradient: FloatArray,
     field: FloatArray,
     gradient: FloatArray,
     missing: IntArray,
 ) -> int:
-    """Add field and gradient of a tile, times its share, at some points.
+    """Add what a tile predicts in its own frame, times its share, in the map frame.
 
     Parameters
     ----------
-    points
-        In the map frame in metres, shape (N, 3).
     rows, share
-        Which of them are asked for, shape (K,), and the tile's share in each, shape (K,) or longer.
-    frame
-        The tile's corner in metres, shape (3,), and axes, shape (3, 3); see ``TileFrame``.
-    walls
-        Lowest and highest coordinates in the tile's frame, metres, shape (3,); points beyond are
-        moved there.
-    grid
-        Lower corner, spacing and coefficients; see ``PotentialGrid``.
-    near
-        Corner, shape, starts and table; see ``NearSources``.
+        Points that are added to, shape (K,), and the tile's share in each, shape (K,) or longer.
+    R_map_tile
+        Axes of the tile, shape (3, 3).
+    part_field, part_gradient
+        In the tile's frame in uT and uT/m, shapes (K, 3) and (K, 3, 3); NaN where not known.
     field, gradient
-        In the map frame in uT and uT/m, shapes (N, 3) and (N, 3, 3); are added to.
+        In the map frame, shapes (N, 3) and (N, 3, 3); are added to.
     missing
-        Which of ``rows`` the grid does not cover, shape (K,); nothing is added there.
+        Which of ``rows`` are not known, shape (K,); nothing is added there.
 
     Returns
     -------
     int
-        Number of rows that the grid does not cover.
+        Number of rows that are not known.
     """
-    corner, R = frame
-    local, count = np.empty((len(rows), 3)), 0
-    for k in range(len(rows)):
-        for i in range(3):
-            local[k, i] = points[rows[k], i]
-    write_local(local, corner, R, local)
-    clip_rows(local, walls[0], walls[1], local)
-    B, G = np.empty((len(rows), 3)), np.empty((len(rows), 3, 3))
-    lower, spacing, coefficients = grid
-    spline_derivatives(local, lower, spacing, coefficients, B, G)
-    near_corner, shape, starts, table = near
-    add_near(local, near_corner, shape, starts, table, B, G)
-    half = np.empty((3, 3))
+    R, B, G = R_map_tile, part_field, part_gradient
+    half, count = np.empty((3, 3)), 0
     for k in range(len(rows)):
         if np.isnan(B[k, 0]):
             missing[count] = k
@@ -304,6 +306,6 @@ def add_compiled(
                 half[i, j] = R[i, 0] * G[k, 0, j] + R[i, 1] * G[k, 1, j] + R[i, 2] * G[k, 2, j]
         for i in range(3):
             for j in range(3):
-                turned = half[i, 0] * R[j, 0] + half[i, 1] * R[j, 1] + half[i, 2] * R[j, 2]
-                gradient[n, i, j] += weight * turned
+                both = half[i, 0] * R[j, 0] + half[i, 1] * R[j, 1] + half[i, 2] * R[j, 2]
+                gradient[n, i, j] += weight * both
     return count

@@ -103,6 +103,18 @@ class NearSources:
         """Memory in bytes."""
         return self.starts.nbytes + self.table.nbytes
 
+    def add_to(self, points: FloatArray, field: FloatArray, gradient: FloatArray) -> None:
+        """Add the near part at points.
+
+        Parameters
+        ----------
+        points
+            In the tile's frame in metres, shape (N, 3).
+        field, gradient
+            In uT and uT/m, shapes (N, 3) and (N, 3, 3); are added to.
+        """
+        add_near(points, self.corner, self.shape, self.starts, self.table, field, gradient)
+
 
 def near_sources(
     sources: PointSources, lower: FloatArray, upper: FloatArray, radius: float
