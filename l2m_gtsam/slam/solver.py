@@ -106,7 +106,8 @@ def _iterations(
         yield
         engine.iterate()
         decrease, error = error - engine.error(), engine.error()
-        converged = decrease <= max(close, TOLERANCE * (error + decrease))
+        # An error that is not a number ends it, too.
+        converged = not decrease > max(close, TOLERANCE * (error + decrease))
 
 
 def _solver(

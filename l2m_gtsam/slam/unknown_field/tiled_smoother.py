@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from l2m_factors import X
 from l2m_gtsam.calibration.optimise import TOLERANCE, Ending
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.records.localisation import Gain
@@ -20,10 +19,10 @@ from l2m_gtsam.slam.options import CalibrationUse, SlamOptions
 from l2m_gtsam.slam.pose_graph import (
     calibration_graph,
     calibration_values,
+    drive_values,
     link_graph,
     link_squared,
     odometry_graph,
-    shared_values,
     steady_drift,
 )
 from l2m_gtsam.slam.relative_motion import DrivePrediction, RelativeMotions
@@ -150,9 +149,7 @@ class TiledProblem:
         tiled = self._divided(motions, poses, sensors)
         noise = scale * sensors.noise
         values = tiled.weights(sensors, noise)
-        values.insert(shared_values(self._drive))
-        for k, pose in enumerate(poses):
-            values.insert(X(k), pose)
+        values.insert(drive_values(self._drive, poses))
         predicted = DrivePrediction(motions, tiled.prediction(values, sensors))
         own = predicted.prediction.whitening(noise)
         robust = self._options.robust
