@@ -27,6 +27,7 @@ from scipy.linalg.lapack import dpotri
 from l2m_gtsam.calibration.sensor_columns import SENSOR, keys_of
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.errors import CalibrationError
+from l2m_gtsam.solve.submatrix import add_upper, submatrix, upper_product
 
 SHARED = -1  # of rows that are no one sensor's
 NO_READINGS = np.empty(0, dtype=np.int64)
@@ -100,13 +101,13 @@ class HalfCovariance:
 
     def among(self, at: IntArray) -> FloatArray:
         """Return the covariance of some variables in their order, shape (k, k)."""
-        half = self.half[np.ix_(at, at)]
+        half = submatrix(self.half, at)
         return np.asarray((half + half.T) * self.scale[at] * self.scale[at, None])
 
     def across(self, at: IntArray, A: FloatArray) -> FloatArray:
         """Return ``A^T Sigma A`` for A of some variables, shape (k, m); the result is (m, m)."""
         scaled = A * self.scale[at, None]
-        half = scaled.T @ self.half[np.ix_(at, at)] @ scaled
+        half = scaled.T @ submatrix(self.half, at) @ scaled
         return np.asarray(half + half.T)
 
     def around(self, A: FloatArray) -> FloatArray:
@@ -149,7 +150,7 @@ class HalfCovariance:
     def trace(self, at: IntArray, J: FloatArray) -> float:
         """Return the trace of ``J Sigma J^T`` for J by some variables, shape (m, k)."""
         scaled = J * self.scale[at]
-        return 2 * float(np.vdot(scaled @ self.half[np.ix_(at, at)], scaled))
+        return 2 * float(upper_product(self.half, at, scaled.T @ scaled))
 
 
 @dataclass(frozen=True)
@@ -273,14 +274,14 @@ def joint_information(
     information[:known, :known] = weights
     pull[:known] = -weights @ at
     for each in rows:
-        information[np.ix_(each.columns, each.columns)] += each.jacobian.T @ each.jacobian
+        add_upper(information, each.columns, each.jacobian.T @ each.jacobian)
         pull[each.columns] -= each.jacobian.T @ each.residual
     # Jacobi's scaling: within a factor n of the best condition that any diagonal scaling gives
     # (van der Sluis 1969).
     scale = 1 / np.sqrt(np.diag(information))
     information *= scale
     information *= scale[:, None]
-    try:  # by its transpose, which is the same and in LAPACK's order
+    try:  # of its upper triangle, which is the lower one of what is in LAPACK's order
         lower = cholesky(information.T, lower=True, overwrite_a=True, check_finite=False)
     except LinAlgError:
         lower = root_by_qr(rows, weights, scale)
