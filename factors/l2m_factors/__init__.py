@@ -44,6 +44,7 @@ from l2m_factors.tile import (
     tile_factor,
     tile_residual,
 )
+from l2m_factors.tile_block import TileBlocks
 from l2m_factors.whitening import Whitening
 
 __all__ = [
@@ -74,6 +75,7 @@ __all__ = [
     "StepError",
     "T",
     "TileBatch",
+    "TileBlocks",
     "TileField",
     "TilePlaces",
     "U",

@@ -45,7 +45,8 @@ class Residual:
         def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
             e = self.error(values, jacobians)
             if jacobians is not None:
-                jacobians[:] = [root @ block for block in jacobians]
+                for slot, block in enumerate(jacobians):  # GTSAM's list takes no slice
+                    jacobians[slot] = root @ block
             return np.asarray(root @ e)
 
         return Residual(self.keys, self.size, error)

@@ -28,11 +28,16 @@ class SensorVariables:
     fixed
         Calibrations that are no variables. Without them there are ``T(i)`` and ``D(i)`` of each
         sensor, and ``S(i)`` for readings with motion.
+
+    Attributes
+    ----------
+    timed
+        Whether there are ``S(i)``.
     """
 
     def __init__(self, readings: KeyPoseReadings, fixed: Calibrations | None) -> None:
         self._sensor, self._fixed = readings.sensor, fixed
-        self._timed = fixed is None and readings.motion is not None
+        self.timed = fixed is None and readings.motion is not None
 
     def on(self, rows: npt.NDArray[np.int64]) -> list[int]:
         """Return the sensors of these readings, ascending."""
@@ -49,7 +54,7 @@ class SensorVariables:
         parts = []
         for sensor in sensors if self._fixed is None else []:
             parts += [values.atPoint3(T(sensor)).tobytes(), values.atVector(D(sensor)).tobytes()]
-            if self._timed:
+            if self.timed:
                 parts.append(struct.pack("d", values.atDouble(S(sensor))))
         return b"".join(parts)
 
@@ -62,7 +67,7 @@ class SensorVariables:
             if values.exists(T(sensor)):
                 known.t[sensor] = values.atPoint3(T(sensor))
                 known.distortion[sensor] = values.atVector(D(sensor))
-                if self._timed:
+                if self.timed:
                     known.offset[sensor] = values.atDouble(S(sensor))
         return known
 
@@ -91,7 +96,7 @@ class SensorVariables:
         if more is not None:
             for axis in range(3):
                 by_D[:, axis, 3 * axis : 3 * axis + 3] += more
-        parts = [seen.de_dt[rows], by_D, *([seen.de_dS[rows]] if self._timed else [])]
+        parts = [seen.de_dt[rows], by_D, *([seen.de_dS[rows]] if self.timed else [])]
         blocks = []
         for sensor in self.on(rows):
             own = (self._sensor[rows] == sensor)[:, None, None]
@@ -118,7 +123,7 @@ class SensorVariables:
         return [np.where(each, R, 0.0) for each in own]
 
     def _keys(self, sensor: int) -> list[int]:
-        return [T(sensor), D(sensor), *([S(sensor)] if self._timed else [])]
+        return [T(sensor), D(sensor), *([S(sensor)] if self.timed else [])]
 
 
 class KeyPoseBatch(ABC):

@@ -5,7 +5,9 @@ found by graduated non-convexity on the whole pose graph (GTSAM's ``GncLMOptimiz
 P. Antonante, V. Tzoumas, L. Carlone, 2020), with start and odometry as known inliers.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 
 import gtsam
@@ -136,6 +138,12 @@ def calibration_values(sensors: KnownSensors) -> gtsam.Values:
         values.insert(T(i), sensors.t[i])
         values.insert(D(i), sensors.distortion[i])
     return values
+
+
+def successive(key_poses: Sequence[int]) -> Iterator[list[int]]:
+    """Yield the key poses, which ascend, whose residuals are one factor."""
+    for _, together in groupby(key_poses, lambda k: k // TOGETHER):
+        yield list(together)
 
 
 def odometry_graph(drive: Drive) -> gtsam.NonlinearFactorGraph:

@@ -10,11 +10,8 @@ from l2m_factors import (
     Calibrations,
     KeyPoseReadings,
     M,
-    TileBatch,
-    Whitening,
+    TileBlocks,
     X,
-    effective_parameters_factor,
-    tile_factor,
 )
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
@@ -29,7 +26,7 @@ from l2m_gtsam.slam.map_prediction import (
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.pose_graph import between_factor, link_graph
+from l2m_gtsam.slam.pose_graph import between_factor, link_graph, successive
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.solver import (
     colamd_ordering,
@@ -67,20 +64,21 @@ class TileReadings:
         The tile with all n readings.
     chosen
         Rows of those that count, shape (c,).
-    whitening
-        Of these, times the roots of their weights, 1/uT, shape (c, 3, 3).
     variance
         Per axis of noise and unresolved waves, over their weights, uT^2, shape (c, 3).
+    blocks
+        Those that count, white times the roots of their weights.
     """
 
     laid: OccupiedTile
     chosen: IntArray
-    whitening: FloatArray
     variance: FloatArray
+    blocks: TileBlocks
 
     @classmethod
     def weighed(
         cls,
+        of_section: SectionReadings,
         laid: OccupiedTile,
         prediction: MapPrediction,
         noise: FloatArray,
@@ -91,6 +89,8 @@ class TileReadings:
 
         Parameters
         ----------
+        of_section
+            All readings of the section.
         laid, prediction
             The tile and its prediction.
         noise
@@ -108,35 +108,29 @@ class TileReadings:
         chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
         W = W[chosen] * np.sqrt(weights[chosen])[:, None, None]
         variance = noise[:, None] ** 2 + laid.field.unresolved(laid.placed.x)
-        return cls(laid, chosen, W, variance[chosen] / weights[chosen, None])
+        readings = of_section.readings[laid.rows[chosen]]
+        blocks = TileBlocks(laid.number, laid.anchor, laid.field, readings, W, of_section.fixed)
+        return cls(laid, chosen, variance[chosen] / weights[chosen, None], blocks)
 
-    def factors(self, of_section: SectionReadings) -> Iterator[gtsam.NonlinearFactor]:
+    def factors(self) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the readings' factors of poses and weights."""
-        batch = self._batch(of_section)
-        for k in batch.key_poses:
-            white = Whitening.independent(self.whitening[batch.rows_of(k)])
-            yield tile_factor(batch, k, white)
+        for together in successive(self.blocks.key_poses):
+            yield self.blocks.residual(together).factor()
 
-    def penalties(
-        self, of_section: SectionReadings, tile: RememberedTile
-    ) -> Iterator[gtsam.NonlinearFactor]:
+    def penalties(self, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the penalties of the parameters that the readings determine (Mallows' C_p)."""
         if not len(self.chosen):
             return
-        batch, x = self._batch(of_section), self.laid.placed.x[self.chosen]
+        x = self.laid.placed.x[self.chosen]
         penalty = self.laid.field.penalty(x, self.variance, tile.past_information)
-        for k in batch.key_poses:
-            factor = effective_parameters_factor(batch, k, penalty[batch.rows_of(k)])
-            if factor is not None:
-                yield factor
+        for together in successive(self.blocks.key_poses):
+            residual = self.blocks.penalty(together, penalty)
+            if residual is not None:
+                yield residual.factor()
 
     def information(self) -> FloatArray:
         """Return the readings' information about the tile's m weights, shape (m, m)."""
         return self.laid.field.information(self.laid.placed.x[self.chosen], self.variance)
-
-    def _batch(self, of_section: SectionReadings) -> TileBatch:
-        laid, readings = self.laid, of_section.readings[self.laid.rows[self.chosen]]
-        return TileBatch(laid.number, laid.anchor, laid.field, readings, of_section.fixed)
 
 
 class OpenSection:
@@ -206,7 +200,7 @@ class OpenSection:
         yield
         for each in self._counted:
             tile = self._tiles[each.laid.number]
-            for factor in each.penalties(self._of_section, tile):
+            for factor in each.penalties(tile):
                 graph.add(factor)
             yield
         yield from self._solved(graph, self._options.max_iterations)
@@ -320,7 +314,7 @@ class OpenSection:
             for number in np.unique(owner).tolist()
         ]
         for tile_readings in self._counted:
-            for factor in tile_readings.factors(self._of_section):
+            for factor in tile_readings.factors():
                 graph.add(factor)
         return graph
 
@@ -347,7 +341,8 @@ class OpenSection:
         prediction = laid.prediction(self._values.atVector(M(tile.number)), sensors)
         noise = sensors.noise[readings.sensor[rows]] * np.where(recent, scale, 1.0)
         mu = np.where(recent, SOFT, np.inf)
-        return TileReadings.weighed(laid, prediction, noise, mu, self._options.robust)
+        robust = self._options.robust
+        return TileReadings.weighed(self._of_section, laid, prediction, noise, mu, robust)
 
     def _solved(self, graph: gtsam.NonlinearFactorGraph, most: int) -> Generator[None, None, None]:
         """Solve for all variables of the section, with a limit of steps."""

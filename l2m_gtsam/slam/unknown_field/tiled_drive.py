@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import groupby
 
 import gtsam
 import numpy as np
@@ -20,7 +19,7 @@ from l2m_factors import (
 from l2m_gtsam.data import FieldSample, FloatArray, IntArray
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.map_prediction import MapPrediction, PlacedReadings, predict
-from l2m_gtsam.slam.pose_graph import TOGETHER
+from l2m_gtsam.slam.pose_graph import successive
 from l2m_gtsam.slam.relative_motion import RelativeMotions
 from l2m_gtsam.slam.solution import REJECTED_WEIGHT
 from l2m_gtsam.slam.unknown_field.linear_field import AXES, LinearField
@@ -248,7 +247,7 @@ class TiledDrive:
             if len(rows):
                 readings = motions.readings[rows]
                 batch = TileBatch(tile.number, tile.anchor, tile.field, readings, fixed)
-                for _, together in groupby(batch.key_poses, lambda k: k // TOGETHER):
+                for together in successive(batch.key_poses):
                     residuals = []
                     for k in together:
                         own = rows[batch.rows_of(k)]

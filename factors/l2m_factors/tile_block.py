@@ -1,0 +1,234 @@
+"""Readings of a tile on several key poses as one factor, evaluated and made white all at once.
+
+A graph that is solved again and again as a drive goes on, with the calibrations of a dozen
+sensors as variables, spends its time in Python: with ``tile_factor`` each key pose asks for two
+dozen values to see whether they changed, and puts together as many blocks of derivatives. Here a
+factor asks once for all readings of the tile, and takes its rows from what was made for all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from l2m_factors.complexity import ComplexityPenalty
+from l2m_factors.field_map import FloatArray, Jacobians
+from l2m_factors.joint_residual import Residual
+from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
+from l2m_factors.keys import M, X
+from l2m_factors.motion import skew
+from l2m_factors.tile import TileBatch, TileField, TilePlaces
+
+
+@dataclass(frozen=True)
+class TileDerivatives:
+    """Derivatives of q components of each of n readings.
+
+    Attributes
+    ----------
+    by_key, by_anchor
+        By the key pose of each and by the tile's anchor, shape (n, q, 6).
+    by_weights
+        By the tile's weights, shape (n, q, m); absent of what does not depend on them.
+    by_sensor
+        By the variables of each one's sensor, one after the other, shape (n, q, .) each.
+    """
+
+    by_key: FloatArray
+    by_anchor: FloatArray
+    by_weights: FloatArray | None
+    by_sensor: tuple[FloatArray, ...]
+
+    def __getitem__(self, rows: npt.NDArray[np.int64]) -> "TileDerivatives":
+        by_weights = None if self.by_weights is None else self.by_weights[rows]
+        by_sensor = tuple(each[rows] for each in self.by_sensor)
+        return TileDerivatives(self.by_key[rows], self.by_anchor[rows], by_weights, by_sensor)
+
+    def along(self, slope: FloatArray) -> "TileDerivatives":
+        """Return those of one component, the sum of three times a slope, shape (n, 3)."""
+        by_sensor = tuple(slope[:, None] @ each for each in self.by_sensor)
+        by_key, by_anchor = slope[:, None] @ self.by_key, slope[:, None] @ self.by_anchor
+        return TileDerivatives(by_key, by_anchor, None, by_sensor)
+
+
+@dataclass(frozen=True)
+class BlockRows:
+    """The readings of a factor, and on which variables each of them depends.
+
+    Attributes
+    ----------
+    keys
+        Key poses but the anchor, the anchor if there are any, weights if they are, sensors.
+    rows
+        The n readings among those of the tile, shape (n,).
+    of_key_pose
+        Which of the n are on each of the key poses but the anchor.
+    of_sensor
+        Which of the n are of each sensor that is a variable.
+    """
+
+    keys: list[int]
+    rows: npt.NDArray[np.int64]
+    of_key_pose: tuple[npt.NDArray[np.int64], ...]
+    of_sensor: tuple[npt.NDArray[np.int64], ...]
+
+    def fill(self, jacobians: list[FloatArray], own: TileDerivatives) -> None:
+        """Put in derivatives of the n readings by each of ``keys``, shape (q n, .) each."""
+        blocks = [placed(own.by_key, at) for at in self.of_key_pose]
+        blocks += [own.by_anchor] if self.of_key_pose else []
+        blocks += [] if own.by_weights is None else [own.by_weights]
+        blocks += [placed(each, at) for at in self.of_sensor for each in own.by_sensor]
+        for slot, block in enumerate(blocks):
+            jacobians[slot] = block.reshape(-1, block.shape[2])
+
+
+def placed(derivatives: FloatArray, at: npt.NDArray[np.int64]) -> FloatArray:
+    """Return derivatives where ``at`` some readings depend on a variable, zero elsewhere."""
+    block = np.zeros_like(derivatives)
+    block[at] = derivatives[at]
+    return block
+
+
+class TileBlocks(TileBatch):
+    """Readings on key poses in one tile, each with noise of its own.
+
+    Parameters
+    ----------
+    number, anchor, field, readings, fixed
+        As of ``TileBatch``.
+    whitening
+        Of each of N readings, 1/uT, shape (N, 3, 3).
+    """
+
+    def __init__(
+        self,
+        number: int,
+        anchor: int,
+        field: TileField,
+        readings: KeyPoseReadings,
+        whitening: FloatArray,
+        fixed: Calibrations | None = None,
+    ) -> None:
+        super().__init__(number, anchor, field, readings, fixed)
+        self._W = whitening
+        self._on_anchor = self._rows.get(anchor, np.empty(0, dtype=np.int64))
+        self._every_sensor = self._variables.on(np.arange(len(readings)))
+        self._stamped: bytes | None = None
+        self._found: KeyPoseResiduals
+        self._white: FloatArray
+        self._where: TilePlaces
+        self._of_readings: TileDerivatives | None = None
+        self._of_places: TileDerivatives | None = None
+
+    def residual(self, key_poses: Sequence[int]) -> Residual:
+        """Return the white residual of the readings on some key poses, shape (3 n,)."""
+        sensors = self._sensors_on(key_poses)
+        keys = [M(self._number), *self._variables.keys(sensors)]
+        block = self._block(key_poses, keys, sensors)
+
+        def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+            self._evaluate(values)
+            if jacobians is not None:
+                block.fill(jacobians, self._reading_derivatives()[block.rows])
+            return self._white[block.rows].ravel()
+
+        return Residual(block.keys, 3 * len(block.rows), error)
+
+    def penalty(self, key_poses: Sequence[int], every: ComplexityPenalty) -> Residual | None:
+        """Return the penalty of readings on some key poses, (n,); None where it has no variables.
+
+        Parameters
+        ----------
+        key_poses
+            Their numbers.
+        every
+            Of all N readings of the tile.
+        """
+        sensors = self._sensors_on(key_poses)
+        block = self._block(key_poses, self._variables.place_keys(sensors), sensors)
+        if not block.keys:
+            return None
+        own = every[block.rows]
+
+        def error(values: gtsam.Values, jacobians: Jacobians) -> FloatArray:
+            self._evaluate(values)
+            if jacobians is not None:
+                block.fill(jacobians, self._place_derivatives()[block.rows].along(own.slope))
+            away = self._where.x[block.rows] - own.at
+            return np.asarray(own.value + np.einsum("ni,ni->n", own.slope, away))
+
+        return Residual(block.keys, len(block.rows), error)
+
+    def _sensors_on(self, key_poses: Sequence[int]) -> list[int]:
+        return sorted({sensor for k in key_poses for sensor in self._sensors[k]})
+
+    def _block(
+        self, key_poses: Sequence[int], beside_poses: list[int], sensors: list[int]
+    ) -> BlockRows:
+        moving = [k for k in key_poses if k != self._anchor]
+        rows = np.concatenate([self._rows[k] for k in key_poses])
+        slot, sensor = self._readings.key_pose[rows], self._readings.sensor[rows]
+        poses = [X(k) for k in (*moving, self._anchor)] if moving else []
+        free = sensors if self._variables.keys(sensors) else []
+        return BlockRows(
+            [*poses, *beside_poses],
+            rows,
+            tuple(np.flatnonzero(slot == k) for k in moving),
+            tuple(np.flatnonzero(sensor == each) for each in free),
+        )
+
+    def _evaluate(self, values: gtsam.Values) -> None:
+        """Evaluate all readings, if anything that they depend on has changed."""
+        present = [k for k in self._rows if self._is_present(values, k)]
+        stamp = self._whole_stamp(values, present)
+        if stamp == self._stamped:
+            return
+        self._found = self._evaluated(values, present)
+        self._where = self._places_at(*self._point)
+        self._white = np.einsum("nij,nj->ni", self._W, self._found.reading.residual)
+        self._of_readings = self._of_places = None
+        self._stamped = stamp
+
+    def _whole_stamp(self, values: gtsam.Values, present: list[int]) -> bytes:
+        numbers = dict.fromkeys([*present, self._anchor])
+        keys = [X(k) for k in numbers if k != self._anchor or values.exists(X(k))]
+        parts = [values.atPose3(key).matrix().tobytes() for key in keys]
+        parts.append(values.atVector(M(self._number)).tobytes())
+        return b"".join(parts) + self._variables.stamp(values, self._every_sensor)
+
+    def _reading_derivatives(self) -> TileDerivatives:
+        """Return derivatives of the white residuals where they were evaluated."""
+        if self._of_readings is None:
+            reading, by_key = self._found.reading, self._W @ self._found.de_dX
+            by_sensor = [reading.de_dt, reading.de_dD]
+            by_sensor += [reading.de_dS] if self._variables.timed else []
+            self._of_readings = TileDerivatives(
+                by_key,
+                self._by_anchor(by_key),
+                self._W @ self._derivatives_by_weights(),
+                tuple(self._W @ each for each in by_sensor),
+            )
+        return self._of_readings
+
+    def _place_derivatives(self) -> TileDerivatives:
+        """Return derivatives of places in the anchor's frame, without time offsets."""
+        if self._of_places is None:
+            R, where = self._where.R_anchor_key, self._where
+            # R exp(w) t = R t - R [t]_x w; a right shift goes along the axes of the key pose.
+            by_key = np.concatenate([-R @ skew(where.t_key), R], axis=2)
+            by_sensor = (R @ where.R_key_lidar,)
+            self._of_places = TileDerivatives(by_key, self._by_anchor(by_key), None, by_sensor)
+        return self._of_places
+
+    def _by_anchor(self, by_key: FloatArray) -> FloatArray:
+        """Return derivatives by the anchor's pose from those by each key pose, (N, q, 6)."""
+        # -Ad(T^-1) with T = (R, p), the key pose in the anchor's frame: ``TileBatch.jacobians``.
+        R, p, _ = self._point
+        turned, shifted = by_key[:, :, :3], by_key[:, :, 3:] @ R.transpose(0, 2, 1)
+        by_anchor = np.concatenate(
+            [shifted @ skew(p) - turned @ R.transpose(0, 2, 1), -shifted], axis=2
+        )
+        by_anchor[self._on_anchor] = 0.0
+        return by_anchor

@@ -1,0 +1,125 @@
+"""Readings of a tile on several key poses as one factor, against a factor for each."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from l2m_factors import (
+    ComplexityPenalty,
+    KeyPoseReadings,
+    M,
+    Residual,
+    TileBatch,
+    TileBlocks,
+    Whitening,
+    X,
+    assert_jacobians_match,
+    effective_parameters,
+    joint_residual,
+    tile_residual,
+)
+from l2m_gtsam.data import FloatArray
+from tests.support.factor_inputs import calibrations, moving, random_carried
+from tests.support.tile_inputs import BASIS, TILE, tile_values
+
+ROUNDING = 1e-10  # of uT and uT/m, up to a few hundred
+
+
+def random_whitening(seed: int, count: int) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    return np.eye(3) + 0.3 * np.tril(rng.normal(size=(count, 3, 3)))
+
+
+def blocks_of(
+    readings: KeyPoseReadings, anchor: int, W: FloatArray, values: gtsam.Values | None
+) -> TileBlocks:
+    fixed = None if values is None else calibrations(values)
+    return TileBlocks(TILE, anchor, BASIS, readings, W, fixed)
+
+
+def assert_alike(ours: FloatArray, theirs: FloatArray) -> None:
+    np.testing.assert_allclose(ours, theirs, rtol=ROUNDING, atol=ROUNDING)
+
+
+def derivatives(residual: Residual, values: gtsam.Values) -> dict[int, FloatArray]:
+    blocks = [np.empty((0, 0))] * len(residual.keys)
+    residual.error(values, blocks)
+    return dict(zip(residual.keys, blocks, strict=True))
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    free=st.booleans(),
+    timed=st.booleans(),
+    anchor=st.integers(0, 2),
+    chosen=st.sets(st.integers(0, 1), min_size=1),
+)
+@settings(deadline=None, max_examples=25)
+def test_a_block_is_its_key_poses_together(
+    seed: int, free: bool, timed: bool, anchor: int, chosen: set[int]
+) -> None:
+    readings, values, key_poses = random_carried(seed), tile_values(seed, 3), sorted(chosen)
+    readings = moving(readings, seed) if timed else readings
+    W, fixed = random_whitening(seed, len(readings)), None if free else calibrations(values)
+    batch = TileBatch(TILE, anchor, BASIS, readings, fixed)
+    white = {k: Whitening.independent(W[batch.rows_of(k)]) for k in key_poses}
+    theirs = joint_residual([tile_residual(batch, k, white[k]) for k in key_poses])
+    ours = blocks_of(readings, anchor, W, None if free else values).residual(key_poses)
+    assert_alike(ours.error(values, None), theirs.error(values, None))
+    own, other = derivatives(ours, values), derivatives(theirs, values)
+    assert own.keys() == other.keys()
+    for key, block in own.items():
+        assert_alike(block, other[key])
+
+
+@given(seed=st.integers(0, 10_000), free=st.booleans(), anchor=st.integers(0, 2))
+@settings(deadline=None, max_examples=15)
+def test_penalties_of_a_block_are_those_of_its_key_poses(
+    seed: int, free: bool, anchor: int
+) -> None:
+    readings, values = random_carried(seed), tile_values(seed, 3)
+    fixed, rng = None if free else calibrations(values), np.random.default_rng(seed)
+    batch, count = TileBatch(TILE, anchor, BASIS, readings, fixed), len(readings)
+    penalty = ComplexityPenalty(
+        rng.normal(size=(count, 3)), rng.uniform(size=count), rng.normal(size=(count, 3))
+    )
+    each = [effective_parameters(batch, k, penalty[batch.rows_of(k)]) for k in batch.key_poses]
+    blocks = blocks_of(readings, anchor, random_whitening(seed, count), None if free else values)
+    ours = blocks.penalty(batch.key_poses, penalty)
+    assert ours is not None
+    own = ours.factor()
+    assert_jacobians_match(own, values)
+    on_anchor = [k for k, one in zip(batch.key_poses, each, strict=True) if one is None]
+    theirs = joint_residual([one for one in each if one is not None]).factor()
+    error = own.unwhitenedError(values)
+    moving_rows = [k not in on_anchor for k in batch.key_poses for _ in batch.rows_of(k)]
+    assert_alike(error[moving_rows], theirs.unwhitenedError(values))
+
+
+def test_derivatives_are_those_of_finite_differences() -> None:
+    readings, values = random_carried(6), tile_values(6, 3)
+    blocks = blocks_of(readings, 0, random_whitening(6, len(readings)), None)
+    assert_jacobians_match(blocks.residual(blocks.key_poses).factor(), values)
+
+
+def test_it_is_evaluated_again_whatever_changes() -> None:
+    readings, values = random_carried(4), tile_values(4, 3)
+    factor = blocks_of(readings, 2, random_whitening(4, len(readings)), None)
+    residual = factor.residual(factor.key_poses)
+    for key in residual.keys:
+        before = residual.error(values, None)
+        moved = gtsam.VectorValues()
+        moved.insert(key, np.full(derivatives(residual, values)[key].shape[1], 0.01))
+        values = values.retract(moved)
+        assert residual.error(values, None) != pytest.approx(before, abs=1e-9)
+
+
+def test_of_the_anchor_alone_there_is_no_pose_and_no_penalty() -> None:
+    readings, values = random_carried(3), tile_values(3)
+    blocks = blocks_of(readings, 1, random_whitening(3, len(readings)), values)
+    assert blocks.residual([1]).keys == [M(TILE)]
+    assert blocks.residual([0, 1]).keys == [X(0), X(1), M(TILE)]
+    nothing = np.zeros((len(readings), 3))
+    assert blocks.penalty([1], ComplexityPenalty(nothing, nothing[:, 0], nothing)) is None
