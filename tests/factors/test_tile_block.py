@@ -18,6 +18,7 @@ from l2m_factors import (
     assert_jacobians_match,
     effective_parameters,
     joint_residual,
+    tile_block,
     tile_residual,
 )
 from l2m_gtsam.data import FloatArray
@@ -66,7 +67,8 @@ def test_a_block_is_its_key_poses_together(
     batch = TileBatch(TILE, anchor, BASIS, readings, fixed)
     white = {k: Whitening.independent(W[batch.rows_of(k)]) for k in key_poses}
     theirs = joint_residual([tile_residual(batch, k, white[k]) for k in key_poses])
-    ours = blocks_of(readings, anchor, W, None if free else values).residual(key_poses)
+    blocks = blocks_of(readings, anchor, W, None if free else values)
+    ours = joint_residual(list(blocks.white_residuals(key_poses)))
     assert_alike(ours.error(values, None), theirs.error(values, None))
     own, other = derivatives(ours, values), derivatives(theirs, values)
     assert own.keys() == other.keys()
@@ -101,13 +103,14 @@ def test_penalties_of_a_block_are_those_of_its_key_poses(
 def test_derivatives_are_those_of_finite_differences() -> None:
     readings, values = random_carried(6), tile_values(6, 3)
     blocks = blocks_of(readings, 0, random_whitening(6, len(readings)), None)
-    assert_jacobians_match(blocks.residual(blocks.key_poses).factor(), values)
+    for residual in blocks.white_residuals(blocks.key_poses):
+        assert_jacobians_match(residual.factor(), values)
 
 
 def test_it_is_evaluated_again_whatever_changes() -> None:
     readings, values = random_carried(4), tile_values(4, 3)
-    factor = blocks_of(readings, 2, random_whitening(4, len(readings)), None)
-    residual = factor.residual(factor.key_poses)
+    blocks = blocks_of(readings, 2, random_whitening(4, len(readings)), None)
+    residual = joint_residual(list(blocks.white_residuals(blocks.key_poses)))
     for key in residual.keys:
         before = residual.error(values, None)
         moved = gtsam.VectorValues()
@@ -119,7 +122,27 @@ def test_it_is_evaluated_again_whatever_changes() -> None:
 def test_of_the_anchor_alone_there_is_no_pose_and_no_penalty() -> None:
     readings, values = random_carried(3), tile_values(3)
     blocks = blocks_of(readings, 1, random_whitening(3, len(readings)), values)
-    assert blocks.residual([1]).keys == [M(TILE)]
-    assert blocks.residual([0, 1]).keys == [X(0), X(1), M(TILE)]
+    assert [each.keys for each in blocks.white_residuals([1])] == [[M(TILE)]]
+    assert [each.keys for each in blocks.white_residuals([0, 1])] == [[X(0), X(1), M(TILE)]]
     nothing = np.zeros((len(readings), 3))
     assert blocks.penalty([1], ComplexityPenalty(nothing, nothing[:, 0], nothing)) is None
+
+
+def test_few_sensors_to_a_factor_are_all_of_them_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same cost, and the same gradient."""
+    readings, values = random_carried(5), tile_values(5, 3)
+    blocks = blocks_of(readings, 2, random_whitening(5, len(readings)), None)
+    whole = joint_residual(list(blocks.white_residuals(blocks.key_poses)))
+    monkeypatch.setattr(tile_block, "SENSORS", 1)
+    parts = list(blocks.white_residuals(blocks.key_poses))
+    assert len(parts) == 2
+    assert all(set(each.keys) < set(whole.keys) for each in parts)
+    of_parts = joint_residual(parts)
+    for key in whole.keys:
+        ours, theirs = (
+            derivatives(each, values)[key].T @ each.error(values, None)
+            for each in (of_parts, whole)
+        )
+        assert_alike(ours, theirs)
+    squares = [float(np.sum(each.error(values, None) ** 2)) for each in (of_parts, whole)]
+    assert squares[0] == pytest.approx(squares[1], rel=ROUNDING)

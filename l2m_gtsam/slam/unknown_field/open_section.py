@@ -115,7 +115,8 @@ class TileReadings:
     def factors(self) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the readings' factors of poses and weights."""
         for together in successive(self.blocks.key_poses):
-            yield self.blocks.residual(together).factor()
+            for residual in self.blocks.white_residuals(together):
+                yield residual.factor()
 
     def penalties(self, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
         """Yield the penalties of the parameters that the readings determine (Mallows' C_p)."""
