@@ -348,9 +348,10 @@ def settle(
         after = estimate.updated(values, sensors)
         if options.sensor_noise_ut is None:
             after = replace(after, noise=optimum.noise())
-        # The weights of the first round are those of the optimum with independent errors.
         at_rest = joint.furthest(sensors) < SETTLED_SIGMAS and joint.decrement < THERE_SIGMAS
-        settled = at_rest and problem.same_noise(after, estimate) and round_ > 0
+        # The first weights are those of the optimum with independent errors, if none is predicted.
+        weighed = round_ > 0 or begin.near
+        settled = weighed and at_rest and problem.same_noise(after, estimate)
         estimate = after
         if settled:
             break
