@@ -17,7 +17,7 @@ from l2m_factors.complexity import ComplexityPenalty
 from l2m_factors.field_map import FloatArray, Jacobians
 from l2m_factors.joint_residual import Residual
 from l2m_factors.key_pose_readings import Calibrations, KeyPoseReadings, KeyPoseResiduals
-from l2m_factors.keys import M, X
+from l2m_factors.keys import M, T, X
 from l2m_factors.motion import skew
 from l2m_factors.tile import TileBatch, TileField, TilePlaces
 
@@ -179,15 +179,14 @@ class TileBlocks(TileBatch):
     ) -> BlockRows:
         rows = np.concatenate([self._rows[k] for k in key_poses])
         rows = rows[np.isin(self._readings.sensor[rows], sensors)]
-        numbers = self._readings.key_pose[rows]
-        moving = [k for k in key_poses if k != self._anchor and k in numbers]
-        slot, sensor = self._readings.key_pose[rows], self._readings.sensor[rows]
+        number, sensor = self._readings.key_pose[rows], self._readings.sensor[rows]
+        moving = [k for k in key_poses if k != self._anchor and k in number]
         poses = [X(k) for k in (*moving, self._anchor)] if moving else []
         free = sensors if self._variables.keys(sensors) else []
         return BlockRows(
             [*poses, *beside_poses],
             rows,
-            tuple(np.flatnonzero(slot == k) for k in moving),
+            tuple(np.flatnonzero(number == k) for k in moving),
             tuple(np.flatnonzero(sensor == each) for each in free),
         )
 
@@ -208,7 +207,8 @@ class TileBlocks(TileBatch):
         keys = [X(k) for k in numbers if k != self._anchor or values.exists(X(k))]
         parts = [values.atPose3(key).matrix().tobytes() for key in keys]
         parts.append(values.atVector(M(self._number)).tobytes())
-        return b"".join(parts) + self._variables.stamp(values, self._every_sensor)
+        known = [sensor for sensor in self._every_sensor if values.exists(T(sensor))]
+        return b"".join(parts) + self._variables.stamp(values, known)
 
     def _reading_derivatives(self) -> TileDerivatives:
         """Return derivatives of the white residuals where they were evaluated."""

@@ -146,3 +146,15 @@ def test_few_sensors_to_a_factor_are_all_of_them_together(monkeypatch: pytest.Mo
         assert_alike(ours, theirs)
     squares = [float(np.sum(each.error(values, None) ** 2)) for each in (of_parts, whole)]
     assert squares[0] == pytest.approx(squares[1], rel=ROUNDING)
+
+
+def test_a_factor_needs_no_values_but_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    readings, values = random_carried(7), tile_values(7, 3)
+    monkeypatch.setattr(tile_block, "SENSORS", 1)
+    W = random_whitening(7, len(readings))
+    for residual in blocks_of(readings, 2, W, None).white_residuals([0]):
+        own, alone = gtsam.Values(), list(blocks_of(readings, 2, W, None).white_residuals([0]))
+        for key in residual.keys:
+            own.insert(values.extract([key]))
+        same = next(each for each in alone if each.keys == residual.keys)
+        assert_alike(same.error(own, None), residual.error(values, None))
