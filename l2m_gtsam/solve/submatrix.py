@@ -1,8 +1,8 @@
 """Rows and columns of a large matrix that a few readings touch: added to, taken out, multiplied.
 
-NumPy's indexing by two lists of places takes a hundred times as long for an element as the sum that
-it is for; where thousands of groups of readings touch dozens to hundreds of variables each, it took
-a third of a calibration's last stage.
+NumPy's indexing by two lists of places takes 40 ns for an element that is added. Where thousands of
+groups of readings touch dozens to hundreds of variables each, that was a fifth of a calibration's
+last stage.
 """
 
 import numpy as np
