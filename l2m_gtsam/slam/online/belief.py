@@ -202,10 +202,14 @@ class PredictedBelief(Belief):
 
     def marginalize_previous(self) -> Belief:
         """Return the belief of the next key pose, the previous one marginalised out."""
-        # X' = X S: Exp(x') = Exp(Ad_{S^-1} x + s) to first order, for right perturbations.
-        J = np.eye(len(self.covariance) - POSE, len(self.covariance))
-        J[:POSE, :POSE], J[:POSE, -POSE:] = self.step.inverse().AdjointMap(), np.eye(POSE)
-        return Belief(self.pose.compose(self.step), self.sensors, J @ self.covariance @ J.T)
+        # X' = X S: Exp(x') = Exp(Ad_{S^-1} x + s) to first order, for right perturbations; sensors
+        # stay as they are.
+        P, turn = self.covariance, self.step.inverse().AdjointMap()
+        rows, after = turn @ P[:POSE] + P[-POSE:], P[:-POSE, :-POSE].copy()
+        after[:POSE] = rows[:, :-POSE]
+        after[:, :POSE] = after[:POSE].T
+        after[:POSE, :POSE] = rows[:, :POSE] @ turn.T + rows[:, -POSE:]
+        return Belief(self.pose.compose(self.step), self.sensors, after)
 
 
 def kalman_gain(P: FloatArray, J: FloatArray) -> FloatArray:
