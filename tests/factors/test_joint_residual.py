@@ -57,3 +57,11 @@ def test_a_graph_of_it_has_the_linear_system_of_all() -> None:
     systems = [graph.linearize(values).hessian(order) for graph in (apart, together)]
     for one, other in zip(*systems, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_a_white_residual_is_a_factor_of_its_own() -> None:
+    """GTSAM's list of derivatives is filled block by block: it takes no slice."""
+    for residual in steps():
+        white = residual.whitened(NOISE).factor()
+        assert white.error(chain()) == pytest.approx(residual.factor(NOISE).error(chain()))
+        assert_jacobians_match(white, chain())
