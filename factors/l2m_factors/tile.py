@@ -81,6 +81,18 @@ class TilePlaces:
     t_key: FloatArray
     x: FloatArray
 
+    @property
+    def by_key(self) -> FloatArray:
+        """Derivatives of places by a right perturbation of each one's key pose, (n, 3, 6)."""
+        # R exp(w) t = R t - R [t]_x w; a right shift goes along the axes of the key pose.
+        R = self.R_anchor_key
+        return np.concatenate([-R @ skew(self.t_key), R], axis=2)
+
+    @property
+    def R_anchor_lidar(self) -> FloatArray:
+        """The lidar's rotation, and derivatives of places by each sensor's position, (n, 3, 3)."""
+        return np.asarray(self.R_anchor_key @ self.R_key_lidar)
+
     def __getitem__(self, rows: npt.NDArray[np.int64]) -> "TilePlaces":
         return TilePlaces(
             self.R_anchor_key[rows], self.R_key_lidar[rows], self.t_key[rows], self.x[rows]
@@ -161,12 +173,10 @@ class TileBatch(KeyPoseBatch):
         self, values: gtsam.Values, key_pose: int, where: TilePlaces
     ) -> list[FloatArray]:
         """Return derivatives of n places by each of ``place_keys_of``, each of shape (n, 3, .)."""
-        R = where.R_anchor_key
-        blocks = self._variables.place_jacobians(R @ where.R_key_lidar, self._rows[key_pose])
+        blocks = self._variables.place_jacobians(where.R_anchor_lidar, self._rows[key_pose])
         if key_pose == self._anchor:
             return blocks
-        # R exp(w) t = R t - R [t]_x w; a right shift goes along the axes of the key pose.
-        by_key = np.concatenate([-R @ skew(where.t_key), R], axis=2)
+        by_key = where.by_key
         relative = self._pose(values, key_pose)
         return [by_key, -by_key @ relative.inverse().AdjointMap(), *blocks]
 
@@ -190,7 +200,7 @@ class TileBatch(KeyPoseBatch):
         """Return derivatives by the weights where all N residuals were evaluated, (N, 3, m)."""
         where, known = self._places_at(*self._point), self._point[2]
         C = known.distortion[self._readings.sensor, :9].reshape(-1, 3, 3)
-        turned = C @ (where.R_anchor_key @ where.R_key_lidar).transpose(0, 2, 1)
+        turned = C @ where.R_anchor_lidar.transpose(0, 2, 1)
         return np.asarray(turned @ self._tile.features(where.x))
 
     def _places_at(self, R: FloatArray, p: FloatArray, known: Calibrations) -> TilePlaces:

@@ -227,10 +227,7 @@ class TileBlocks(TileBatch):
     def _place_derivatives(self) -> TileDerivatives:
         """Return derivatives of places in the anchor's frame, without time offsets."""
         if self._of_places is None:
-            R, where = self._where.R_anchor_key, self._where
-            # R exp(w) t = R t - R [t]_x w; a right shift goes along the axes of the key pose.
-            by_key = np.concatenate([-R @ skew(where.t_key), R], axis=2)
-            by_sensor = (R @ where.R_key_lidar,)
+            by_key, by_sensor = self._where.by_key, (self._where.R_anchor_lidar,)
             self._of_places = TileDerivatives(by_key, self._by_anchor(by_key), None, by_sensor)
         return self._of_places
 
