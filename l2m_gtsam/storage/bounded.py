@@ -89,7 +89,8 @@ def read_content(
     with opened(path, error, missing) as file:
         found = file.read(most_bytes + 1)  # files of the system have no size beforehand
     if len(found) > most_bytes:
-        raise error(f"{path}: larger than {most_bytes / MEGABYTE:g} MB, not a file of this program")
+        most = f"{most_bytes / MEGABYTE:g} MB"
+        raise error(f"{path}: larger than {most}, which no file of the kind expected here is")
     return found
 
 
