@@ -3,13 +3,15 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
 
 from l2m_gtsam.calibration.budget.processes import Process
 from l2m_gtsam.calibration.joint_information import JointInformation, Rows
-from l2m_gtsam.data import FloatArray, IntArray
+from l2m_gtsam.data import BoolArray, FloatArray, IntArray
 from l2m_gtsam.records.error_budget import DisturbanceKind
+from l2m_gtsam.solve.chi_square import chance_beyond
 from l2m_gtsam.solve.variance_components import (
     TO_THE_TOP,
     VarianceComponents,
@@ -17,9 +19,9 @@ from l2m_gtsam.solve.variance_components import (
     shared_components,
 )
 
-# Twice a logarithm of likelihood. Where a process is not there, half of all drives give zero, and
-# 0.7 % more than this (a mixture of chi-square distributions, Self and Liang, JASA 82, 1987).
-LEAST_GAIN = 6.0
+# Twice a logarithm of likelihood. Of processes that are not there 0.7 % have more; and of what is
+# found, so much may be there by chance.
+LEAST_GAIN, BY_CHANCE = 6.0, 0.05
 NO_WEIGHTS = np.empty(0, dtype=np.int64)
 BATCH = 4000  # readings whose processes are held at once: 30 MB
 HARDLY = 1.5  # standard deviations of a score: no more is not worth a likelihood
@@ -211,7 +213,9 @@ def search(known: ProcessInformation) -> Searched:
             for k, each in enumerate(known.processes)
             if each.kind in kinds
         }
-        shown = {k: found for k, found in alone.items() if found.gain > LEAST_GAIN}
+        gains_alone = np.array([found.gain for found in alone.values()])
+        worth = credible(gains_alone, len(known.processes))
+        shown = dict(compress(alone.items(), worth))
         if not shown:
             break
         gains = {kind: _gain(shown, kind) for kind in kinds}
@@ -222,6 +226,31 @@ def search(known: ProcessInformation) -> Searched:
                 taken[k] = found
                 variances[known.columns[k]] = found.variances
     return _together(known, taken)
+
+
+def credible(gains: FloatArray, looked_for: int) -> BoolArray:
+    """Return which of the best processes are more than the luck of having looked for many.
+
+    Of what is kept, a share of ``BY_CHANCE`` at most is not there (Benjamini and Hochberg, JRSS B
+    57, 1995): one process in many has to gain more than several that are seen together. None is
+    kept that does not gain ``LEAST_GAIN``.
+
+    Parameters
+    ----------
+    gains
+        Twice the logarithms of their likelihoods, shape (K,).
+    looked_for
+        How many processes there were to choose from, K or more.
+    """
+    # Where a process is not there, half of all drives give zero, and the others a chi-square of
+    # one (Self and Liang, JASA 82, 1987): the parts of a process are too alike for more.
+    chance = 0.5 * chance_beyond(gains, 1)
+    order = np.argsort(chance)
+    rank = np.arange(1, len(order) + 1)
+    below = np.flatnonzero(chance[order] <= BY_CHANCE * rank / looked_for)
+    worth = np.zeros(len(order), dtype=bool)
+    worth[order[: below[-1] + 1 if len(below) else 0]] = True
+    return worth & (gains > LEAST_GAIN)
 
 
 def _gain(found: dict[int, FoundProcess], kind: DisturbanceKind) -> float:
@@ -263,15 +292,15 @@ def _together(known: ProcessInformation, taken: dict[int, FoundProcess]) -> Sear
     alone = np.concatenate([found.sizes for found in taken.values()])
     fit = shared_components([system], [every], known.squares, TO_THE_TOP, alone)
     system = system.whiter(fit.noise)
-    kept = []
+    likely = []
     for k, each in taken.items():
         others = np.where(of == k, 0.0, fit.sizes) @ every
         own = known.columns[k]
         here = np.searchsorted(at, own)
         left = system.left_to(others, here)
         sizes = fit.sizes[of == k]
-        likely = left.fit(sizes @ each.process.forms[each.form]).likelihood
-        gain = 2 * likely - _price(each.process)
-        if gain > LEAST_GAIN:
-            kept.append(FoundProcess(each.process, each.form, sizes, gain))
+        gain = 2 * left.fit(sizes @ each.process.forms[each.form]).likelihood
+        likely.append(FoundProcess(each.process, each.form, sizes, gain - _price(each.process)))
+    worth = credible(np.array([each.gain for each in likely]), len(known.processes))
+    kept = list(compress(likely, worth))
     return known.searched(kept, fit.noise) if kept else NOTHING_SEARCHED
