@@ -36,6 +36,7 @@ COLOURS = {
     "ours": "#1b7837",
 }
 LOWEST_M = 0.005  # of the axis
+SIMULATED = {"warehouse", "corridor"}
 
 
 @dataclass(frozen=True)
@@ -98,10 +99,13 @@ class SlamArrayStudy(Study[SlamArrayOptions, SlamArrayCell, SlamArraySummary]):
         return SlamArraySummary(options, tuple(row_of(key, own) for key, own in groups.items()))
 
     def page_context(self, summary: SlamArraySummary) -> dict[str, Any]:
-        """Return what is lost: rows that odometry wins, and those whose odometry was kept."""
+        """Return which places there are, rows that odometry wins, and those that kept odometry."""
         named = {f"{row.site}, {row.kind}": row for row in summary.rows}
+        kinds = {row.site.split()[0] for row in summary.rows}
         return {
             "methods": METHODS,
+            "kinds": kinds,
+            "ours": kinds & SIMULATED,
             "worse": [
                 f"{name} ({', '.join(own)})"
                 for name, row in named.items()

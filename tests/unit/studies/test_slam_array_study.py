@@ -1,5 +1,6 @@
 """The study of SLAM with several sensors: its page, from made-up cells, and what its cells use."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,13 @@ def test_what_is_lost_is_on_the_page() -> None:
     assert "worse than its odometry: robot 1, slip (map: particle filter)." in page
     assert "no gain is shown: robot 1, walk (2); array 6, walk (2) seeds." in page
     assert "| robot 1 | 3, 30 m | slip | 200 | 160 | 20 | 20 | 20 | 20 | 90 % | 90 % |" in page
+    assert "*Robot* is" in page
+    assert "we simulate" not in page
     assert set(SLAM_ARRAY.figures(summary)) == {"slam-array"}
+    simulated = replace(summary.rows[0], site="warehouse 1")
+    page = SLAM_ARRAY.page(replace(summary, rows=(simulated,)))
+    assert "*Warehouse* is our simulation" in page
+    assert "*Robot* is" not in page
 
 
 def test_steps_of_the_particle_filter_are_a_tenth_of_a_metre_apart() -> None:
