@@ -10,7 +10,8 @@ from tests.support.browsing import find_tools
 from tests.support.repository import REPOSITORY
 
 # Machines are as fast as they are, and the first call of a compiled function compiles it.
-settings.register_profile("l2m", deadline=None)
+# Each run draws its own examples: fewer of them in a run, and many over the runs.
+settings.register_profile("l2m", deadline=None, max_examples=40)
 settings.load_profile("l2m")
 
 

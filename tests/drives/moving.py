@@ -117,11 +117,17 @@ def moving_drive(
     )
 
 
-def options(drive: MovingDrive, kind: Uncertainty = Uncertainty.FULL) -> CalibrationOptions:
-    """Return options that start each sensor 9 cm from its place."""
+def options(
+    drive: MovingDrive, kind: Uncertainty = Uncertainty.FULL, *, steel: bool = True
+) -> CalibrationOptions:
+    """Return options that start each sensor 9 cm from its place.
+
+    ``steel`` is whether steel is looked for that came or went since the survey.
+    """
     start = {each.sensor: tuple((each.t_lidar_mag + 0.05).tolist()) for each in drive.sensors}
+    changes = {} if steel else {"sources": {"most": 0}}
     return CalibrationOptions.model_validate(
-        {"start": start, "solve": OneKeyOptions(uncertainty=kind)}
+        {"start": start, "solve": OneKeyOptions(uncertainty=kind), "changes": changes}
     )
 
 

@@ -11,6 +11,7 @@ from l2m_gtsam.config import Config, load_config
 from l2m_gtsam.data import FloatArray, KnownSensor
 from l2m_gtsam.mapping.map_building import map_fields, map_recordings, sensor_positions
 from l2m_gtsam.maps.field_map import FieldMap
+from l2m_gtsam.maps.harmonic.learning import LearningOptions
 from l2m_gtsam.recording.sync import synchronise
 from l2m_gtsam.records.calibration import SensorCalibration, SensorStatus
 from l2m_gtsam.storage.bag import read_recording
@@ -27,7 +28,13 @@ RUN1 = {
 
 @pytest.fixture(scope="module")
 def config(repository: Path) -> Config:
-    return load_config(repository / "configs" / "optitrack.yaml")
+    """That of the recording, with a map that is learnt in small windows."""
+    found = load_config(repository / "configs" / "optitrack.yaml")
+    learning = LearningOptions(windows=2, rough=1, modes=150)
+    harmonic = found.mapping.model.harmonic.model_copy(update={"learning": learning})
+    model = found.mapping.model.model_copy(update={"harmonic": harmonic})
+    mapping = found.mapping.model_copy(update={"model": model})
+    return found.model_copy(update={"mapping": mapping})
 
 
 def build(bags: Path, kind: str, config: Config) -> FieldMap:

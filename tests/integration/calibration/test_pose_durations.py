@@ -10,7 +10,7 @@ from l2m_gtsam.records.calibration import CalibrationResult
 from l2m_gtsam.records.error_budget import DurationSource
 from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble
-from tests.drives.troubled import DRIVE, OPTIONS, hall
+from tests.drives.troubled import DRIVE, OPTIONS, hall, starts
 
 READINGS = 1600  # of each sensor
 
@@ -23,11 +23,9 @@ def result(
         position_m=OPTIONS.pose_m, rotation_deg=OPTIONS.pose_deg, correlation_s=stated_s
     )
     options = OPTIONS.model_copy(update={"pose_s": lasting_s, "readings": readings})
-    recording, _ = troubled_drive(options, hall(Trouble.CLEAN), Trouble.POSES, DRIVE)
-    solve = OneKeyOptions(pose_noise=poses)
-    return calibrated(
-        recording, hall(Trouble.CLEAN).field_map, CalibrationOptions(solve=solve)
-    ).result
+    recording, truth = troubled_drive(options, hall(Trouble.CLEAN), Trouble.POSES, DRIVE)
+    chosen = CalibrationOptions(start=starts(truth), solve=OneKeyOptions(pose_noise=poses))
+    return calibrated(recording, hall(Trouble.CLEAN).field_map, chosen).result
 
 
 @pytest.mark.parametrize("lasting_s", [0.1, 5.0])

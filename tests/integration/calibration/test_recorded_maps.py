@@ -111,9 +111,9 @@ class Array:
 
     def field_map(self) -> CompiledMap:
         """Return the map of the runs that make it, from all sensors."""
-        R, p = self.R[MAPPED], self.p[MAPPED]
+        R, p = self.R[MAPPED, ::HALF], self.p[MAPPED, ::HALF]
         points = np.einsum("rnij,sj->rnsi", R, self.t) + p[:, :, None]
-        field = np.einsum("rnij,rnsj->rnsi", R, self.mag[MAPPED])
+        field = np.einsum("rnij,rnsj->rnsi", R, self.mag[MAPPED, ::HALF])
         return HarmonicMap.fit(points.reshape(-1, 3), field.reshape(-1, 3)).compile()
 
     def readings(self, run: int) -> Readings:

@@ -11,7 +11,7 @@ from l2m_gtsam.records.calibration import CalibrationResult, SensorStatus
 from l2m_gtsam.records.error_budget import ErrorCause, StatedSize
 from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble
-from tests.drives.troubled import DRIVE, OPTIONS, hall
+from tests.drives.troubled import DRIVE, OPTIONS, hall, starts
 
 
 def calibration(times: float, cause: ErrorCause) -> CalibrationResult:
@@ -26,8 +26,8 @@ def calibration(times: float, cause: ErrorCause) -> CalibrationResult:
             correlation_s=OPTIONS.pose_s,
         )
         solve, trouble = OneKeyOptions(pose_noise=poses), Trouble.POSES
-    recording, _ = troubled_drive(OPTIONS, place, trouble, DRIVE)
-    options = CalibrationOptions(solve=solve)
+    recording, truth = troubled_drive(OPTIONS, place, trouble, DRIVE)
+    options = CalibrationOptions(start=starts(truth), solve=solve)
     return calibrated(recording, place.field_map, options).result
 
 

@@ -96,11 +96,11 @@ def test_scans_of_another_room_are_counted_and_left_out(
     )
     mixed = [
         replace(step, surface=odd[0].surface) if 5 <= k < 8 else step
-        for k, step in enumerate(steps)
+        for k, step in enumerate(steps[:14])
     ]
     found = localise_scans(mixed, cloud, unsure(pose(DRIVE, 0)), OPTIONS)
     assert found.refused == {Refusal.ELSEWHERE: 3}
-    kept = [k for k in range(len(DRIVE)) if not 5 <= k < 8]
+    kept = [k for k in range(len(mixed)) if not 5 <= k < 8]
     np.testing.assert_array_equal(found.trajectory.stamp_ns, DRIVE.stamp_ns[kept])
     np.testing.assert_allclose(found.trajectory.p, DRIVE.p[kept], rtol=0, atol=2e-3)
 
@@ -178,12 +178,12 @@ def test_loops_are_closed(steps: list[ScanStep]) -> None:
 
 def test_wrong_loops_are_refused(steps: list[ScanStep]) -> None:
     """Odometry believes to be back where it began; the scans are of another room."""
-    odd = follow(scans(OTHER, DRIVE, np.random.default_rng(3)), ScanOdometryOptions())
+    odd = follow(
+        scans(OTHER, rows(DRIVE, range(8)), np.random.default_rng(3)), ScanOdometryOptions()
+    )
     later = 60_000_000_000
     moved = [replace(each, stamp_ns=each.stamp_ns + later) for each in odd]
-    found = find_loop_closures(
-        chain(steps[:20], moved[:8]), LoopOptions(least_way_m=4.0, search_m=4.0)
-    )
+    found = find_loop_closures(chain(steps[:20], moved), LoopOptions(least_way_m=4.0, search_m=4.0))
     wrong = [each for each in found.loops if each.to_ns - each.from_ns > later / 2]
     assert wrong == []
     assert found.refused[Refusal.ELSEWHERE] >= 2

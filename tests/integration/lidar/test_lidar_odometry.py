@@ -108,8 +108,8 @@ def test_scans_without_points_and_missing_ones() -> None:
 @pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_pause_in_which_the_motion_changed(share: float) -> None:
     """Four seconds without a scan, in which the lidar stands still, or is half as fast."""
-    true = rows(round_trip(100), [*range(0, 30, 2), *range(30 + round(40 * share), 60, 2)])
-    later = np.where(np.arange(len(true)) < 15, 0, round(4e9 * (1 - share)))
+    true = rows(round_trip(100), [*range(16, 30, 2), *range(30 + round(40 * share), 60, 2)])
+    later = np.where(np.arange(len(true)) < 7, 0, round(4e9 * (1 - share)))
     true = replace(true, stamp_ns=true.stamp_ns + later)
     steps = list(follow(scans(ROOM, true, np.random.default_rng(3)), OPTIONS))
     last = len(true) - 1

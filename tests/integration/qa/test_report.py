@@ -54,9 +54,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @pytest.fixture(scope="module")
-def reported(made: Made) -> tuple[Level, str]:
+def told() -> list[tuple[str, float]]:
+    """How far the report said that it was."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def reported(made: Made, told: list[tuple[str, float]]) -> tuple[Level, str]:
     """The verdict and the page, made from the files."""
-    level = report_folder(made.folder, None).level
+    level = report_folder(made.folder, None, lambda *how_far: told.append(how_far)).level
     return level, (made.folder / REPORT_FILE).read_text()
 
 
@@ -87,19 +93,13 @@ def test_metrics_come_back_as_they_were(made: Made, tmp_path: Path) -> None:
     json.loads(again, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
 
 
-def test_the_report_needs_no_bag_and_no_map(
-    made: Made, reported: tuple[Level, str], tmp_path: Path
-) -> None:
-    """The same page from the files as from what the calibration had in memory."""
-    result = read_calibration(made.folder / CALIBRATION_FILE)
-    write_report(tmp_path, result, made.metrics, QaOptions())
-    assert (tmp_path / REPORT_FILE).read_text() == reported[1]
-
-
 def test_what_was_just_written_is_reported_without_being_read(
     made: Made, reported: tuple[Level, str], tmp_path: Path
 ) -> None:
-    """The same page as of its folder, and the same refusal beside a localisation."""
+    """The same page as of its folder, which has no bag and no map.
+
+    And the same refusal beside a localisation.
+    """
     found = EvaluatedCalibration(read_calibration(made.folder / CALIBRATION_FILE), made.metrics)
     assert report_calibration(tmp_path, found, QaOptions()).level is reported[0]
     assert (tmp_path / REPORT_FILE).read_text() == reported[1]
@@ -142,10 +142,9 @@ def test_the_page_asks_for_nothing(reported: tuple[Level, str]) -> None:
     assert set(re.findall(r"url\(#([^)]+)\)", page)) <= set(names)
 
 
-def test_a_report_tells_how_far_it_is(made: Made) -> None:
+@pytest.mark.usefixtures("reported")
+def test_a_report_tells_how_far_it_is(made: Made, told: list[tuple[str, float]]) -> None:
     """A step for each sensor, and the end only once the page is written."""
-    told: list[tuple[str, float]] = []
-    report_folder(made.folder, None, lambda stage, fraction: told.append((stage, fraction)))
     assert {stage for stage, _ in told} == {"report"}
     fractions = [fraction for _, fraction in told]
     assert fractions == sorted(fractions)

@@ -18,7 +18,7 @@ from l2m_gtsam.storage.cloud import read_cloud
 from tests.worlds.quick_maps import QUICK_HARMONIC
 
 SMALL = ScenarioOptions(
-    floor_plan=FloorPlanOptions(length=16.0, width=9.0, rack_rows=1, blocks=1),
+    floor_plan=FloorPlanOptions(length=12.0, width=8.0, rack_rows=1, blocks=1),
     suite=MappingSuiteOptions(lateral=(-0.3, 0.3), heights=(0.0,)),
     mapping_sampling=SamplingOptions(field_rate=4.0),
     array=SensorArrayOptions(count=1),

@@ -28,7 +28,7 @@ def hall() -> DipoleWorld:
 
 def survey(world: DipoleWorld) -> tuple[FloatArray, FloatArray]:
     rng = np.random.default_rng(1)
-    points = rng.uniform([0, 0, 0.2], [30, 4, 0.8], (15_000, 3))
+    points = rng.uniform([0, 0, 0.2], [30, 4, 0.8], (8_000, 3))
     return points, world.field_and_gradient(points)[0] + rng.normal(0, NOISE, points.shape)
 
 
