@@ -36,7 +36,10 @@ def half_of(survey: SurveyDrive) -> SurveyDrive:
 
 @cache
 def surveyed(times: float) -> HarmonicMap:
-    """Return the map of half a hall whose suite is stated so many times too large; with 0 not at all."""
+    """Return the map of half a hall whose suite is stated so many times too large.
+
+    With 0 it is not stated at all.
+    """
     place, right = place_of(World.HALL, SEED), known_suite(OPTIONS)
     recorded = half_of(survey_of(place, OPTIONS)).recorded(right, place, OPTIONS, off=True)
     stated = {

@@ -11,15 +11,14 @@ from l2m_gtsam.mapping.suite_calibration import calibrate_suite
 from l2m_gtsam.progress import silent
 from l2m_gtsam.recording.pose_noise import PoseNoiseOptions
 from l2m_gtsam.records.calibration import CalibrationResult
-from tests.drives.suite_surveys import QUICK as SEARCHING
-from tests.drives.suite_surveys import errors, suite, surveyed
+from tests.drives.suite_surveys import QUICK, errors, suite, surveyed
 from tests.worlds.surveyed import strange_hall
 
 POSITION_M, ROTATION_DEG, LASTING_S = 0.02, 0.8, 2.0
 EXACT = PoseNoiseOptions(position_m=0.0, rotation_deg=0.0)
 STATED = PoseNoiseOptions(position_m=POSITION_M, rotation_deg=ROTATION_DEG, correlation_s=LASTING_S)
 TRUTH, SEED = suite(2, 2), 6
-QUICK = SEARCHING.model_copy(update={"searches": 0})  # no steel stands beside the way
+PLAIN = QUICK.model_copy(update={"searches": 0})  # no steel stands beside the way
 
 
 def misplaced(recording: Recording, seed: int) -> Recording:
@@ -38,7 +37,7 @@ def misplaced(recording: Recording, seed: int) -> Recording:
 
 def calibrated(seed: int, options: PoseNoiseOptions | None) -> CalibrationResult:
     recording = misplaced(surveyed(seed, TRUTH, strange_hall(2)), seed)
-    return calibrate_suite([recording], None, QUICK, silent, options)
+    return calibrate_suite([recording], None, PLAIN, silent, options)
 
 
 def distances(result: CalibrationResult) -> FloatArray:
