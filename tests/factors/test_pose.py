@@ -37,7 +37,7 @@ from tests.support.factor_inputs import (
 from tests.worlds.exact import dipole_world
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000))
 def test_jacobians_match_central_differences(seed: int) -> None:
     """By pose, place, distortion, time offset, errors of map and step: 1e-6 of the largest."""

@@ -60,7 +60,7 @@ def in_tile(tile: int, A: FloatArray) -> list[SharedError]:
     return [SharedError(M(tile), A)]
 
 
-@settings(max_examples=20)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000), tile=st.sampled_from(sorted(TILES)))
 def test_jacobians_match_central_differences(seed: int, tile: int) -> None:
     """Random poses, t, C, H, weights and features, any rows; 1e-6 as for all factors."""

@@ -36,7 +36,7 @@ def batch_of(readings: KeyPoseReadings, anchor: int, values: gtsam.Values | None
 
 
 @given(seed=st.integers(0, 10_000), free=st.booleans(), anchor=st.integers(0, 2))
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=10)
 def test_derivatives_by_a_step_are_those_of_finite_differences(
     seed: int, free: bool, anchor: int
 ) -> None:
@@ -49,7 +49,7 @@ def test_derivatives_by_a_step_are_those_of_finite_differences(
 
 
 @given(seed=st.integers(0, 10_000), free=st.booleans(), timed=st.booleans())
-@settings(deadline=None, max_examples=20)
+@settings(deadline=None, max_examples=10)
 def test_derivatives_are_those_of_finite_differences(seed: int, free: bool, timed: bool) -> None:
     readings, values = random_carried(seed), tile_values(seed)
     readings = moving(readings, seed) if timed else readings

@@ -108,13 +108,13 @@ def test_a_killed_study_goes_on(
 
 @pytest.fixture
 def scheduler(tmp_path: Path) -> Iterator[str]:
-    """A scheduler and two workers of its own, on loopback, stopped afterwards."""
+    """A scheduler and a worker of its own, on loopback, stopped afterwards."""
     file = tmp_path / "scheduler.json"
     quiet = {"env": ENVIRONMENT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     where = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
     dask = [sys.executable, "-m", "distributed.cli"]
     begin = [[f"{dask[2]}.dask_scheduler", "--port", "0"]]
-    begin += [[f"{dask[2]}.dask_worker", "--no-nanny", "--nthreads", "1"]] * 2
+    begin += [[f"{dask[2]}.dask_worker", "--no-nanny", "--nthreads", "1"]]
     commands = [[*dask[:2], *command, *where] for command in begin]
     started = [subprocess.Popen(command, **quiet) for command in commands]  # type: ignore[call-overload]
     deadline = time.monotonic() + 60

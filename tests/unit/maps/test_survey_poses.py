@@ -27,10 +27,8 @@ from tests.worlds.harmonic import GIVEN, basis, places, rms
 TILT, LASTING_S, NOISE, SPEED = np.deg2rad(0.6), 2.0, 0.1, 0.3
 EARTH = np.array([15.0, 8.0, -44.0])
 SIDE = 2.4
-# Learnt in two small windows.
-NO_SEARCH = HarmonicOptions(
-    search=SearchOptions(rounds=0), learning=LearningOptions(windows=1, rough=1, modes=150)
-)
+# Learnt in small windows.
+NO_SEARCH = HarmonicOptions(search=SearchOptions(rounds=0), learning=LearningOptions(modes=200))
 
 
 def errors(count: int, seed: int = 0, lasting_s: float = 2.0) -> SurveyPoses:

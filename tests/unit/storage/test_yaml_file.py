@@ -21,7 +21,7 @@ TREE = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(st.dictionaries(st.text("ab", min_size=1, max_size=3), TREE))
 def test_content_comes_back(content: dict[str, Any]) -> None:
     found = YAML(typ="safe", pure=True).load(yaml_text(content, "Comment."))
