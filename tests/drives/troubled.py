@@ -12,7 +12,6 @@ import numpy as np
 from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
 from l2m_gtsam.calibration.options import CalibrationOptions
 from l2m_gtsam.data import KnownSensor, Recording
-from l2m_gtsam.maps.build import MapOptions
 from l2m_gtsam.qa.evaluate import evaluate
 from l2m_gtsam.qa.options import QaOptions
 from l2m_gtsam.qa.verdict.calibration import judge
@@ -21,9 +20,7 @@ from l2m_gtsam.studies.troubles.drives import troubled_drive
 from l2m_gtsam.studies.troubles.options import Trouble, TroublesOptions, World
 from l2m_gtsam.studies.troubles.surveys import TroubledPlace, troubled_place
 
-# Learnt in small windows.
-MAP = MapOptions.model_validate({"harmonic": {"learning": {"modes": 150}}})
-OPTIONS = TroublesOptions(surveys=2, drives=1, survey_readings=900, readings=400, map=MAP)
+OPTIONS = TroublesOptions(surveys=2, drives=1, survey_readings=900, readings=400)
 DRIVE = 1
 
 

@@ -44,7 +44,7 @@ def field_map() -> HarmonicMap:
 @pytest.fixture(scope="module")
 def readings() -> Readings:
     """Poses are wrong by 3 mm and 0.1 degrees, for half a second: knots and bridges between."""
-    drive = turning_drive(100)
+    drive = turning_drive()
     root = np.diag(np.repeat([np.deg2rad(0.1), 0.003], 3))
     return replace(drive, pose_root=np.broadcast_to(root, (len(drive), 6, 6)))
 

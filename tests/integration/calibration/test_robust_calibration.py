@@ -21,7 +21,6 @@ from l2m_gtsam.studies.honesty.drives import Disturbed, spikes
 from tests.drives.disturbances import bursts, moved_steel
 
 NOISE = 0.2
-MAP = HarmonicOptions(learning=LearningOptions(modes=150))  # learnt in small windows
 # Noises: a reading that is off by more must be found, one that is off by less must not. Between,
 # one reading by itself cannot be told from noise.
 TOLD, CHANGED = 5.0, 1.0
@@ -37,12 +36,14 @@ class Place:
     drive: CalibrationDrive
 
 
-def place(seed: int) -> Place:
+def place(
+    seed: int, options: HarmonicOptions | None = None, sensors: int = 3, count: int = 600
+) -> Place:
     hall = steel_hall(seed)
     data = survey(hall, seed, noise=NOISE)
     cloud = hall_cloud(hall, CloudVariant.ACCURATE, seed)
-    field_map = HarmonicMap.fit(data.points, data.field, MAP, cloud=cloud)
-    drive = calibration_drive(hall, seed, data.span, NOISE, sensors=2, count=500)
+    field_map = HarmonicMap.fit(data.points, data.field, options, cloud=cloud)
+    drive = calibration_drive(hall, seed, data.span, NOISE, sensors=sensors, count=count)
     return Place(field_map.compile(), drive)
 
 
@@ -76,7 +77,8 @@ def found_places(readings: Readings, field_map: QueryableMap) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def hall() -> Place:
-    return place(1)
+    """A map that is learnt in small windows."""
+    return place(1, HarmonicOptions(learning=LearningOptions(modes=150)), sensors=2, count=500)
 
 
 @pytest.fixture(scope="module")
