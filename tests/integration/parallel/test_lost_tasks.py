@@ -107,7 +107,7 @@ def written(key: tuple[int, Path], folder: Path) -> int:
     if key[0] == 1:
         raise NoRoomError("no room")
     if (folder / "1.begun").exists():
-        sleep(6.0)  # longer than Dask waits before it kills a worker
+        sleep(5.0)  # longer than the four seconds that Dask waits before it kills a worker
     (folder / f"{key[0]}.ended").touch()
     return key[0]
 

@@ -48,7 +48,8 @@ def test_a_survey_of_dipoles_is_predicted_with_a_true_sigma() -> None:
     error = sample.field - truth
     theirs = SlidingGP.fit(points, field).query(at).field - truth
     assert sample.inside.all()
-    # 0.040 against 0.091 uT on a survey of eight metres; three heights at random help the independent axes.
+    # 0.040 against 0.091 uT on a survey of eight metres; three heights at random help the
+    # independent axes.
     assert rms(error) < 0.55 * rms(theirs)
     assert rms(sample.gradient - slope) < 0.3 * rms(slope)
     # Some 170 independent scores.

@@ -173,7 +173,7 @@ def test_what_is_not_finite_is_dropped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_cloud(path), [[1, 2, 3]])
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(points=clouds(NEAR), edge=st.floats(0.02, 50.0), cut=st.integers(0, 40))
 def test_thinning_gives_the_mean_of_every_cell(points: FloatArray, edge: float, cut: int) -> None:
     cells: dict[tuple[int, ...], list[FloatArray]] = {}

@@ -40,7 +40,7 @@ def folder() -> Iterator[Path]:
         yield Path(path)
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.lists(fleet_rows(), max_size=5))
 def test_a_csv_has_every_number_to_the_last_digit(rows: list[FleetRow]) -> None:
     with folder() as out:
@@ -60,7 +60,7 @@ def test_a_csv_has_every_number_to_the_last_digit(rows: list[FleetRow]) -> None:
                 assert float(cells[name]) == value
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.lists(fleet_rows(), max_size=5))
 def test_parquet_has_the_same_with_stamps_for_dates(rows: list[FleetRow]) -> None:
     with folder() as out:
