@@ -87,7 +87,7 @@ def test_a_suite_that_is_off_as_stated_makes_true_sigmas(drive: Readings, survey
     # 15 are expected. Both sensors share the survey's errors and the drive its noise, so that a
     # survey counts as one draw of 15 degrees of freedom: the bounds are left once in 400.
     freedom = 15 * surveys
-    low, high = chi2.ppf([0.00125, 0.99875], freedom) / surveys
+    low, high = (float(chi2.ppf(share, freedom)) / surveys for share in (0.00125, 0.99875))
     assert low < np.mean(found) < high
 
 
