@@ -13,7 +13,6 @@ from l2m_gtsam.errors import MapError
 from l2m_gtsam.maps.build import map_from_state
 from l2m_gtsam.maps.harmonic.evidence import condition, evidence, normal_of
 from l2m_gtsam.maps.harmonic.harmonic_map import HarmonicMap
-from l2m_gtsam.maps.harmonic.learning import LearningOptions
 from l2m_gtsam.maps.harmonic.learnt import HarmonicOptions
 from l2m_gtsam.maps.harmonic.search import SearchOptions
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
@@ -27,8 +26,7 @@ from tests.worlds.harmonic import GIVEN, basis, places, rms
 TILT, LASTING_S, NOISE, SPEED = np.deg2rad(0.6), 2.0, 0.1, 0.3
 EARTH = np.array([15.0, 8.0, -44.0])
 SIDE = 2.4
-# Learnt in small windows.
-NO_SEARCH = HarmonicOptions(search=SearchOptions(rounds=0), learning=LearningOptions(modes=200))
+NO_SEARCH = HarmonicOptions(search=SearchOptions(rounds=0))
 
 
 def errors(count: int, seed: int = 0, lasting_s: float = 2.0) -> SurveyPoses:
