@@ -10,6 +10,7 @@ from l2m_gtsam.batch import drives, reports, validation
 from l2m_gtsam.qa.report import localisation_page
 from tests.drives.fleet_runs import FleetRun, small_fleet
 from tests.support.command_line import Demo, l2m
+from tests.support.computed_once import computed_once
 from tests.worlds.halls import SMALL_HALL
 
 
@@ -33,11 +34,12 @@ def without_pages() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
-    """Run the demonstration in a small hall."""
+    """Run the demonstration in a small hall: the tutorial's, with its map and calibration."""
     folder = tmp_path_factory.mktemp("demo")
     options = folder / "hall.yaml"
     options.write_text(json.dumps(SMALL_HALL))  # JSON is YAML
-    return Demo(folder, l2m("demo", "--options", options, "--out", folder).out)
+    with computed_once(tmp_path_factory):
+        return Demo(folder, l2m("demo", "--options", options, "--out", folder).out)
 
 
 @pytest.fixture(scope="session")

@@ -1,33 +1,22 @@
 """The documentation: every block of every page runs, every message is a real one."""
 
 import ast
-import hashlib
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.api import calls
 from l2m_gtsam.api.results import JudgedCalibration
-from l2m_gtsam.batch import drives, maps
 from l2m_gtsam.batch.simulation import simulate_bags
-from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
-from l2m_gtsam.calibration.options import CalibrationOptions
-from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.config import load_options
-from l2m_gtsam.data import FloatArray, KnownSensor, Recording, SourceFile
-from l2m_gtsam.mapping.map_building import map_recordings
-from l2m_gtsam.mapping.options import MappingOptions
-from l2m_gtsam.maps.field_map import FieldMap, Summarised
-from l2m_gtsam.progress import Progress, silent
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.simulate.bag_writer import BagKind
 from l2m_gtsam.simulate.scenario import ScenarioOptions
+from tests.support.computed_once import computed_once
 from tests.support.map_files import copy_map
 from tests.support.pages import blocks, run_page, words
 from tests.support.repository import REPOSITORY
@@ -55,63 +44,12 @@ def named(page: Path) -> str:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _a_map_is_built_once() -> Iterator[None]:
-    """Several pages build the same map of the same survey: the first builds it for all."""
-    built: dict[str, FieldMap] = {}
-
-    def once(
-        recordings: Sequence[Recording],
-        suite: Mapping[str, KnownSensor] | None,
-        options: MappingOptions,
-        cloud: FloatArray | None = None,
-    ) -> FieldMap:
-        bags = [each.source.sha256 for each in recordings]
-        points = None if cloud is None else hashlib.sha256(cloud.tobytes()).hexdigest()
-        key = repr((bags, suite, options, points))
-        if key not in built:
-            built[key] = map_recordings(recordings, suite, options, cloud)
-        return built[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (calls, maps):
-            patch.setattr(module, "map_recordings", once)
+def _maps_and_calibrations_are_computed_once(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[None]:
+    """Several pages build the same map and calibrate the same drive: the first does it for all."""
+    with computed_once(tmp_path_factory):
         yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _a_drive_is_calibrated_once() -> Iterator[None]:
-    """Several pages calibrate the same drive on the same map: the first does it for all."""
-    found: dict[str, Calibrated] = {}
-
-    def once(
-        recording: Recording,
-        field_map: QueryableMap,
-        options: CalibrationOptions,
-        map_source: SourceFile | None = None,
-        progress: Progress = silent,
-    ) -> Calibrated:
-        assert isinstance(field_map, Summarised)
-        key = repr((readings_of(recording), field_map.summary, options))
-        if key not in found:
-            found[key] = calibrated(recording, field_map, options, map_source, progress)
-        result = replace(found[key].result, bag=recording.source, map=map_source)
-        return replace(found[key], result=result)
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in (calls, drives):
-            patch.setattr(module, "calibrated", once)
-        yield
-
-
-def readings_of(recording: Recording) -> str:
-    """Return a sum over what was read and where, whoever read it from a bag."""
-    poses, told = recording.trajectory, hashlib.sha256()
-    arrays = [poses.stamp_ns, poses.R, poses.p]
-    arrays += [each for one in recording.series for each in (one.stamp_ns, one.field)]
-    for each in arrays:
-        told.update(each.tobytes())
-    names = [each.sensor for each in recording.series]
-    return f"{names} {poses.covariance is None} {told.hexdigest()}"
 
 
 @pytest.fixture(scope="module")

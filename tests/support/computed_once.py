@@ -1,0 +1,89 @@
+"""Maps and calibrations of one place that many tests ask for: computed once in a run of the tests.
+
+Commands, bags, files and pages are those of each test; only equal numbers from equal numbers are
+not computed again.
+"""
+
+import hashlib
+import pickle
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar, cast
+
+import pytest
+
+from l2m_gtsam.api import calls
+from l2m_gtsam.batch import drives, maps
+from l2m_gtsam.calibration.calibrate import Calibrated, calibrated
+from l2m_gtsam.calibration.options import CalibrationOptions
+from l2m_gtsam.calibration.view import QueryableMap
+from l2m_gtsam.data import FloatArray, KnownSensor, Recording, SourceFile
+from l2m_gtsam.mapping.map_building import map_recordings
+from l2m_gtsam.mapping.options import MappingOptions
+from l2m_gtsam.maps.field_map import FieldMap, Summarised
+from l2m_gtsam.progress import Progress, silent
+from tests.support.made_once import made_once
+
+Found = TypeVar("Found")
+KEPT = "kept.pickle"
+
+
+@contextmanager
+def computed_once(factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Compute a map of a survey, and a calibration of a drive on a map, once for all workers."""
+    here: dict[str, object] = {}
+
+    def once(key: object, compute: Callable[[], Found]) -> Found:
+        name = f"computed-{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}"
+
+        def keep(folder: Path) -> None:
+            here[name] = compute()
+            (folder / KEPT).write_bytes(pickle.dumps(here[name]))
+
+        folder = made_once(factory, name, keep)
+        if name not in here:  # another worker computed it; our own has opened tiles
+            here[name] = pickle.loads((folder / KEPT).read_bytes())  # noqa: S301 - our own
+        return cast("Found", here[name])
+
+    def mapped(
+        recordings: Sequence[Recording],
+        suite: Mapping[str, KnownSensor] | None,
+        options: MappingOptions,
+        cloud: FloatArray | None = None,
+    ) -> FieldMap:
+        read = [readings_of(each) for each in recordings]
+        points = None if cloud is None else hashlib.sha256(cloud.tobytes()).hexdigest()
+        key = ("map", read, suite, options, points)
+        return once(key, lambda: map_recordings(recordings, suite, options, cloud))
+
+    def solved(
+        recording: Recording,
+        field_map: QueryableMap,
+        options: CalibrationOptions,
+        map_source: SourceFile | None = None,
+        progress: Progress = silent,
+    ) -> Calibrated:
+        assert isinstance(field_map, Summarised)
+        key = ("calibration", readings_of(recording), field_map.summary, options)
+        found = once(key, lambda: calibrated(recording, field_map, options, map_source, progress))
+        return replace(found, result=replace(found.result, bag=recording.source, map=map_source))
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (calls, maps):
+            patch.setattr(module, "map_recordings", mapped)
+        for module in (calls, drives):
+            patch.setattr(module, "calibrated", solved)
+        yield
+
+
+def readings_of(recording: Recording) -> str:
+    """Return a sum over what was read and where, whoever read it from a bag."""
+    poses, told = recording.trajectory, hashlib.sha256()
+    arrays = [poses.stamp_ns, poses.R, poses.p]
+    arrays += [each for one in recording.series for each in (one.stamp_ns, one.field)]
+    for each in arrays:
+        told.update(each.tobytes())
+    names = [each.sensor for each in recording.series]
+    return f"{names} {poses.covariance is None} {told.hexdigest()}"
