@@ -19,8 +19,9 @@ from tests.support.browsing import BAG, HOSTILE, Looked, look
 
 
 @pytest.fixture(scope="session")
-def hostile_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of a report on sensors with names that are markup; one of them came loose."""
+def hostile_report(browser: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a printed report on sensors with names that are markup; one came loose."""
+    assert browser
     folder = tmp_path_factory.mktemp("hostile")
     drive = loose()
     series = tuple(replace(s, sensor=HOSTILE[s.sensor]) for s in drive.recording.series)
@@ -32,7 +33,7 @@ def hostile_report(tmp_path_factory: pytest.TempPathFactory) -> Path:
     whole = Config(calibration=options).model_dump(mode="json")
     write_calibration(folder / CALIBRATION_FILE, replace(found.result, options=whole))
     write_metrics(folder / METRICS_FILE, metrics)
-    report_folder(folder, None)
+    report_folder(folder, None, pdf=True)
     return folder
 
 

@@ -27,7 +27,8 @@ from tests.support.browsing import (
 )
 
 MOST_BYTES = 350_000  # 96 rows: a fleet of 800 then stays below three megabytes
-DRIVES = 12  # more than nine: day 2 comes before day 10
+DRIVES = 12  # of one vehicle, more than nine: day 2 comes before day 10
+OTHERS = 3  # of each other vehicle
 HOSTILE = (
     "<script>alert(1)</script>",
     '"><img src=x onerror=alert(2)>$\\frac{',
@@ -40,8 +41,9 @@ def hostile_rows() -> list[FleetRow]:
     """A fleet with names that are markup; a sensor moved, some drives failed."""
     rng = np.random.default_rng(4)
     rows = []
-    for vehicle, name in zip(HOSTILE, HOSTILE[1:] + HOSTILE[:1], strict=True):
-        for day in range(DRIVES):
+    counts = (DRIVES, OTHERS, OTHERS)
+    for vehicle, name, count in zip(HOSTILE, HOSTILE[1:] + HOSTILE[:1], counts, strict=True):
+        for day in range(count):
             t = np.array([0.3, -0.1, 0.2]) + rng.normal(0, 0.002, 3)
             verdict = ("pass", "warn", "fail")[day % 3]
             found = sensor_row(name, t=tuple(t), verdict=verdict, reason=HOSTILE[day % 3])
@@ -135,7 +137,7 @@ def test_columns_are_sorted_by_keyboard(sorting: Sorted) -> None:
     assert all(len(each["cells"]) == len(rows) for each in sorting.presses)
     ours = [cell for cell in bags["cells"] if cell.startswith(f"{HOSTILE[1]}_")]
     numbers = [int(cell.rpartition("_")[2]) for cell in ours]
-    assert numbers == sorted(3 * [*range(DRIVES)])  # day 2 before day 10
+    assert numbers == sorted([*range(DRIVES), *(2 * [*range(OTHERS)])])  # day 2 before day 10
     failed = sum(each.sensor is None for each in rows)
     for press, turned in ((rising, 1), (falling, -1)):
         assert press["cells"][-failed:] == [""] * failed  # blanks last either way

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE, report_folder
+from l2m_gtsam.batch.reports import PDF_FILE, REPORT_FILE
 from tests.support.browsing import (
     BAG,
     HOSTILE,
@@ -88,7 +88,6 @@ def test_names_from_a_bag_are_text(looked: Looked) -> None:
 
 def test_a_report_is_printed(browser: str, hostile_report: Path) -> None:
     assert browser
-    report_folder(hostile_report, None, pdf=True)
     content = (hostile_report / PDF_FILE).read_bytes()
     assert content.startswith(b"%PDF")
     # Two pages on the whole, and one for each of three sensors.

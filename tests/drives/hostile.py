@@ -37,7 +37,7 @@ def fleet_rows() -> list[FleetRow]:
     found = []
     for k, name in enumerate(NAMES):
         sensor = sensor_row(name, reason=name)
-        found += [row(day, sensor, vehicle=name, bag=f"{name}.bag") for day in range(3)]
+        found += [row(day, sensor, vehicle=name, bag=f"{name}.bag") for day in range(2)]
         found.append(replace(row(4), vehicle=name, sensor=None, error=f"{name}: {NAMES[-k]}"))
     return found
 

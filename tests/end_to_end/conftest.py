@@ -2,33 +2,27 @@
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from l2m_gtsam.batch import drives, reports, validation
-from l2m_gtsam.qa.report import localisation_page
 from tests.drives.fleet_runs import FleetRun, small_fleet
 from tests.support.command_line import Demo, l2m
 from tests.support.computed_once import computed_once
+from tests.support.left_out import no_pages, texts_parsed_once
 from tests.worlds.halls import SMALL_HALL
 
 
 @pytest.fixture(scope="module")
 def without_pages() -> Iterator[None]:
     """Draw no pages and pictures, which take a second each and are looked at in other tests."""
+    with no_pages():
+        yield
 
-    def empty(*_: object) -> str:
-        return ""
 
-    def touched(_: object, path: Path) -> None:
-        path.touch()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reports, "calibration_page", empty)
-        patch.setattr(localisation_page, "localisation_page", empty)
-        patch.setattr(validation, "validation_page", empty)
-        patch.setattr(drives, "save_figure", touched)
+@pytest.fixture(scope="module")
+def texts_read_once() -> Iterator[None]:
+    """Parse a text of YAML once, however often it is read."""
+    with texts_parsed_once():
         yield
 
 

@@ -61,8 +61,11 @@ def tutorial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def workplace(tutorial: Path, tmp_path: Path) -> Path:
-    """A folder with what the other pages take for granted, under the names that they use."""
+def workplace(tutorial: Path, without_pages: None, texts_read_once: None, tmp_path: Path) -> Path:
+    """A folder with what the other pages take for granted, under the names that they use.
+
+    Reports are drawn by the tutorial alone.
+    """
     sim = tutorial / "sim"
     for source, name in (
         (sim / "calibration_ros1.bag", "drive.bag"),

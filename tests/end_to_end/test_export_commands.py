@@ -11,6 +11,8 @@ from l2m_gtsam.storage.exports.formats import FORMATS
 from tests.drives.yard import T_LIDAR_MAG, C, CalibratedYard, calibrated, calibrated_yard
 from tests.support.command_line import complaint_here, l2m
 
+pytestmark = pytest.mark.usefixtures("without_pages")
+
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> CalibratedYard:

@@ -1,8 +1,7 @@
 """``l2m batch``: a small fleet through the command line."""
 
-import os
 import re
-import subprocess
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +29,6 @@ def test_every_bag_is_a_row(fleet_run: FleetRun) -> None:
         ("truck_1", "day_9.mcap", "warn"),
         ("truck_2", HOSTILE, "error"),
         ("truck_2", "day_1.bag", "error"),
-        ("truck_2", "day_0.bag", "warn"),
     ]
     assert [row["date"] for row in rows[:2]] == ["2023-11-14T22:13:20Z", "2023-11-23T22:13:20Z"]
     for row in rows:
@@ -48,7 +46,7 @@ def test_every_bag_is_a_row(fleet_run: FleetRun) -> None:
 def test_one_line_sums_up_and_failures_are_named(fleet_run: FleetRun) -> None:
     lines = fleet_run.said.out.splitlines()
     assert lines[0].startswith(
-        "5 drives of 2 vehicles: 3 calibrated, 2 not; sensors: 0 pass, 3 warn"
+        "4 drives of 2 vehicles: 2 calibrated, 2 not; sensors: 0 pass, 2 warn"
     )
     assert sum(line.startswith("not calibrated: truck_2, ") for line in lines) == 2
     assert lines[-1].startswith("written: ")
@@ -56,7 +54,7 @@ def test_one_line_sums_up_and_failures_are_named(fleet_run: FleetRun) -> None:
 
 def test_the_page_links_to_reports_that_are_there(fleet_run: FleetRun) -> None:
     page = (fleet_run.out / "index.html").read_text()
-    for path in ("truck_1/day_0", "truck_1/day_9", "truck_2/day_0"):
+    for path in ("truck_1/day_0", "truck_1/day_9"):
         assert f'href="{path}/report.html"' in page
         assert (fleet_run.out / path / "report.html").is_file()
     assert "<img" not in page
@@ -183,12 +181,16 @@ def test_wrong_input_is_one_line(
     assert not (tmp_path / "out" / "fleet.csv").exists()
 
 
-def test_the_script_is_the_command(repository: Path, tmp_path: Path) -> None:
+def test_the_script_is_the_command(
+    repository: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """`scripts/calibrate_bags.py` takes the same options."""
-    script = repository / "scripts" / "calibrate_bags.py"
-    command = [sys.executable, str(script), str(tmp_path), "--out", str(tmp_path / "out")]
-    ended = subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=600, env=dict(os.environ)
-    )
-    assert ended.returncode == 2
-    assert "no bags in it" in ended.stderr
+    script = str(repository / "scripts" / "calibrate_bags.py")
+    monkeypatch.setattr(sys, "argv", [script, str(tmp_path), "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(script, run_name="__main__")
+    assert end.value.code == 2
+    assert "no bags in it" in capsys.readouterr().err

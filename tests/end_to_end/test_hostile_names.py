@@ -256,7 +256,7 @@ def test_the_table_of_a_fleet(tmp_path: Path) -> None:
     write_csv(tmp_path / "fleet.csv", named)
     text = (tmp_path / "fleet.csv").read_text(encoding="utf-8")
     table = list(csv.DictReader(io.StringIO(text)))
-    assert len(table) == 4 * len(NAMES)
+    assert len(table) == 3 * len(NAMES)
     for each in table:
         for key in ("vehicle", "bag"):
             assert not (each[key] or "").startswith(("=", "@")), each[key]

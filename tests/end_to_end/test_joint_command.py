@@ -2,9 +2,12 @@
 
 from pathlib import Path
 
+import pytest
+
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_metrics
 from tests.support.command_line import complaint_here, l2m
+from tests.support.computed_once import computed_once
 
 
 def test_bags_that_are_missing_or_given_twice(tmp_path: Path) -> None:
@@ -18,12 +21,15 @@ def test_bags_that_are_missing_or_given_twice(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_two_real_drives(shared_data: Path, tmp_path: Path, repository: Path) -> None:
+def test_two_real_drives(
+    shared_data: Path, tmp_path: Path, repository: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """A handheld sensor under a motion-capture system, on the map of the first drive."""
     bags, config = shared_data / "bags", repository / "configs" / "optitrack.yaml"
     first, second = bags / "optitrack_run0_ros1.bag", bags / "optitrack_run1_ros1.bag"
     map_path, out = tmp_path / "map.npz", tmp_path / "out"
-    l2m("map", "build", first, "--config", config, "--out", map_path)
+    with computed_once(tmp_path_factory):  # the map of test_optitrack_commands.py
+        l2m("map", "build", first, "--config", config, "--out", map_path)
     l2m("calibrate", second, "--bag", first, "--map", map_path, "--config", config, "--out", out)
     result = read_calibration(out / "calibration.yaml")
     assert result.bag is None

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Reader, Writer
 
 from l2m_gtsam.batch.files import SavedMap
 from l2m_gtsam.batch.scan_poses import read_drive_on, read_drive_or_follow
@@ -17,6 +16,7 @@ from l2m_gtsam.simulate.scenario import Scenario, ScenarioOptions
 from l2m_gtsam.storage.calibration_file import read_calibration, write_calibration
 from l2m_gtsam.storage.map_file import load_map, save_map
 from l2m_gtsam.storage.record_files import read_slam
+from tests.drives.begun import begin, without
 from tests.drives.calibrations import calibration, sensor
 from tests.support.command_line import complaint_here, l2m
 from tests.worlds.halls import SMALL_HALL
@@ -52,28 +52,6 @@ class Scanned:
     config: Path
     nowhere: Path
     scenario: Scenario
-
-
-def without(topic: str, bag: Path, out: Path, seconds: float = np.inf) -> Path:
-    """Copy a ROS1 bag, or the begin of it, without one of its topics."""
-    with Reader(bag) as reader:
-        assert topic in reader.topics
-    return begin(bag, out, seconds, besides=topic)
-
-
-def begin(bag: Path, out: Path, seconds: float, besides: str = "") -> Path:
-    """Copy the first seconds of a ROS1 bag."""
-    with Reader(bag) as reader, Writer(out) as writer:
-        kept = [c for c in reader.connections if c.topic != besides]
-        new = {
-            c.id: writer.add_connection(c.topic, c.msgtype, msgdef=c.msgdef.data, md5sum=c.digest)
-            for c in kept
-        }
-        for connection, stamp, raw in reader.messages(kept):
-            if stamp - reader.start_time > 1e9 * seconds:
-                break
-            writer.write(new[connection.id], stamp, raw)
-    return out
 
 
 @pytest.fixture(scope="module")

@@ -5,18 +5,21 @@ from pathlib import Path
 
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
+from tests.drives.begun import begin
 from tests.support.command_line import complaint_here, l2m
+from tests.worlds.quick_maps import QUICK_HARMONIC
 
+SECONDS = 40.0  # of a drive of 104
 QUICK = {"sync": {"thin_distance_m": 0.05}, "windows": 1, "readings": 800, "modes": 120}
 
 
 def test_a_suite_is_calibrated_and_maps(shared_data: Path, tmp_path: Path) -> None:
     """A handheld sensor that is 20 ms late; what it is found to be is what the map is made with."""
-    bag = shared_data / "bags" / "optitrack_run0_ros1.bag"
+    bag = begin(shared_data / "bags" / "optitrack_run0_ros1.bag", tmp_path / "begin.bag", SECONDS)
     config, out = tmp_path / "quick.json", tmp_path / "made" / "suite.yaml"
     named = {"fields": ["/imu/mag"], "poses": "/optitrack/pose"}
     prior = {"floor_scale": 7.0, "floor_depth": 0.55, "noise": 0.12}
-    mapping = {"suite": QUICK, "model": {"harmonic": {"hyperparameters": prior}}}
+    mapping = {"suite": QUICK, "model": {"harmonic": QUICK_HARMONIC | {"hyperparameters": prior}}}
     config.write_text(json.dumps({"bag": named, "mapping": mapping}))
     run = l2m("map", "suite", bag, "--config", config, "--out", out)
     assert "imu/mag" in run.out

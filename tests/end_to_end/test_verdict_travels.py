@@ -3,7 +3,6 @@
 import csv
 import json
 import shutil
-from copy import deepcopy
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -25,12 +24,11 @@ from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.known_sensors import read_known_sensors
 from l2m_gtsam.storage.open_bag import open_bag
 from l2m_gtsam.storage.record_files import read_validation
-from l2m_gtsam.storage.yaml_file import BoundedYAML
 from tests.drives.yard import CalibratedYard, calibrated_yard, written
 from tests.support.command_line import Finished, ended, l2m, one_line
 from tests.support.one_process import computed_here
 
-pytestmark = pytest.mark.usefixtures("without_pages")
+pytestmark = pytest.mark.usefixtures("without_pages", "texts_read_once")
 
 FORMATS = ("ros2-launch", "urdf", "kalibr", "json", "bias-scale", "px4", "ardupilot")
 ROBOT = '<robot name="r">\n  <link name="lidar"/>\n</robot>\n'
@@ -162,23 +160,8 @@ class Commands(RuleBasedStateMachine):
         assert {name: found[name] for name in wanted} == wanted
 
 
-def test_a_fail_leaves_no_file_without_a_verdict(
-    place: CalibratedYard, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Six walks of six commands.
-
-    A text that several commands read is parsed for the first of them.
-    """
-    parsed, parse = dict[str, Any](), BoundedYAML.load
-
-    def load(reader: BoundedYAML, stream: Any) -> Any:
-        if not isinstance(stream, str):
-            return parse(reader, stream)
-        if stream not in parsed:
-            parsed[stream] = parse(reader, stream)
-        return deepcopy(parsed[stream])
-
-    monkeypatch.setattr(BoundedYAML, "load", load)
+def test_a_fail_leaves_no_file_without_a_verdict(place: CalibratedYard, tmp_path: Path) -> None:
+    """Six walks of six commands."""
     Commands.place, Commands.folder = place, tmp_path
     kinds = {"ros1": "ros1", "sqlite3": "sqlite3", "mcap": "mcap"}
     Commands.bags = {kind: written(tmp_path, kind, f"drive_{kind}") for kind in kinds}
