@@ -60,14 +60,20 @@ def _make(folder: Path) -> None:
 
 
 def written(
-    folder: Path, kind: str, name: str = "drive", seed: int = FIRST, offset: FloatArray = H
+    folder: Path,
+    kind: str,
+    name: str = "drive",
+    seed: int = FIRST,
+    offset: FloatArray = H,
+    poses: int | None = None,
 ) -> Path:
     """Write a drive through the west with turns and tilts, and one distorted sensor.
 
-    Each seed is another day: drives of one time and one way would be one drive.
+    It has 550 poses, or only the first of them. Each seed is another day: drives of one time and
+    one way would be one drive.
     """
     make, entries = ros(kind), []
-    p, rng = route(-2.8, 0.2), np.random.default_rng(seed)
+    p, rng = route(-2.8, 0.2)[:poses], np.random.default_rng(seed)
     k = np.arange(len(p))
     angles = np.column_stack([0.05 * k, 0.3 * np.sin(0.31 * k), 0.3 * np.cos(0.43 * k)])
     R = Rotation.from_euler("ZYX", angles)

@@ -25,6 +25,7 @@ from l2m_gtsam.parallel.cluster import ClusterOptions
 from l2m_gtsam.records.fleet import DriveOutcome
 from tests.drives.fleet_runs import FleetRun, table
 from tests.drives.fleets import not_a_bag, vehicle
+from tests.support.left_out import no_pages
 from tests.support.one_process import computed_here
 
 Spoil = Callable[[FleetRun], None]
@@ -180,10 +181,14 @@ def test_a_full_disk_is_no_row(
     monkeypatch.setattr(batch_fleet, "computed", computed_here)
     with monkeypatch.context() as patch:
         patch.setattr(fleet_task, "write_outcome", full)  # the last of a drive's results
-        with pytest.raises(NoRoomError, match=r"day_0: .* No space left on device; make room"):
+        with (
+            no_pages(),
+            pytest.raises(NoRoomError, match=r"day_0: .* No space left on device; make room"),
+        ):
             run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
     assert contents(there.out) == before
-    fleet = run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
+    with no_pages():
+        fleet = run_fleet(there.order, ClusterOptions(workers=1), lambda *_: None)
     assert fleet.computed == 1
     assert contents(there.out).keys() == before.keys()
     assert contents(there.out) != before

@@ -6,8 +6,11 @@ import pytest
 
 from l2m_gtsam.storage.calibration_file import read_calibration
 from l2m_gtsam.storage.record_files import read_metrics
+from tests.drives.begun import begin
 from tests.support.command_line import complaint_here, l2m
 from tests.support.computed_once import computed_once
+
+SECONDS = 40.0  # of drives of 104 and 101
 
 
 def test_bags_that_are_missing_or_given_twice(tmp_path: Path) -> None:
@@ -30,6 +33,7 @@ def test_two_real_drives(
     map_path, out = tmp_path / "map.npz", tmp_path / "out"
     with computed_once(tmp_path_factory):  # the map of test_optitrack_commands.py
         l2m("map", "build", first, "--config", config, "--out", map_path)
+    first, second = (begin(each, tmp_path / each.name, SECONDS) for each in (first, second))
     l2m("calibrate", second, "--bag", first, "--map", map_path, "--config", config, "--out", out)
     result = read_calibration(out / "calibration.yaml")
     assert result.bag is None

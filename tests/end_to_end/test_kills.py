@@ -16,7 +16,7 @@ from tests.fuzz.kills import kill_all, killed
 from tests.fuzz.trials import BAD, Command, commands, files, prepared, table
 
 FILES = Path(__file__).parents[1] / "files"
-KILLS = 6  # of a command that takes half a second
+KILLS = 4  # of a command that takes half a second
 ALL = 200  # in the studies
 
 

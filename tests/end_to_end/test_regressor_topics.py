@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from l2m_gtsam.records.sensor_models import Model
 from l2m_gtsam.storage.calibration_file import read_calibration
 from tests.drives.bags import Entry, ros, write
+from tests.drives.yard import calibrated_yard
 from tests.support.command_line import complaint_here, l2m
-from tests.worlds.yard import NOISE, START, STEP, Yard, make_yard, route, world
+from tests.worlds.yard import NOISE, START, STEP, Yard, route, world
 
 pytestmark = pytest.mark.usefixtures("without_pages")
 
@@ -21,18 +22,16 @@ H = np.array([0.8, -0.5, 0.6])  # uT/A
 
 @pytest.fixture(scope="module")
 def yard(tmp_path_factory: pytest.TempPathFactory) -> Yard:
-    return make_yard(tmp_path_factory.mktemp("yard"))
+    return calibrated_yard(tmp_path_factory).yard
 
 
 @pytest.fixture(scope="module")
-def field_map(yard: Yard) -> Path:
-    path = yard.west.parent / "map.npz"
-    l2m("map", "build", yard.west, "--config", yard.config, "--out", path)
-    return path
+def field_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return calibrated_yard(tmp_path_factory).map
 
 
 @pytest.fixture(scope="module")
-def drive(yard: Yard) -> Path:
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A drive through the west, turning and tilting, whose motor's current swings by 2 A."""
     make, entries = ros("mcap"), []
     p, rng = route(-2.8, 0.2), np.random.default_rng(5)
@@ -60,7 +59,7 @@ def drive(yard: Yard) -> Path:
             ),
         }
         entries += [Entry(topic, kind, stamp, each) for topic, (kind, each) in messages.items()]
-    return write(yard.west.parent, "mcap", entries, "drive")
+    return write(tmp_path_factory.mktemp("regressors"), "mcap", entries, "drive")
 
 
 def configured(folder: Path, yard: Yard, regressors: dict[str, Any]) -> Path:

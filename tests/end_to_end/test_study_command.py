@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from l2m_gtsam.simulate.floor_plan import FloorPlanOptions
 from l2m_gtsam.storage.yaml_file import write_yaml
 from l2m_gtsam.studies import run
 from tests.support.command_line import complaint_here, l2m
 from tests.support.one_process import computed_here
+from tests.worlds.halls import SMALL_HALL
 from tests.worlds.study_sites import TINY_BASIN as TINY
 
 
@@ -16,7 +18,12 @@ def test_a_study_from_options_to_page_and_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One cell, in another process; the second run has one more to do, the third nothing."""
-    one_start = TINY.model_copy(update={"starts": 1, "few_starts": 1, "rings": 1})
+    hall = TINY.site.scenario.model_copy(
+        update={"floor_plan": FloorPlanOptions.model_validate(SMALL_HALL["floor_plan"])}
+    )
+    site = TINY.site.model_copy(update={"scenario": hall})
+    small = {"starts": 1, "few_starts": 1, "rings": 1, "site": site}
+    one_start = TINY.model_copy(update=small)
     options, out = tmp_path / "tiny.yaml", tmp_path / "out"
     command = ("study", "basin", "--options", options, "--out", out, "--workers")
     write_yaml(options, one_start.model_dump(mode="json"), "Small.")

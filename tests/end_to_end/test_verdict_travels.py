@@ -32,6 +32,7 @@ pytestmark = pytest.mark.usefixtures("without_pages", "texts_read_once")
 
 FORMATS = ("ros2-launch", "urdf", "kalibr", "json", "bias-scale", "px4", "ardupilot")
 ROBOT = '<robot name="r">\n  <link name="lidar"/>\n</robot>\n'
+SHORT = 150  # poses, three lines of the route
 LOOSE, TIGHT, NEVER = ({"warn": limit, "fail": limit} for limit in (1e6, 1e-9, 1e-9))
 LIMITS = (
     *("position_sigma_m", "rotation_sigma_deg", "hard_iron_sigma_ut", "unexplained", "rejected"),
@@ -302,6 +303,7 @@ def test_what_a_failed_calibration_was_used_for_says_so(
     folder, quick = failed.folder, place.yard.config
     files = ("--calibration", failed.calibration, "--map", place.map)
     drive = written(folder, "mcap", "other", seed=8)
+    short = written(folder, "mcap", "short", seed=9, poses=SHORT)
     l2m("validate", drive, *files, "--out", folder / "valid")
     l2m("validate", *files[:2], "--compare", place.calibration, "--out", folder / "compared")
     for name in ("valid", "compared"):
@@ -309,7 +311,7 @@ def test_what_a_failed_calibration_was_used_for_says_so(
         assert any("judged FAIL" in each.text for each in verdict.reasons)
         assert verdict.level is not Level.PASS
     common = ("--config", failed.config, "--out", folder / "path")
-    assert ended("slam", drive, *files, *common, "--strict").code == 3
+    assert ended("slam", short, *files, *common, "--strict").code == 3
     assert "is FAIL" in " ".join(json.loads((folder / "path" / "slam.json").read_text())["notes"])
     suite, field_map, more = ("--suite", failed.calibration), folder / "m.npz", folder / "more.npz"
     quickly = ("--config", quick, "--no-tiles")
@@ -317,11 +319,10 @@ def test_what_a_failed_calibration_was_used_for_says_so(
     l2m("map", "update", place.map, drive, *suite, *quickly, "--out", more)
     for made in (field_map, more):
         assert "whose verdict is FAIL" in l2m("map", "info", made).err
-    once = folder / "once.yaml"  # enough rounds for what is looked at here
-    once.write_text(
-        json.dumps({**json.loads(quick.read_text()), "mapping": {"suite": {"rounds": 1}}})
-    )
-    l2m("map", "suite", drive, *suite, "--config", once, "--out", folder / "suite.yaml")
+    once = folder / "once.yaml"  # enough for what is looked at here
+    little = {"rounds": 1, "windows": 1, "readings": 300, "modes": 60}
+    once.write_text(json.dumps({**json.loads(quick.read_text()), "mapping": {"suite": little}}))
+    l2m("map", "suite", short, *suite, "--config", once, "--out", folder / "suite.yaml")
     assert "whose verdict is FAIL" in " ".join(read_calibration(folder / "suite.yaml").doubts)
     start = ("--config", place.calibration.parent / "c.yaml")
     l2m("calibrate", place.drive, "--map", field_map, *start, "--out", folder / "on_it")
