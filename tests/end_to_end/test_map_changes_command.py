@@ -175,7 +175,10 @@ def test_bad_drives_are_one_line_and_leave_the_map(kept: Kept, tmp_path: Path) -
     turned = tmp_path / "turned.yaml"
     entry = {"t_lidar_mag": [0, 0, 0], "H": [4.0, -3.0, 2.0]}
     turned.write_text(json.dumps({"sensors": {"mag": entry}}))
-    line = refused(later, "--config", kept.config, "--suite", turned)
+    settings = json.loads(kept.config.read_text())
+    settings["calibration"] = {"changes": {"sources": {"most": 3}}}  # offered to explain it
+    config.write_text(json.dumps(settings))
+    line = refused(later, "--config", config, "--suite", turned)
     assert "do not read as they are calibrated" in line
 
 
