@@ -1,8 +1,14 @@
 """The scaling study: its exponents and ratios, and the whole of it at a tiny size."""
 
+import io
 import re
+import sys
+from contextlib import redirect_stdout
 from mmap import mmap
 from pathlib import Path
+from subprocess import CompletedProcess
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +18,7 @@ from hypothesis import strategies as st
 from l2m_gtsam.calibration.start.global_start import StartOptions
 from l2m_gtsam.maps.training import training_set
 from l2m_gtsam.studies.methods import numeric_least_squares
+from l2m_gtsam.studies.scaling import workers
 from l2m_gtsam.studies.scaling.measurements import (
     Measurement,
     Quantity,
@@ -23,8 +30,9 @@ from l2m_gtsam.studies.scaling.measurements import (
 )
 from l2m_gtsam.studies.scaling.study import SCALING
 from l2m_gtsam.studies.scaling.tasks import middle, taken
-from l2m_gtsam.studies.scaling.workers import Stint, rate
+from l2m_gtsam.studies.scaling.workers import Stint, measured_workers, rate
 from tests.support.inline_study import run_inline
+from tests.support.one_process import computed_here
 from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.exact import drive as simulated
 from tests.worlds.study_sites import one_row_site
@@ -34,19 +42,19 @@ FRESH = 64 * MIB
 # Calibrations on a harmonic map take longer; others test them.
 SITE = one_row_site(0.1, "bilinear")
 TINY = ScalingOptions(
-    readings=(60, 120),
-    numeric_readings=60,
+    readings=(40, 80),
+    numeric_readings=40,
     sensors=(1,),
-    each=60,
-    survey=(300, 600),
-    dense=(100, 200),
+    each=40,
+    survey=(150, 300),
+    dense=(50, 100),
     workers=(1,),
     calibrations=2,
     rounds=1,
     rate=4.0,
     site=SITE,
     small_site=SITE,
-    search=StartOptions(search_radius=1.0, poses=40),
+    search=StartOptions(search_radius=0.7, poses=20, basins=2),
 )
 
 
@@ -55,23 +63,42 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("scaling")
 
 
+def run_here(program: list[str], **given: Any) -> CompletedProcess[str]:
+    """Run one of our programs in this process, which spares seconds of imports."""
+    printed = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(printed):
+        patch.setattr(sys, "stdin", io.StringIO(given["input"]))
+        exec(program[-1], {})  # noqa: S102 - our own program
+    return CompletedProcess(program, 0, printed.getvalue(), "")
+
+
 @pytest.fixture(scope="module")
 def table(out: Path) -> ScalingTable:
-    return run_inline(SCALING, TINY, out)
+    """The study without processes of their own; the program of workers runs here, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workers, "subprocess", SimpleNamespace(run=run_here))
+        patch.setattr(workers, "computed", computed_here)
+        return run_inline(SCALING, TINY, out)
+
+
+@pytest.mark.study
+def test_workers_are_timed_in_a_program_of_its_own() -> None:
+    alone, started = measured_workers(TINY, 1)
+    assert 0 < alone.seconds < started.seconds
 
 
 def test_every_size_is_timed(table: ScalingTable) -> None:
     found = {(c.part, c.way): [each.size for each in c.points] for c in table.curves}
     assert found == {
-        (Quantity.READINGS, TimedTask.POINT): [60, 120],
-        (Quantity.READINGS, TimedTask.FULL): [60, 120],
-        (Quantity.READINGS, TimedTask.NUMERIC): [60],
+        (Quantity.READINGS, TimedTask.POINT): [40, 80],
+        (Quantity.READINGS, TimedTask.FULL): [40, 80],
+        (Quantity.READINGS, TimedTask.NUMERIC): [40],
         (Quantity.SENSORS, TimedTask.POINT): [1],
         (Quantity.SENSORS, TimedTask.FULL): [1],
         (Quantity.SENSORS, TimedTask.NUMERIC): [1],
-        (Quantity.SURVEY, TimedTask.HARMONIC): [300, 600],
-        (Quantity.SURVEY, TimedTask.SLIDING): [300, 600],
-        (Quantity.SURVEY, TimedTask.DENSE): [100, 200],
+        (Quantity.SURVEY, TimedTask.HARMONIC): [150, 300],
+        (Quantity.SURVEY, TimedTask.SLIDING): [150, 300],
+        (Quantity.SURVEY, TimedTask.DENSE): [50, 100],
         (Quantity.WORKERS, TimedTask.BATCH): [1],
         (Quantity.WORKERS, TimedTask.STARTED): [1],
     }
