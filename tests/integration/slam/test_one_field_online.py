@@ -97,18 +97,28 @@ def test_it_is_one_field_and_jumps_of_the_recording_are_motion(
     assert rms(np.stack([each.T_map_lidar.t for each in poses]), truth) < 0.5 * rms(drift, truth)
 
 
-@pytest.mark.parametrize("share", [0.15, 0.7], ids=["before the field is learnt", "after"])
+# Of the messages. The field is learnt after 18 % of the path, and again after 36 %.
+@pytest.mark.parametrize(
+    ("share", "until", "learnt"),
+    [(0.12, 0.25, False), (0.3, 0.4, True)],
+    ids=["before the field is learnt", "after"],
+)
 def test_a_saved_drive_goes_on_as_it_would_have(
-    ship: TrueDrive, whole: tuple[OnlineSlam, list[OnlinePose]], share: float
+    ship: TrueDrive,
+    whole: tuple[OnlineSlam, list[OnlinePose]],
+    share: float,
+    until: float,
+    learnt: bool,
 ) -> None:
     odometry, options = odometry_of(ship, Form.VEHICLE)
     given = list(messages(ship.recording(odometry)))
-    at = round(share * len(given))
+    at, end = round(share * len(given)), round(until * len(given))
     slam = OnlineSlam(as_recorded(STATED_UT), options)
     first = [pose for each in given[:at] for pose in give(slam, each)]
+    assert (EventKind.FIELD_LEARNT in [each.kind for each in slam.events()]) is learnt
     slam = resumed_slam(saved_state(slam), as_recorded(STATED_UT), options)
-    rest = [pose for each in given[at:] for pose in give(slam, each)]
-    _, expected = whole
+    rest = [pose for each in given[at:end] for pose in give(slam, each)]
+    expected = whole[1][: len(first) + len(rest)]
     assert [each.stamp_ns for each in (*first, *rest)] == [each.stamp_ns for each in expected]
     for one, other in zip(rest, expected[len(first) :], strict=True):
         np.testing.assert_allclose(one.T_map_lidar.t, other.T_map_lidar.t, rtol=0, atol=1e-9)
@@ -176,11 +186,14 @@ def test_a_drive_too_long_to_be_solved_goes_on_with_the_filter(
 
 
 def test_a_pose_that_odometry_excludes_is_refused(ship: TrueDrive) -> None:
-    """As if odometry were a hundred times better known at one key pose."""
+    """As if odometry were a hundred times better known at one key pose.
+
+    In the first 40 % of the drive, where the field was learnt after 18 %.
+    """
     odometry, options = odometry_of(ship, Form.VEHICLE)
     slam = OnlineSlam(as_recorded(STATED_UT), options)
-    refused = None
-    for each in messages(ship.recording(odometry)):
+    refused, given = None, list(messages(ship.recording(odometry)))
+    for each in given[: round(0.4 * len(given))]:
         found = give(slam, each)
         explorer = slam.estimator
         if not found or not isinstance(explorer, OneFieldExplorer) or not explorer.is_learnt:
