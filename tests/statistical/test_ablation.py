@@ -34,7 +34,7 @@ TINY = AblationOptions(
     spacings=(0.0, 1.5),
     window=WindowOptions(width=4.0, height=3.0, step=0.5),
     site=one_row_site(0.1),
-    search=StartOptions(search_radius=1.0, poses=40),
+    search=StartOptions(search_radius=1.0, poses=20, basins=2),
 )
 
 

@@ -136,7 +136,7 @@ def assert_agree(found: list[Agreement]) -> None:
 
 
 def test_planned_sigmas_are_those_found_afterwards() -> None:
-    assert_agree(list(agreements(worlds=1, drives=6)))
+    assert_agree(list(agreements(worlds=1, drives=3)))
 
 
 @pytest.mark.study

@@ -10,13 +10,14 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.slam.exploration import Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.exploring import COARSE, explored
+from tests.drives.exploring import explored
 from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
 
 SENSORS = 4
 FAR_APART = {"distance_m": 0.5, "readings": 2}  # on long drives
+FEW_WAVES = {"modes": 100}  # as quick, and enough for as few readings
 
 
 def drive_in(seed: int, truth: Trajectory) -> tuple[tuple[KnownSensor, ...], SlamDrive]:
@@ -32,7 +33,7 @@ def lapped() -> tuple[tuple[KnownSensor, ...], SlamDrive]:
 
 @pytest.fixture(scope="module")
 def plain(lapped: tuple[tuple[KnownSensor, ...], SlamDrive]) -> Exploration:
-    return explored(lapped[1], lapped[0], key_poses=FAR_APART)
+    return explored(lapped[1], lapped[0], key_poses=FAR_APART, tiles=FEW_WAVES)
 
 
 def test_a_place_that_is_come_to_again_takes_the_drift_out(
@@ -69,7 +70,7 @@ def short() -> tuple[tuple[KnownSensor, ...], SlamDrive]:
 
 @pytest.fixture(scope="module")
 def short_plain(short: tuple[tuple[KnownSensor, ...], SlamDrive]) -> Exploration:
-    return explored(short[1], short[0])
+    return explored(short[1], short[0], tiles=FEW_WAVES)
 
 
 def spiked(drive: SlamDrive) -> SlamDrive:
@@ -92,7 +93,7 @@ def test_readings_that_no_tile_explains_are_rejected(
     short: tuple[tuple[KnownSensor, ...], SlamDrive], short_plain: Exploration
 ) -> None:
     """Nearly all are found, and sigmas hold."""
-    found = explored(spiked(short[1]), short[0])
+    found = explored(spiked(short[1]), short[0], tiles=FEW_WAVES)
     assert rejected(short_plain) < 0.01
     assert 0.04 < rejected(found) < 0.07
     assert pose_nees(short[1].truth, found.result.trajectory).mean() < 12
@@ -104,7 +105,7 @@ def test_little_is_lost_where_readings_are_rejected(
 ) -> None:
     """Where the drift is taken out; on a shorter drive neither of the errors is determined."""
     sensors, drive = lapped
-    found = explored(spiked(drive), sensors, key_poses=FAR_APART)
+    found = explored(spiked(drive), sensors, key_poses=FAR_APART, tiles=FEW_WAVES)
     assert 0.04 < rejected(found) < 0.07
     error = position_error(drive.truth, found.result.trajectory)
     assert error < position_error(drive.truth, plain.result.trajectory) + 0.03
@@ -135,7 +136,8 @@ def test_a_calibration_is_refined_without_a_map() -> None:
     sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
     rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
     # Tiles that are a little larger than by default: fewer, in less than half the time.
-    chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0}}
+    tiles, key_poses = {"core": 4.0, "modes": 150}, {"distance_m": 0.5, "readings": 4}
+    chosen = {"key_poses": key_poses, "calibration": "refined", "tiles": tiles}
     options = SlamOptions.model_validate(chosen)
     found = explore(drive.recording, rough, options, silent).result
     assert found.calibration is not None

@@ -39,7 +39,7 @@ class Scaled:
 
 @cache
 def scaled(seed: int) -> Scaled:
-    rng, truth = np.random.default_rng(seed), rounds(30)[np.arange(0, 600, 2)]
+    rng, truth = np.random.default_rng(seed), rounds(30)[np.arange(0, 600, 3)]
     sensors = random_sensors(seed, 2)
     drawn = drawn_drive(dipole_world(seed), sensors, truth, rng, EXACT, 0.2, 3, DRIFT)
     longer = float(SIGMA * rng.normal())

@@ -24,6 +24,7 @@ from tests.worlds.exact import dipole_world, random_sensors
 WORLD = dipole_world(1)
 SECONDS = 30
 HALF = 300  # readings
+FAR_APART = COARSE.model_copy(update={"distance_m": 0.4})  # enough to tell another building
 STUDY = pytest.mark.study
 
 
@@ -225,7 +226,7 @@ def test_another_building_is_not_here(
     known = calibrated(sensors, sigma=WIDE, rng=np.random.default_rng(3))
     use = CalibrationUse.REFINED if refined else CalibrationUse.FIXED
     known = known if refined else calibrated(sensors)
-    result = found(drive, known, seed, calibration=use.value).result
+    result = found(drive, known, seed, calibration=use.value, key_poses=FAR_APART).result
     assert result.status is LocalisationStatus.NOT_HERE
     assert "another place" in result.message
 
@@ -234,7 +235,7 @@ def test_another_field_where_scans_fit_is_not_here(
     drive: SlamDrive, sensors: tuple[KnownSensor, ...]
 ) -> None:
     """A cloud of this place beside the field of another one: readings say so."""
-    options = SlamOptions.model_validate({"key_poses": COARSE})
+    options = SlamOptions.model_validate({"key_poses": FAR_APART})
     world, seen = dipole_world(99), fixes(drive, range(30))
     result = localise(
         drive.recording, world, calibrated(sensors), options, silent, evidence=seen

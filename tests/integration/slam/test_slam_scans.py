@@ -147,7 +147,7 @@ def test_loops_of_scans_help_where_nothing_is_mapped() -> None:
     loops = ScanEvidence(loops=find_loop_closures(steps, LoopOptions()).loops)
     assert len(loops) > 10
     # Tiles that are a little larger than by default, and fewer key poses: a third of the time.
-    coarse = {"tiles": TileOptions(core=4.0), "key_poses": FAR_APART}
+    coarse = {"tiles": TileOptions(core=4.0, modes=100), "key_poses": FAR_APART}
     options = OPTIONS.model_copy(update=coarse)
     found = explore(drive.recording, calibrated(known), options, silent, evidence=loops).result
     assert found.scans is not None
@@ -224,7 +224,7 @@ def revisiting() -> LoopsOnLine:
     ]
     options = OPTIONS.model_copy(
         update={
-            "tiles": TileOptions(modes=100),
+            "tiles": TileOptions(modes=60),
             "key_poses": FAR_APART,
             "calibration": CalibrationUse.REFINED,
         }

@@ -27,7 +27,7 @@ def test_from_far_off_no_visit_is_believed_to_find_another_field(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Three laps of 10 m, and odometry that is a metre off after one: nothing was moved."""
-    own, rng = random_sensors(4, 6), np.random.default_rng(4)
+    own, rng = random_sensors(4, 3), np.random.default_rng(4)
     recorded = slam_drive(dipole_world(4), own, laps(54, (1.9, 1.4)), rng)
     odometry = slipping(recorded.truth, rng, share=0.1)
     recording = replace(recorded.recording, trajectory=odometry)
