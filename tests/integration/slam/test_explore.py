@@ -10,7 +10,7 @@ from l2m_gtsam.progress import silent
 from l2m_gtsam.records.localisation import LocalisationStatus
 from l2m_gtsam.slam.exploration import Exploration, explore
 from l2m_gtsam.slam.options import SlamOptions
-from tests.drives.exploring import explored
+from tests.drives.exploring import COARSE, explored
 from tests.drives.slam import SlamDrive, calibrated, laps, slam_drive
 from tests.support.pose_errors import pose_nees, position_error
 from tests.worlds.exact import dipole_world, random_sensors
@@ -136,8 +136,7 @@ def test_a_calibration_is_refined_without_a_map() -> None:
     sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
     rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
     # Tiles that are a little larger than by default: fewer, in less than half the time.
-    tiles, key_poses = {"core": 4.0, "modes": 150}, {"distance_m": 0.5, "readings": 4}
-    chosen = {"key_poses": key_poses, "calibration": "refined", "tiles": tiles}
+    chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0}}
     options = SlamOptions.model_validate(chosen)
     found = explore(drive.recording, rough, options, silent).result
     assert found.calibration is not None
