@@ -224,7 +224,7 @@ def revisiting() -> LoopsOnLine:
     ]
     options = OPTIONS.model_copy(
         update={
-            "tiles": TileOptions(modes=60),
+            "tiles": TileOptions(modes=100),
             "key_poses": FAR_APART,
             "calibration": CalibrationUse.REFINED,
         }
