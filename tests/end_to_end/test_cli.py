@@ -172,7 +172,7 @@ def test_a_process_ends_with_one_line(tmp_path: Path) -> None:
     assert "nowhere.bag: no such file" in one_line(run)
 
 
-def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+def test_debug_leaves_an_error_to_python(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="no such file"):
         ended("inspect", tmp_path / "nowhere.bag", "--debug")
 

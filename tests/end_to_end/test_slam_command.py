@@ -1,8 +1,6 @@
 """`l2m slam` on a bag, and on what it cannot work with."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from evo.tools import file_interface
 
 from l2m_gtsam.batch.reports import report_folder
 from l2m_gtsam.data import Distortion
-from l2m_gtsam.qa.report import localisation_page
 from l2m_gtsam.records.verdict import Level
 from l2m_gtsam.storage.bag import read_trajectory
 from l2m_gtsam.storage.bag_options import BagOptions
@@ -23,6 +20,7 @@ from l2m_gtsam.storage.trajectory_files import write_tum
 from tests.drives.calibrations import calibration, sensor
 from tests.drives.yard import calibrated_yard
 from tests.support.command_line import complaint_here, l2m
+from tests.support.left_out import no_pages
 from tests.worlds.yard import NOISE, Yard, route, survey
 
 LINE = len(route(-3, 0.5)) // 11
@@ -47,14 +45,6 @@ def past_the_post(tmp_path_factory: pytest.TempPathFactory) -> Path:
     The others add time to a solve, and hardly any knowledge: their field is nearly uniform.
     """
     return survey(tmp_path_factory.mktemp("past_the_post"), "drive", NEXT_TO_POST, 1)
-
-
-@contextmanager
-def without_page() -> Iterator[None]:
-    """Draw no page, which takes seconds, where none is looked at."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(localisation_page, "localisation_page", lambda *_: "")
-        yield
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +78,7 @@ def test_a_drive_is_localised(yard: Yard, field_map: Path, known: Path, tmp_path
     files = ("--map", field_map, "--calibration", known, "--config", config, "--out", out)
     truth = tmp_path / "truth.tum"
     write_tum(truth, read_trajectory(yard.west, BagOptions(poses="/pose")))
-    with without_page():
+    with no_pages():
         run = l2m("slam", yard.west, *files, "--truth", truth)
     assert "localised: the map explains" in run.out
     assert "verdict: " in run.out
@@ -139,7 +129,7 @@ def check_report(out: Path, folder: Path) -> None:
     assert page.read_text() == text
     strict = folder / "strict.yaml"
     strict.write_text("qa: {slam: {position_sigma_m: {warn: 1.0e-6, fail: 2.0e-6}}}")
-    with without_page():
+    with no_pages():
         assert report_folder(out, strict).level is Level.FAIL
     (out / "metrics.json").write_text("{}")
     assert "holds a calibration (metrics.json) and a localisation" in complaint_here("report", out)
@@ -163,7 +153,7 @@ def test_a_drive_without_a_map_makes_one(
     assert [each["role"] for each in told["sources"]] == ["drive", "calibration"]
     assert "found together" in (out / "report.html").read_text()
     own = ("--map", out / "map.npz", "--out", tmp_path / "again")
-    with without_page():
+    with no_pages():
         again = l2m("slam", past_the_post, *files, *own)
     assert "localised: the map explains" in again.out
     lost = configured(yard, tmp_path, start={"anywhere": True})

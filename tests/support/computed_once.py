@@ -80,10 +80,10 @@ def computed_once(factory: pytest.TempPathFactory) -> Iterator[None]:
 
 def readings_of(recording: Recording) -> str:
     """Return a sum over what was read and where, whoever read it from a bag."""
-    poses, told = recording.trajectory, hashlib.sha256()
+    poses, digest = recording.trajectory, hashlib.sha256()
     arrays = [poses.stamp_ns, poses.R, poses.p]
     arrays += [each for one in recording.series for each in (one.stamp_ns, one.field)]
     for each in arrays:
-        told.update(each.tobytes())
+        digest.update(each.tobytes())
     names = [each.sensor for each in recording.series]
-    return f"{names} {poses.covariance is None} {told.hexdigest()}"
+    return f"{names} {poses.covariance is None} {digest.hexdigest()}"

@@ -54,15 +54,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 @pytest.fixture(scope="module")
-def told() -> list[tuple[str, float]]:
+def steps() -> list[tuple[str, float]]:
     """How far the report said that it was."""
     return []
 
 
 @pytest.fixture(scope="module")
-def reported(made: Made, told: list[tuple[str, float]]) -> tuple[Level, str]:
+def reported(made: Made, steps: list[tuple[str, float]]) -> tuple[Level, str]:
     """The verdict and the page, made from the files."""
-    level = report_folder(made.folder, None, lambda *how_far: told.append(how_far)).level
+    level = report_folder(made.folder, None, lambda *how_far: steps.append(how_far)).level
     return level, (made.folder / REPORT_FILE).read_text()
 
 
@@ -143,10 +143,10 @@ def test_the_page_asks_for_nothing(reported: tuple[Level, str]) -> None:
 
 
 @pytest.mark.usefixtures("reported")
-def test_a_report_tells_how_far_it_is(made: Made, told: list[tuple[str, float]]) -> None:
+def test_a_report_tells_how_far_it_is(made: Made, steps: list[tuple[str, float]]) -> None:
     """A step for each sensor, and the end only once the page is written."""
-    assert {stage for stage, _ in told} == {"report"}
-    fractions = [fraction for _, fraction in told]
+    assert {stage for stage, _ in steps} == {"report"}
+    fractions = [fraction for _, fraction in steps]
     assert fractions == sorted(fractions)
     assert (fractions[0], fractions[-1], fractions.count(1.0)) == (0.0, 1.0, 1)
     assert len(set(fractions)) >= len(made.calibrated.result.sensors) + 2
