@@ -71,11 +71,14 @@ def part_folder(path: Path) -> Iterator[Path]:
 
 def sweep(path: Path) -> None:
     """Remove the parts of a name that nobody holds."""
-    pattern = re.compile(rf"\.{re.escape(path.name)}\.[0-9a-f]{{8}}{re.escape(SUFFIX)}")
-    with suppress(OSError):
-        for each in path.parent.iterdir():
-            if pattern.fullmatch(each.name):
-                _remove_unheld(each)
+    start, digits = f".{path.name}.", re.compile("[0-9a-f]{8}")
+    with suppress(OSError), os.scandir(path.parent) as files:
+        for each in files:  # no path of each: a folder may have thousands of files
+            name = each.name
+            if not (name.startswith(start) and name.endswith(SUFFIX)):
+                continue
+            if digits.fullmatch(name[len(start) : -len(SUFFIX)]):
+                _remove_unheld(path.parent / name)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from l2m_gtsam.maps.harmonic.basis import Basis, batches
 from l2m_gtsam.maps.harmonic.shared_noise import SharedNoise
 from l2m_gtsam.maps.harmonic.triangular import TriangularFactor
 from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.solve.submatrix import submatrix
 
 ROUNDING, LOST = 1e-14, 1e-11
 
@@ -111,16 +112,20 @@ def marginalised(normal: Normal, kept: IntArray, log_variance: FloatArray, noise
     log_variance, noise
         Prior of all weights, shape (m,), and noise in uT.
     """
-    gone = np.setdiff1d(np.arange(len(normal.Fy)), kept)
+    others = np.ones(len(normal.Fy), dtype=np.bool_)
+    others[kept] = False
+    gone = np.flatnonzero(others)
     D = np.exp(0.5 * log_variance[gone])
-    part = Normal(normal.FF[np.ix_(gone, gone)], normal.Fy[gone], normal.yy, 0, 0.0)
+    part = Normal(submatrix(normal.FF, gone), normal.Fy[gone], normal.yy, 0, 0.0)
     K = whitened_factor(part, D, noise)
-    right = np.column_stack([normal.FF[np.ix_(gone, kept)], normal.Fy[gone]]) * D[:, None] / noise
-    half = solve_triangular(K, right, lower=True, check_finite=False)
+    right = np.empty((len(gone), len(kept) + 1), order="F")
+    right[:, :-1], right[:, -1] = normal.FF[np.ix_(kept, gone)].T, normal.Fy[gone]
+    right *= (D / noise)[:, None]
+    half = solve_triangular(K, right, lower=True, overwrite_b=True, check_finite=False)
     # Schur complement of the block that is integrated out.
     known = half.T @ half
     return Normal(
-        normal.FF[np.ix_(kept, kept)] - known[:-1, :-1],
+        submatrix(normal.FF, kept) - known[:-1, :-1],
         normal.Fy[kept] - known[:-1, -1],
         normal.yy - float(known[-1, -1]),
         normal.rows,
@@ -180,18 +185,33 @@ def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights
 
 def whitened_factor(normal: Normal, D: FloatArray, noise: float) -> FloatArray:
     """Return the Cholesky factor of ``I + D F^T W F D / sigma^2``, shape (m, m)."""
-    A = normal.FF * (D[:, None] * D / noise**2)
     # One is lost to rounding where the readings know a weight 1e16 times better than the prior.
-    A[np.diag_indices_from(A)] += 1.0 + ROUNDING * A.diagonal()
+    A = whitened(normal, D, noise, ROUNDING)
     try:
-        return np.asarray(cholesky(A, lower=True, check_finite=False))
+        return np.asarray(cholesky(A, lower=True, overwrite_a=True, check_finite=False))
     except LinAlgError:  # what was integrated out before left rounding of the largest entries
+        A = whitened(normal, D, noise, ROUNDING)
         A[np.diag_indices_from(A)] += LOST * A.diagonal().max()
-        return np.asarray(cholesky(A, lower=True, check_finite=False))
+        return np.asarray(cholesky(A, lower=True, overwrite_a=True, check_finite=False))
+
+
+def whitened(normal: Normal, D: FloatArray, noise: float, rounding: float) -> FloatArray:
+    """Return ``I + D F^T W F D / sigma^2``, (m, m), in LAPACK's order.
+
+    Its diagonal has a share more, for rounding.
+    """
+    scale = D / noise
+    A = normal.FF * scale[:, None]
+    A *= scale
+    A[np.diag_indices_from(A)] += 1.0 + rounding * A.diagonal()
+    return np.asarray(A.T)  # it is symmetric: columns one after the other, without a copy
 
 
 def inverse_of(factor: FloatArray) -> FloatArray:
-    """Return the lower triangle of the inverse of the matrix with this Cholesky factor, (m, m)."""
+    """Return the lower triangle of the inverse of the matrix with this Cholesky factor, (m, m).
+
+    Above its diagonal are zeros, as in the factor.
+    """
     inverse, _ = dpotri(factor, lower=1)
     return np.asarray(inverse)
 
@@ -242,7 +262,8 @@ class EvidenceSlopes:
     by_log_noise
         By the logarithm of the noise.
     unknown
-        Lower triangle of ``A^-1``: what is left of the prior's covariance, whitened, (m, m).
+        Lower triangle of ``A^-1``, zeros above: what is left of the prior's covariance, whitened,
+        (m, m).
     """
 
     by_log_variance: FloatArray
@@ -260,7 +281,7 @@ class EvidenceSlopes:
         # Fisher information tr(P S_i P S_j) / 2 of a Gaussian's covariance: for the log variances
         # of two weights it is half the square of an entry of I - A^-1, of which one triangle is
         # stored.
-        known = -np.tril(self.unknown)
+        known = -self.unknown
         known[np.diag_indices_from(known)] += 1.0
         known *= known
         half = slopes @ known @ slopes.T

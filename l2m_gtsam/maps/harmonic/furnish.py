@@ -13,6 +13,7 @@ from l2m_gtsam.maps.harmonic.modes import CEILING, FLOOR, modes_up_to
 from l2m_gtsam.maps.harmonic.structure import Sources
 from l2m_gtsam.maps.harmonic.tiling import Resolution
 from l2m_gtsam.maps.training import TrainingSet
+from l2m_gtsam.solve.linear_algebra import leading_eigenvectors
 
 UNIFORM_SIGMA = 100.0  # microtesla; the Earth's field is at most 65
 # A combination of moments whose information is this much below the best of its structure's is
@@ -77,5 +78,4 @@ def dipoles_of(
         F = moment_features(points[at], positions) * np.sqrt(readings.weight[at])[:, None, None]
         F = F.reshape(-1, 3 * len(positions))
         information += F.T @ F
-    values, vectors = np.linalg.eigh(information)
-    return Dipoles(positions, vectors[:, values >= visible * values[-1]], strength)
+    return Dipoles(positions, leading_eigenvectors(information, visible), strength)

@@ -6,6 +6,7 @@ from l2m_gtsam.solve.linear_algebra import (
     correlation_factor,
     covariance_root,
     information_root,
+    leading_eigenvectors,
     lower_information_root,
     right_divided,
     triangular_information_root,
@@ -69,3 +70,27 @@ def test_what_is_divided_from_the_right_comes_back() -> None:
     np.testing.assert_allclose(right_divided(A, C) @ C, A, atol=1e-13)
     np.testing.assert_allclose(right_divided(A, C[0]) @ C[0], A, atol=1e-13)
     np.testing.assert_allclose(right_divided(np.eye(3), C) @ C, [np.eye(3)] * 5, atol=1e-13)
+
+
+def test_leading_eigenvectors_span_what_all_eigenvectors_do() -> None:
+    """Eigenvalues fall over twenty decades, as those of sources that are seen from afar."""
+    rng = np.random.default_rng(5)
+    turned, _ = np.linalg.qr(rng.normal(size=(60, 60)))
+    values = 10.0 ** -np.linspace(0, 20, 60)
+    matrix = (turned * values) @ turned.T
+    for least in (1e-3, 1e-7):
+        found = leading_eigenvectors((matrix + matrix.T) / 2, least)
+        kept = turned[:, values >= least]
+        assert found.shape == kept.shape
+        np.testing.assert_allclose(found.T @ found, np.eye(found.shape[1]), atol=1e-12)
+        # What is left out is 60 pivots of 1e-6 of the least at most; the next value is 2.2 times
+        # smaller than the least, so that the space turns by 1e-4 at most.
+        np.testing.assert_allclose(found @ (found.T @ kept), kept, atol=1e-4)
+        # The largest comes last.
+        np.testing.assert_allclose(abs(found[:, -1] @ turned[:, 0]), 1.0, atol=1e-9)
+
+
+def test_of_equal_eigenvalues_all_vectors_lead() -> None:
+    for matrix in (np.zeros((3, 3)), 2.0 * np.eye(3)):
+        found = leading_eigenvectors(matrix, 1e-7)
+        np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-15)
