@@ -83,8 +83,19 @@ class Planes:
         """Which of them are planes, shape (N,)."""
         return np.asarray(self.flatness < FLAT)
 
+    @classmethod
+    def unfitted(cls, count: int) -> "Planes":
+        """Return space for so many planes."""
+        return cls(
+            np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2, 3)), np.empty(count)
+        )
+
     def __getitem__(self, rows: IntArray) -> "Planes":
         return Planes(self.point[rows], self.normal[rows], self.slope[rows], self.flatness[rows])
+
+    def __setitem__(self, rows: IntArray, planes: "Planes") -> None:
+        self.point[rows], self.normal[rows] = planes.point, planes.normal
+        self.slope[rows], self.flatness[rows] = planes.slope, planes.flatness
 
 
 def fitted_planes(point: FloatArray, neighbours: FloatArray) -> Planes:
@@ -97,7 +108,8 @@ def fitted_planes(point: FloatArray, neighbours: FloatArray) -> Planes:
     neighbours
         K of each, itself among them, shape (N, K, 3).
     """
-    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
+    middle = neighbours.mean(axis=1)
+    centred = neighbours - middle[:, None]
     count = neighbours.shape[1]
     spread = np.einsum("nki,nkj->nij", centred, centred) / count
     values, vectors = np.linalg.eigh(spread)
@@ -110,7 +122,7 @@ def fitted_planes(point: FloatArray, neighbours: FloatArray) -> Planes:
     width = np.linalg.norm(neighbours - point[:, None], axis=2).max(axis=1)
     narrow = values[:, 1] < NARROW**2 * values[:, 2]
     flatness[narrow | (width > WIDEST_M)] = np.inf
-    return Planes(neighbours.mean(axis=1), vectors[:, :, 0], slope, flatness)
+    return Planes(middle, vectors[:, :, 0], slope, flatness)
 
 
 def distances(points: FloatArray, T: RigidTransform, planes: Planes) -> FloatArray:
@@ -198,6 +210,8 @@ class Surface:
         self.cloud: Any = gicp.voxelgrid_sampling(cloud, edge) if edge and len(points) else cloud
         self.points: FloatArray = np.array(self.cloud.points()[:, :3])
         self.tree: Any = gicp.KdTree(self.cloud) if self.usable else None
+        self._planes = Planes.unfitted(len(self.points))
+        self._fitted = np.zeros(len(self.points), dtype=np.bool_)
         if self.usable:
             gicp.estimate_covariances(self.cloud, self.tree, NEIGHBOURS)
 
@@ -215,9 +229,14 @@ class Surface:
         return np.array(rows, dtype=np.int64), np.sqrt(np.array(squared))
 
     def planes(self, rows: IntArray) -> Planes:
-        """Return the planes that fit the surface at some of its points."""
-        found, _ = self.tree.batch_knn_search(self.points[rows], NEIGHBOURS)
-        return fitted_planes(self.points[rows], self.points[np.array(found, dtype=np.int64)])
+        """Return the planes that fit the surface at some of its points; each is fitted once."""
+        new = np.unique(rows[~self._fitted[rows]])
+        if len(new):
+            found, _ = self.tree.batch_knn_search(self.points[new], NEIGHBOURS)
+            around = self.points[np.array(found, dtype=np.int64)]
+            self._planes[new] = fitted_planes(self.points[new], around)
+            self._fitted[new] = True
+        return self._planes[rows]
 
 
 def smoothed(points: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from numba import njit
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from l2m_factors import N, SlowError, slow_bridge, slow_error_graph
@@ -51,6 +52,52 @@ class SensorNoise:
     def scaled(self, factor: float) -> "SensorNoise":
         """Return noise that is so many times as large."""
         return replace(self, ut=factor * self.ut)
+
+
+def whiten(noise: SensorNoise, seconds: FloatArray, rows: FloatArray) -> float:
+    """Multiply rows by the inverse of the Cholesky factor of N readings' noise along one axis.
+
+    The rows become the innovations of a Kalman filter that follows the slow error: in linear time.
+
+    Parameters
+    ----------
+    noise
+        Of the sensor.
+    seconds
+        Times of the readings in ascending order, shape (N,).
+    rows
+        Shape (N, q) in C order, changed in place.
+
+    Returns
+    -------
+    float
+        Logarithm of the factor's determinant.
+    """
+    slow, white = noise.slow_ut**2, noise.white_ut**2
+    return float(write_innovations(np.exp(-np.diff(seconds) / noise.slow_s), slow, white, rows))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def write_innovations(decay: FloatArray, slow: float, white: float, rows: FloatArray) -> float:
+    """Write innovations over rows (N, q), for the decay of the slow error between these, (N - 1,).
+
+    ``slow`` and ``white`` are variances; see ``whiten``.
+    """
+    expected, variance, volume = np.zeros(rows.shape[1]), slow, 0.0
+    for n in range(len(rows)):
+        if n:
+            left = decay[n - 1]
+            variance = left * left * variance + (1 - left * left) * slow
+            expected *= left
+        total = variance + white
+        gain, scale = variance / total, 1 / np.sqrt(total)
+        volume += 0.5 * np.log(total)
+        for c in range(rows.shape[1]):
+            off = rows[n, c] - expected[c]
+            expected[c] += gain * off
+            rows[n, c] = scale * off
+        variance -= gain * variance
+    return volume
 
 
 class SlowErrors:

@@ -21,7 +21,7 @@ from scipy.optimize import Bounds, minimize
 
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.maps.potential import PotentialBasis, PotentialHyperparameters
-from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise
+from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, whiten
 
 LEARNT_FROM, LEARNT_WITH = 300, 200  # readings and waves
 MARGIN = 1.5  # of the box about the path, in lengths of the field: on its faces the field is normal
@@ -46,7 +46,7 @@ class LearntReadings:
     field
         Along the axes of the vehicle, corrected by the calibration, uT, shape (N, 3).
     seconds
-        Their times, shape (N,).
+        Their times in ascending order, shape (N,).
     """
 
     x: FloatArray
@@ -135,13 +135,16 @@ class SpectrumLikelihood:
         first = PotentialHyperparameters(sigma=self._strength, length=1.0)
         low, high = x.min(axis=0) - MARGIN, x.max(axis=0) + MARGIN
         self._basis = PotentialBasis.over(low, high, first, LEARNT_WITH)
-        self._features = readings.R.transpose(0, 2, 1) @ self._basis.features(x)
-        corrected = np.zeros((self._count, AXES, 12))
+        self._seconds = readings.seconds
+        # Side by side, so that both are made white at once: features of the waves, and derivatives
+        # of the corrected readings by A and h.
+        waves = len(self._basis)
+        self._columns = np.zeros((self._count, AXES, waves + 12))
+        self._columns[:, :, :waves] = readings.R.transpose(0, 2, 1) @ self._basis.features(x)
         for axis in range(AXES):
-            corrected[:, axis, 3 * axis : 3 * axis + 3] = b
-            corrected[:, axis, 9 + axis] = 1.0
-        self._corrected = corrected
-        self._apart = np.abs(np.subtract.outer(readings.seconds, readings.seconds))
+            at = waves + 3 * axis
+            self._columns[:, axis, at : at + 3] = b
+            self._columns[:, axis, waves + 9 + axis] = 1.0
         self._mean = np.append(np.eye(AXES).ravel(), np.zeros(AXES))
         self._variance = np.repeat([distortion**2, offset_ut**2], [9, 3])
 
@@ -169,20 +172,17 @@ class SpectrumLikelihood:
 
     def _without_field(self, at: FloatArray) -> tuple[FloatArray, float]:
         """Return the information about A, h with the field integrated out, and its volume."""
-        noise = self.noise(at)
-        slow = (1 - noise.white) * np.exp(-self._apart / noise.slow_s)
-        root = cholesky(noise.ut**2 * (slow + noise.white * np.eye(self._count)), lower=True)
-
-        def white(rows: FloatArray) -> FloatArray:
-            flat = solve_triangular(root, rows.reshape(self._count, -1), lower=True)
-            return np.asarray(flat.reshape(AXES * self._count, -1))
-
-        F = white(self._features) * np.sqrt(self._basis.variances(self.prior(at)))
-        G = white(self._corrected)
-        lower = cholesky(np.eye(F.shape[1]) + F.T @ F, lower=True)
-        half = solve_triangular(lower, F.T @ G, lower=True)
-        volume = np.log(np.diag(lower)).sum() + AXES * np.log(np.diag(root)).sum()
-        return G.T @ G - half.T @ half, float(volume)
+        waves = len(self._basis)
+        rows = self._columns.copy()
+        rows[:, :, :waves] *= np.sqrt(self._basis.variances(self.prior(at)))
+        volume = AXES * whiten(self.noise(at), self._seconds, rows.reshape(self._count, -1))
+        rows = rows.reshape(AXES * self._count, -1)
+        every = rows.T @ rows
+        known, shared = np.eye(waves) + every[:waves, :waves], every[:waves, waves:]
+        lower = cholesky(known, lower=True, check_finite=False)
+        half = solve_triangular(lower, shared, lower=True, check_finite=False)
+        volume += float(np.log(np.diag(lower)).sum())
+        return every[waves:, waves:] - half.T @ half, volume
 
     def _by_distortion(self, information: FloatArray) -> float:
         """Return the log likelihood with A, h integrated out, of readings of this information."""

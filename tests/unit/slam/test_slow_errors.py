@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from l2m_factors import N, SlowError, slow_bridge, slow_error_graph
-from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors
+from l2m_gtsam.slam.unknown_field.sensor_noise import SensorNoise, SlowErrors, whiten
 
 TIMES = np.array([0.0, 0.4, 1.0, 1.1, 3.0])
 
@@ -88,3 +88,24 @@ def test_noise_is_split() -> None:
     assert noise.white_ut == pytest.approx(1.2)
     assert noise.slow_ut == pytest.approx(1.6)
     assert SensorNoise(1.0, 1e-6, 1.0).floored().white_ut == pytest.approx(0.3)
+
+
+@given(
+    white=st.floats(1e-3, 1 - 1e-3),
+    slow_s=st.floats(0.05, 50.0),
+    apart=st.lists(st.floats(0.0, 10.0), min_size=1, max_size=12),
+)
+def test_rows_are_made_white_as_by_the_cholesky_factor(
+    white: float, slow_s: float, apart: list[float]
+) -> None:
+    """Readings at one time, too: their white noise is their own."""
+    noise, seconds = SensorNoise(0.7, white, slow_s), np.cumsum(apart)
+    alike = np.exp(-np.abs(np.subtract.outer(seconds, seconds)) / slow_s)
+    covariance = noise.slow_ut**2 * alike + noise.white_ut**2 * np.eye(len(seconds))
+    lower = np.linalg.cholesky(covariance)
+    rows = np.random.default_rng(0).normal(size=(len(seconds), 4))
+    expected = np.linalg.solve(lower, rows)
+    volume = whiten(noise, seconds, rows)
+    # The covariance is at worst 1e4 times worse conditioned than its white part.
+    np.testing.assert_allclose(rows, expected, rtol=1e-9, atol=1e-9)
+    assert volume == pytest.approx(np.log(np.diag(lower)).sum(), rel=1e-9, abs=1e-9)
