@@ -1,6 +1,7 @@
 """Scans on clouds of rooms: poses to a millimetre, covariances that hold, refusals."""
 
 import sys
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from l2m_gtsam.data import FloatArray, RigidTransform, Trajectory
 from l2m_gtsam.errors import LidarError
 from l2m_gtsam.geometry import difference, perturbed
+from l2m_gtsam.lidar import surface as surface_module
 from l2m_gtsam.lidar.registration import (
     Refusal,
     Registration,
@@ -15,7 +17,7 @@ from l2m_gtsam.lidar.registration import (
     by_scan,
     register,
 )
-from l2m_gtsam.lidar.surface import Surface, smoothed
+from l2m_gtsam.lidar.surface import Planes, Surface, fitted_planes, smoothed
 from l2m_gtsam.storage.cloud import thinned_cloud
 from tests.worlds.lidar_rooms import CORRIDOR, ROOM, Room, round_trip, rows, scans, seen, straight
 
@@ -46,6 +48,27 @@ def at(poses: Trajectory, k: int) -> RigidTransform:
 
 def scan_at(room: Room, T: RigidTransform, seed: int, noise_m: float = 0.01) -> Surface:
     return Surface(seen(room, T, np.random.default_rng(seed), noise_m), OPTIONS.edge)
+
+
+def test_planes_of_a_surface_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In whatever pieces they are asked for, with repeats: each is that of its own neighbours."""
+    points = np.random.default_rng(3).uniform(0, 2, (60, 3)) * [1, 1, 0.02]
+    at_once = Surface(points).planes(np.arange(60))
+    fitted = list[int]()
+
+    def counted(point: FloatArray, neighbours: FloatArray) -> Planes:
+        fitted.append(len(point))
+        return fitted_planes(point, neighbours)
+
+    monkeypatch.setattr(surface_module, "fitted_planes", counted)
+    surface = Surface(points)
+    for piece in ([5, 3, 5], range(0, 60, 2), range(60), [59, 0]):
+        asked = np.array(piece)
+        found = surface.planes(asked)
+        for one, other in zip(astuple(found), astuple(at_once[asked]), strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert fitted == [2, 30, 28]
+
 
 
 @pytest.mark.parametrize("k", [3, 50, 95])
