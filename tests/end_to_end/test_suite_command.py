@@ -9,7 +9,8 @@ from tests.drives.begun import begin
 from tests.support.command_line import complaint_here, l2m
 from tests.worlds.quick_maps import QUICK_HARMONIC
 
-SECONDS = 40.0  # of a drive of 104
+# Of a drive of 104; 38 to 41 of them determine no place, and what is found depends on rounding.
+SECONDS = 60.0
 QUICK = {"sync": {"thin_distance_m": 0.05}, "windows": 1, "readings": 800, "modes": 120}
 
 
