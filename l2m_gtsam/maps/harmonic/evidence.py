@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
-from scipy.linalg.lapack import dpotri
+from scipy.linalg.lapack import dlauum, dtrtri
 
 from l2m_gtsam.data import FloatArray, IntArray
 from l2m_gtsam.maps.harmonic.basis import Basis, batches
@@ -207,13 +207,15 @@ def whitened(normal: Normal, D: FloatArray, noise: float, rounding: float) -> Fl
     return np.asarray(A.T)  # it is symmetric: columns one after the other, without a copy
 
 
-def inverse_of(factor: FloatArray) -> FloatArray:
-    """Return the lower triangle of the inverse of the matrix with this Cholesky factor, (m, m).
-
-    Above its diagonal are zeros, as in the factor.
-    """
-    inverse, _ = dpotri(factor, lower=1)
+def inverse_factor_of(factor: FloatArray) -> FloatArray:
+    """Return the inverse of a lower triangular matrix, zeros above the diagonal, (m, m)."""
+    inverse, _ = dtrtri(factor, lower=1)
     return np.asarray(inverse)
+
+
+def unknown_share(inverse_factor: FloatArray) -> FloatArray:
+    """Return the share of each weight's prior variance that is left, the diagonal of A^-1, (m,)."""
+    return np.asarray(np.einsum("ij,ij->j", inverse_factor, inverse_factor))
 
 
 @dataclass(frozen=True)
@@ -241,13 +243,13 @@ class Evidence:
     rows: int
 
     def slopes(self) -> "EvidenceSlopes":
-        """Return the derivatives, which cost twice as much as the value."""
-        unknown = inverse_of(self.factor)
-        known = 1 - np.diag(unknown)  # share of each weight's prior variance that is gone
+        """Return the derivatives, which cost as much as the value."""
+        inverse_factor = inverse_factor_of(self.factor)
+        known = 1 - unknown_share(inverse_factor)
         return EvidenceSlopes(
             by_log_variance=0.5 * (self.mean**2 - known),
             by_log_noise=self.misfit + float(known.sum()) - self.rows,
-            unknown=unknown,
+            inverse_factor=inverse_factor,
         )
 
 
@@ -261,14 +263,13 @@ class EvidenceSlopes:
         By the logarithm of each weight's prior variance, shape (m,).
     by_log_noise
         By the logarithm of the noise.
-    unknown
-        Lower triangle of ``A^-1``, zeros above: what is left of the prior's covariance, whitened,
-        (m, m).
+    inverse_factor
+        ``K^-1``, lower triangular, shape (m, m).
     """
 
     by_log_variance: FloatArray
     by_log_noise: float
-    unknown: FloatArray
+    inverse_factor: FloatArray
 
     def information(self, slopes: FloatArray) -> FloatArray:
         """Return the expected information on numbers that the prior depends on, shape (p, p).
@@ -279,9 +280,10 @@ class EvidenceSlopes:
             Derivatives of the logarithms of the prior variances by these numbers, shape (p, m).
         """
         # Fisher information tr(P S_i P S_j) / 2 of a Gaussian's covariance: for the log variances
-        # of two weights it is half the square of an entry of I - A^-1, of which one triangle is
-        # stored.
-        known = -self.unknown
+        # of two weights it is half the square of an entry of I - A^-1, of which the lower triangle
+        # is computed: what is left of the prior's covariance, whitened.
+        unknown, _ = dlauum(self.inverse_factor, lower=1)
+        known = -np.asarray(unknown)
         known[np.diag_indices_from(known)] += 1.0
         known *= known
         half = slopes @ known @ slopes.T

@@ -12,9 +12,10 @@ from l2m_gtsam.maps.harmonic.dipoles import Dipoles
 from l2m_gtsam.maps.harmonic.evidence import (
     Normal,
     evidence,
-    inverse_of,
+    inverse_factor_of,
     marginalised,
     normal_of,
+    unknown_share,
     whitened_factor,
 )
 from l2m_gtsam.maps.harmonic.explanation import explanation_of, patchwork
@@ -235,4 +236,4 @@ def learn_strengths(basis: Basis, normal: Normal, hyperparameters: Hyperparamete
 def determined_weights(normal: Normal, log_variance: FloatArray, noise: float) -> FloatArray:
     """Return the share of each weight's prior variance that the readings removed, shape (m,)."""
     K = whitened_factor(normal, np.exp(0.5 * log_variance), noise)
-    return np.asarray(1.0 - np.diag(inverse_of(K)))
+    return 1.0 - unknown_share(inverse_factor_of(K))
