@@ -21,7 +21,9 @@ from l2m_gtsam.calibration.half_difference import HalfDifference
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import (
+    TOLERANCE,
     Ending,
+    JointCovariance,
     covariance_by_qr,
     joint_covariance,
     optimise,
@@ -48,6 +50,7 @@ from l2m_gtsam.solve.rank import Determinacy
 # Of each round whose weights may be the last; two of these at least are made, and each step
 # shortens what remains fourfold.
 POLISHING_STEPS = 2
+NEARLY = 0.1  # of the error: a descent with weights of an intermediate stage ends at less
 OWN = np.arange(SENSOR)  # where a sensor that shares no error stands among its variables
 
 
@@ -203,14 +206,16 @@ def joint_step(
 ) -> JointStep:
     """Optimise T(i), D(i), S(i) of all sensors, then the noise from the residuals that remain.
 
-    ``exact`` goes to where the gradient vanishes; with the weights of an intermediate stage a step
-    less is enough.
+    ``exact`` goes to where the gradient vanishes; with the weights of an intermediate stage a
+    descent that has nearly ended is enough.
     """
     sensors = problem.view.sensors
-    start = estimate.values(sensors)
-    optimised = optimise(problem.graph, start, options.optimizer, options.joint_iterations)
-    steps = POLISHING_STEPS if exact else POLISHING_STEPS - 1
-    values = polish(problem.graph, optimised.values, steps).values
+    start, most = estimate.values(sensors), options.joint_iterations
+    tolerance = TOLERANCE if exact else NEARLY
+    optimised = optimise(problem.graph, start, options.optimizer, most, tolerance=tolerance)
+    values = optimised.values
+    if exact:
+        values = polish(problem.graph, values, POLISHING_STEPS).values
     after = estimate.updated(values, sensors)
     most = options.largest_offset_s
     after = replace(after, offset=np.clip(after.offset, -most, most))
@@ -231,14 +236,64 @@ def _noise(problem: JointProblem, estimate: Estimate) -> FloatArray:
     return noise
 
 
+@dataclass(frozen=True)
+class JointOptimum:
+    """The joint graph where its own weights have it.
+
+    Attributes
+    ----------
+    values
+        The optimum.
+    linear
+        The graph linearised there.
+    among
+        Covariances of all parameters of some sensors.
+    whitenings
+        Of each residual, shape (N, 3, 3).
+    """
+
+    values: gtsam.Values
+    linear: gtsam.GaussianFactorGraph
+    among: JointCovariance
+    whitenings: FloatArray
+
+    @classmethod
+    def of(cls, problem: JointProblem, estimate: Estimate) -> "JointOptimum":
+        """Linearise the graph at an estimate."""
+        values = estimate.values(problem.view.sensors)
+        linear = problem.graph.linearize(values)
+        among = joint_covariance(linear, values, partial(covariance_by_qr, linear))
+        return cls(values, linear, among, whitening(problem.covariance))
+
+
 def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
     """Return covariance and figures of every sensor at the optimum of its own weights."""
-    values = estimate.values(problem.view.sensors)
-    linear = problem.graph.linearize(values)
-    among = joint_covariance(linear, values, partial(covariance_by_qr, linear))
+    return _solutions(problem, estimate, JointOptimum.of(problem, estimate))
+
+
+def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
+    """Return the same with covariances that hold what the scatter of parts of the drive shows."""
+    optimum, widened = JointOptimum.of(problem, estimate), []
+    values, W = optimum.values, optimum.whitenings
+    for found in _solutions(problem, estimate, optimum):
+        s = found.sensor
+        rows = problem.batch.rows_of(s)
+        residual = problem.batch.residuals(values, s).residual[rows]
+        white = (W[rows] @ residual[:, :, None]).ravel()
+        own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
+        covariance, together = HalfCovariance.of(optimum.among((s,))), len(problem.view.sensors)
+        parts = scatters(problem.view.readings, [own], OWN, covariance)
+        excess = unmodelled(parts, OWN, covariance, together)
+        widened.append(found.widened(excess))
+    return tuple(widened)
+
+
+def _solutions(
+    problem: JointProblem, estimate: Estimate, optimum: JointOptimum
+) -> tuple[SensorSolution, ...]:
+    values, among = optimum.values, optimum.among
     missed = contradictions(estimate.priors.among(problem.view.sensors), values, among)
-    gradients = linear.gradientAtZero()
-    W = whitening(problem.covariance)
+    gradients = optimum.linear.gradientAtZero()
     solutions = []
     for s in problem.view.sensors:
         rows, test = problem.batch.rows_of(s), problem.determinacies[s]
@@ -249,32 +304,13 @@ def sensor_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorS
             SensorSolution(
                 sensor=s,
                 joint_covariance=with_infinities(covariance, test),
-                figures=residual_figures(residual, W[rows], test.free),
+                figures=residual_figures(residual, optimum.whitenings[rows], test.free),
                 determinacy=test,
                 remaining_sigmas=float(np.sqrt(gradient @ covariance @ gradient)),
                 contradictions=tuple(each for each in missed if s in each.sensors),
             )
         )
     return tuple(solutions)
-
-
-def robust_solutions(problem: JointProblem, estimate: Estimate) -> tuple[SensorSolution, ...]:
-    """Return the same with covariances that hold what the scatter of parts of the drive shows."""
-    values, W = estimate.values(problem.view.sensors), whitening(problem.covariance)
-    linear = problem.graph.linearize(values)
-    among = joint_covariance(linear, values, partial(covariance_by_qr, linear))
-    widened = []
-    for found in sensor_solutions(problem, estimate):
-        s = found.sensor
-        rows = problem.batch.rows_of(s)
-        residual = problem.batch.residuals(values, s).residual[rows]
-        white = (W[rows] @ residual[:, :, None]).ravel()
-        own = Rows(s, OWN, whitened_jacobian(problem.batch, W, values, s), white, rows)
-        covariance, together = HalfCovariance.of(among((s,))), len(problem.view.sensors)
-        parts = scatters(problem.view.readings, [own], OWN, covariance)
-        excess = unmodelled(parts, OWN, covariance, together)
-        widened.append(found.widened(excess))
-    return tuple(widened)
 
 
 def with_infinities(covariance: FloatArray, test: Determinacy) -> FloatArray:
