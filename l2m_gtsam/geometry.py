@@ -108,6 +108,7 @@ def from_matrix(matrix: FloatArray) -> RigidTransform:
 
 
 AXES = "xyz"
+FLAT = 0.1  # of the largest singular value of C: no sensor's is as flat, mirrored or not
 
 
 @dataclass(frozen=True)
@@ -142,15 +143,22 @@ def polar_rotation(C: FloatArray, covariance: FloatArray) -> PolarRotation:
     Raises
     ------
     CalibrationError
-        det C <= 0: an axis is mirrored and no rotation fits; the message names it.
+        det C <= 0: an axis is mirrored and no rotation fits, and the message names it; or C is flat
+        and its sign says nothing.
     """
-    if not np.linalg.det(C) > 0:
-        msg = (
-            f"det C = {np.linalg.det(C):.3g}: the sensor's {flipped_axis(C)} axis looks flipped; "
-            "reverse it in the driver or with `bag.axes`, a rotation cannot"
-        )
-        raise CalibrationError(msg)
     U, s, Vt = np.linalg.svd(C)
+    sign = np.linalg.det(C)
+    if not sign > 0 and s[-1] < FLAT * s[0]:
+        raise CalibrationError(
+            f"det C = {sign:.3g}: C is nearly singular, as no sensor's is: the drive hardly "
+            "determines it; drive with all headings and some tilt, or give what is known of the "
+            "sensor"
+        )
+    if not sign > 0:
+        raise CalibrationError(
+            f"det C = {sign:.3g}: the sensor's {flipped_axis(C)} axis looks flipped; reverse it in "
+            "the driver or with `bag.axes`, a rotation cannot"
+        )
     R = np.asarray(U @ Vt)
     P = Vt.T @ np.diag(s) @ Vt
     skew = np.zeros((3, 9))

@@ -210,9 +210,9 @@ def joint_step(
     descent that has nearly ended is enough.
     """
     sensors = problem.view.sensors
-    start, most = estimate.values(sensors), options.joint_iterations
+    start, steps = estimate.values(sensors), options.joint_iterations
     tolerance = TOLERANCE if exact else NEARLY
-    optimised = optimise(problem.graph, start, options.optimizer, most, tolerance=tolerance)
+    optimised = optimise(problem.graph, start, options.optimizer, steps, tolerance=tolerance)
     values = optimised.values
     if exact:
         values = polish(problem.graph, values, POLISHING_STEPS).values

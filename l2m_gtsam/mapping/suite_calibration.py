@@ -316,7 +316,10 @@ def _sensor(drive: SuiteDrive, solution: SuiteSolution, i: int) -> SensorCalibra
     own = slice(SIZE * i, SIZE * (i + 1))
     parameters, covariance = solution.last.sensors[i], solution.last.covariance[own, own]
     distortion = Distortion.from_vector(parameters[3:TAU])
-    rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
+    try:
+        rotation = polar_rotation(distortion.C, covariance[3:12, 3:12])
+    except CalibrationError as error:
+        raise CalibrationError(f"{drive.readings.sensors[i]}: {error}") from None
     sigma = float(np.sqrt(covariance[TAU, TAU]))
     status, message = _ending(solution)
     noise = float(solution.last.windows.prior.noise * np.cbrt(np.linalg.det(distortion.C)))

@@ -173,11 +173,11 @@ class SpectrumLikelihood:
     def _without_field(self, at: FloatArray) -> tuple[FloatArray, float]:
         """Return the information about A, h with the field integrated out, and its volume."""
         waves = len(self._basis)
-        rows = self._columns.copy()
-        rows[:, :, :waves] *= np.sqrt(self._basis.variances(self.prior(at)))
-        volume = AXES * whiten(self.noise(at), self._seconds, rows.reshape(self._count, -1))
-        rows = rows.reshape(AXES * self._count, -1)
-        every = rows.T @ rows
+        columns = self._columns.copy()
+        columns[:, :, :waves] *= np.sqrt(self._basis.variances(self.prior(at)))
+        volume = AXES * whiten(self.noise(at), self._seconds, columns.reshape(self._count, -1))
+        white = columns.reshape(AXES * self._count, -1)
+        every = white.T @ white
         known, shared = np.eye(waves) + every[:waves, :waves], every[:waves, waves:]
         lower = cholesky(known, lower=True, check_finite=False)
         half = solve_triangular(lower, shared, lower=True, check_finite=False)

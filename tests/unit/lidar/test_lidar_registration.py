@@ -70,7 +70,6 @@ def test_planes_of_a_surface_are_fitted_once(monkeypatch: pytest.MonkeyPatch) ->
     assert fitted == [2, 30, 28]
 
 
-
 @pytest.mark.parametrize("k", [3, 50, 95])
 def test_a_scan_is_found_to_the_millimetre(room_cloud: Surface, k: int) -> None:
     true = at(round_trip(120), k)

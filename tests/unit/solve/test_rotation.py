@@ -43,3 +43,11 @@ def test_a_flipped_axis_is_named(axis: int) -> None:
     C[axis] *= -1.02
     with pytest.raises(CalibrationError, match=f"the sensor's {'xyz'[axis]} axis looks flipped"):
         polar_rotation(C, np.zeros((9, 9)))
+
+
+def test_of_a_flat_matrix_no_axis_is_called_flipped() -> None:
+    """What a drive hardly determines may have any sign: from a survey of 40 s in the hand."""
+    C = np.array([[1.37, -1.16, -1.0], [-1.22, 1.04, 0.9], [-0.81, 0.69, 0.5]])
+    assert np.linalg.det(C) < 0
+    with pytest.raises(CalibrationError, match="C is nearly singular"):
+        polar_rotation(C, np.zeros((9, 9)))
