@@ -196,6 +196,8 @@ def inflated(information: FloatArray, least: FloatArray) -> FloatArray:
 class Surface:
     """A cloud that scans are registered on, or a scan that is.
 
+    Planes that were asked for are kept, about 100 bytes each.
+
     Parameters
     ----------
     points
@@ -232,11 +234,14 @@ class Surface:
         """Return the planes that fit the surface at some of its points; each is fitted once."""
         new = np.unique(rows[~self._fitted[rows]])
         if len(new):
-            found, _ = self.tree.batch_knn_search(self.points[new], NEIGHBOURS)
-            around = self.points[np.array(found, dtype=np.int64)]
-            self._planes[new] = fitted_planes(self.points[new], around)
+            self._planes[new] = self.fitted(new)
             self._fitted[new] = True
         return self._planes[rows]
+
+    def fitted(self, rows: IntArray) -> Planes:
+        """Return the same without keeping them."""
+        found, _ = self.tree.batch_knn_search(self.points[rows], NEIGHBOURS)
+        return fitted_planes(self.points[rows], self.points[np.array(found, dtype=np.int64)])
 
 
 def smoothed(points: FloatArray) -> FloatArray:
@@ -256,7 +261,7 @@ def smoothed(points: FloatArray) -> FloatArray:
     moved = points.copy()
     for low in range(0, len(points), PIECE_POINTS):
         rows = np.arange(low, min(low + PIECE_POINTS, len(points)))
-        planes = surface.planes(rows)
+        planes = surface.fitted(rows)  # each once: a cloud may have millions
         off = np.einsum("ni,ni->n", planes.normal, points[rows] - planes.point)
         moved[rows] -= np.where(planes.flat, off, 0.0)[:, None] * planes.normal
     return moved
