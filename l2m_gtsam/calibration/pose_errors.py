@@ -23,6 +23,7 @@ from l2m_gtsam.calibration.view import QueryableMap, places_of
 from l2m_gtsam.data import FloatArray, IntArray, Readings
 
 SEGMENTS = 60  # of a drive, at most: six weights at each end of one
+ROUNDING = 1e-9  # of a segment: a drive of just so many has no more for it
 SHORTEST_S = 1e-6  # stands for errors that do not last
 SHORT = 0.25  # of a segment: means over segments say more of errors that last no longer
 
@@ -61,7 +62,7 @@ class PoseKnots:
         between = max(correlation_s / 2, whole / SEGMENTS)
         knots, spacing = [], []
         for first, last in ends:
-            count = max(int(np.ceil((last - first) / between)) + 1, 2)
+            count = max(int(np.ceil((last - first) / between - ROUNDING)) + 1, 2)
             knots.append(np.linspace(first, last, count))
             spacing += [float(knots[-1][1] - knots[-1][0])] * (count - 1) + [np.inf]
         spaced = np.array(spacing[:-1])

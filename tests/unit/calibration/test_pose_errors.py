@@ -51,6 +51,12 @@ def test_knots_stand_as_close_as_errors_last_but_are_not_too_many() -> None:
     np.testing.assert_allclose(alone.bridge(np.array([3.0])), 0, atol=1e-6)
 
 
+@given(first=st.floats(0.0, 1e4), length=st.floats(1.0, 1e4))
+def test_rounding_adds_no_segment(first: float, length: float) -> None:
+    """A drive has just as many as are allowed, whenever it begins: another one moves all knots."""
+    assert len(PoseKnots.over(np.array([first, first + length]), 1e-3).seconds) == SEGMENTS + 1
+
+
 def test_errors_that_do_not_last_are_independent() -> None:
     at = np.linspace(0, 10, 7)[1:-1] + 0.01
     knots = PoseKnots.over(np.linspace(0, 10, 100), 0.0)
