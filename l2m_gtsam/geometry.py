@@ -108,7 +108,7 @@ def from_matrix(matrix: FloatArray) -> RigidTransform:
 
 
 AXES = "xyz"
-FLAT = 0.1  # of the largest singular value of C: no sensor's is as flat, mirrored or not
+SINGULAR = 0.1  # of the largest singular value of C: no sensor's is as flat, mirrored or not
 
 
 @dataclass(frozen=True)
@@ -147,17 +147,17 @@ def polar_rotation(C: FloatArray, covariance: FloatArray) -> PolarRotation:
         and its sign says nothing.
     """
     U, s, Vt = np.linalg.svd(C)
-    sign = np.linalg.det(C)
-    if not sign > 0 and s[-1] < FLAT * s[0]:
+    volume = np.linalg.det(C)
+    if not volume > 0 and s[-1] < SINGULAR * s[0]:
         raise CalibrationError(
-            f"det C = {sign:.3g}: C is nearly singular, as no sensor's is: the drive hardly "
+            f"det C = {volume:.3g}: C is nearly singular, as no sensor's is: the drive hardly "
             "determines it; drive with all headings and some tilt, or give what is known of the "
             "sensor"
         )
-    if not sign > 0:
+    if not volume > 0:
         raise CalibrationError(
-            f"det C = {sign:.3g}: the sensor's {flipped_axis(C)} axis looks flipped; reverse it in "
-            "the driver or with `bag.axes`, a rotation cannot"
+            f"det C = {volume:.3g}: the sensor's {flipped_axis(C)} axis looks flipped; reverse it "
+            "in the driver or with `bag.axes`, a rotation cannot"
         )
     R = np.asarray(U @ Vt)
     P = Vt.T @ np.diag(s) @ Vt

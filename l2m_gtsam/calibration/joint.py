@@ -21,6 +21,7 @@ from l2m_gtsam.calibration.half_difference import HalfDifference
 from l2m_gtsam.calibration.joint_information import HalfCovariance, Rows
 from l2m_gtsam.calibration.moving_fields import Correction
 from l2m_gtsam.calibration.optimise import (
+    NEARLY,
     TOLERANCE,
     Ending,
     JointCovariance,
@@ -50,7 +51,6 @@ from l2m_gtsam.solve.rank import Determinacy
 # Of each round whose weights may be the last; two of these at least are made, and each step
 # shortens what remains fourfold.
 POLISHING_STEPS = 2
-NEARLY = 0.1  # of the error: a descent with weights of an intermediate stage ends at less
 OWN = np.arange(SENSOR)  # where a sensor that shares no error stands among its variables
 
 

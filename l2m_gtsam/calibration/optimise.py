@@ -17,6 +17,7 @@ from l2m_gtsam.data import FloatArray
 # Smallest decrease of the error that counts, relative and absolute (GTSAM's own). A descent only
 # has to come near: polishing ends it, and what remains is judged in standard deviations.
 TOLERANCE = 1e-5
+NEARLY = 0.1  # the same where other steps, or a round with other weights, go on from its end
 # Relative rise of the error that the seams of a map explain: measured 3e-5.
 SEAM_RISE = 1e-3
 

@@ -23,6 +23,7 @@ from l2m_gtsam.calibration.joint_information import (
     rows_of_factors,
 )
 from l2m_gtsam.calibration.optimise import (
+    NEARLY,
     TOLERANCE,
     Ending,
     LinearSolver,
@@ -44,7 +45,6 @@ NEAR_SIGMAS = 0.3
 ROUND_SIGMAS = 0.6
 # A round whose step is as short as this for all variables together may be the last.
 THERE_SIGMAS = 1.0
-NEARLY = 0.1  # smallest decrease of the error, as a share, after which a descent goes on to there
 POLISHING_STEPS = 2  # each shortens what remains fourfold at least
 
 

@@ -186,16 +186,16 @@ def condition(normal: Normal, log_variance: FloatArray, noise: float) -> Weights
 def whitened_factor(normal: Normal, D: FloatArray, noise: float) -> FloatArray:
     """Return the Cholesky factor of ``I + D F^T W F D / sigma^2``, shape (m, m)."""
     # One is lost to rounding where the readings know a weight 1e16 times better than the prior.
-    A = whitened(normal, D, noise, ROUNDING)
+    A = whitened(normal, D, noise)
     try:
         return np.asarray(cholesky(A, lower=True, overwrite_a=True, check_finite=False))
     except LinAlgError:  # what was integrated out before left rounding of the largest entries
-        A = whitened(normal, D, noise, ROUNDING)
+        A = whitened(normal, D, noise)
         A[np.diag_indices_from(A)] += LOST * A.diagonal().max()
         return np.asarray(cholesky(A, lower=True, overwrite_a=True, check_finite=False))
 
 
-def whitened(normal: Normal, D: FloatArray, noise: float, rounding: float) -> FloatArray:
+def whitened(normal: Normal, D: FloatArray, noise: float) -> FloatArray:
     """Return ``I + D F^T W F D / sigma^2``, (m, m), in LAPACK's order.
 
     Its diagonal has a share more, for rounding.
@@ -203,7 +203,7 @@ def whitened(normal: Normal, D: FloatArray, noise: float, rounding: float) -> Fl
     scale = D / noise
     A = normal.FF * scale[:, None]
     A *= scale
-    A[np.diag_indices_from(A)] += 1.0 + rounding * A.diagonal()
+    A[np.diag_indices_from(A)] += 1.0 + ROUNDING * A.diagonal()
     return np.asarray(A.T)  # it is symmetric: columns one after the other, without a copy
 
 
