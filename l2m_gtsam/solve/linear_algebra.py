@@ -1,7 +1,7 @@
 """Roots and inverses of covariances that may be badly scaled or singular."""
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cholesky
 from scipy.linalg.lapack import dpstrf, dtrtri
 
 from l2m_gtsam.data import FloatArray
@@ -46,6 +46,8 @@ def information_root(covariance: FloatArray, sigma: FloatArray, least: float) ->
 def triangular_information_root(covariance: FloatArray, ridge: float) -> FloatArray:
     """Return the lower triangle W with ``W^T W`` the inverse of a covariance.
 
+    Of an information it gives the covariance.
+
     Parameters
     ----------
     covariance
@@ -60,7 +62,8 @@ def triangular_information_root(covariance: FloatArray, ridge: float) -> FloatAr
     """
     sigma = np.sqrt(np.diag(covariance))
     lower = correlation_factor(covariance, ridge)
-    return np.asarray(solve_triangular(lower, np.diag(1 / sigma), lower=True, check_finite=False))
+    W, _ = dtrtri(lower, lower=1)
+    return np.asarray(W / sigma)
 
 
 def correlation_factor(covariance: FloatArray, ridge: float) -> FloatArray:

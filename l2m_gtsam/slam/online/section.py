@@ -8,7 +8,7 @@ import numpy as np
 from l2m_factors import X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.online.belief import POSE
-from l2m_gtsam.slam.solver import covariance_of, ordered, unless_indeterminate
+from l2m_gtsam.slam.solver import net_covariance, ordered, unless_indeterminate
 
 # Steps after which a variable is relinearised: rad and m, as a field is curved within decimetres;
 # entries of C; never for H, in which readings are linear.
@@ -112,7 +112,7 @@ class Section:
         if covariance is None:
             left = engine.joint(keys, gtsam.EliminateQR)
             net = left.eliminateSequential(ordered(keys), gtsam.EliminateQR)
-            covariance = covariance_of(net.matrix()[0])
+            covariance = net_covariance(net, keys)
         return np.roll(covariance, POSE, axis=(0, 1))
 
     def next(self, last: int) -> "Section":

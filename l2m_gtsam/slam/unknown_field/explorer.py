@@ -33,6 +33,7 @@ from l2m_gtsam.slam.unknown_field.open_section import OpenSection
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior
 
 GROUP, SECTION = 20, 100  # limits in key poses instead of metres, for a vehicle that turns
+FEW = 20  # key poses: to solve them again costs little, and past poses end 27 instead of 33 mm off
 FINISHED = object()
 PIECE_M = 0.1  # of path, in which a piece of the work is done; at least one at a key pose
 
@@ -44,8 +45,12 @@ class ExploringOptions(Options):
     """New key poses are solved after this distance; until then, and while it is solved, they are
     predicted by odometry. Half of it costs nearly twice the time."""
     section_m: float = Field(default=10.0, gt=0)
-    """So much is solved together; of what lies further back tiles alone are kept. A vehicle that
-    comes back as far off as odometry has drifted has to find its place within it."""
+    """So much is solved together at most; of what lies further back tiles alone are kept. A vehicle
+    that comes back as far off as odometry has drifted has to find its place within it."""
+    settled: float = Field(default=0.2, ge=0)
+    """A section of 20 key poses or more ends before that once readings move none of them by this
+    share of the depth of the field's sources, for derivatives are the same there. Most of the work
+    is to solve sections again: so dense key poses take half the time, and errors are the same."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +206,7 @@ class Explorer:
             return ExplorerState(None, self._memory, (), tuple(self._waiting), 0)
         self.finish()
         if self._solved > self._first:
-            self._work = self._handing_over(self._section)
+            self._work = self._handing_over(self._section, self._solved, self._solved_m)
             self._complete()
         return ExplorerState(self._section.prior, self._memory, tuple(self._past), (), self._solved)
 
@@ -300,16 +305,24 @@ class Explorer:
         """Solve the last stretch with what is waiting, and begin another if it is long."""
         group, path_m = [self._tied(each) for each in self._waiting], self._path_m
         self._waiting = []
-        belief = yield from section.extended(group)
-        self._solved, self._solved_m = group[-1].number, path_m
+        yield from section.extended(group)
+        last = group[-1].number
+        if path_m - self._opened_m >= self._pace.section_m or self._is_done(section, last):
+            yield from self._handing_over(section, last, path_m)
+            belief = self._memory.belief(last, self._sensors)
+        else:
+            belief = section.belief()
+        self._solved, self._solved_m = last, path_m
         for each in self._waiting:
             belief = belief.predicted(each.step, each.covariance).marginalize_previous()
         self._belief = belief
         self._reckoned = {k: each for k, each in self._reckoned.items() if k > self._solved}
-        long = path_m - self._opened_m >= self._pace.section_m
-        if long or self._solved - self._first >= SECTION:
-            yield
-            yield from self._handing_over(section)
+
+    def _is_done(self, section: OpenSection, last: int) -> bool:
+        """Return whether a section need not be solved again when key poses come."""
+        depth_m, count = section.prior.hyperparameters.shallowest, last - self._first
+        settled = section.moved_m < self._pace.settled * depth_m
+        return count >= SECTION or (settled and count >= FEW)
 
     def _tied(self, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
         """Return a key pose whose links to marginalised key poses begin at these poses' anchors."""
@@ -324,9 +337,8 @@ class Explorer:
             parts.append(Links.single(origin, key_pose.number, found))
         return replace(key_pose, links=Links.joined(parts))
 
-    def _handing_over(self, section: OpenSection) -> Iterator[None]:
-        """Marginalise the solved key poses but anchors, and begin another section."""
-        last = self._solved
+    def _handing_over(self, section: OpenSection, last: int, path_m: float) -> Iterator[None]:
+        """Marginalise the key poses up to the last but anchors, and begin another section."""
         memory = yield from section.closed()
         for k in range(len(self._past), last + 1):
             anchor = section.tile(k).anchor
@@ -334,5 +346,5 @@ class Explorer:
                 MarginalizedPose(anchor, section.pose(anchor).between(section.pose(k)))
             )
         self._memory = memory
-        self._first, self._opened_m = last, self._solved_m
+        self._first, self._opened_m = last, path_m
         self._section = section.next(self._memory, last)

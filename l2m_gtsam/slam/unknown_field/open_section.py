@@ -167,6 +167,7 @@ class OpenSection:
         self._values = part_of(memory.known.values, self._shared)
         self._tile_of: dict[int, int] = {}
         self._counted: list[TileReadings] = []
+        self._moved_m = 0.0
         self._prior: gtsam.NonlinearFactorGraph | None = None
         self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
         self._linear = gtsam.GaussianFactorGraph()  # at its solution
@@ -176,8 +177,13 @@ class OpenSection:
         """The prior of the field."""
         return self._field_prior
 
-    def extended(self, new: Sequence[ArrivedKeyPose]) -> Generator[None, None, Belief]:
-        """Add key poses, solve, and return the posterior of the last.
+    @property
+    def moved_m(self) -> float:
+        """How far readings moved one of the key poses when they were solved last, at most."""
+        return self._moved_m
+
+    def extended(self, new: Sequence[ArrivedKeyPose]) -> Iterator[None]:
+        """Add key poses and solve.
 
         Yields between pieces of the work, of a linearisation each.
         """
@@ -187,6 +193,7 @@ class OpenSection:
         self._predict(new)
         if any(len(each.links) for each in new):
             yield from self._moved_by_loops(new)
+        before = self._places()
         numbers = [each.number for each in new]
         if self._first not in self._tile_of:
             numbers = [self._first, *(k for k in numbers if k > self._first)]
@@ -207,7 +214,13 @@ class OpenSection:
         yield from self._solved(graph, self._options.max_iterations)
         yield
         self._linear = self._graph.linearize(self._values)
-        return self._belief()
+        self._moved_m = float(np.linalg.norm(self._places() - before, axis=1).max(initial=0.0))
+        yield
+
+    def belief(self) -> Belief:
+        """Return the posterior of the last key pose."""
+        known = self._known([X(self._last), *self._calibrations])
+        return Belief(self.pose(self._last), self._sensors, known.covariance)
 
     def closed(self) -> Generator[None, None, FieldMemory]:
         """Return the memory updated by the section; yields between pieces of the work."""
@@ -261,6 +274,11 @@ class OpenSection:
         found = yield from stepwise_levenberg_marquardt(graph, values, order, most, CLOSE)
         self._values.update(found)
         yield
+
+    def _places(self) -> FloatArray:
+        """Return where the section's key poses are in metres, shape (K, 3)."""
+        places = [self.pose(each.number).translation() for each in self._key_poses]
+        return np.array(places).reshape(-1, 3)
 
     def _enter(self, k: int) -> bool:
         """Assign a key pose to its tile; return whether the section enters a tile of the memory."""
@@ -378,7 +396,3 @@ class OpenSection:
         sizes = {key: self._size(key) for key in keys}
         covariance = joint_covariance(self._linear, keys)
         return JointGaussian(part_of(self._values, keys), sizes, covariance)
-
-    def _belief(self) -> Belief:
-        known = self._known([X(self._last), *self._calibrations])
-        return Belief(self.pose(self._last), self._sensors, known.covariance)

@@ -1,5 +1,6 @@
 """Covariances of many poses, one by one and together, and where Cholesky is refused."""
 
+from itertools import permutations
 from typing import Any
 
 import gtsam
@@ -16,6 +17,7 @@ from l2m_gtsam.slam.solver import (
     colamd_ordering,
     joint_covariance,
     levenberg_marquardt,
+    net_covariance,
     ordered,
     pose_covariances,
     pose_covariances_together,
@@ -178,3 +180,24 @@ def test_what_no_factor_tells_is_refused_in_one_line() -> None:
         values.insert(X(k), gtsam.Pose3())
     with pytest.raises(CalibrationError, match="orders of magnitude"), reported_ill_conditioning():
         joint_covariance(graph.linearize(values), [X(1)])
+
+
+def test_covariances_are_in_the_order_asked_for_whatever_gtsam_eliminates_first() -> None:
+    """Two variables that hang on a third one alone: GTSAM takes its branches in either order."""
+    rng, sizes = np.random.default_rng(7), {X(0): 2, X(1): 3, X(2): 1}
+    linear = gtsam.GaussianFactorGraph()
+    for key, size in sizes.items():
+        unit = gtsam.noiseModel.Unit.Create(size)
+        linear.add(gtsam.JacobianFactor(key, rng.normal(size=(size, size)), np.zeros(size), unit))
+    for key in (X(0), X(1)):
+        blocks = [rng.normal(size=(2, sizes[each])) for each in (key, X(2))]
+        unit = gtsam.noiseModel.Unit.Create(2)
+        linear.add(gtsam.JacobianFactor(key, blocks[0], X(2), blocks[1], np.zeros(2), unit))
+    out_of_turn = 0
+    for keys in permutations(sizes):
+        net = linear.eliminateSequential(ordered(keys), gtsam.EliminateQR)
+        out_of_turn += net.at(0).firstFrontalKey() != keys[0]
+        H = linear.hessian(ordered(keys))[0]
+        # The condition of H, 1e3, times rounding.
+        np.testing.assert_allclose(net_covariance(net, keys), np.linalg.inv(H), rtol=1e-11)
+    assert out_of_turn > 0
