@@ -69,14 +69,14 @@ class BlockRows:
     rows
         The n readings among those of the tile, shape (n,).
     of_key_pose
-        Which of the n are on each of the key poses but the anchor.
+        Which of the n are on each of the key poses but the anchor: one run each.
     of_sensor
         Which of the n are of each sensor that is a variable.
     """
 
     keys: list[int]
     rows: npt.NDArray[np.int64]
-    of_key_pose: tuple[npt.NDArray[np.int64], ...]
+    of_key_pose: tuple[slice, ...]
     of_sensor: tuple[npt.NDArray[np.int64], ...]
 
     def fill(self, jacobians: list[FloatArray], own: TileDerivatives) -> None:
@@ -89,11 +89,17 @@ class BlockRows:
             jacobians[slot] = block.reshape(-1, block.shape[2])
 
 
-def placed(derivatives: FloatArray, at: npt.NDArray[np.int64]) -> FloatArray:
+def placed(derivatives: FloatArray, at: slice | npt.NDArray[np.int64]) -> FloatArray:
     """Return derivatives where ``at`` some readings depend on a variable, zero elsewhere."""
-    block = np.zeros_like(derivatives)
+    block = np.zeros(derivatives.shape)
     block[at] = derivatives[at]
     return block
+
+
+def run_of(numbers: npt.NDArray[np.int64], number: int) -> slice:
+    """Return where one of several numbers stands, which come in runs."""
+    at = np.flatnonzero(numbers == number)
+    return slice(int(at[0]), int(at[-1]) + 1)
 
 
 class TileBlocks(TileBatch):
@@ -182,13 +188,14 @@ class TileBlocks(TileBatch):
         rows = np.concatenate([self._rows[k] for k in key_poses])
         rows = rows[np.isin(self._readings.sensor[rows], sensors)]
         number, sensor = self._readings.key_pose[rows], self._readings.sensor[rows]
-        moving = [k for k in key_poses if k != self._anchor and k in number]
+        runs = {k: run_of(number, k) for k in key_poses if k != self._anchor and k in number}
+        moving = list(runs)
         poses = [X(k) for k in (*moving, self._anchor)] if moving else []
         free = sensors if self._variables.keys(sensors) else []
         return BlockRows(
             [*poses, *beside_poses],
             rows,
-            tuple(np.flatnonzero(number == k) for k in moving),
+            tuple(runs.values()),
             tuple(np.flatnonzero(sensor == each) for each in free),
         )
 

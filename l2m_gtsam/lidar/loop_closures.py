@@ -103,7 +103,8 @@ def find_loop_closures(steps: Iterable[ScanStep], options: LoopOptions) -> LoopC
         last = path
         here = KeyScan.of(step.stamp_ns, step.surface, step.T_odom_lidar, path)
         for k in candidates(kept, here, options):
-            closed = closed_loop(kept[k], here, step.surface, options.registration)
+            first = kept[k].surface()
+            closed = closed_loop(kept[k], here, first, step.surface, options.registration)
             if isinstance(closed, LoopClosure):
                 loops.append(closed)
             else:
@@ -121,7 +122,11 @@ def candidates(kept: Sequence[KeyScan], here: KeyScan, options: LoopOptions) -> 
 
 
 def closed_loop(
-    earlier: KeyScan, here: KeyScan, scan: Surface, options: RegistrationOptions
+    earlier: KeyScan,
+    here: KeyScan,
+    first: Surface,
+    scan: Surface,
+    options: RegistrationOptions,
 ) -> LoopClosure | Refusal:
     """Return the loop closure between two scans, or why there is none.
 
@@ -129,15 +134,16 @@ def closed_loop(
     ----------
     earlier, here
         Both scans; their poses together tell where the second is looked for in the first.
-    scan
-        The second.
+    first, scan
+        What they saw.
     options
         How they are registered.
     """
-    first, guess = earlier.surface(), between(earlier.T, here.T)
+    guess = between(earlier.T, here.T)
     found = register(scan, first, guess, options)
-    back = register(first, scan, found.T.inverse(), options)
-    refusal = found.refusal(options) or back.refusal(options)
+    refusal = found.refusal(options)
+    if refusal is None:
+        refusal = register(first, scan, found.T.inverse(), options).refusal(options)
     if refusal is not None:
         return refusal
     estimate = by_scan(found, guess, options)

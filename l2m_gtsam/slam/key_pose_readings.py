@@ -100,11 +100,14 @@ def evenly_spread(groups: IntArray, most: int) -> IntArray:
 
     ``groups`` has a row of labels for each, shape (N, L); members of a group come in order.
     """
+    if not len(groups):
+        return np.empty(0, dtype=np.int64)
     order = np.lexsort(groups.T[::-1])
-    ends = np.flatnonzero(np.diff(groups[order], axis=0).any(axis=1)) + 1
-    return np.concatenate([_evenly(part, most) for part in np.split(order, ends)])
-
-
-def _evenly(rows: IntArray, most: int) -> IntArray:
-    chosen = np.linspace(0, len(rows) - 1, min(most, len(rows))).round().astype(int)
-    return np.asarray(rows[chosen])
+    begins = np.flatnonzero(np.append(True, np.diff(groups[order], axis=0).any(axis=1)))
+    sizes = np.diff(np.append(begins, len(groups)))
+    counts = np.minimum(sizes, most)
+    # Of n members those at 0, (n - 1) / (c - 1), ..., n - 1.
+    nth = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    apart = (sizes - 1) / np.maximum(counts - 1, 1)
+    chosen = np.rint(nth * np.repeat(apart, counts)).astype(np.int64)
+    return np.asarray(order[np.repeat(begins, counts) + chosen])

@@ -32,11 +32,6 @@ class Hyperparameters(Options):
     noise: float = Field(default=0.2, gt=0)
     """Standard deviation of a reading per axis in microtesla."""
 
-    @property
-    def shallowest(self) -> float:
-        """Depth in metres of the nearer side's sources, over which the field changes."""
-        return min(self.floor_depth, self.ceiling_depth)
-
 
 BOUNDS = {
     "floor_scale": (1e-3, 1e4),

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from l2m_gtsam.data import FloatArray, Readings, RigidTransform, Trajectory
+from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between
 from l2m_gtsam.recording.sync import has_pose, interpolated, twists, with_offsets
 from l2m_gtsam.records.scans import Scan, taken_at_once
@@ -262,8 +262,7 @@ class Intake:
         """Return the key pose at a row of poses that begin at the one before."""
         trajectory, rows = trajectory_of(poses), np.array([0, row])
         options = self._options
-        taken = self._placed(waiting, trajectory)
-        readings = thinned_readings(taken, trajectory, rows, options.key_poses.readings)
+        readings = self._placed(waiting, trajectory, rows)
         steps = odometry_steps(trajectory, rows, options.drift)
         steps = steps.with_scale_as_drift(options.drift.over_m)
         of_key_pose = key_pose_readings(readings, trajectory, rows)
@@ -298,12 +297,13 @@ class Intake:
             self._known.names, sensor, stamps, np.empty((len(stamps), 3, 3)), none, field
         )
 
-    def _placed(self, waiting: Readings, trajectory: Trajectory) -> Readings:
-        """Return readings at poses of odometry, those in gaps of it left out."""
-        offset = self._known.offset
+    def _placed(self, waiting: Readings, trajectory: Trajectory, rows: IntArray) -> Readings:
+        """Return readings thinned, at poses of odometry, those in gaps of it left out."""
+        offset, options = self._known.offset, self._options
         at = waiting.stamp_ns + np.round(offset[waiting.sensor] / NS).astype(np.int64)
-        there = has_pose(trajectory, at, self._options.max_pose_gap_s)
-        return with_offsets(waiting[np.flatnonzero(there)], trajectory, offset)
+        there = waiting[np.flatnonzero(has_pose(trajectory, at, options.max_pose_gap_s))]
+        taken = thinned_readings(there, trajectory, rows, options.key_poses.readings)
+        return with_offsets(taken, trajectory, offset)
 
     def _check_sensors(self, stamp_ns: int, *, moved: bool) -> None:
         silent_ns = round((self._online.silent_s + self._online.delay_s) / NS)

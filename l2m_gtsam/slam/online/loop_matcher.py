@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -39,6 +40,11 @@ class KeptScan:
     stamp_ns: int
     points: "np.ndarray[tuple[int, ...], np.dtype[np.float32]]"
     path_m: float
+
+    @cached_property
+    def surface(self) -> Surface:
+        """What it saw; scans of later visits are compared with it again and again."""
+        return Surface(self.points.astype(np.float64))
 
     def seen_from(self, T_map_key: RigidTransform) -> KeyScan:
         """Return it as it is placed by its key pose."""
@@ -122,7 +128,8 @@ class LoopMatcher:
         scans = [each.seen_from(there.T) for each, there in zip(self.kept, before, strict=True)]
         found = list[Links | str]()
         for row in candidates(scans, here, options):
-            closed = closed_loop(scans[row], here, surface, options.registration)
+            first = self.kept[row].surface
+            closed = closed_loop(scans[row], here, first, surface, options.registration)
             if isinstance(closed, Refusal):
                 continue  # of single scans most see too little of each other
             earlier = self.kept[row]

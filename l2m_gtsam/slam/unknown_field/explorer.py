@@ -47,10 +47,11 @@ class ExploringOptions(Options):
     section_m: float = Field(default=10.0, gt=0)
     """So much is solved together at most; of what lies further back tiles alone are kept. A vehicle
     that comes back as far off as odometry has drifted has to find its place within it."""
-    settled: float = Field(default=0.2, ge=0)
-    """A section of 20 key poses or more ends before that once readings move none of them by this
-    share of the depth of the field's sources, for derivatives are the same there. Most of the work
-    is to solve sections again: so dense key poses take half the time, and errors are the same."""
+    settled_m: float = Field(default=0.1, ge=0)
+    """A section of 20 key poses or more ends before that once readings move none of them as far:
+    fields of buildings change over half a metre and more, so that derivatives stay as they are.
+    Most of the work is to solve sections again: dense key poses take half the time, and errors are
+    the same."""
 
 
 @dataclass(frozen=True)
@@ -320,8 +321,7 @@ class Explorer:
 
     def _is_done(self, section: OpenSection, last: int) -> bool:
         """Return whether a section need not be solved again when key poses come."""
-        depth_m, count = section.prior.hyperparameters.shallowest, last - self._first
-        settled = section.moved_m < self._pace.settled * depth_m
+        count, settled = last - self._first, section.moved_m < self._pace.settled_m
         return count >= SECTION or (settled and count >= FEW)
 
     def _tied(self, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:

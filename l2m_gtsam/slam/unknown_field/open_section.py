@@ -1,6 +1,6 @@
 """The last stretch of a drive through an unknown field, solved again as it grows."""
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -38,10 +38,10 @@ from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
 from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
-# Noise of new readings, stage by stage, as a multiple of the true: in a tile of this section, and
-# where the vehicle enters a tile of an earlier one, as far off as odometry has drifted.
-ONWARDS = (4.0, 1.0)
-AGAIN = (16.0, 4.0, 1.0)
+# Noise of new readings in a stage before the last, as a multiple of the true: in a tile where the
+# vehicle was, and where it comes to one as far off as odometry has drifted.
+ONWARDS = (4.0,)
+AGAIN = (16.0, 4.0)
 CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
 SOFT = 1.0  # convexity of the loss for new readings, mu of ``solve.robust``
 
@@ -145,6 +145,8 @@ class OpenSection:
         Joint Gaussian of ``X(first)``, the tiles and the calibrations that are variables.
     first
         Its first key pose; readings before it have counted in the section before.
+    left
+        Tiles of the section before, which the vehicle does not come to anew.
     """
 
     def __init__(
@@ -154,12 +156,14 @@ class OpenSection:
         options: SlamOptions,
         memory: FieldMemory,
         first: int,
+        left: Set[int] = frozenset(),
     ) -> None:
         self._sensors = sensors_in(memory.known.values, sensors)
         self._field_prior, self._options = prior, options
         self._memory, self._tiles = memory, list(memory.tiles)
         self._calibrations = memory.calibrations
         self._first = self._last = first
+        self._left = left
         self._key_poses: list[ArrivedKeyPose] = []
         self._fixed = None if self._calibrations else sensors.fixed()
         self._of_section = SectionReadings(joined_readings([]), self._fixed)
@@ -198,13 +202,12 @@ class OpenSection:
         if self._first not in self._tile_of:
             numbers = [self._first, *(k for k in numbers if k > self._first)]
         entered = [self._enter(k) for k in numbers]
-        stages = AGAIN if any(entered) else ONWARDS
-        for scale in stages[:-1]:
+        for scale in AGAIN if any(entered) else ONWARDS:
             graph = self._factors(numbers[0], scale)
             yield
             yield from self._solved(graph, 1)
             yield
-        graph = self._factors(numbers[0], stages[-1])
+        graph = self._factors(numbers[0], 1.0)
         yield
         for each in self._counted:
             tile = self._tiles[each.laid.number]
@@ -240,7 +243,8 @@ class OpenSection:
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
         """Return a new section from a key pose on."""
-        return OpenSection(self._sensors, self._field_prior, self._options, memory, first)
+        left = frozenset(self._tile_of.values())
+        return OpenSection(self._sensors, self._field_prior, self._options, memory, first, left)
 
     def pose(self, number: int) -> gtsam.Pose3:
         """Return the estimate of a key pose of the section, or of the memory."""
@@ -281,7 +285,7 @@ class OpenSection:
         return np.array(places).reshape(-1, 3)
 
     def _enter(self, k: int) -> bool:
-        """Assign a key pose to its tile; return whether the section enters a tile of the memory."""
+        """Assign a key pose to its tile; return whether the vehicle comes to it anew."""
         anchors = [self.pose(tile.anchor) for tile in self._tiles]
         number = tile_of(self.pose(k), anchors, self._field_prior.options.core)
         self._tile_of[k] = number
@@ -293,7 +297,7 @@ class OpenSection:
         if self._values.exists(M(number)):
             return False
         self._share([X(self._tiles[number].anchor), M(number)])
-        return True
+        return number not in self._left
 
     def _share(self, keys: Sequence[int]) -> None:
         """Take variables of the memory into the section; those of its own stay."""
