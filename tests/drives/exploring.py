@@ -30,6 +30,7 @@ class OnLine:
     beliefs: list[Belief]
     truth: list[gtsam.Pose3]
     sizes: list[int]
+    sections: int
 
     @classmethod
     def over(
@@ -42,11 +43,14 @@ class OnLine:
         """Follow a drive."""
         drive = drive.as_walk(options.drift.over_m)
         explorer, beliefs, sizes = Explorer(drive.start, drive.sensors, options, pace=pace), [], []
+        memory, sections = explorer.memory, 1
         for key_pose in key_poses_of(drive):
             beliefs.append(explorer.add(key_pose))
             sizes.append(len(explorer.memory.known.covariance))
+            sections += explorer.memory is not memory
+            memory = explorer.memory
         beliefs[-1] = explorer.finish()
-        return cls(explorer, drive, beliefs, truth, sizes)
+        return cls(explorer, drive, beliefs, truth, sizes, sections)
 
     def off(self, poses: list[gtsam.Pose3]) -> FloatArray:
         """Return how far poses are off, in metres."""

@@ -119,6 +119,18 @@ def test_it_is_evaluated_again_whatever_changes() -> None:
         assert residual.error(values, None) != pytest.approx(before, abs=1e-9)
 
 
+def test_a_factor_may_be_asked_with_its_own_values_alone() -> None:
+    """As GTSAM asks a graph of one factor; then with all values again."""
+    readings, values = random_carried(4), tile_values(4, 3)
+    blocks = blocks_of(readings, 2, random_whitening(4, len(readings)), None)
+    for key_pose in blocks.key_poses:
+        for residual in blocks.white_residuals([key_pose]):
+            whole = residual.error(values, None)
+            alone = residual.error(values.extract(residual.keys), None)
+            np.testing.assert_array_equal(alone, whole)
+            np.testing.assert_array_equal(residual.error(values, None), whole)
+
+
 def test_of_the_anchor_alone_there_is_no_pose_and_no_penalty() -> None:
     readings, values = random_carried(3), tile_values(3)
     blocks = blocks_of(readings, 1, random_whitening(3, len(readings)), values)

@@ -19,6 +19,7 @@ from tests.worlds.exact import random_sensors
 SMALL = (1.9, 1.4)  # radii of laps of 10 m
 TILES = {"modes": 100, "learn_over_m": 9.0}
 OFF = np.concatenate([np.full(3, 0.005), np.full(9, 0.005), np.full(3, 0.3)])
+DENSE = {"distance_m": 0.055, "readings": 1}
 QUICK = {"key_poses": {"distance_m": 0.3, "readings": 2}, "tiles": TILES}
 
 
@@ -89,6 +90,24 @@ def test_sections_know_what_one_section_would() -> None:
     apart = gtsam.Pose3.Logmap(other.pose.between(last.pose))
     sigma = np.sqrt(np.diag(other.pose_covariance))
     # Poses that were let go are held where they were linearised, robust weights as they were.
+    assert np.abs(apart / sigma).max() < 0.5
+    ratio = np.sqrt(np.diag(last.pose_covariance)) / sigma
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.3
+
+
+def test_dense_key_poses_are_let_go_once_they_settle() -> None:
+    """A lap and a bit, 10 key poses a second: twice as many sections or more, alike within sigmas."""
+    options = SlamOptions.model_validate({**QUICK, "key_poses": DENSE})
+    own = random_sensors(4, 4)
+    drive, true = prepared_drive(4, laps(24, SMALL), own, calibrated(own), options)
+    paces = [ExploringOptions(settled_m=settled_m) for settled_m in (0.1, 0.0)]
+    short, long = (OnLine.over(drive, true, options, pace) for pace in paces)
+    assert short.sections > 2 * long.sections
+    last, other = short.beliefs[-1], long.beliefs[-1]
+    apart = gtsam.Pose3.Logmap(other.pose.between(last.pose))
+    sigma = np.sqrt(np.diag(other.pose_covariance))
+    # As above: key poses that were let go stay where they were linearised.
     assert np.abs(apart / sigma).max() < 0.5
     ratio = np.sqrt(np.diag(last.pose_covariance)) / sigma
     assert ratio.min() > 0.8
