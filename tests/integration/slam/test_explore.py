@@ -136,7 +136,7 @@ def test_a_calibration_is_refined_without_a_map() -> None:
     sigma = np.concatenate([np.full(3, 0.05), np.full(9, 0.01), np.full(3, 1.0)])
     rough = calibrated(sensors, sigma=sigma, rng=np.random.default_rng(5))
     # Tiles that are a little larger than by default: fewer, in less than half the time.
-    chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0}}
+    chosen = {"key_poses": COARSE, "calibration": "refined", "tiles": {"core": 4.0, "modes": 100}}
     options = SlamOptions.model_validate(chosen)
     found = explore(drive.recording, rough, options, silent).result
     assert found.calibration is not None
