@@ -1,8 +1,8 @@
 """SLAM on line without a map, message by message: a dozen sensors whose calibrations are refined.
 
 Ten key poses a second in laps of a hall of dipoles, with and without a scan each half second. Times
-are those of processors, of all threads together. An hour takes a quarter of an hour a row:
-``python -m benchmarks.online_exploring 200`` drives 200 seconds instead.
+are those of processors, of all threads together. ``python -m benchmarks.online_exploring 3600``
+drives an hour, which takes a quarter of an hour a row.
 """
 
 import resource
@@ -29,7 +29,7 @@ from tests.worlds.exact import dipole_world, random_sensors
 from tests.worlds.lidar_rooms import ROOM, rows, scans
 
 SENSORS, SMALL = 12, (1.9, 1.4)  # radii in metres of laps of 10 m
-HOUR, EVERY = 3600.0, 10  # seconds; poses from scan to scan, of 20 a second
+SECONDS, EVERY = 200.0, 10  # of a drive; poses from scan to scan, of 20 a second
 OFF = np.concatenate([np.full(3, 0.005), np.full(9, 0.005), np.full(3, 0.3)])  # m, -, uT
 OPTIONS = SlamOptions.model_validate(
     {
@@ -167,4 +167,4 @@ def report(seconds: float) -> Table:
 
 
 if __name__ == "__main__":
-    Console(width=160).print(report(float(sys.argv[1]) if sys.argv[1:] else HOUR))
+    Console(width=160).print(report(float(sys.argv[1]) if sys.argv[1:] else SECONDS))

@@ -14,7 +14,9 @@ MODULES = (
     "one_key",
     "map_uncertainty",
     "last_stage",
+    "error_budget",
     "online_localisation",
+    "online_exploring",
     "slam_engine",
 )
 

@@ -33,7 +33,7 @@ from l2m_gtsam.slam.unknown_field.open_section import OpenSection
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, drive_prior
 
 GROUP, SECTION = 20, 100  # limits in key poses instead of metres, for a vehicle that turns
-FEW = 20  # key poses: to solve them again costs little, and past poses end 27 instead of 33 mm off
+FEW = 20  # key poses: a section of fewer is cheap to solve again, and its poses gain by it
 FINISHED = object()
 PIECE_M = 0.1  # of path, in which a piece of the work is done; at least one at a key pose
 

@@ -97,7 +97,7 @@ def test_sections_know_what_one_section_would() -> None:
 
 
 def test_dense_key_poses_are_let_go_once_they_settle() -> None:
-    """A lap and a bit, 10 key poses a second: twice as many sections or more, alike within sigmas."""
+    """A lap and a bit, 10 key poses a second: more than twice the sections, alike within sigmas."""
     options = SlamOptions.model_validate({**QUICK, "key_poses": DENSE})
     own = random_sensors(4, 4)
     drive, true = prepared_drive(4, laps(24, SMALL), own, calibrated(own), options)
