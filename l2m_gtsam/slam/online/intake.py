@@ -12,7 +12,7 @@ import numpy as np
 
 from l2m_gtsam.data import FloatArray, IntArray, Readings, RigidTransform, Trajectory
 from l2m_gtsam.geometry import between
-from l2m_gtsam.recording.sync import has_pose, interpolated, twists, with_offsets
+from l2m_gtsam.recording.sync import at_poses, has_pose, interpolated, twists
 from l2m_gtsam.records.scans import Scan, taken_at_once
 from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.key_pose_readings import key_pose_readings, thinned_readings
@@ -303,7 +303,7 @@ class Intake:
         at = waiting.stamp_ns + np.round(offset[waiting.sensor] / NS).astype(np.int64)
         there = waiting[np.flatnonzero(has_pose(trajectory, at, options.max_pose_gap_s))]
         taken = thinned_readings(there, trajectory, rows, options.key_poses.readings)
-        return with_offsets(taken, trajectory, offset)
+        return at_poses(taken, trajectory, offset)
 
     def _check_sensors(self, stamp_ns: int, *, moved: bool) -> None:
         silent_ns = round((self._online.silent_s + self._online.delay_s) / NS)
