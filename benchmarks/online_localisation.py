@@ -4,7 +4,6 @@ The peer is iSAM2 as it comes: the same factors, in one graph of the whole drive
 processors, of all threads together: what else a machine does would count otherwise.
 """
 
-import resource
 import time
 from dataclasses import dataclass
 from functools import partial
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from benchmarks.memory import peak_mib
 from benchmarks.one_key import NOISE, hall, survey
 from l2m_gtsam.calibration.view import QueryableMap
 from l2m_gtsam.data import FloatArray, Trajectory
@@ -77,11 +77,6 @@ def followed(drawn: DrawnDrive, field_map: QueryableMap, free: bool, section: in
         if number == warm:
             memory = peak_mib()
     return Run(cost, off, peak_mib() - memory)
-
-
-def peak_mib() -> float:
-    """Return the most memory that the process has had so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def report() -> Table:

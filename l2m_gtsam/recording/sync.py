@@ -182,10 +182,10 @@ def with_offsets(readings: Readings, trajectory: Trajectory, offset: FloatArray)
 
 
 def at_poses(readings: Readings, trajectory: Trajectory, offset: FloatArray) -> Readings:
-    """Return the same without the lidar's motion, which takes most of the time for few readings."""
+    """Return readings as ``with_offsets``, but without the lidar's motion, a third of the work."""
     own = offset[readings.sensor]
     R, p = _poses_at(trajectory, 1e-9 * (readings.stamp_ns - trajectory.stamp_ns[0]) + own)
-    return replace(readings, R_map_lidar=R, p_map_lidar=p)
+    return replace(readings, R_map_lidar=R, p_map_lidar=p, motion=None)
 
 
 def has_pose(trajectory: Trajectory, stamp_ns: IntArray, max_pose_gap_s: float) -> BoolArray:

@@ -308,7 +308,7 @@ class Explorer:
         self._waiting = []
         yield from section.extended(group)
         last = group[-1].number
-        if path_m - self._opened_m >= self._pace.section_m or self._is_done(section, last):
+        if self._is_done(section, last, path_m):
             yield from self._handing_over(section, last, path_m)
             belief = self._memory.belief(last, self._sensors)
         else:
@@ -319,10 +319,11 @@ class Explorer:
         self._belief = belief
         self._reckoned = {k: each for k, each in self._reckoned.items() if k > self._solved}
 
-    def _is_done(self, section: OpenSection, last: int) -> bool:
-        """Return whether a section need not be solved again when key poses come."""
-        count, settled = last - self._first, section.moved_m < self._pace.settled_m
-        return count >= SECTION or (settled and count >= FEW)
+    def _is_done(self, section: OpenSection, last: int, path_m: float) -> bool:
+        """Return whether a section ends here, and is not solved again when key poses come."""
+        count, long_m = last - self._first, path_m - self._opened_m
+        settled = count >= FEW and section.moved_m < self._pace.settled_m
+        return settled or count >= SECTION or long_m >= self._pace.section_m
 
     def _tied(self, key_pose: ArrivedKeyPose) -> ArrivedKeyPose:
         """Return a key pose whose links to marginalised key poses begin at these poses' anchors."""

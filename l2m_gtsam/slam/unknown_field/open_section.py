@@ -1,16 +1,13 @@
 """The last stretch of a drive through an unknown field, solved again as it grows."""
 
 from collections.abc import Generator, Iterator, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
 from l2m_factors import (
-    Calibrations,
-    KeyPoseReadings,
     M,
-    TileBlocks,
     X,
 )
 from l2m_gtsam.data import FloatArray, IntArray
@@ -18,7 +15,6 @@ from l2m_gtsam.slam.drive import KnownSensors
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, is_pose, part_of, prior_factors
 from l2m_gtsam.slam.key_pose_readings import joined_readings
 from l2m_gtsam.slam.map_prediction import (
-    MapPrediction,
     PlacedReadings,
     place_readings,
     sensors_in,
@@ -26,17 +22,16 @@ from l2m_gtsam.slam.map_prediction import (
 from l2m_gtsam.slam.online.belief import POSE, Belief
 from l2m_gtsam.slam.online.key_pose import ArrivedKeyPose
 from l2m_gtsam.slam.options import SlamOptions
-from l2m_gtsam.slam.pose_graph import between_factor, link_graph, successive
-from l2m_gtsam.slam.solution import REJECTED_WEIGHT
+from l2m_gtsam.slam.pose_graph import between_factor, link_graph
 from l2m_gtsam.slam.solver import (
     colamd_ordering,
     joint_covariance,
     stepwise_levenberg_marquardt,
 )
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile, tile_of
+from l2m_gtsam.slam.unknown_field.section_readings import SectionReadings, TileReadings
 from l2m_gtsam.slam.unknown_field.tiled_drive import OccupiedTile
 from l2m_gtsam.slam.unknown_field.tiles import FieldPrior, WaveTile, level_axes
-from l2m_gtsam.solve.robust import WEIGHTS, RobustOptions
 
 # Noise of new readings in a stage before the last, as a multiple of the true: in a tile where the
 # vehicle was, and where it comes to one as far off as odometry has drifted.
@@ -44,94 +39,6 @@ ONWARDS = (4.0,)
 AGAIN = (16.0, 4.0)
 CLOSE = 0.5  # decrease of the error: a step of a sigma, of hundreds of variables together
 SOFT = 1.0  # convexity of the loss for new readings, mu of ``solve.robust``
-
-
-@dataclass(frozen=True)
-class SectionReadings:
-    """Readings of a section so far, and their sensors' calibrations; None where these are free."""
-
-    readings: KeyPoseReadings
-    fixed: Calibrations | None
-
-
-@dataclass(frozen=True)
-class TileReadings:
-    """The readings of a tile that count, of n.
-
-    Attributes
-    ----------
-    laid
-        The tile with all n readings.
-    chosen
-        Rows of those that count, shape (c,).
-    variance
-        Per axis of noise and unresolved waves, over their weights, uT^2, shape (c, 3).
-    blocks
-        Those that count, white times the roots of their weights.
-    """
-
-    laid: OccupiedTile
-    chosen: IntArray
-    variance: FloatArray
-    blocks: TileBlocks
-
-    @classmethod
-    def weighed(
-        cls,
-        of_section: SectionReadings,
-        laid: OccupiedTile,
-        prediction: MapPrediction,
-        noise: FloatArray,
-        mu: FloatArray,
-        robust: RobustOptions,
-    ) -> "TileReadings":
-        """Return the robust weights of readings by a tile's prediction.
-
-        Parameters
-        ----------
-        of_section
-            All readings of the section.
-        laid, prediction
-            The tile and its prediction.
-        noise
-            Standard deviation of each reading in uT, shape (n,).
-        mu
-            Convexity of the loss for each reading, see ``solve.robust``, shape (n,).
-        robust
-            Loss and confidence.
-        """
-        W = prediction.whitening_of(noise)
-        r2, weights = prediction.squared(W), np.empty(len(mu))
-        for stage in np.unique(mu):
-            own = mu == stage
-            weights[own] = WEIGHTS[robust.loss](r2[own], robust.largest, stage)
-        chosen = np.flatnonzero(weights > REJECTED_WEIGHT)
-        W = W[chosen] * np.sqrt(weights[chosen])[:, None, None]
-        variance = noise[:, None] ** 2 + laid.field.unresolved(laid.placed.x)
-        readings = of_section.readings[laid.rows[chosen]]
-        blocks = TileBlocks(laid.number, laid.anchor, laid.field, readings, W, of_section.fixed)
-        return cls(laid, chosen, variance[chosen] / weights[chosen, None], blocks)
-
-    def factors(self) -> Iterator[gtsam.NonlinearFactor]:
-        """Yield the readings' factors of poses and weights."""
-        for together in successive(self.blocks.key_poses):
-            for residual in self.blocks.white_residuals(together):
-                yield residual.factor()
-
-    def penalties(self, tile: RememberedTile) -> Iterator[gtsam.NonlinearFactor]:
-        """Yield the penalties of the parameters that the readings determine (Mallows' C_p)."""
-        if not len(self.chosen):
-            return
-        x = self.laid.placed.x[self.chosen]
-        penalty = self.laid.field.penalty(x, self.variance, tile.past_information)
-        for together in successive(self.blocks.key_poses):
-            residual = self.blocks.penalty(together, penalty)
-            if residual is not None:
-                yield residual.factor()
-
-    def information(self) -> FloatArray:
-        """Return the readings' information about the tile's m weights, shape (m, m)."""
-        return self.laid.field.information(self.laid.placed.x[self.chosen], self.variance)
 
 
 class OpenSection:
@@ -145,7 +52,7 @@ class OpenSection:
         Joint Gaussian of ``X(first)``, the tiles and the calibrations that are variables.
     first
         Its first key pose; readings before it have counted in the section before.
-    left
+    before
         Tiles of the section before, which the vehicle does not come to anew.
     """
 
@@ -156,14 +63,14 @@ class OpenSection:
         options: SlamOptions,
         memory: FieldMemory,
         first: int,
-        left: Set[int] = frozenset(),
+        before: Set[int] = frozenset(),
     ) -> None:
         self._sensors = sensors_in(memory.known.values, sensors)
         self._field_prior, self._options = prior, options
         self._memory, self._tiles = memory, list(memory.tiles)
         self._calibrations = memory.calibrations
         self._first = self._last = first
-        self._left = left
+        self._tiles_before = before
         self._key_poses: list[ArrivedKeyPose] = []
         self._fixed = None if self._calibrations else sensors.fixed()
         self._of_section = SectionReadings(joined_readings([]), self._fixed)
@@ -243,8 +150,8 @@ class OpenSection:
 
     def next(self, memory: FieldMemory, first: int) -> "OpenSection":
         """Return a new section from a key pose on."""
-        left = frozenset(self._tile_of.values())
-        return OpenSection(self._sensors, self._field_prior, self._options, memory, first, left)
+        tiles = frozenset(self._tile_of.values())
+        return OpenSection(self._sensors, self._field_prior, self._options, memory, first, tiles)
 
     def pose(self, number: int) -> gtsam.Pose3:
         """Return the estimate of a key pose of the section, or of the memory."""
@@ -297,7 +204,7 @@ class OpenSection:
         if self._values.exists(M(number)):
             return False
         self._share([X(self._tiles[number].anchor), M(number)])
-        return number not in self._left
+        return number not in self._tiles_before
 
     def _share(self, keys: Sequence[int]) -> None:
         """Take variables of the memory into the section; those of its own stay."""

@@ -8,6 +8,7 @@ import pytest
 
 from l2m_gtsam.data import FloatArray, Trajectory
 from l2m_gtsam.progress import silent
+from l2m_gtsam.slam.online.belief import Belief
 from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.unknown_field.explorer import ExploringOptions
 from l2m_gtsam.slam.unknown_field.tiled_stages import map_drive
@@ -27,6 +28,19 @@ def on_line(seed: int, truth: Trajectory, sensors: int, section_m: float) -> OnL
     options, own = SlamOptions.model_validate(QUICK), random_sensors(seed, sensors)
     drive, true = prepared_drive(seed, truth, own, calibrated(own), options)
     return OnLine.over(drive, true, options, ExploringOptions(section_m=section_m))
+
+
+def assert_alike(last: Belief, other: Belief) -> None:
+    """Two beliefs agree within their sigmas.
+
+    Poses that were let go are held where they were linearised, robust weights as they were.
+    """
+    apart = gtsam.Pose3.Logmap(other.pose.between(last.pose))
+    sigma = np.sqrt(np.diag(other.pose_covariance))
+    assert np.abs(apart / sigma).max() < 0.5
+    ratio = np.sqrt(np.diag(last.pose_covariance)) / sigma
+    assert ratio.min() > 0.8
+    assert ratio.max() < 1.3
 
 
 @pytest.fixture(scope="module")
@@ -86,14 +100,7 @@ def test_before_the_prior_is_learnt_poses_are_those_of_odometry(round_and_round:
 def test_sections_know_what_one_section_would() -> None:
     """Sections of 4 m and one of the whole drive, a lap and a bit: alike within sigmas."""
     short, whole = (on_line(4, laps(22, SMALL), 3, length) for length in (4.0, 1000.0))
-    last, other = short.beliefs[-1], whole.beliefs[-1]
-    apart = gtsam.Pose3.Logmap(other.pose.between(last.pose))
-    sigma = np.sqrt(np.diag(other.pose_covariance))
-    # Poses that were let go are held where they were linearised, robust weights as they were.
-    assert np.abs(apart / sigma).max() < 0.5
-    ratio = np.sqrt(np.diag(last.pose_covariance)) / sigma
-    assert ratio.min() > 0.8
-    assert ratio.max() < 1.3
+    assert_alike(short.beliefs[-1], whole.beliefs[-1])
 
 
 def test_dense_key_poses_are_let_go_once_they_settle() -> None:
@@ -104,14 +111,7 @@ def test_dense_key_poses_are_let_go_once_they_settle() -> None:
     paces = [ExploringOptions(settled_m=settled_m) for settled_m in (0.1, 0.0)]
     short, long = (OnLine.over(drive, true, options, pace) for pace in paces)
     assert short.sections > 2 * long.sections
-    last, other = short.beliefs[-1], long.beliefs[-1]
-    apart = gtsam.Pose3.Logmap(other.pose.between(last.pose))
-    sigma = np.sqrt(np.diag(other.pose_covariance))
-    # As above: key poses that were let go stay where they were linearised.
-    assert np.abs(apart / sigma).max() < 0.5
-    ratio = np.sqrt(np.diag(last.pose_covariance)) / sigma
-    assert ratio.min() > 0.8
-    assert ratio.max() < 1.3
+    assert_alike(short.beliefs[-1], long.beliefs[-1])
 
 
 def test_where_nothing_is_read_odometry_carries_on() -> None:
