@@ -16,7 +16,7 @@ from l2m_factors import M, X
 from l2m_gtsam.data import FloatArray
 from l2m_gtsam.slam.joint_gaussian import JointGaussian, prior_factors
 from l2m_gtsam.slam.online.belief import kalman_gain
-from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt
+from l2m_gtsam.slam.solver import colamd_ordering, joint_posterior, levenberg_marquardt
 from tests.reference.dense_newton import newton
 
 STEPS = 3  # of a section's last stage, as measured
@@ -82,7 +82,7 @@ def open_section(tiles: int, weights: int) -> list[str]:
         for factor in priors:
             whole.add(factor)
         found = levenberg_marquardt(whole, given.start, colamd_ordering(whole), STEPS, 0.0)
-        joint_covariance(whole.linearize(found.values), [last])
+        joint_posterior(whole.linearize(found.values), [last]).covariance
 
     dense = seconds(
         lambda: newton(given.graph, given.known, given.start, given.sizes, STEPS), 3, process_time

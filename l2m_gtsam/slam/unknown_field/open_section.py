@@ -25,7 +25,7 @@ from l2m_gtsam.slam.options import SlamOptions
 from l2m_gtsam.slam.pose_graph import between_factor, link_graph
 from l2m_gtsam.slam.solver import (
     colamd_ordering,
-    joint_covariance,
+    joint_posterior,
     stepwise_levenberg_marquardt,
 )
 from l2m_gtsam.slam.unknown_field.field_memory import FieldMemory, RememberedTile, tile_of
@@ -80,8 +80,8 @@ class OpenSection:
         self._counted: list[TileReadings] = []
         self._moved_m = 0.0
         self._prior: gtsam.NonlinearFactorGraph | None = None
-        self._graph = gtsam.NonlinearFactorGraph()  # as it was solved last
-        self._linear = gtsam.GaussianFactorGraph()  # at its solution
+        self._after = memory.known  # of the variables that the memory keeps or shares
+        self._promised = 0.0  # decrease of the error by another step
 
     @property
     def prior(self) -> FieldPrior:
@@ -112,8 +112,8 @@ class OpenSection:
         for scale in AGAIN if any(entered) else ONWARDS:
             graph = self._factors(numbers[0], scale)
             yield
+            graph.push_back(self._prior_factors())
             yield from self._solved(graph, 1)
-            yield
         graph = self._factors(numbers[0], 1.0)
         yield
         for each in self._counted:
@@ -121,22 +121,23 @@ class OpenSection:
             for factor in each.penalties(tile):
                 graph.add(factor)
             yield
-        yield from self._solved(graph, self._options.max_iterations)
-        yield
-        self._linear = self._graph.linearize(self._values)
+        graph.push_back(self._prior_factors())
+        yield from self._solved(graph, 1)
+        yield from self._looked_at(graph)
+        if self._promised > CLOSE:
+            yield from self._solved(graph, self._options.max_iterations - 1)
+            yield from self._looked_at(graph)
         self._moved_m = float(np.linalg.norm(self._places() - before, axis=1).max(initial=0.0))
         yield
 
     def belief(self) -> Belief:
         """Return the posterior of the last key pose."""
-        known = self._known([X(self._last), *self._calibrations])
+        known = self._after.marginal([X(self._last), *self._calibrations])
         return Belief(self.pose(self._last), self._sensors, known.covariance)
 
     def closed(self) -> Generator[None, None, FieldMemory]:
         """Return the memory updated by the section; yields between pieces of the work."""
-        after = self._known(self._kept())
-        yield
-        known = self._memory.known.updated(after)
+        known = self._memory.known.updated(self._after)
         yield
         tiles = list(self._tiles)
         for each in self._counted:
@@ -274,19 +275,35 @@ class OpenSection:
         robust = self._options.robust
         return TileReadings.weighed(self._of_section, laid, prediction, noise, mu, robust)
 
-    def _solved(self, graph: gtsam.NonlinearFactorGraph, most: int) -> Generator[None, None, None]:
-        """Solve for all variables of the section, with a limit of steps."""
+    def _prior_factors(self) -> gtsam.NonlinearFactorGraph:
+        """Return the memory's factors on the variables that it shares."""
         if self._prior is None:
             self._prior = gtsam.NonlinearFactorGraph()
             for factor in prior_factors(self._memory.known.marginal(self._shared)):
                 self._prior.add(factor)
-        graph.push_back(self._prior)
-        self._graph = graph
+        return self._prior
+
+    def _solved(self, graph: gtsam.NonlinearFactorGraph, most: int) -> Generator[None, None, None]:
+        """Solve for all variables of the section, with a limit of steps."""
         order = colamd_ordering(graph)
         self._values = yield from stepwise_levenberg_marquardt(
             graph, self._values, order, most, CLOSE
         )
         self._sensors = sensors_in(self._values, self._sensors)
+        yield
+
+    def _looked_at(self, graph: gtsam.NonlinearFactorGraph) -> Iterator[None]:
+        """Linearise where it was solved: what is known then, and what another step promises.
+
+        The one elimination tells both; a step to see that the error stays would be another.
+        """
+        linear, keys = graph.linearize(self._values), self._kept()
+        yield
+        found = joint_posterior(linear, keys)
+        sizes = {key: self._size(key) for key in keys}
+        self._after = JointGaussian(part_of(self._values, keys), sizes, found.covariance)
+        self._promised = found.decrease
+        yield
 
     def _kept(self) -> list[int]:
         """Return the variables that the memory keeps or shares, the last pose at the end."""
@@ -301,9 +318,3 @@ class OpenSection:
         if gtsam.symbolChr(key) == ord("M"):
             return len(self._tiles[gtsam.symbolIndex(key)].field)
         return self._memory.known.sizes[key] if key in self._calibrations else POSE
-
-    def _known(self, keys: list[int]) -> JointGaussian:
-        """Return the joint posterior of some variables."""
-        sizes = {key: self._size(key) for key in keys}
-        covariance = joint_covariance(self._linear, keys)
-        return JointGaussian(part_of(self._values, keys), sizes, covariance)

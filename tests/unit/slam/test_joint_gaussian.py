@@ -15,7 +15,7 @@ from l2m_gtsam.slam.joint_gaussian import (
     prior_factors,
     retracted,
 )
-from l2m_gtsam.slam.solver import colamd_ordering, joint_covariance, levenberg_marquardt, ordered
+from l2m_gtsam.slam.solver import colamd_ordering, joint_posterior, levenberg_marquardt, ordered
 from tests.reference.dense_newton import newton
 
 ROUNDING = 1e-8  # of matrices of condition 1e4, with 1e-12 added to correlations
@@ -82,7 +82,7 @@ def solved(
         whole.add(factor)
     for _ in range(3):  # to the last digit
         values = levenberg_marquardt(whole, values, colamd_ordering(whole), 50, 0.0).values
-    covariance = joint_covariance(whole.linearize(values), list(sizes))
+    covariance = joint_posterior(whole.linearize(values), list(sizes)).covariance
     return values, JointGaussian(values, sizes, covariance)
 
 

@@ -15,7 +15,7 @@ from l2m_gtsam.slam.solver import (
     TOGETHER,
     Marginals,
     colamd_ordering,
-    joint_covariance,
+    joint_posterior,
     levenberg_marquardt,
     net_covariance,
     ordered,
@@ -78,7 +78,7 @@ def test_where_cholesky_is_refused_covariances_come_from_qr(
     marginals = Marginals(linear, colamd_ordering(graph))
     alone = pose_covariances(marginals, len(P))
     together = pose_covariances_together(marginals, len(P))
-    pair, last = joint_covariance(linear, [X(5), X(2)]), joint_covariance(linear, [X(8)])
+    pair, last = joint_posterior(linear, [X(5), X(2)]).covariance, joint_posterior(linear, [X(8)]).covariance
     for k, true in enumerate(P):
         assert off(alone[k], true) < 1e-5
         assert off(together[k], true) < 1e-5
@@ -179,7 +179,7 @@ def test_what_no_factor_tells_is_refused_in_one_line() -> None:
     for k in (0, 1):
         values.insert(X(k), gtsam.Pose3())
     with pytest.raises(CalibrationError, match="orders of magnitude"), reported_ill_conditioning():
-        joint_covariance(graph.linearize(values), [X(1)])
+        joint_posterior(graph.linearize(values), [X(1)]).covariance
 
 
 def test_covariances_are_in_the_order_asked_for_whatever_gtsam_eliminates_first() -> None:
