@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import (
     BoolArray,
@@ -19,6 +19,7 @@ from l2m_gtsam.data import (
     Trajectory,
 )
 from l2m_gtsam.errors import SyncError
+from l2m_gtsam.geometry import interpolated_rotations
 from l2m_gtsam.options import Options
 
 
@@ -213,7 +214,7 @@ def _poses_at(trajectory: Trajectory, at: FloatArray) -> tuple[FloatArray, Float
     """
     seconds = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
     at = np.clip(at, 0.0, seconds[-1])
-    R = Slerp(seconds, Rotation.from_matrix(trajectory.R))(at).as_matrix()
+    R = interpolated_rotations(trajectory.R, seconds, at)
     return R, np.column_stack([np.interp(at, seconds, axis) for axis in trajectory.p.T])
 
 

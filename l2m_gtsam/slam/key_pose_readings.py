@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from l2m_factors import KeyPoseReadings
 from l2m_gtsam.data import FloatArray, IntArray, Readings, Trajectory
+from l2m_gtsam.geometry import turn_angle
 
 ARM_M = 1.0  # lever arm that converts a rotation into a distance
 CREEP_M_S = 1e-6  # makes the progress of a parked vehicle increase with time
@@ -87,7 +87,7 @@ def _fractions(
     trajectory: Trajectory, first: IntArray, last: IntArray, stamp_ns: IntArray
 ) -> FloatArray:
     """Return the fraction of the motion from a first pose to a last that is done, shape (N,)."""
-    turn = Rotation.from_matrix(trajectory.R[:-1].transpose(0, 2, 1) @ trajectory.R[1:]).magnitude()
+    turn = turn_angle(trajectory.R[:-1].transpose(0, 2, 1) @ trajectory.R[1:])
     seconds = 1e-9 * (trajectory.stamp_ns - trajectory.stamp_ns[0])
     distance = np.linalg.norm(np.diff(trajectory.p, axis=0), axis=1)
     done = np.append(0.0, np.cumsum(distance + ARM_M * turn + CREEP_M_S * np.diff(seconds)))

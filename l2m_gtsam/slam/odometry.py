@@ -9,10 +9,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from l2m_gtsam.data import FloatArray, IntArray, RigidTransform, Trajectory
-from l2m_gtsam.geometry import IDENTITY, between, isotropic_covariance, moved
+from l2m_gtsam.geometry import IDENTITY, between, isotropic_covariance, moved, turn_angle
 from l2m_gtsam.lidar.odometry import LEAST_POINTS, ScanStep
 from l2m_gtsam.lidar.surface import Surface
 from l2m_gtsam.recording.odometry_jumps import Jump, RepairedOdometry
@@ -253,7 +252,7 @@ def drift_covariance(R: FloatArray, p: FloatArray, options: DriftOptions) -> Flo
     options
         Drift of odometry.
     """
-    length, turn = np.linalg.norm(p, axis=1), Rotation.from_matrix(R).magnitude()
+    length, turn = np.linalg.norm(p, axis=1), turn_angle(R)
     # Steps err independently: variances add up to (share * over_m)^2 after over_m metres.
     over = options.over_m * length
     position = options.position_share**2 * over

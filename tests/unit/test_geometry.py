@@ -1,13 +1,13 @@
-"""Covariances of poses between ROS and GTSAM, against derivatives of GTSAM's own poses."""
+"""Covariances of poses against derivatives of GTSAM's own poses, rotations against SciPy."""
 
 import gtsam
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from l2m_gtsam.data import FloatArray, RigidTransform
-from l2m_gtsam.geometry import from_ros, moved, to_ros
+from l2m_gtsam.geometry import from_ros, interpolated_rotations, moved, to_ros, turn_angle
 
 SEEDS = st.integers(0, 2**32 - 1)
 STEP = 1e-6
@@ -88,3 +88,32 @@ def test_a_lever_turns_a_rotation_into_a_shift() -> None:
     expected = np.zeros((6, 6))
     expected[np.ix_([2, 4], [2, 4])] = 1e-6 * np.array([[1, 2], [2, 4]])
     np.testing.assert_allclose(found, expected, rtol=1e-14)  # rounding
+
+
+@given(SEEDS, st.floats(0.0, np.pi))
+def test_the_angle_of_a_rotation(seed: int, angle: float) -> None:
+    axis = np.random.default_rng(seed).normal(size=(5, 3))
+    vector = angle * axis / np.linalg.norm(axis, axis=1)[:, None]
+    R = Rotation.from_rotvec(vector).as_matrix()
+    # Of half a turn the cosine keeps the square of what is missing: root of the rounding.
+    np.testing.assert_allclose(turn_angle(R), angle, rtol=1e-12, atol=1e-7 if angle > 3 else 1e-15)
+
+
+@given(SEEDS, st.sampled_from([0.0, 1e-12, 1e-6, 0.1, 2.5, 3.1, np.pi]))
+def test_rotations_are_interpolated_along_the_shortest_arc(seed: int, largest: float) -> None:
+    """As SciPy does, from poses at rest to turns of nearly a half."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=(7, 3))
+    steps = largest * rng.uniform(size=(7, 1)) * axis / np.linalg.norm(axis, axis=1)[:, None]
+    steps[3] = 0.0
+    turned = [Rotation.random(random_state=seed)]
+    for step in steps:
+        turned.append(turned[-1] * Rotation.from_rotvec(step))
+    R = np.stack([each.as_matrix() for each in turned])
+    at = np.cumsum(rng.uniform(1e-3, 1.0, len(R)))
+    between = np.concatenate([at, rng.uniform(at[0], at[-1], 20)])
+    expected = Slerp(at, Rotation.from_matrix(R))(between).as_matrix()
+    # Near half turns the sine of 0.14 divides rounding twice.
+    np.testing.assert_allclose(
+        interpolated_rotations(R, at, between), expected, rtol=0, atol=1e-13
+    )

@@ -252,7 +252,8 @@ class Intake:
             key_pose = replace(key_pose, covariance=covariance, lost=suspect.lost)
             if suspect.replaced:
                 key_pose = replace(key_pose, recorded=recorded)
-        key_pose = replace(key_pose, scans=scans_at(taken, trajectory_of(poses), row))
+        if taken:
+            key_pose = replace(key_pose, scans=scans_at(taken, trajectory_of(poses), row))
         self._check_sensors(stamp, moved=key_pose.length_m >= self._options.key_poses.distance_m)
         return key_pose
 
@@ -317,8 +318,6 @@ class Intake:
 
 def scans_at(scans: Sequence[Scan], trajectory: Trajectory, row: int) -> tuple[ScanAtKeyPose, ...]:
     """Return scans as if taken at once, with their poses relative to that of a row."""
-    if not scans:
-        return ()
     stamps = np.array([each.stamp_ns for each in scans], dtype=np.int64)
     at, motion = interpolated(trajectory, stamps), twists(trajectory, stamps)
     key = RigidTransform(trajectory.R[row], trajectory.p[row])

@@ -1,5 +1,6 @@
 """Readings of one sensor that have come and wait for their key pose."""
 
+from bisect import bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -79,7 +80,7 @@ class SensorBuffer:
 
     def take(self, until_ns: int) -> tuple[IntArray, FloatArray]:
         """Remove the readings up to a time and return them, (n,) and (n, 3); none while stuck."""
-        count = int(np.searchsorted(self.stamp_ns, until_ns, side="right"))
+        count = bisect_right(self.stamp_ns, until_ns)
         stamps, values = self.stamp_ns[:count], self.values[:count]
         del self.stamp_ns[:count], self.values[:count]
         if self.stuck:
